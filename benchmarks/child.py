@@ -23,9 +23,9 @@ from pathlib import Path
 import record
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "blender_primdiffusion"))
-from backend.client import BackendClient, Died  # noqa: E402
-from backend.requests import Backend, ChildRequest  # noqa: E402
+sys.path.insert(0, str(ROOT))
+from blender_primdiffusion.backend.client import BackendClient, Died  # noqa: E402
+from blender_primdiffusion.backend.requests import Backend, ChildRequest  # noqa: E402
 
 TICK_S = 0.1
 """The interval of Blender's timer in seconds."""

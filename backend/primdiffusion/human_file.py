@@ -29,7 +29,10 @@ import torch
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyModel
 from primdiffusion.formats import compact_human
+from primdiffusion.formats.arrays import write_stored
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.json_files import LARGEST_INTEGER, parse_json
+from primdiffusion.formats.regular_files import check_size
 from primdiffusion.human import Human, body_of
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
@@ -43,6 +46,8 @@ FORMAT_VERSION_ON_FILES = 2
 """Version for humans on a body of the user's files."""
 BLENDER_FORMAT_VERSION = 2
 """Version of human.npz."""
+LARGEST_FILE = 256 * 2**20
+_FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
 """Tensors of a .human.safetensors file."""
 
@@ -94,12 +99,13 @@ def load_human(path: str | Path) -> Human:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no human file {path}: check the path, or generate a human")
+    check_size(path, path.stat().st_size, LARGEST_FILE)
     try:
         with safetensors.safe_open(path, framework="pt") as file:
             metadata = file.metadata() or {}
             _check_format(path, metadata)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  safe_open is no mapping
-    except safetensors.SafetensorError as e:
+    except (safetensors.SafetensorError, OSError, RuntimeError) as e:
         raise HumanFileError(f"{path} is truncated or not a safetensors file ({e}): generate the human again") from e
     tensors = _expanded(path, tensors, metadata)
     _check_shapes(path, tensors)
@@ -119,8 +125,10 @@ def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
     if metadata.get("format") != FORMAT:
         raise NoPersonError(f"{path} is a safetensors file without a human: choose a .human.safetensors file")
     version = metadata.get("format_version", "")
-    if not version.isdecimal() or int(version) < 1:
-        raise HumanFileError(f"{path} does not contain a valid human (format version {version!r}): generate it again")
+    if not (version.isascii() and version.isdecimal() and len(version) <= 9) or int(version) < 1:
+        raise HumanFileError(
+            f"{path} does not contain a valid human (format version {version!r:.9}): generate it again"
+        )
     if int(version) > compact_human.FORMAT_VERSION:
         raise HumanFileError(
             f"{path} was written by a newer PrimDiffusion (format {version}, this one reads up to "
@@ -149,7 +157,7 @@ def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
     for name, shape in SHAPES.items():
         if name not in tensors:
             raise HumanFileError(f"{path} does not contain a valid human ({name} is missing): generate it again")
-        if tuple(tensors[name].shape) != shape or not tensors[name].is_floating_point():
+        if tuple(tensors[name].shape) != shape or tensors[name].dtype not in _FLOATS:
             given = f"{tensors[name].dtype} {tuple(tensors[name].shape)}"
             raise HumanFileError(
                 f"{path} does not contain a valid human ({name} is {given}, not {shape}): generate it again"
@@ -167,8 +175,8 @@ def _check_betas(human: Human) -> None:
 
 def _provenance(metadata: Mapping[str, str]) -> dict[str, Any]:
     try:
-        provenance = json.loads(metadata.get("provenance", ""))
-    except (ValueError, RecursionError) as e:
+        provenance = parse_json(metadata.get("provenance", ""))
+    except ValueError as e:
         raise ValueError(f"its provenance is not JSON ({e}): generate the human again") from e
     _check_provenance(provenance)
     return provenance
@@ -194,6 +202,8 @@ def _check_provenance(provenance: Any) -> None:
         if name in provenance and not _is(provenance[name], kind):
             _reject(name, provenance[name], wanted)
     _check_attributes("attributes", provenance.get("attributes", {}))
+    if not provenance.get("full_density", 1) > 0:
+        _reject("full_density", provenance["full_density"], "above zero")
     edits = provenance.get("edits", [])
     if not isinstance(edits, list):
         _reject("edits", edits, "a list of objects")
@@ -214,7 +224,7 @@ def _check_attributes(name: str, attributes: Any) -> None:
 def _is(value: Any, kind: Any) -> bool:
     if isinstance(value, bool) or (isinstance(value, float) and not math.isfinite(value)):
         return False
-    return isinstance(value, kind)
+    return isinstance(value, kind) and not (isinstance(value, int) and abs(value) > LARGEST_INTEGER)
 
 
 def _reject(name: str, value: Any, wanted: str) -> NoReturn:
@@ -256,14 +266,13 @@ def export_for_blender(path: str | Path, human: Human) -> None:
         **_shape_fields(body, anchors, len(human.betas)),
     }
     plain = {name: value.detach().cpu().contiguous().numpy() for name, value in arrays.items()}
-    with written_whole(path) as unfinished, unfinished.open("wb") as file:
-        np.savez(
-            file,
-            format_version=np.int64(BLENDER_FORMAT_VERSION),
-            meta=np.array(json.dumps(dict(human.provenance))),
-            joint_names=np.array(JOINT_NAMES),
-            **plain,
-        )
+    described = {
+        "format_version": np.array(BLENDER_FORMAT_VERSION, np.int64),
+        "meta": np.array(json.dumps(dict(human.provenance))),
+        "joint_names": np.array(JOINT_NAMES),
+    }
+    with written_whole(path) as unfinished:
+        write_stored(unfinished, {**described, **plain})
 
 
 def _shape_fields(body: BodyModel, anchors: Anchors, betas: int) -> dict[str, torch.Tensor]:

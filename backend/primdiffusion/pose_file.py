@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +11,16 @@ from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.formats.json_files import read_json
 
 POSE_KEYS = ("pose", "poses", "theta")
 TRANSLATION_KEYS = ("translation", "trans", "transl")
 BODY_NUMBERS = 66
 """Axis-angle numbers of the 22 joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
+
+
+LARGEST_NUMBER = 1e6
+"""Radians and metres in a pose: larger angles have no digits left after the point in float32."""
 
 
 class InvalidPoseError(ValueError):
@@ -36,12 +40,13 @@ def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
         raise FileNotFoundError(f"there is no pose file {path}: check the path")
     try:
         if path.suffix == ".json":
-            content: Any = json.loads(path.read_text("utf-8"))
+            content: Any = read_json(path)
         else:
             content = read_arrays(path, optional=(*POSE_KEYS, *TRANSLATION_KEYS))
     except (ValueError, OSError) as e:
+        reason = str(e).removeprefix(f"{path}")[:120].strip(" :")
         raise InvalidPoseError(
-            f"{path} is neither JSON nor an npz of plain arrays ({e}): convert it to one of these"
+            f"{path} is neither JSON nor an npz of plain arrays ({reason}): convert it to one of these"
         ) from e
     return pose_from_numbers(content, str(path), frame)
 
@@ -53,18 +58,28 @@ def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
         pose = _first(content, POSE_KEYS, None)
         translation = _first(content, TRANSLATION_KEYS, translation)
     try:
-        theta = np.asarray(pose, dtype=np.float32)
+        with np.errstate(over="ignore"):  # infinite numbers are rejected below
+            theta = _numbers(pose)
         theta = body_theta(_frame(_a_row_a_pose(theta), frame))
-        move = _frame(np.asarray(translation, dtype=np.float32), frame)[:3].copy()
+        move = _frame(_numbers(translation), frame)[:3].copy()
         if len(move) < 3:
             raise ValueError(f"{len(move)} numbers instead of 3")
-    except (TypeError, ValueError, IndexError) as e:
+    except (TypeError, ValueError, IndexError, OverflowError) as e:
         raise InvalidPoseError(
             f"{name} holds no pose: it needs {3 * J} axis-angle numbers ({J} joints x 3, radians)"
         ) from e
     if not (np.isfinite(theta).all() and np.isfinite(move).all()):
         raise InvalidPoseError(f"{name} holds NaN or infinite numbers: export the pose again")
+    if max(np.abs(theta).max(initial=0), np.abs(move).max(initial=0)) > LARGEST_NUMBER:
+        raise InvalidPoseError(f"{name} holds numbers above {LARGEST_NUMBER:g}, which are no angles or metres")
     return BodyPose.from_axis_angle(torch.from_numpy(theta), torch.from_numpy(move))
+
+
+def _numbers(values: Any) -> NDArray[np.float32]:
+    given = np.asarray(values)
+    if given.dtype.kind not in "iuf":
+        raise TypeError(f"{given.dtype} instead of numbers")
+    return given.astype(np.float32)
 
 
 def _first(content: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:

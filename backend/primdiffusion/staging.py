@@ -78,6 +78,7 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     if path.exists() and not path.is_file():
         raise PermissionError(errno.EPERM, "this is not a regular file and will not be replaced", str(path))
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    unfinished.unlink(missing_ok=True)  # a link of that name would be followed
     try:
         yield unfinished
         os.replace(unfinished, path)

@@ -10,6 +10,7 @@ import collections
 import dataclasses
 import itertools
 import json
+import math
 import os
 import subprocess
 import time
@@ -17,6 +18,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from ..formats.json_files import parse_message
 from .child_streams import LOG_LINES, Input, Output
 
 PROGRAM = "primdiffusion"
@@ -211,6 +213,8 @@ class BackendClient:
             self._input.flush()
         exit_code = self._process.poll()  # before reading: then all that it wrote is there
         for message in self._arrived():
+            if fault := _fault(message, self._hello):
+                return [*events, *self._give_up(fault)]
             self._silence, self._reported_silence = 0.0, False
             if message.get("id") in self._abandoned and "method" not in message:
                 self._abandoned.discard(message["id"])
@@ -309,11 +313,20 @@ class BackendClient:
         """The end of the child, once, after its last messages."""
         self._ended = True
         last = _parse(self._output.rest()) if self._output is not None else None
-        if last is not None:
+        if last is not None and not _fault(last, self._hello):
             yield self._event(last)
         self._close_streams()
         if not self._expected_to_end:
             yield Died(exit_code, death_sentence(exit_code), self.stderr)
+
+    def _give_up(self, fault: str) -> Iterator[Event]:
+        """End a child whose messages cannot be trusted: the last event, unless it was to end anyway."""
+        expected, errors = self._expected_to_end, self.stderr
+        self.kill(0.0)
+        self._ended = True
+        self._lines.clear()
+        if not expected:
+            yield Died(0, f"the backend was ended because it sent a malformed message ({fault})", errors)
 
     def _close_streams(self) -> None:
         if self._errors is not None:
@@ -330,10 +343,60 @@ class BackendClient:
 
 def _parse(line: bytes) -> dict[str, Any] | None:
     try:
-        message = json.loads(line)
-    except (ValueError, RecursionError):
+        message = parse_message(line)
+    except ValueError:
         return None
     return message if isinstance(message, dict) else None
+
+
+_KINDS: dict[str, tuple[type, ...]] = {
+    "step": (int,), "total": (int,), "index": (int,), "eta_s": (int, float, type(None)), "stage": (str,),
+    "picture": (str, type(None)), "ready": (bool,), "problem": (str, type(None)), "device": (str, type(None)),
+    "device_name": (str, type(None)), "version": (str,), "python": (str,), "executable": (str,), "pid": (int,),
+    "protocol": (int,), "memory_gb": (int, float), "memory_free_gb": (int, float),
+}  # fmt: skip
+"""Types of what the child reports, where it reports it (docs/design/protocol.md)."""
+
+
+def _fault(message: Mapping[str, Any], hello: int) -> str | None:
+    """What is wrong with a message, if anything: it names the member that is not of its type."""
+    id, method, error = message.get("id"), message.get("method"), message.get("error")
+    params, result = message.get("params"), message.get("result")
+    if not (id is None or type(id) is int):
+        return "id"
+    if "method" in message:
+        if not isinstance(method, str):
+            return "method"
+        if not isinstance(params, dict | None):
+            return "params"
+        return _faulty_member(params or {})
+    if "error" in message:
+        if (
+            not isinstance(error, dict)
+            or type(error.get("code")) is not int
+            or not isinstance(error.get("message"), str)
+        ):
+            return "error"
+        data = error.get("data")
+        if not (data is None or (isinstance(data, dict) and all(isinstance(data.get(k, ""), str) for k in _DATA))):
+            return "data of error"
+        return None
+    if "result" not in message or not isinstance(result, dict):
+        return "result"
+    return _faulty_member(result) if id == hello else None
+
+
+_DATA = ("kind", "remedy")
+
+
+def _faulty_member(members: Mapping[str, Any]) -> str | None:
+    for name, value in members.items():
+        kinds = _KINDS.get(name, (object,))
+        if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds and object not in kinds):
+            return name
+        if isinstance(value, float) and not math.isfinite(value):
+            return name
+    return None
 
 
 def death_sentence(exit_code: int) -> str:

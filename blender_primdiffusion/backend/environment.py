@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
-import json
 import os
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import time
 from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 
+from ..formats.json_files import parse_json
 from .child_streams import Output
 from .client import PROGRAM, child_environment, is_program
 
@@ -216,7 +216,7 @@ def _try(
     if exit_code != 0:
         raise BackendNotFound(f"{named} cannot run it: {complaints[-1] if complaints else f'exit code {exit_code}'}")
     try:
-        about = json.loads(answered[-1])
+        about = parse_json(answered[-1])
         return BackendPython(path, source, about["version"], about["torch"], about["python"])
     except (ValueError, IndexError, KeyError) as e:
         raise BackendNotFound(f"{named} is no Python interpreter: it answered {answered[:1]}") from e

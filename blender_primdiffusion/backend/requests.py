@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import shutil
 import time
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from ..formats.removing import remove_folder
 from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
 
 
@@ -351,7 +351,7 @@ class ChildRequest:
     def _clear_leftovers(self) -> None:
         """Remove the folder of half-written files of a killed child (named by the backend's staging.py)."""
         if self._client is not None and self._out_dir is not None:
-            shutil.rmtree(self._out_dir / f".primdiffusion-partial-{self._client.pid}", ignore_errors=True)
+            remove_folder(self._out_dir / f".primdiffusion-partial-{self._client.pid}", self._out_dir)
             if self._out_dir_is_new:
                 with contextlib.suppress(OSError):  # holds other files, or was never created
                     self._out_dir.rmdir()

@@ -15,13 +15,14 @@ import contextlib
 import dataclasses
 import json
 import os
-import shutil
 import sys
 import time
 from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
+from ..formats.json_files import read_json
+from ..formats.removing import remove_file, remove_folder
 from .client import BackendClient
 from .environment import MARK, BackendPython, SetUpFolder, search, tried
 from .packages import Lock, SetUpFailed, clean_environment, followed, what_went_wrong
@@ -66,7 +67,7 @@ def state_of(folder: SetUpFolder) -> tuple[State, dict[str, Any]]:
     if not folder.environment.is_dir():
         return "absent", {}
     try:
-        about = json.loads((folder.environment / MARK).read_text(encoding="utf-8"))
+        about = read_json(folder.environment / MARK)
         made_with = Path(about["base"])
     except (OSError, ValueError, KeyError, TypeError):
         return "broken", {}
@@ -80,10 +81,10 @@ def set_up(
     a human. `compute` (cpu, cuda or apple) is for its mark."""
     python, host = folder.python, sys.executable
     folder.root.mkdir(parents=True, exist_ok=True)
-    (folder.environment / MARK).unlink(missing_ok=True)
-    shutil.rmtree(folder.temporary, ignore_errors=True)
+    remove_file(folder.environment / MARK, folder.environment)
+    remove_folder(folder.temporary, folder.temporary.parent)
     folder.temporary.mkdir(exist_ok=True)
-    folder.log.unlink(missing_ok=True)
+    remove_file(folder.log, folder.log.parent)
     yield Step("Making the environment", 0.0)
     environment = clean_environment(folder.temporary, folder.downloads)
     making = [host, *_VENV, str(folder.environment)]
@@ -107,7 +108,7 @@ def set_up(
     unfinished.write_text(json.dumps(marked, indent=1), encoding="utf-8")
     os.replace(unfinished, folder.environment / MARK)
     for leftover in (folder.downloads, folder.temporary):
-        shutil.rmtree(leftover, ignore_errors=True)
+        remove_folder(leftover, leftover.parent)
     return _ready(about)
 
 
@@ -121,7 +122,7 @@ def self_test(folder: SetUpFolder, python: Path | None, module_path: Path, cache
 def remove(folder: SetUpFolder, cache: Path | None) -> Steps:
     """Environment, downloads and `cache`, where it is not shared, are gone; nothing else in the folder is touched."""
     _, about = state_of(folder)
-    (folder.environment / MARK).unlink(missing_ok=True)
+    remove_file(folder.environment / MARK, folder.environment)
     going = [folder.environment, folder.downloads, folder.temporary, *([cache] if cache is not None else ())]
     program = "import shutil, sys; [shutil.rmtree(path) for path in sys.argv[1:]]"
     command = [sys.executable, "-I", "-c", program, *(str(path) for path in going if path.exists())]
@@ -167,7 +168,7 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
         }
     finally:
         backend.release()
-        shutil.rmtree(person, ignore_errors=True)
+        remove_folder(person, person.parent)
 
 
 def _installing(folder: SetUpFolder, lock: Lock, said: str) -> Step:

@@ -7,9 +7,10 @@ A safetensors file begins with the length of its header (8 bytes, little-endian)
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
+
+from ..formats.json_files import parse_json
 
 _LONGEST_HEADER = 100_000_000
 """What safetensors itself accepts."""
@@ -34,7 +35,7 @@ def read_vocabulary(path: Path) -> Vocabulary:
         length = int.from_bytes(file.read(8), "little")
         header = file.read(length) if length <= _LONGEST_HEADER else b""
     try:
-        tree = json.loads(json.loads(header)["__metadata__"]["architecture"]).get("vocabulary") or {}
+        tree = parse_json(parse_json(header)["__metadata__"]["architecture"]).get("vocabulary") or {}
         categories = {name: tuple(map(str, values)) for name, values in tree.get("categories", {}).items()}
         scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree.get("scalars", {}).items()}
     except (ValueError, KeyError, TypeError, AttributeError) as error:

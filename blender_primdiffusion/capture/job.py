@@ -19,6 +19,7 @@ from ..formats.camera_files import write_layouts
 from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
+from ..formats.removing import check_unlinked, remove_folder
 from ..motion.files import MotionFileError, read_motion
 from ..motion.motion import Motion
 from ..motion.poses import built_in_poses, pick_poses
@@ -142,8 +143,9 @@ def _try_subject(
         report.skipped.append(scan_file.name)
         yield clock.skip_rest(views)
         return
-    remove_damaged(folder, wrong)
     try:
+        check_unlinked(folder)
+        remove_damaged(folder, wrong)
         yield from _capture(context, settings, scan_file, poses, body, load, clock)
         complete(folder)
         report.done.append(scan_file.name)
@@ -168,7 +170,7 @@ def _name_reference(root: Path, subject: str) -> None:
         os.symlink(subject, reference, target_is_directory=True)
     except OSError:  # Windows without the right to links, or a disk that has none
         partial = root / f".{RELEASED_REFERENCE}.partial"
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_folder(partial, partial.parent)
         shutil.copytree(root / subject, partial)
         os.replace(partial, reference)
 

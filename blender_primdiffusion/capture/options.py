@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import NoReturn, get_args
@@ -12,6 +11,7 @@ import numpy as np
 
 from ..console import UsageError
 from ..formats.camera_rig import Arrangement, Rig, View
+from ..formats.json_files import read_json
 from ..formats.requests import LAYOUTS, PASSES
 from .blender_camera import CameraError
 from .settings import Background, CaptureSettings, Device, Light
@@ -111,7 +111,7 @@ def settings_of(options: argparse.Namespace) -> CaptureSettings:
 def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
     """The cameras of a cameras.json, in the order of their names. Raises CameraError or OSError."""
     try:
-        named = json.loads(path.read_text(encoding="utf-8"))
+        named = read_json(path)
         views = []
         for name in sorted(named):
             k, r, t = (np.array(named[name][key], np.float64) for key in "KRT")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import re
 import struct
@@ -15,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, array_names, read_arrays
+from ..formats.json_files import parse_json
 from ..motion.files import POSE_KEYS, MotionFileError, motion_from_arrays
 
 ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
@@ -87,12 +87,12 @@ def own_betas(path: Path) -> tuple[list[float], str] | None:
             magic, _, _, length, kind = struct.unpack("<4sIII4s", stream.read(20))
             if magic != b"glTF" or kind != b"JSON" or length > _LARGEST_JSON:
                 return None
-            content = json.loads(stream.read(length))
+            content = parse_json(stream.read(length))
         for holder in (content.get("asset", {}), *content.get("scenes", [])):
             about = (holder.get("extras") or {}).get("primdiffusion")
             if about:
                 return [float(beta) for beta in about["betas"]], str(about.get("body", "default"))
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error, RecursionError):
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, struct.error):
         return None
     return None
 

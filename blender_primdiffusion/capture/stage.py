@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,6 +10,7 @@ from pathlib import Path
 import bpy
 
 from ..formats.camera_rig import View
+from ..formats.removing import remove_file, remove_folder
 from .blender_camera import aim
 from .passes import Centres, Colours, read_centres, read_colours
 from .settings import CaptureSettings, Device
@@ -133,7 +133,7 @@ class Stage:
     def close(self) -> None:
         """Remove everything from the file."""
         self.added.remove()
-        shutil.rmtree(self.scratch, ignore_errors=True)
+        remove_folder(self.scratch, self.scratch.parent)
 
 
 def _set_up_cycles(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
@@ -207,7 +207,7 @@ def _render(stage: Stage, view: View, seed: int) -> Path:
     render.resolution_x, render.resolution_y = view.width, view.height
     render.pixel_aspect_x, render.pixel_aspect_y = aim(stage.camera, view)
     scene.cycles.seed = seed
-    path.unlink(missing_ok=True)
+    remove_file(path, path.parent)
     try:
         with stage.added:  # the first render makes the image Render Result
             bpy.ops.render.render(scene=scene.name)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import tempfile
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..formats.removing import remove_file, remove_folder
 
 SHARED_MEMORY = Path("/dev/shm")
 CHANNELS = 5
@@ -80,14 +81,14 @@ class SharedFrames:
         """Remove the frame of this name; its last user still maps it."""
         frame = self._spare.pop(name, None)
         if frame is not None:
-            frame.path.unlink(missing_ok=True)
+            remove_file(frame.path, frame.path.parent)
 
     def close(self) -> None:
         """Remove the folder."""
         self._spare.clear()
         folder = self._folders.pop(_FOLDER, None)
         if folder is not None:
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_folder(folder, folder.parent)
 
     def _allocate(self, name: str, size: int) -> Path:
         """A file of `size` allocated bytes: otherwise a full memory file system would crash the process later."""
@@ -113,7 +114,7 @@ def _reserve(path: Path, size: int) -> Path:
         else:
             os.truncate(descriptor, size)
     except OSError:
-        path.unlink(missing_ok=True)
+        remove_file(path, path.parent)
         raise
     finally:
         os.close(descriptor)
@@ -130,4 +131,4 @@ def _sweep() -> None:
             try:
                 os.kill(int(pid), 0)
             except ProcessLookupError:
-                shutil.rmtree(folder, ignore_errors=True)
+                remove_folder(folder, folder.parent)

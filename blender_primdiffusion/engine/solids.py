@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.removing import remove_file
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from ..scene.human import BODY_MARK
@@ -101,7 +102,7 @@ def stored(solids: SceneSolids, folder: Path) -> Path | None:
     with replacing(path) as partial:
         np.savez(partial, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
     for old in sorted(folder.glob("solids_*.npz"), key=lambda file: file.stat().st_mtime_ns)[:-_MOST_FILES]:
-        old.unlink(missing_ok=True)
+        remove_file(old, folder)
     return path
 
 

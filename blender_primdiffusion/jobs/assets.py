@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
+from ..formats.json_files import parse_json
+from ..formats.removing import remove_file
 from ..motion.pose_library import builtin_poses, current_pose
 from ..motion.poses import grounding
 from ..motion.rotation import from_axis_angle, to_axis_angle
@@ -43,7 +44,7 @@ def mark(asset: bpy.types.ID, description: str, tags: Iterable[str], picture: ND
 def asset_description(person: bpy.types.Collection) -> tuple[str, list[str]]:
     """Description and tags of a human: its seed and attributes."""
     try:
-        made = json.loads(person[MARK])
+        made = parse_json(person[MARK])
     except (ValueError, TypeError):
         made = {}
     asked = made.get("attributes") or {}
@@ -179,7 +180,7 @@ def write_pose_library(context: bpy.types.Context, folder: Path | None = None) -
     except RuntimeError as error:
         raise OSError(f"{path} could not be written: {error}") from error
     finally:
-        unfinished.unlink(missing_ok=True)
+        remove_file(unfinished, unfinished.parent)
         data = armature.data
         bpy.data.batch_remove([*actions, armature, data])
     _add_library(folder)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import bpy
 
+from ..formats.json_files import read_json
 from ..places import own_folder
 
 FAULT = (
@@ -96,7 +97,7 @@ def _recall() -> bool | None:
         return False
     if _build() not in _known:
         with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
-            _known[_build()] = bool(json.loads(_file().read_text(encoding="utf-8"))[_build()])
+            _known[_build()] = bool(read_json(_file())[_build()])
     return _known.get(_build())
 
 

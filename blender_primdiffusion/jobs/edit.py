@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, ClassVar
@@ -12,6 +11,7 @@ import bpy
 import numpy as np
 
 from ..backend.requests import sentence
+from ..formats.json_files import parse_json
 from ..scene.attachment import in_viewport
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import Replaced, edit_destination, replace_person, restore_destination, restore_volumes
@@ -174,7 +174,7 @@ class RegenerateJob(Job):
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Raises ValueError where another checkpoint has generated another human."""
         person, human = self.target.found(), Path(result["human"])
-        made, before = read_human(human).meta, json.loads(person[MARK])
+        made, before = read_human(human).meta, parse_json(person[MARK])
         for name in ("checkpoint_sha256", "checkpoint"):
             if name in before and made.get(name) != before[name]:
                 raise ValueError(
@@ -189,7 +189,7 @@ class RegenerateJob(Job):
 
 def made_from_seed(person: bpy.types.Collection) -> dict[str, Any]:
     """The provenance of a human that its seed reproduces. Raises ValueError for others."""
-    made = json.loads(person[MARK])
+    made = parse_json(person[MARK])
     if made.get("edits"):
         raise ValueError(
             f"{person.name!r} was edited after they were generated, so no seed reproduces them: restore their files"

@@ -12,6 +12,7 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
+from ..formats.removing import remove_file
 from ..motion.skeleton import unchain
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
@@ -268,7 +269,7 @@ class ExportVdbSequenceJob(Job):
         for index, grid in enumerate(result["files"]):
             name = f"{self.stem}_{self.first + index:04d}.vdb"
             write_grid(_for_other_programs(read_grid(Path(grid))), folder / name)
-            Path(grid).unlink()
+            remove_file(Path(grid), Path(grid).parent)
             written.append(folder / name)
         size = sum(path.stat().st_size for path in written) / 1e6
         for path in written:
@@ -329,7 +330,7 @@ def put(source: Path, target: Path) -> None:
         shutil.copyfile(source, unfinished)
         unfinished.replace(target)
     finally:
-        unfinished.unlink(missing_ok=True)
+        remove_file(unfinished, unfinished.parent)
 
 
 def _for_other_programs(grid: MergedGrid) -> MergedGrid:

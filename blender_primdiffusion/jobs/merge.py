@@ -11,6 +11,7 @@ import numpy as np
 
 from ..engine.picture import pose_of
 from ..formats.joints import JOINT_NAMES
+from ..formats.removing import remove_file
 from ..scene.attachment import set_attachment
 from ..scene.human import armature_of
 from ..scene.material import set_density_gain
@@ -108,7 +109,7 @@ class MergeFramesJob(Job):
             return False
         try:
             self._digests.append(write_grid(read_grid(grid), grid.with_suffix(".vdb")))
-            grid.unlink()
+            remove_file(grid, folder)
         except (OSError, ValueError) as error:  # `finish` reports it
             self._error = error
         return _grid(folder, len(self._digests)).is_file()

@@ -6,7 +6,6 @@ import abc
 import collections
 import dataclasses
 import itertools
-import shutil
 import tempfile
 import time
 import traceback
@@ -17,6 +16,7 @@ import bpy
 
 from ..backend.client import Died, Silent
 from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError
+from ..formats.removing import remove_folder
 from ..places import new_backend, preference
 from ..scene.attachment import volumes_may_wait
 from .remedies import defect_in_the_scene, error_in_the_scene
@@ -303,7 +303,7 @@ class Queue:
 
     def _clear_folder(self) -> None:
         if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            remove_folder(self._folder, self._folder.parent)
             self._folder = None
 
     def _backend_for(self, python: str) -> Backend:

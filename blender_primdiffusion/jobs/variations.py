@@ -11,6 +11,7 @@ from typing import Any
 
 import bpy
 
+from ..formats.removing import remove_folder
 from .pictures import icons
 from .queue import Job, chosen_checkpoint
 
@@ -62,7 +63,7 @@ class Sheet:
                     shutil.move(person[name], own / file)
                 made.append(Variation(int(person["seed"]), own))
         except OSError:
-            shutil.rmtree(folder, ignore_errors=True)
+            remove_folder(folder, folder.parent)
             raise
         self.clear()
         self.variations, self.title, self.around, self._folder = made, title, around, folder
@@ -70,7 +71,7 @@ class Sheet:
     def clear(self) -> None:
         """Remove all variations and their files."""
         if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            remove_folder(self._folder, self._folder.parent)
         self.variations, self.title, self.around, self._folder = [], "", False, None
 
     def at(self, index: int) -> Variation:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -10,13 +12,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from .motion import Detected, Motion
+from ..formats.regular_files import TooLargeError, read_regular
+from .motion import LARGEST_NUMBER, Detected, Motion
 from .rigs import BoneMap, UnknownBonesError, chosen_bones, facing, map_bones, rig_from_smpl
 from .rotation import about_axis
 from .skeleton import REST_JOINTS, unchain
 
-LARGEST_BYTES = 256 * 2**20
+LARGEST_BYTES = 64 * 2**20
+MOST_JOINTS = 1000
+MOST_ROTATIONS = 5_000_000
+"""Joints times frames: 24 joints for an hour at 60 frames/s, 65 joints for 20 minutes."""
+LONGEST_FRAME_TIME, SHORTEST_FRAME_TIME = 10.0, 1e-4
+"""Seconds."""
 _CHANNELS = {f"{axis}{kind}": (kind, "XYZ".index(axis)) for axis in "XYZ" for kind in ("position", "rotation")}
+_MOTION = re.compile(r"\s*Frames:\s*(\d{1,15})\s+Frame\s+Time:\s*(\S{1,40})", re.IGNORECASE)
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "decimetres": 0.1}
 
 
@@ -95,19 +104,24 @@ def bone_names(hierarchy: Hierarchy) -> list[str]:
 
 def parse_bvh(path: Path) -> Hierarchy:
     """Parse a BVH file. Raises BvhError where it is no BVH file or truncated."""
-    if path.stat().st_size > LARGEST_BYTES:
-        raise BvhError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces")
-    text = path.read_text("utf-8", errors="replace")
+    try:
+        text = read_regular(path, LARGEST_BYTES).decode("utf-8", errors="replace")
+    except TooLargeError as e:
+        raise BvhError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces") from e
     head, found, tail = text.partition("MOTION")
     if not found or "HIERARCHY" not in head:
         raise BvhError(f"{path} is not a BVH file: it has no HIERARCHY followed by MOTION")
     try:
         names, parents, offsets, channels = _parse_hierarchy(head.split("HIERARCHY", 1)[1].split())
-        values, frame_time = _parse_motion(tail, sum(map(len, channels)))
-    except (ValueError, IndexError, KeyError) as e:
-        raise BvhError(f"{path} is not a complete BVH file ({e}): export it again") from e
+        values, frame_time = _parse_motion(tail, sum(map(len, channels)), len(names))
+    except (ValueError, IndexError, KeyError, OverflowError) as e:
+        raise BvhError(f"{path} is not a complete BVH file ({e!s:.120}): export it again") from e
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
         raise BvhError(f"{path} holds NaN or infinite numbers: export the motion again")
+    if max(np.abs(values).max(initial=0), np.abs(offsets).max(initial=0)) > LARGEST_NUMBER:
+        raise BvhError(
+            f"{path} holds numbers above {LARGEST_NUMBER:g}, which are no angles or lengths: export it again"
+        )
     if not names:
         raise BvhError(f"{path} has no ROOT: export the motion again")
     return Hierarchy(names, parents, offsets, channels, values, frame_time)
@@ -127,6 +141,8 @@ def _parse_hierarchy(words: list[str]) -> tuple[list[str], list[int], NDArray, l
             name = " ".join(words[at + 1 : brace]) if word != "END" else f"{names[open_joints[-1]]}_end"
             if word == "ROOT" and names:
                 raise ValueError("a second ROOT: one skeleton a file is read")
+            if len(names) == MOST_JOINTS:
+                raise ValueError(f"more than {MOST_JOINTS} joints")
             parents.append(open_joints[-1] if open_joints else -1)
             names.append(name)
             offsets.append([0.0, 0.0, 0.0])
@@ -138,27 +154,41 @@ def _parse_hierarchy(words: list[str]) -> tuple[list[str], list[int], NDArray, l
             at += 4
         elif word == "CHANNELS":
             count = int(words[at + 1])
+            if not 0 <= count <= len(_CHANNELS):
+                raise ValueError(f"{count} channels of a joint")
             given = words[at + 2 : at + 2 + count]
             unknown = [channel for channel in given if channel not in _CHANNELS]
             if unknown:
-                raise ValueError(f"the channel {unknown[0]!r} is unknown")
+                raise ValueError(f"the channel {unknown[0]!r:.40} is unknown")
             channels[open_joints[-1]] = given
             at += 2 + count
         elif word == "}":
             open_joints.pop()
             at += 1
         else:
-            raise ValueError(f"{words[at]!r} where a joint was expected")
+            raise ValueError(f"{words[at]!r:.40} where a joint was expected")
     if open_joints:
         raise ValueError("a brace is not closed")
     return names, parents, np.array(offsets, np.float64).reshape(-1, 3), channels
 
 
-def _parse_motion(text: str, columns: int) -> tuple[NDArray[np.float64], float]:
-    words = text.split()
-    frames_at, time_at = words.index("Frames:"), words.index("Time:")
-    frames, frame_time = int(words[frames_at + 1]), float(words[time_at + 1])
-    numbers = np.array(words[time_at + 2 :], np.float64)
+def _parse_motion(text: str, columns: int, joints: int) -> tuple[NDArray[np.float64], float]:
+    found = _MOTION.match(text)
+    if found is None:
+        raise ValueError("MOTION is not followed by Frames: and Frame Time:")
+    frames, frame_time = int(found[1]), float(found[2])
+    if not columns:
+        raise ValueError("no joint has channels")
+    if frames * joints > MOST_ROTATIONS:
+        raise ValueError(f"{frames} frames of {joints} joints are more than {MOST_ROTATIONS} rotations, cut the motion")
+    if not (frame_time <= 0 or SHORTEST_FRAME_TIME <= frame_time <= LONGEST_FRAME_TIME):
+        raise ValueError(f"a frame time of {frame_time:g} s")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # numpy warns at the first word that is no number
+        try:
+            numbers = np.fromstring(text[found.end() :], np.float64, sep=" ")
+        except DeprecationWarning as e:
+            raise ValueError("a word where a number was expected") from e
     if frames < 1 or numbers.size < frames * columns:
         raise ValueError(f"{frames} frames of {columns} numbers are announced, but there are {numbers.size} numbers")
     return numbers[: frames * columns].reshape(frames, columns), frame_time

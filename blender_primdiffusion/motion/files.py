@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -13,13 +12,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, array_names, read_arrays, read_npy
+from ..formats.json_files import read_json
+from ..formats.regular_files import TooLargeError
 from ..formats.whole_files import replacing
 from .adjust import axis_direction, axis_name, find_up, turn_y_up
 from .bvh import BvhError, read_bvh
-from .motion import Detected, Motion
+from .motion import LARGEST_NUMBER, Detected, Motion
 from .rotation import about_axis, from_axis_angle, nearest, to_axis_angle
 from .skeleton import REST_JOINTS
 
+MOST_NUMBERS = 40_000_000
+"""Of an array: an hour of SMPL-X at 60 frames/s has 36 million."""
+LARGEST_FPS, SMALLEST_FPS = 10_000.0, 0.1
 DEFAULT_FPS = 30.0
 """Frame rate of motion whose file does not state it."""
 _POSES = ("poses", "pose", "theta", "fullpose")
@@ -70,6 +74,8 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
         else:
             raise MotionFileError(f"{path} is no pose file: .npz, .npy, .json and .bvh files are")
     except (ArrayFileError, BvhError) as e:
+        raise MotionFileError(str(e)) from e
+    except TooLargeError as e:
         raise MotionFileError(str(e)) from e
     except OSError as e:
         raise MotionFileError(f"{path} cannot be read ({e.strerror or e}): check that it may be opened") from e
@@ -126,15 +132,15 @@ def _read_npy(path: Path) -> tuple[Motion, bool]:
 
 def _read_json(path: Path) -> tuple[Motion, bool]:
     try:
-        content = json.loads(path.read_text("utf-8"))
-    except (ValueError, OSError, RecursionError) as e:
-        raise MotionFileError(f"{path} is not JSON ({e}): export it again") from e
+        content = read_json(path)
+    except (ValueError, OSError) as e:
+        raise MotionFileError(f"{path} is not JSON that can be read ({e!s:.120}): export it again") from e
     if not isinstance(content, dict):
         content = {"pose": content}
     try:
         arrays = {key: np.asarray(content[key], np.float64) for key in POSE_KEYS if key in content}
-    except (ValueError, TypeError) as e:
-        raise MotionFileError(f"{path} holds something else than lists of numbers of equal length ({e})") from e
+    except (ValueError, TypeError, OverflowError) as e:
+        raise MotionFileError(f"{path} holds something else than lists of numbers of equal length ({e!s:.80})") from e
     if not any(key in arrays for key in (*_POSES, *_REST)):
         raise MotionFileError(f"{path} holds no poses: it needs 'pose', or 'global_orient' and 'body_pose'")
     return motion_from_arrays(arrays, path), False
@@ -152,6 +158,11 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
             raise MotionFileError(f"{path}: {key!r} holds no frame; export the motion again")
         if not np.isfinite(array).all():
             raise MotionFileError(f"{path}: {key!r} holds NaN or infinite numbers; export the motion again")
+        if array.size > MOST_NUMBERS or np.abs(array.astype(np.float64)).max() > LARGEST_NUMBER:
+            raise MotionFileError(
+                f"{path}: {key!r} holds more than {MOST_NUMBERS} numbers, or one above {LARGEST_NUMBER:g}; cut the "
+                "motion into pieces, or export it again"
+            )
     rest = _first(arrays, _REST)
     if rest is None:
         given = _matrices(_given(arrays, _POSES), path)
@@ -174,6 +185,8 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     translations = np.array(np.broadcast_to(translations.reshape(-1, 3), (frames, 3)))
     rate = _first(arrays, _RATES)
     stated = float(rate.ravel()[0]) if rate is not None and rate.size == 1 and float(rate.ravel()[0]) > 0 else 0.0
+    if stated and not SMALLEST_FPS <= stated <= LARGEST_FPS:
+        raise MotionFileError(f"{path} states {stated:g} frames per second; export the motion again")
     if not stated and frames > 1:
         notes.append(f"states no frame rate: {DEFAULT_FPS:g} frames per second are assumed")
     detected = Detected(rig=_BODIES.get(joints, f"{joints} joints"), up="y", fps=stated)

@@ -30,6 +30,10 @@ class Detected:
     """Whether lengths were scaled to average legs, so that they must be scaled to each body."""
 
 
+LARGEST_NUMBER = 1e6
+"""Of angles and lengths in files, in any unit: larger angles have few digits left after the point."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Motion:
     """Poses of SMPL's skeleton; y up, facing +z where the pelvis' rotation is the identity."""

@@ -12,6 +12,9 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ..formats.json_files import read_json
+from ..formats.removing import remove_file
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
@@ -37,9 +40,9 @@ def picture_of(pose: Path) -> Path:
 
 def delete_pose(pose: Path) -> None:
     """Remove the file of a pose, with its picture. Raises OSError where the file stays."""
-    pose.unlink()
+    remove_file(pose, pose.parent)
     with contextlib.suppress(OSError):  # without the pose it is not shown
-        picture_of(pose).unlink()
+        remove_file(picture_of(pose), pose.parent)
 
 
 def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> Path:
@@ -75,10 +78,10 @@ def load_pose(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     import numpy as np  # see the module's docstring
 
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = read_json(path)
         pose = np.asarray(content["pose"], np.float64)
         translation = np.asarray(content["transl"], np.float64)
-    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise PoseFileError(f"the pose file {str(path)!r} cannot be read ({error}): save the pose again") from error
     finite = np.isfinite(pose).all() and np.isfinite(translation).all()
     if pose.shape != (24, 3) or translation.shape != (3,) or not finite:

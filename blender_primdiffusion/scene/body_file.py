@@ -15,6 +15,7 @@ import bpy
 import numpy as np
 
 from ..formats.arrays import check_shapes, read_arrays
+from ..formats.removing import remove_file
 from .human import VolumeWriteError, folders_of
 from .shape import FIELDS, INTEGERS, OPTIONAL_FIELDS, ShapeModel, faulty_field
 
@@ -64,7 +65,7 @@ def saved_body_file(model: ShapeModel, folder: Path) -> Iterator[str]:
         yield path.name
     except BaseException:
         if made:
-            path.unlink(missing_ok=True)
+            remove_file(path, path.parent)
         raise
 
 
@@ -125,7 +126,7 @@ def _write(path: Path, model: ShapeModel) -> None:
         os.replace(unfinished, path)
     except OSError as error:
         if unfinished is not None:
-            unfinished.unlink(missing_ok=True)
+            remove_file(unfinished, unfinished.parent)
         raise VolumeWriteError(
             f"the body's file could not be written to {str(path.parent)!r} ({error}); save the .blend in a folder with "
             "write permission and free space"

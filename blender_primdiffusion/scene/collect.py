@@ -14,6 +14,7 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from ..formats.removing import remove_file
 from .body_file import BODY_FILE, BODY_NPZ, body_files
 from .human import (
     HOME,
@@ -160,7 +161,7 @@ def _collect(blend_path: str, away: Iterable[bpy.types.Volume]) -> Collected:
                 made.append(destination)
     except OSError as error:
         for path in made:
-            path.unlink(missing_ok=True)
+            remove_file(path, path.parent)
         raise VolumeWriteError(
             f"the files of humans could not be copied to {str(target)!r} ({error}); save the .blend in a folder with "
             "write permission and free space"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 
 import bpy
@@ -10,6 +9,7 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
+from ..formats.json_files import parse_json
 from .human import MARK, armature_of, humans, volumes_of
 from .shape import betas_of, has_custom_shape
 
@@ -171,7 +171,7 @@ def current_overlap(collection: bpy.types.Collection) -> int:
     the surface or merged) or missing. For other shapes it is counted once, in some 50 ms, from what Blender has
     evaluated. Raises ValueError, KeyError or TypeError where the collection's provenance was changed by hand.
     """
-    stored = int(json.loads(collection[MARK])["most_overlapping"])
+    stored = int(parse_json(collection[MARK])["most_overlapping"])
     if not has_custom_shape(collection):
         return stored
     key = (collection.session_uid, collection[MARK], tuple(betas_of(collection)))

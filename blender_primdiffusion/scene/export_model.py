@@ -6,7 +6,6 @@ That scene holds nothing else, so the user's selection, modes and visibility sta
 from __future__ import annotations
 
 import dataclasses
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,6 +14,7 @@ from pathlib import Path
 import bpy
 
 from ..formats.joints import JOINT_NAMES
+from ..formats.removing import remove_folder
 from .human import copy_file
 
 
@@ -64,7 +64,7 @@ def write_model(
             raise RuntimeError(f"Blender's exporter wrote no {kind} file: see the console")
         _publish(folder, path)
     finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_folder(folder, folder.parent)
 
 
 @contextmanager

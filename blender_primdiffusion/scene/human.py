@@ -15,6 +15,8 @@ from pathlib import Path
 
 import bpy
 
+from ..formats.removing import remove_file
+
 TEMPORARY = "primdiffusion_humans"
 """Folder, among Blender's temporary files, for the humans of a .blend that was never saved."""
 PERSON_FILE = "person.human.safetensors"
@@ -157,7 +159,7 @@ def copy_file(source: Path, destination: Path) -> bool:
         shutil.copyfile(source, unfinished)
         os.replace(unfinished, destination)
     finally:
-        unfinished.unlink(missing_ok=True)
+        remove_file(unfinished, unfinished.parent)
     return new
 
 

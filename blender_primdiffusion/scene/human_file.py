@@ -17,8 +17,12 @@ from numpy.typing import NDArray
 
 from ..formats import compact_human
 from ..formats.arrays import check_shapes
+from ..formats.json_files import parse_json
+from ..formats.regular_files import read_regular
+from ..formats.removing import remove_file
 from .human import BETA_COUNT
 
+_LARGEST_FILE = 256 << 20
 _LARGEST_HEADER = 1 << 20
 _METADATA = "__metadata__"
 _DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BF16": "<u2"}
@@ -58,22 +62,24 @@ class HumanTensors:
 
 def read_tensors(path: Path) -> HumanTensors:
     """Read a .human file. Raises ValueError for a file of another kind or a damaged one, OSError."""
-    data = path.read_bytes()
+    data = read_regular(path, _LARGEST_FILE)
     length = int.from_bytes(data[:8], "little")
     try:
         if not 2 <= length <= min(_LARGEST_HEADER, len(data) - 8):
             raise ValueError("it has no header")
-        header = json.loads(data[8 : 8 + length])
+        header = parse_json(data[8 : 8 + length])
         metadata = header.pop(_METADATA, {})
         arrays = {}
         for name, about in header.items():
             begin, end = about["data_offsets"]
+            if type(begin) is not int or type(end) is not int or not 0 <= begin <= end:
+                raise ValueError(f"{name!r:.40} has no place in it")
             raw = data[8 + length + begin : 8 + length + end]
             if len(raw) != end - begin:
                 raise ValueError("it is truncated")
             arrays[name] = (str(about["dtype"]), tuple(about["shape"]), raw)
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path.name!r} contains no human ({error}); {_REMEDY}") from error
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path.name!r} contains no human ({error!s:.120}); {_REMEDY}") from error
     if not isinstance(metadata, dict) or metadata.get("format") != "primdiffusion.human":
         raise ValueError(f"{path.name!r} contains no human but something else; {_REMEDY}")
     return HumanTensors(metadata, arrays)
@@ -129,7 +135,7 @@ def payload_in(human: HumanTensors, name: str) -> HumanPayload:
         if wrong := [field for field, values in arrays.items() if not np.isfinite(values).all()]:
             raise ValueError(f"{wrong[0]!r} holds NaN or infinite numbers")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{name!r} is damaged ({error}); {_REMEDY}") from error
+        raise ValueError(f"{name!r} is damaged ({error!s:.120}); {_REMEDY}") from error
     return HumanPayload(**{"rest_half_extent": None, **arrays})
 
 
@@ -198,9 +204,9 @@ def motion_in(human: HumanTensors) -> HumanMotion | None:
     if "motion" not in human.metadata:
         return None
     try:
-        fps = float(json.loads(human.metadata["motion"])["fps"])
+        fps = float(parse_json(human.metadata["motion"])["fps"])
         arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"the motion in the .human file is damaged ({error}); {_REMEDY}") from error
     frames = len(arrays[0])
     for array, shape in zip(arrays, _MOTION.values(), strict=True):
@@ -231,7 +237,7 @@ def write_tensors(path: Path, human: HumanTensors) -> None:
                 file.write(human.arrays[name][2])
         os.replace(unfinished, path)
     finally:
-        unfinished.unlink(missing_ok=True)
+        remove_file(unfinished, unfinished.parent)
 
 
 def _stored(array: NDArray[np.float32]) -> tuple[str, tuple[int, ...], bytes]:

@@ -15,8 +15,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, array_names, check_shapes, read_arrays
+from ..formats.arrays import ArrayFileError, all_finite, array_names, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES, PARENTS
+from ..formats.json_files import parse_json
+from ..formats.removing import remove_file
 from .body_file import body_file_name, saved_body_file
 from .cycles import max_overlap
 from .shape import FIELDS, OPTIONAL_FIELDS, ShapeModel, faulty_field
@@ -85,9 +87,18 @@ def read_human(path: str | Path) -> HumanFile:
     if not path.is_file():
         raise HumanNpzError(f"there is no human file at {str(path)!r}; {_REMEDY}")
     try:
+        return _read(path)
+    except HumanNpzError:
+        raise
+    except (ValueError, TypeError, OverflowError) as error:  # a text where a number belongs, or too large a number
+        raise HumanNpzError(f"{path.name!r} is damaged ({error!s:.120}); {_REMEDY}") from error
+
+
+def _read(path: Path) -> HumanFile:
+    try:
         arrays = read_arrays(path, array_names(path))
     except (ArrayFileError, OSError) as error:
-        raise HumanNpzError(f"{path.name!r} is damaged or no human file ({error}); {_REMEDY}") from error
+        raise HumanNpzError(f"{path.name!r} is damaged or no human file ({error!s:.200}); {_REMEDY}") from error
     version = int(_scalar(arrays, "format_version", path))
     if not 1 <= version <= FORMAT_VERSION:
         raise HumanNpzError(
@@ -95,9 +106,12 @@ def read_human(path: str | Path) -> HumanFile:
             "use an add-on and a backend of the same release"
         )
     try:
-        meta = json.loads(str(_scalar(arrays, "meta", path)))
-    except json.JSONDecodeError as error:
+        meta = parse_json(str(_scalar(arrays, "meta", path)))
+    except ValueError as error:
         raise HumanNpzError(f"the field 'meta' of {path.name!r} is not JSON ({error}); {_REMEDY}") from error
+    density = meta.get("full_density", 1) if isinstance(meta, dict) else None
+    if isinstance(density, bool) or not isinstance(density, int | float) or not density > 0:
+        raise HumanNpzError(f"the field 'meta' of {path.name!r} holds no provenance, or no full density; {_REMEDY}")
     _check_skeleton(arrays, path)
     sizes: dict[str, int] = {}
     human = _checked_values(HumanFile(meta=meta, **_fields(arrays, path, _SHAPES, sizes)), path)
@@ -142,7 +156,7 @@ def _fields(
 
 def _checked_values(human: HumanFile, path: Path) -> HumanFile:
     for name in _SHAPES:
-        if not np.isfinite(getattr(human, name)).all():
+        if not all_finite(getattr(human, name)):
             raise HumanNpzError(f"the field {name!r} of {path.name!r} holds NaN or infinite values; {_REMEDY}")
     gram = np.swapaxes(human.rotation, -1, -2) @ human.rotation
     faults = {
@@ -245,7 +259,7 @@ class WrittenHuman:
         for path in self.made:
             if path.parent != but:
                 with contextlib.suppress(OSError):  # Windows locks files that are being read
-                    path.unlink()
+                    remove_file(path, path.parent)
         with contextlib.suppress(OSError):
             remove_empty(self.folder, self.existing)
 

@@ -12,7 +12,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, check_shapes, read_arrays
+from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
+from ..formats.json_files import parse_json
+from ..formats.removing import remove_file
 from .human import VolumeWriteError, armature_of, copy_file, folders_of, person_file_name, stored_path
 from .material import person_material
 from .volumes import write_vdb
@@ -59,6 +61,9 @@ def read_grid(path: Path) -> MergedGrid:
     try:
         stored = read_arrays(path, tuple(_SHAPES))
         check_shapes(path, stored, _SHAPES, {})
+        faulty = [name for name, values in stored.items() if not all_finite(values)]
+        if faulty or not stored["voxel"] > 0:
+            raise ArrayFileError(f"{(faulty or ['voxel'])[0]!r} holds NaN or impossible numbers")
     except ArrayFileError as error:
         raise ValueError(f"the merged grid {path.name!r} is damaged ({error}); merge again") from error
     return MergedGrid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
@@ -100,7 +105,7 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
     except OSError as error:
         for path in new:
             if path.is_file():
-                path.unlink()
+                remove_file(path, folder)
         raise _write_error(folder, error) from error
     return targets
 
@@ -132,7 +137,7 @@ def merged_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
 
 def merged_state(merged: bpy.types.Object) -> MergedState:
     """What a merged object shows."""
-    saved = json.loads(merged[MARK])
+    saved = parse_json(merged[MARK])
     return MergedState(**{**saved, "poses": tuple(saved["poses"])})
 
 

@@ -20,8 +20,9 @@ from mathutils import Color
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, check_shapes, read_arrays
+from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
+from ..formats.json_files import parse_json
 from .body_file import shape_model_of
 from .build import build_body_mesh
 from .convention import points_to_blender
@@ -62,11 +63,11 @@ def read_proxy(path: Path) -> ProxyMesh:
         check_shapes(path, arrays, _SHAPES, sizes)
     except ArrayFileError as error:
         raise ValueError(f"the mesh {path.name!r} is damaged ({error}); export again") from error
-    names = tuple(str(name) for name in arrays["joint_names"])
-    if int(arrays["format_version"]) != _FORMAT_VERSION or names != JOINT_NAMES:
+    names = tuple(str(name) for name in arrays["joint_names"].ravel())
+    if str(arrays["format_version"]) != str(_FORMAT_VERSION) or names != JOINT_NAMES:
         raise ValueError(f"the mesh {path.name!r} is of another version: use an add-on and a backend of one release")
     for name in _SHAPES:
-        if not np.isfinite(arrays[name]).all():
+        if not all_finite(arrays[name]):
             raise ValueError(f"the field {name!r} of {path.name!r} holds NaN or infinite values; export again")
     if arrays["faces"].min() < 0 or arrays["faces"].max() >= sizes["V"]:
         raise ValueError(f"the faces of {path.name!r} have corners that do not exist; export again")
@@ -97,7 +98,7 @@ def proxy_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
 
 def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas: NDArray | None) -> bool:
     """Whether the human was edited since, or has a shape that the proxy could not follow."""
-    made_of, now = json.loads(proxy[PROXY_MARK]), _origin(collection, betas)
+    made_of, now = parse_json(proxy[PROXY_MARK]), _origin(collection, betas)
     same_shape = (made_of["betas"] is None) == (now["betas"] is None) and (
         now["betas"] is None or np.allclose(made_of["betas"], now["betas"], atol=1e-4)
     )
@@ -106,13 +107,13 @@ def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas
 
 def shown_betas(proxy: bpy.types.Object) -> NDArray[np.float64] | None:
     """The shape [10] that a proxy shows; None where it is unknown."""
-    betas = json.loads(proxy[PROXY_MARK])["betas"]
+    betas = parse_json(proxy[PROXY_MARK])["betas"]
     return None if betas is None else np.array(betas, np.float64)
 
 
 def show_betas(proxy: bpy.types.Object, betas: NDArray) -> None:
     """Store with a proxy that it shows another shape [10]."""
-    proxy[PROXY_MARK] = json.dumps({**json.loads(proxy[PROXY_MARK]), "betas": _rounded(betas)})
+    proxy[PROXY_MARK] = json.dumps({**parse_json(proxy[PROXY_MARK]), "betas": _rounded(betas)})
 
 
 def show_textures_in_solid() -> None:

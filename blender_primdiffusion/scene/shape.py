@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
 from collections.abc import Mapping
 from typing import NamedTuple
 
@@ -12,6 +11,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.arrays import all_finite
+from ..formats.json_files import parse_json
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, armature_of
 
 _TINY = 1e-12
@@ -163,7 +164,7 @@ INTEGERS = ("faces", "face", "stencil_vertex")
 def faulty_field(model: ShapeModel) -> str | None:
     """The first field that holds impossible values, if any."""
     for name, values in model.arrays().items():
-        if not np.isfinite(values).all():
+        if not all_finite(values):
             return name
     limits = {"faces": len(model.template), "face": len(model.faces), "stencil_vertex": len(model.template)}
     for name, limit in limits.items():
@@ -273,7 +274,7 @@ def generated_betas(collection: bpy.types.Collection) -> NDArray[np.float64]:
     Raises ValueError where the collection's provenance is damaged.
     """
     try:
-        betas = np.array(json.loads(collection[MARK])["betas"], np.float64)
+        betas = np.array(parse_json(collection[MARK])["betas"], np.float64)
     except (ValueError, KeyError, TypeError):
         betas = np.empty(0)
     if betas.shape != (BETA_COUNT,):

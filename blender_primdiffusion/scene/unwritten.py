@@ -14,6 +14,7 @@ from pathlib import Path
 
 import bpy
 
+from ..formats.removing import remove_file
 from .human import MARK, folders_of, unwritten_in
 from .human_npz import HumanNpzError, file_names, read_human, unwritten_name
 from .volumes import bake, write_error, write_file
@@ -49,7 +50,7 @@ def write_unwritten(source: Path) -> Generator[None, None, None]:
                 with tempfile.TemporaryDirectory(prefix=".writing_", dir=source.parent) as hidden:
                     os.replace(Path(hidden, write_file(grids, k, Path(hidden), version)), path)
                 yield
-        source.unlink(missing_ok=True)
+        remove_file(source, source.parent)
     except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
         raise write_error(source.parent, error) from error
 

@@ -19,6 +19,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.removing import remove_file, remove_folder
 from .human import VolumeWriteError, folders_of, unwritten_in, volume_path
 
 VOXELS = 8
@@ -171,10 +172,10 @@ def staged(folder: Path) -> Iterator[Staging]:
                 raise write_error(folder, error) from error
     except BaseException:
         for path in published:
-            path.unlink(missing_ok=True)
+            remove_file(path, folder)
         raise
     finally:
-        shutil.rmtree(hidden, ignore_errors=True)
+        remove_folder(hidden, hidden.parent)
         remove_empty(folder, existing)
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import json
 import os
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -18,6 +16,8 @@ import bpy
 
 from ..backend.child_streams import Output
 from ..console import CANCELLED, DONE
+from ..formats.json_files import parse_json
+from ..formats.removing import remove_folder
 
 PATIENCE_S = 0.7
 """After this a child that was asked to stop is killed: its views are written whole or not at all."""
@@ -124,7 +124,7 @@ class CaptureSession:
 
         if not line.startswith(MARK):
             return  # printed by Blender
-        progress = json.loads(line[len(MARK) :])
+        progress = parse_json(line[len(MARK) :])
         if "line" in progress:
             self.lines.append(progress["line"])
             return
@@ -157,7 +157,7 @@ class CaptureSession:
 
     def _clear_folder(self) -> None:
         if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
+            remove_folder(self._folder, self._folder.parent)
             self._folder = None
 
 

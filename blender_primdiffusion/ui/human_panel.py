@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..backend.requests import sentence
+from ..formats.removing import OutsideFolderError, remove_file
 from ..jobs.follow import Reporting, submit
 from ..jobs.late_volumes import late_volumes
 from ..jobs.missing_files import look, state
@@ -158,9 +159,9 @@ files that share the folder, may need them"""
         for path in unused(humans_folder()):
             try:
                 size += path.stat().st_size
-                path.unlink()
+                remove_file(path, humans_folder())
                 removed += 1
-            except OSError as error:
+            except (OSError, OutsideFolderError) as error:
                 self.report({"WARNING"}, f"{str(path)!r} could not be removed ({error})")
         self.report({"INFO"}, f"Removed {removed} files ({size / 1e6:.1f} MB) from {str(humans_folder())!r}")
         return {"FINISHED"}

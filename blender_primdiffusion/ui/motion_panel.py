@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
+from ..formats.json_files import parse_json
 from ..jobs.follow import Reporting
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from .drawing import HUMAN, SidebarPanel, draw_lines, property_columns
@@ -216,7 +216,7 @@ class PRIMDIFFUSION_MT_actions(bpy.types.Menu):
 def facts_of(action: bpy.types.Action) -> dict[str, str]:
     """What was found when the motion was imported; nothing for actions of other origin."""
     try:
-        found = json.loads(action.get(FACTS, "{}"))
+        found = parse_json(action.get(FACTS, "{}"))
     except (ValueError, TypeError):
         return {}
     return {str(k): str(v) for k, v in found.items()} if isinstance(found, dict) else {}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import random
 from typing import TYPE_CHECKING
 
@@ -10,6 +9,7 @@ import bpy
 from bpy.app.translations import pgettext_iface
 
 from ..backend.requests import sentence
+from ..formats.json_files import parse_json
 from ..jobs.target import named_person, selected_person
 from ..scene.human import BETA_COUNT, BETAS, MARK, armature_of, humans
 from .drawing import HUMAN, SidebarPanel, draw_lines, property_columns
@@ -221,7 +221,7 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     from ..scene.cycles import current_overlap
     from ..scene.volumes import person_memory
 
-    provenance = json.loads(person[MARK])
+    provenance = parse_json(person[MARK])
     lines = [(name.capitalize(), f"{provenance[name]}") for name in _SHOWN if provenance.get(name) not in (None, "")]
     lines += [(name.capitalize(), f"{value}") for name, value in (provenance.get("attributes") or {}).items()]
     for edit in provenance.get("edits", ()):

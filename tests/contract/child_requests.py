@@ -6,8 +6,8 @@ import sys
 from collections.abc import Generator
 from pathlib import Path
 
-from backend.client import BackendClient
-from backend.requests import Backend, ChildRequest
+from blender_primdiffusion.backend.client import BackendClient
+from blender_primdiffusion.backend.requests import Backend, ChildRequest
 
 _PICTURE_PX = 16
 

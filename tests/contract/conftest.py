@@ -1,12 +1,9 @@
-"""The real child and the real client, without Blender: the extension's package `backend` is loaded by itself."""
+"""The real child and the real client, without Blender."""
 
-import sys
 from pathlib import Path
 
 import pytest
 from tiny_model import save_tiny_checkpoint
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "blender_primdiffusion"))
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,9 @@ import sys
 import time
 
 import pytest
-from backend.requests import ChildRequest
 from child_requests import generate_request, this_pythons_backend
+
+from blender_primdiffusion.backend.requests import ChildRequest
 
 TICK_S = 0.1
 """Of Blender's timer."""

@@ -7,11 +7,12 @@ import time
 from pathlib import Path
 
 import pytest
-from backend.client import BackendClient
-from backend.environment import BackendNotFound, ImportTimedOut
-from backend.requests import Backend, ChildRequest
 from child_requests import generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
+
+from blender_primdiffusion.backend.client import BackendClient
+from blender_primdiffusion.backend.environment import BackendNotFound, ImportTimedOut
+from blender_primdiffusion.backend.requests import Backend, ChildRequest
 
 PYTHON = Path(sys.executable)
 

@@ -9,8 +9,10 @@ import time
 from pathlib import Path
 
 import pytest
-from backend.child_streams import LONGEST_LINE
-from backend.client import (
+from conversation import BUSY_STEPS
+
+from blender_primdiffusion.backend.child_streams import LONGEST_LINE
+from blender_primdiffusion.backend.client import (
     BackendClient,
     Died,
     ErrorResponse,
@@ -20,7 +22,6 @@ from backend.client import (
     child_environment,
     death_sentence,
 )
-from conversation import BUSY_STEPS
 
 PYTHON = Path(sys.executable)
 
@@ -210,7 +211,7 @@ def test_polling_a_child_that_reads_nothing_never_waits(fake_child):
 
 
 def test_a_poll_ends_when_its_time_is_over_and_a_flood_loses_no_message(fake_child, monkeypatch):
-    monkeypatch.setattr("backend.client.POLL_S", 0.0)
+    monkeypatch.setattr("blender_primdiffusion.backend.client.POLL_S", 0.0)
     count = 20_000
     client = fake_child(f"""
         for i in range({count}):

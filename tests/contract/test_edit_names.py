@@ -4,11 +4,12 @@ from pathlib import Path
 
 import pytest
 import tiny_model
-from backend.vocabulary import read_vocabulary
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.samplers import SAMPLERS as BACKENDS_SAMPLERS
 from primdiffusion.editing.regions import parts_of, region_of
 from primdiffusion.formats.requests import PARTS, SAMPLERS
+
+from blender_primdiffusion.backend.vocabulary import read_vocabulary
 
 
 def test_every_part_of_the_body_is_a_region():

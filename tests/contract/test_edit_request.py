@@ -4,10 +4,11 @@ import time
 from pathlib import Path
 
 import pytest
-from backend.requests import ChildRequest
 from child_requests import edit_request, generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
 from primdiffusion.human_file import load_human
+
+from blender_primdiffusion.backend.requests import ChildRequest
 
 PART = {"region": ["hair"], "seed": 2}
 PARAMS = {

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
-from backend.client import BackendClient
-from backend.environment import (
+from blender_primdiffusion.backend.client import BackendClient
+from blender_primdiffusion.backend.environment import (
     MARK,
     NOT_INSTALLED,
     TRIAL,
@@ -20,7 +20,7 @@ from backend.environment import (
     search,
     tried,
 )
-from backend.requests import run_to_end
+from blender_primdiffusion.backend.requests import run_to_end
 from tiny_packages import until
 
 PYTHON = Path(sys.executable)

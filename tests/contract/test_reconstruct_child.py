@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from backend.requests import ChildRequest
 from capture_scenes import captured
 from child_requests import reconstruct_request, this_pythons_backend
 from conversation import Conversation
 from tiny_encoder import save_tiny_encoder
+
+from blender_primdiffusion.backend.requests import ChildRequest
 
 CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
 FIRST = "person_000000"

@@ -7,9 +7,10 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from backend.environment import LONGEST_INSIDE, WINDOWS_LONGEST, short_root
-from backend.packages import Machine, chosen_compute, locks_for, read_lock, this_machine
 from packaging.requirements import Requirement
+
+from blender_primdiffusion.backend.environment import LONGEST_INSIDE, WINDOWS_LONGEST, short_root
+from blender_primdiffusion.backend.packages import Machine, chosen_compute, locks_for, read_lock, this_machine
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ROOT / "blender_primdiffusion" / "requirements"

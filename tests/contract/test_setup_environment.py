@@ -11,13 +11,13 @@ from typing import NamedTuple
 
 import psutil
 import pytest
-from backend.environment import MARK, VARIABLE, SetUpFolder, candidates
-from backend.packages import SetUpFailed, read_lock
-from backend.requests import run_to_end
-from backend.setup import Steps, state_of
 from tiny_packages import BACKEND, own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
 
-from backend import setup
+from blender_primdiffusion.backend import setup
+from blender_primdiffusion.backend.environment import MARK, VARIABLE, SetUpFolder, candidates
+from blender_primdiffusion.backend.packages import SetUpFailed, read_lock
+from blender_primdiffusion.backend.requests import run_to_end
+from blender_primdiffusion.backend.setup import Steps, state_of
 
 
 class Place(NamedTuple):

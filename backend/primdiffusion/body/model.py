@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import axis_angle_to_matrix, polar
@@ -209,12 +210,10 @@ class PosedBody(TensorRecord):
 @functools.cache
 def default_body() -> BodyModel:
     """The body that ships with the package: float32, 12,196 vertices, 10 shape components, no pose blend shapes."""
-    with (
-        importlib.resources.as_file(importlib.resources.files("primdiffusion.body") / "data/body.npz") as path,
-        np.load(path) as f,
-    ):
-        arrays = {name: f[name] for name in ("v_template", "shapedirs", "J_regressor", "weights", "vt", "f", "ft")}
-        parents = f["kintree_table"][0].astype(np.int64)
+    names = ("v_template", "shapedirs", "J_regressor", "weights", "vt", "f", "ft", "kintree_table")
+    with importlib.resources.as_file(importlib.resources.files("primdiffusion.body") / "data/body.npz") as path:
+        arrays = read_arrays(path, names)
+    parents = arrays["kintree_table"][0].astype(np.int64)
     parents[0] = -1
     return BodyModel(
         template=torch.from_numpy(arrays["v_template"]),

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import os
 import pathlib
-import zipfile
-import zlib
 
 import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, J
 from primdiffusion.body.smpl_pickle import BodyFileError, as_array, read_pickle
+from primdiffusion.formats.arrays import ArrayFileError, all_finite, array_names, read_arrays, read_npy
+from primdiffusion.formats.regular_files import read_regular
 
+LARGEST_OBJ = 32 * 2**20
 SHAPE_COMPONENTS = 10
 """Shape components loaded by default, of the up to 300 in SMPL files."""
 POSE_FEATURES = (J - 1) * 9
@@ -94,10 +95,9 @@ class _ArrayFile:
         try:
             if self._pickled is not None:
                 return as_array(self._pickled[name])
-            with np.load(self.path, allow_pickle=False) as file:
-                return file[name]
-        except (ValueError, EOFError, OSError, zipfile.BadZipFile, zlib.error) as error:
-            raise self.wrong(name, f"cannot be read ({error})") from error
+            return read_arrays(self.path, (name,))[name]
+        except (ValueError, OSError) as error:
+            raise self.wrong(name, f"cannot be read ({str(error).removeprefix(f'{self.path}: ')[:120]})") from error
 
     def shaped(self, name: str, shape: tuple[int | str, ...]) -> np.ndarray:
         array = self.raw(name)
@@ -113,8 +113,9 @@ class _ArrayFile:
         return array
 
     def real(self, name: str, shape: tuple[int | str, ...]) -> np.ndarray:
-        array = np.array(self.shaped(name, shape), np.float32)
-        if not np.isfinite(array).all():
+        with np.errstate(over="ignore"):  # infinite numbers are rejected below
+            array = np.array(self.shaped(name, shape), np.float32)
+        if not all_finite(array):
             raise self.wrong(name, "holds NaN or infinite numbers")
         return array
 
@@ -128,10 +129,9 @@ class _ArrayFile:
 
 def _npz_names(path: pathlib.Path) -> set[str]:
     try:
-        with zipfile.ZipFile(path) as archive:
-            return {name.removesuffix(".npy") for name in archive.namelist()}
-    except zipfile.BadZipFile as error:
-        raise BodyFileError(f"{path} is not a whole .npz file ({error}); download it again.") from error
+        return set(array_names(path))
+    except ArrayFileError as error:
+        raise BodyFileError(str(error)) from error
 
 
 def _parents(arrays: _ArrayFile) -> np.ndarray:
@@ -166,7 +166,7 @@ def _texture_coordinates(
             f"body of {len(faces)} faces; they must be T x 2 and {len(faces)} x 3, in the body's face order."
         )
     coordinate_faces = coordinate_faces.astype(np.int64)
-    if not np.isfinite(coordinates).all() or coordinate_faces.min() < 0 or coordinate_faces.max() >= len(coordinates):
+    if not all_finite(coordinates) or coordinate_faces.min() < 0 or coordinate_faces.max() >= len(coordinates):
         raise BodyFileError(
             f"{source}: texture coordinates are NaN or their numbers out of range; use the body's own UV file."
         )
@@ -188,10 +188,10 @@ def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 
 def _numpy_file(path: pathlib.Path) -> np.ndarray:
     try:
-        array = np.load(path, allow_pickle=False)
-    except (ValueError, EOFError) as error:
-        raise BodyFileError(f"{path} is not a whole .npy file of numbers ({error}); download it again.") from error
-    if not isinstance(array, np.ndarray) or array.dtype.kind not in "iuf":
+        array = read_npy(path)
+    except ArrayFileError as error:
+        raise BodyFileError(f"{error}; download it again.") from error
+    if array.dtype.kind not in "iuf":
         raise BodyFileError(f"{path} does not hold one array of numbers; give the pair (vt.npy, ft.npy).")
     return array
 
@@ -201,7 +201,7 @@ def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.
     coordinates: list[list[float]] = []
     corner_of_face: dict[frozenset[int], dict[int, int]] = {}
     try:
-        for line in path.read_text(encoding="latin1").splitlines():
+        for line in read_regular(path, LARGEST_OBJ).decode("latin1").splitlines():
             key, _, rest = line.partition(" ")
             if key == "vt":
                 coordinates.append([float(number) for number in rest.split()[:2]])
@@ -210,7 +210,7 @@ def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.
                 corners = {vertex: coordinate for vertex, coordinate in corner_numbers}
                 corner_of_face[frozenset(corners)] = corners
         coordinate_faces = [[corner_of_face[frozenset(face)][v] for v in face] for face in faces.tolist()]
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, IndexError, OverflowError) as error:
         raise BodyFileError(f"{path} is not an OBJ with texture coordinates in every face ({error}).") from error
     except KeyError as error:
         raise BodyFileError(

@@ -9,14 +9,18 @@ old and new versions of numpy and scipy; chumpy need not be installed.
 from __future__ import annotations
 
 import pathlib
-import pickle
 import re
-import struct
-from typing import IO
 
 import numpy as np
 import scipy.sparse
 
+from primdiffusion.body.pickle_opcodes import Inert, PickleError, load_pickle
+from primdiffusion.formats.regular_files import read_regular
+
+LARGEST_PICKLE = 512 * 2**20
+"""SMPL with 300 shape components takes 250 MB."""
+MOST_NUMBERS = 10_000_000
+"""In lists, and in sparse matrices as they become dense; the regressor of SMPL's joints has 165,360."""
 MAX_NESTING = 8
 """Limit on nested chumpy selections; body models nest less."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
@@ -30,62 +34,51 @@ class UnsafePickleError(BodyFileError):
     """A pickle names a global that a body model does not need."""
 
 
-class _Stored:
-    """Constructor arguments and state of a pickled object."""
-
-    def __init__(self, *arguments: object) -> None:
-        self.arguments = arguments
-        self.state: object = None
-
-    def __setstate__(self, state: object) -> None:
-        self.state = state
-
-
-class _Array(_Stored):
+class _Array(Inert):
     """numpy's array: state (version, shape, dtype, column-major, raw bytes)."""
 
 
-class _BufferArray(_Stored):
+class _BufferArray(Inert):
     """numpy's array in protocol 5: arguments (raw bytes, dtype, shape, order)."""
 
 
-class _Scalar(_Stored):
+class _Scalar(Inert):
     """numpy's scalar: arguments (dtype, raw bytes)."""
 
 
-class _NumberType(_Stored):
+class _NumberType(Inert):
     """numpy's dtype: argument 0 such as "f8", state 1 the byte order."""
 
 
-class _Latin1Bytes(_Stored):
+class _Latin1Bytes(Inert):
     """Bytes written as text by protocol 2: arguments (text, "latin1")."""
 
 
-class _Chumpy(_Stored):
+class _Chumpy(Inert):
     """chumpy's array: state["x"]."""
 
 
-class _ChumpySelection(_Stored):
+class _ChumpySelection(Inert):
     """chumpy's indexing of another array: state["a"], ["idxs"], ["preferred_shape"]."""
 
 
-class _SparseColumns(_Stored):
+class _SparseColumns(Inert):
     """scipy's compressed sparse columns: state["data"], ["indices"], ["indptr"], ["_shape"]."""
 
 
 class _Reconstructed:
     """copyreg's object constructor of protocols 0 and 1: arguments (class, base, base state)."""
 
-    def __new__(cls, kind: object, *_: object) -> _Stored:  # type: ignore[misc]
-        if not (isinstance(kind, type) and issubclass(kind, _Stored)):
+    def __new__(cls, kind: object, *_: object) -> Inert:  # type: ignore[misc]
+        if not (isinstance(kind, type) and issubclass(kind, Inert)):
             raise UnsafePickleError(
-                f"The pickle rebuilds an object of kind {kind!r}; take the file from its publisher again."
+                f"The pickle rebuilds a {type(kind).__name__}, which is no array; take the publisher's file again."
             )
         return kind()
 
 
 _GLOBALS: dict[tuple[str, str], type] = {
-    ("numpy", "ndarray"): _Stored,
+    ("numpy", "ndarray"): Inert,
     ("numpy", "dtype"): _NumberType,
     ("_codecs", "encode"): _Latin1Bytes,
     ("chumpy.ch", "Ch"): _Chumpy,
@@ -102,19 +95,18 @@ _GLOBALS: dict[tuple[str, str], type] = {
     },
     **{(f"scipy.sparse{module}", "csc_matrix"): _SparseColumns for module in ("", ".csc", "._csc")},
     **{(module, "_reconstructor"): _Reconstructed for module in ("copy_reg", "copyreg")},
-    **{(module, "object"): _Stored for module in ("__builtin__", "builtins")},
+    **{(module, "object"): Inert for module in ("__builtin__", "builtins")},
 }
 
 
-class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> type:
-        try:
-            return _GLOBALS[module, name]
-        except KeyError:
-            raise UnsafePickleError(
-                f"The pickle asks for the global {module}.{name}, which a body model does not need, so nothing in "
-                "it was run; take the file from its publisher again, or convert it to .npz where you trust it."
-            ) from None
+def _find(module: str, name: str) -> type:
+    try:
+        return _GLOBALS[module, name]
+    except KeyError:
+        raise UnsafePickleError(
+            f"The pickle asks for the global {f'{module}.{name}':.80}, which a body model does not need, so nothing in "
+            "it was run; take the file from its publisher again, or convert it to .npz where you trust it."
+        ) from None
 
 
 def read_pickle(path: pathlib.Path) -> dict[str, object]:
@@ -123,9 +115,9 @@ def read_pickle(path: pathlib.Path) -> dict[str, object]:
     Raises:
         UnsafePickleError: the pickle names a global outside the list above.
         BodyFileError: it is not a pickle, is truncated, or does not hold a dictionary.
+        TooLargeError: it is larger than `LARGEST_PICKLE`.
     """
-    with open(path, "rb") as file:
-        content = load_restricted(file, str(path))
+    content = load_restricted(read_regular(path, LARGEST_PICKLE), str(path))
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise BodyFileError(
             f"{path} holds no dictionary of named arrays but a {type(content).__name__}; is it an SMPL file?"
@@ -133,21 +125,16 @@ def read_pickle(path: pathlib.Path) -> dict[str, object]:
     return content
 
 
-def load_restricted(file: IO[bytes], name: str) -> object:
+def load_restricted(data: bytes, name: str) -> object:
     """Load a pickle with inert records in place of objects; `name` identifies it in errors.
 
     Raises:
         UnsafePickleError: the pickle names a global outside the list above.
-        BodyFileError: it is not a pickle, or is truncated.
+        BodyFileError: it is not a pickle, is truncated, or exceeds the limits of `load_pickle`.
     """
     try:
-        return _Unpickler(file, encoding="latin1").load()
-    except UnsafePickleError:
-        raise
-    except (
-        pickle.UnpicklingError, EOFError, TypeError, ValueError, AttributeError, LookupError, RecursionError,
-        MemoryError, OverflowError, struct.error,
-    ) as error:  # fmt: skip
+        return load_pickle(data, _find)
+    except PickleError as error:
         raise BodyFileError(f"{name} is not a whole pickle file ({error}); download it again.") from error
 
 
@@ -202,12 +189,27 @@ def _as_array(value: object, nesting: int) -> np.ndarray:
         case _SparseColumns(state={"data": data, "indices": indices, "indptr": starts, "_shape": shape}):
             array = _dense(*(as_array(part, nesting + 1) for part in (data, indices, starts, shape)))
         case list() | tuple() | int() | float():
+            _check_count(value)
             array = np.asarray(value)
         case _:
             raise ValueError(f"a {type(value).__name__.strip('_')} stands where an array of numbers belongs")
     if array.dtype.kind not in "biuf":
         raise ValueError(f"an array holds {array.dtype} where numbers belong")
     return array
+
+
+def _check_count(value: object) -> None:
+    """Raise ValueError for too many numbers in nested lists; one list may be contained many times."""
+    level, count = [value], 1
+    for _ in range(MAX_NESTING + 1):
+        lists = [entry for entry in level if isinstance(entry, list | tuple)]
+        count += sum(map(len, lists))
+        if count > MOST_NUMBERS:
+            raise ValueError(f"a list holds more than {MOST_NUMBERS} numbers")
+        level = [entry for inner in lists for entry in inner]
+        if not level:
+            return
+    raise ValueError(f"lists are nested more than {MAX_NESTING} deep")
 
 
 def _number_type(kind: object) -> np.dtype:
@@ -229,7 +231,7 @@ def _raw_bytes(raw: object) -> bytes | bytearray:
 
 def _dense(data: np.ndarray, indices: np.ndarray, starts: np.ndarray, shape: np.ndarray) -> np.ndarray:
     rows, columns = (int(n) for n in shape)
-    if rows * columns > 10**8 or len(starts) != columns + 1:
+    if min(rows, columns) < 0 or rows * columns > MOST_NUMBERS or len(starts) != columns + 1:
         raise ValueError(f"a sparse matrix claims {rows} x {columns} entries, which its other parts contradict")
     matrix = scipy.sparse.csc_matrix((data, indices, starts), shape=(rows, columns))
     matrix.check_format(full_check=True)

@@ -38,6 +38,8 @@ from primdiffusion.capture.reader import (
     windowed_view,
 )
 from primdiffusion.formats import capture_layout
+from primdiffusion.formats.arrays import map_npy
+from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
@@ -95,10 +97,10 @@ def open_pack(subject: Subject) -> UInt8[np.ndarray, "F C H W 4"] | None:
     """A subject's memory-mapped array; None if there is none or the images have changed since."""
     path = pack_path(subject)
     try:
-        about = json.loads(path.with_suffix(".json").read_text(encoding="utf-8"))
+        about = read_json(path.with_suffix(".json"))
         if about != {"format": PACK_FORMAT, "version": PACK_VERSION, "source": source_stamp(subject)}:
             return None
-        array = np.load(path, mmap_mode="r", allow_pickle=False)
+        array = map_npy(path)
     except (OSError, ValueError, EOFError):
         return None
     view = subject.views[0]

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-import json
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
+
+from primdiffusion.formats.json_files import parse_json
 
 LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
 """Options that a renderer must support: list its subjects as {"line": NAME} on marked lines, and render one."""
@@ -59,7 +60,7 @@ def subjects_of(command: Sequence[str]) -> list[str]:
         ran = subprocess.run([*command, *LIST], capture_output=True, text=True, check=False)
     except OSError as e:
         raise FarmError(f"the renderer {command[0]!r} cannot be started ({e}): give its path") from e
-    listed = [json.loads(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
+    listed = [parse_json(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
     if ran.returncode or not listed:
         raise FarmError(f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it printed nothing'}")
     return [line["line"] for line in listed]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import io
-import json
 import re
 import struct
 from pathlib import Path
@@ -16,16 +15,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
-from PIL import Image
 
 from primdiffusion.body.model import J, default_body
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.json_files import JsonError, parse_json
+from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\x00"
 NUMBERS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+
+
+LARGEST_GLB = 256 * 2**20
 
 
 class GlbError(ValueError):
@@ -60,7 +64,7 @@ class Glb:
             raw = np.frombuffer(self.binary, np.uint8, (count - 1) * stride + number.itemsize * width, first)
         except GlbError:
             raise
-        except (LookupError, TypeError, ValueError) as e:
+        except (LookupError, TypeError, ValueError, OverflowError) as e:
             raise GlbError(f"{self.path}: accessor {accessor} is damaged ({e}): export the file again") from e
         rows = np.lib.stride_tricks.as_strided(raw, (count, number.itemsize * width), (stride, 1))
         values = np.ascontiguousarray(rows).view(number)
@@ -78,9 +82,9 @@ class Glb:
             view = self.content["bufferViews"][self.content["images"][image]["bufferView"]]
             first = int(view.get("byteOffset", 0))
             data = self.binary[first : first + int(view["byteLength"])]
-            with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as picture:
+            with opened_picture(io.BytesIO(data)) as picture:
                 return np.asarray(picture.convert("RGBA"))
-        except (LookupError, TypeError, ValueError, OSError, SyntaxError, Image.DecompressionBombError) as e:
+        except (LookupError, TypeError, ValueError, OSError, OverflowError) as e:
             raise GlbError(f"{self.path}: image {image} cannot be read ({e}): pack PNG or JPEG into the file") from e
 
 
@@ -92,7 +96,7 @@ def read_glb(path: str | Path) -> Glb:
         GlbError: it is not binary glTF 2.0, or truncated.
     """
     path = Path(path)
-    data = path.read_bytes()
+    data = read_regular(path, LARGEST_GLB)
     try:
         magic, version, length = struct.unpack_from("<4sII", data)
         if magic != MAGIC or version != 2:
@@ -104,8 +108,8 @@ def read_glb(path: str | Path) -> Glb:
             size, kind = struct.unpack_from("<I4s", data, at)
             chunks.setdefault(kind, data[at + 8 : at + 8 + size])
             at += 8 + size
-        content = json.loads(chunks[JSON_CHUNK])
-    except (struct.error, KeyError, UnicodeDecodeError, json.JSONDecodeError, RecursionError) as e:
+        content = parse_json(chunks[JSON_CHUNK])
+    except (struct.error, KeyError, JsonError) as e:
         raise GlbError(f"{path} is not a complete .glb file ({e}): write it again") from e
     if not isinstance(content, dict):
         raise GlbError(f"{path} contains no glTF object: write it again")
@@ -160,8 +164,10 @@ def read_person(path: str | Path) -> SkinnedPerson:
         return SkinnedPerson(TexturedMesh(_parts(glb)), _betas(glb))
     except GlbError:
         raise
-    except (LookupError, TypeError, ValueError, AttributeError) as e:
-        raise GlbError(f"{path} is not a human on the default body ({type(e).__name__}: {e}): make it again") from e
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
+        raise GlbError(
+            f"{path} is not a human on the default body ({type(e).__name__} {e!s:.80}): make it again"
+        ) from e
 
 
 def _betas(glb: Glb) -> Float[np.ndarray, "n"]:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -13,7 +11,8 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.formats.arrays import ArrayFileError, read_numbers
+from primdiffusion.formats.arrays import ArrayFileError, read_npy, read_numbers
+from primdiffusion.formats.json_files import read_json
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.pose_file import body_theta
 
@@ -34,7 +33,7 @@ class MotionFileError(ValueError):
 
 def built_in_poses() -> BodyPose:
     """All built-in poses, the near-T pose first: rotations [20, 24, 3, 3]."""
-    turns = np.array(list(json.loads(BUILT_IN.read_text(encoding="utf-8")).values()))
+    turns = np.array(list(read_json(BUILT_IN).values()))
     return _as_pose(turns, np.zeros((len(turns), 3)))
 
 
@@ -119,12 +118,12 @@ def _as_pose(turns: NDArray, translation: NDArray) -> BodyPose:
 def _read_plain(path: Path) -> dict[str, NDArray]:
     try:
         if path.suffix == ".npy":
-            return {"poses": np.load(io.BytesIO(path.read_bytes()), allow_pickle=False)}
-        content = json.loads(path.read_text(encoding="utf-8"))
+            return {"poses": read_npy(path)}
+        content = read_json(path)
         if not isinstance(content, dict):
             content = {"poses": content}
         return {key: np.asarray(content[key], np.float64) for key in KEYS if key in content}
-    except (ValueError, TypeError, OSError, EOFError, RecursionError) as e:
+    except (ValueError, TypeError, OSError, EOFError) as e:
         raise MotionFileError(f"{path} is not a pose file ({e}): give axis-angle values as .npz, .npy or .json") from e
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,6 @@ import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
-from PIL import Image
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
@@ -20,8 +18,10 @@ from primdiffusion.capture.people_files import SUBJECT_NAME
 from primdiffusion.capture.smpl_parameters import SmplParameters, read_smpl
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 
@@ -248,7 +248,7 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
         CaptureFileError: it is damaged or has another size.
     """
     try:
-        with Image.open(path, formats=("JPEG", "PNG")) as picture:
+        with opened_picture(path) as picture:
             if picture.size != (width, height):
                 raise CaptureFileError(
                     f"{path} has {picture.size[0]} x {picture.size[1]} pixels, its camera {width} x {height}: "
@@ -259,7 +259,7 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
             return np.array(picture.convert("RGB" if kind in ("img", "normal") else "L"))
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
-    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as e:
+    except (OSError, ValueError) as e:
         if isinstance(e, CaptureFileError):
             raise
         raise CaptureFileError(f"{path} is not a complete image ({e}): render it again") from e
@@ -269,10 +269,10 @@ def _read_views(folder: Path) -> list[View]:
     """Read cameras.json; image sizes are not in it and come from the images."""
     path = folder / CAMERAS_FILE
     try:
-        named = json.loads(path.read_text(encoding="utf-8"))
+        named = read_json(path)
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
-    except (OSError, ValueError, RecursionError) as e:
+    except (OSError, ValueError) as e:
         raise CaptureFileError(f"{path} cannot be read ({e}): render the subject again") from e
     views = []
     try:
@@ -286,7 +286,7 @@ def _read_views(folder: Path) -> list[View]:
             views.append(View(k, r, t, width, height))
     except FileNotFoundError:
         raise
-    except (LookupError, TypeError, ValueError, AttributeError) as e:
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
         if isinstance(e, CaptureFileError):
             raise
         raise CaptureFileError(f"{path} is not a list of cameras ({e}): render the subject again") from e
@@ -301,9 +301,9 @@ def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
         pictures = sorted((folder / kind / f"camera{camera:04d}").glob(f"[0-9]*{capture_layout.ENDINGS[kind]}"))
         for path in pictures[:1]:
             try:
-                with Image.open(path, formats=("JPEG", "PNG")) as picture:
+                with opened_picture(path) as picture:
                     return picture.size
-            except (OSError, SyntaxError, ValueError) as e:
+            except (OSError, ValueError) as e:
                 raise CaptureFileError(f"{path} is not a complete image ({e}): render it again") from e
     raise FileNotFoundError(f"{folder} has no images of camera {camera}: render the subject again")
 

@@ -24,6 +24,7 @@ from primdiffusion.formats import camera_files, capture_layout, picture_files
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.removing import check_unlinked
 from primdiffusion.formats.requests import PASSES
 from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
@@ -252,6 +253,7 @@ def _try(job: RenderJob, name: str, frames: Sequence[int]) -> SubjectResult:
     try:
         setup = _set_up(job, name)
         if frames[0] == 0:
+            check_unlinked(job.out / name)
             write_parameters(job.out / name, setup)
         views = sum(1 for _ in render_frames(job.out / name, setup, frames, job.passes, job.samples))
         return SubjectResult(name, "done", views=views)

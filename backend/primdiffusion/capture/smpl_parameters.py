@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +11,7 @@ from jaxtyping import Float32
 
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.body.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
-from primdiffusion.formats.arrays import ArrayFileError, read_member, read_numbers
+from primdiffusion.formats.arrays import ArrayFileError, read_numbers, read_pickled_bytes
 from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
@@ -51,14 +50,9 @@ def read_smpl(subject: Path) -> SmplParameters:
 
 def _read_pickled(path: Path) -> dict[str, np.ndarray]:
     """Read the dictionary from a 0-d object array, without executing code from it."""
-    stream = io.BytesIO(read_member(path, "smpl.npy"))
+    pickled = read_pickled_bytes(path, "smpl")
     try:
-        version = np.lib.format.read_magic(stream)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        _, _, kind = read(stream)
-        if not kind.hasobject:
-            raise ValueError(f"it contains {kind}")
-        (content,) = array_of_objects(load_restricted(stream, str(path)))
+        (content,) = array_of_objects(load_restricted(pickled, str(path)))
         if not isinstance(content, dict):
             raise ValueError(f"it contains a {type(content).__name__}")
         return {key: as_array(content[key]) for key in KEYS}
@@ -66,7 +60,7 @@ def _read_pickled(path: Path) -> dict[str, np.ndarray]:
         raise
     except KeyError as e:
         raise ArrayFileError(f"{path} lacks {e}: render the subject again, or download the file again") from e
-    except (ValueError, SyntaxError, TypeError) as e:
+    except (ValueError, TypeError) as e:
         raise ArrayFileError(f"{path} contains no dictionary of SMPL parameters ({e}): download it again") from e
 
 

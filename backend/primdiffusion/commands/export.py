@@ -109,7 +109,9 @@ class GaussiansRequest:
         if self.object is None or self.joints is None:
             primitives = place(human)
         else:
-            primitives = place_skinned(human, torch.tensor(self.joints), torch.tensor(self.object))
+            primitives = place_skinned(
+                human, torch.tensor(self.joints, dtype=torch.float32), torch.tensor(self.object, dtype=torch.float32)
+            )
         report("gaussians", 1, 2, None)
         splats = gaussians_of(primitives, self.limit)
         report("write", 2, 2, 0.0)
@@ -158,7 +160,7 @@ def _shaped(person: Path, betas: list | None) -> Human:
     from primdiffusion.reshaping import reshaped
 
     human = load_human(person)
-    return human if betas is None else reshaped(human, torch.tensor(betas))
+    return human if betas is None else reshaped(human, torch.tensor(betas, dtype=torch.float32))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -136,7 +136,7 @@ class FrameDrawer:
         return seconds
 
     def _camera(self, frame: FrameSpec) -> Camera:
-        intrinsics, view = torch.tensor(frame.intrinsics), torch.tensor(frame.world_to_camera)
+        intrinsics, view = (torch.tensor(m, dtype=torch.float32) for m in (frame.intrinsics, frame.world_to_camera))
         whole = Camera(intrinsics.float(), view.float(), frame.width, frame.height).to(self._device)
         return whole if frame.region is None else whole.crop(*frame.corner, *frame.size)
 

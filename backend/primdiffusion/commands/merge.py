@@ -152,8 +152,9 @@ def _placed(human: Human, person: PosedPerson) -> Primitives:
     from primdiffusion.reshaping import reshaped
 
     if person.betas is not None:
-        human = reshaped(human, torch.tensor(person.betas))
-    return place_skinned(human, torch.tensor(person.joints), torch.tensor(person.object))
+        human = reshaped(human, torch.tensor(person.betas, dtype=torch.float32))
+    joints, matrix = (torch.tensor(numbers, dtype=torch.float32) for numbers in (person.joints, person.object))
+    return place_skinned(human, joints, matrix)
 
 
 def _write(path: Path, primitives: Primitives, voxel: float) -> list[int]:

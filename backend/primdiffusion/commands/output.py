@@ -15,6 +15,7 @@ from torch import Tensor
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.removing import remove_file
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import export_for_blender, save_human
 from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
@@ -115,7 +116,7 @@ class PreviewFiles(contextlib.AbstractContextManager):
     def _remove(self, paths: list[Path]) -> None:
         for path in paths:
             with contextlib.suppress(OSError):  # Windows keeps a file that is being read; it is removed with the folder
-                path.unlink()
+                remove_file(path, path.parent)
 
 
 @contextlib.contextmanager

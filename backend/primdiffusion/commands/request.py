@@ -27,6 +27,9 @@ STEP_LIMIT = 1000
 """The schedule's length: a sampler cannot take more steps."""
 LARGEST_PREVIEW = 1024
 """Pixels a side: a larger one would delay sampling and cancelling."""
+LARGEST_GUIDANCE = 100
+LARGEST_SIDE = 65_536
+"""Pixels of a picture."""
 LARGEST_NUMBER = 1e30
 """Products of larger numbers overflow float32."""
 
@@ -102,6 +105,8 @@ def _value(kind: Any, value: Any, name: str) -> Any:
     if kind is Path and isinstance(value, str) and value:
         return Path(value)
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
+        if not -LARGEST_NUMBER <= value <= LARGEST_NUMBER:
+            raise ParameterError(f"{name} is {value!r:.40}: give a finite number, of at most {LARGEST_NUMBER:g}")
         return value
     if kind in (bool, int, str, list, types.NoneType) and type(value) is kind:
         return value
@@ -220,15 +225,15 @@ def check_steps(steps: int) -> None:
 
 
 def check_size(size: int) -> None:
-    """Raise ValueError for an empty picture."""
-    if size < 1:
-        raise ValueError(f"size is {size} pixels: choose 1 or more")
+    """Raise ValueError for a picture that is empty or larger than LARGEST_SIDE."""
+    if not 1 <= size <= LARGEST_SIDE:
+        raise ValueError(f"size is {size} pixels: choose 1 to {LARGEST_SIDE}")
 
 
 def check_sides(width: int, height: int) -> None:
-    """Raise ValueError for an empty picture."""
-    if min(width, height) < 1:
-        raise ValueError(f"the image size is {width} x {height} pixels: choose sides of 1 or more")
+    """Raise ValueError for a picture that is empty or larger than LARGEST_SIDE."""
+    if min(width, height) < 1 or max(width, height) > LARGEST_SIDE:
+        raise ValueError(f"the image size is {width} x {height} pixels: choose sides of 1 to {LARGEST_SIDE}")
 
 
 def check_picture_px(picture_px: int) -> None:
@@ -246,17 +251,23 @@ def check_attributes(attributes: dict[str, Any], guidance: float) -> None:
             )
         if isinstance(value, list):
             raise ValueError(f"the attribute {name!r} is given twice: give it once")
-        number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+        number = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER
         if not (isinstance(value, str) or number):
             raise ValueError(f"the attribute {name!r} is {value!r:.40}: give a string or a number")
-    if not math.isfinite(guidance):
-        raise ValueError(f"guidance is {guidance}: give a number, 1 for none")
+    if not abs(guidance) <= LARGEST_GUIDANCE:
+        raise ValueError(f"guidance is {guidance}: give a number up to {LARGEST_GUIDANCE}, 1 for none")
+
+
+SMALLEST_VOXEL, LARGEST_VOXEL = 1e-4, 10.0
+"""Metres."""
 
 
 def check_voxel(voxel: float) -> None:
     """Raise ValueError unless this is a positive length."""
-    if not (math.isfinite(voxel) and voxel > 0):
-        raise ValueError(f"voxel is {voxel}: give the side of a voxel in metres, above zero")
+    if not SMALLEST_VOXEL <= voxel <= LARGEST_VOXEL:
+        raise ValueError(
+            f"voxel is {voxel}: give the side of a voxel in metres, {SMALLEST_VOXEL} to {LARGEST_VOXEL} and above zero"
+        )
 
 
 def check_angle(name: str, angle: float, unit: str) -> None:

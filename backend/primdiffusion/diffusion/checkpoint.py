@@ -27,6 +27,7 @@ from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.formats.json_files import JsonError, parse_json
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetupError, find_body_setup
 from primdiffusion.staging import write_atomically
 
@@ -93,7 +94,7 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict
     """
     tensors, metadata = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
-        architecture, card = json.loads(metadata["architecture"]), json.loads(metadata["card"])
+        architecture, card = parse_json(metadata["architecture"]), parse_json(metadata["card"])
         return tensors, architecture, {**card, "sha256": file_hash(path)}
 
 
@@ -102,8 +103,9 @@ def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor],
     metadata = read_metadata(path, formats)
     with safe_open(path, framework="pt") as file:
         tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-    check_finite(path, tensors)
-    return {key: value.float() for key, value in tensors.items()}, metadata
+    numbers = {key: value.float() for key, value in tensors.items()}  # types of 8 bits have no isfinite
+    check_finite(path, numbers)
+    return numbers, metadata
 
 
 @contextlib.contextmanager
@@ -111,7 +113,7 @@ def mismatches_named(path: Path, *also: type[Exception]) -> Iterator[None]:
     """Raise CheckpointError for errors (and `also`) caused by tensors that contradict the file's own architecture."""
     try:
         yield
-    except (KeyError, TypeError, json.JSONDecodeError, RuntimeError, *also) as error:
+    except (KeyError, TypeError, JsonError, RuntimeError, *also) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
         raise CheckpointError(
             f"{path} does not match its own description ({reason}): download or train it again"
@@ -131,8 +133,9 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
     """
     path = default_checkpoint() if path is None else Path(path)
     metadata = read_metadata(path, (FORMAT, ENCODER_FORMAT))
-    known = json.loads(metadata.get("architecture", "{}")).get("vocabulary")
-    return json.loads(metadata["card"]) | ({"attributes": known} if known else {})
+    with mismatches_named(path, AttributeError):
+        known = parse_json(metadata.get("architecture", "{}")).get("vocabulary")
+        return parse_json(metadata["card"]) | ({"attributes": known} if known else {})
 
 
 def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.formats.arrays import read_numbers
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, SIDED_PARTS
 from primdiffusion.geometry.surface import surface_points
@@ -69,8 +69,8 @@ DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDED_PARTS)
 
 def read_weights(path: str | Path) -> Float[Tensor, "v"]:
     """Read painted weights. Raises FileNotFoundError, and ValueError for a file without usable weights."""
-    weights = read_arrays(path, ("weights",))["weights"]
-    if weights.dtype.kind not in "fiub" or weights.ndim != 1:
+    weights = read_numbers(path, ("weights",))["weights"]
+    if weights.ndim != 1:
         raise ValueError(f"weights in {path} are {weights.dtype} {weights.shape}: give one number for each vertex")
     return torch.from_numpy(weights.astype(np.float32))
 

@@ -20,6 +20,7 @@ from primdiffusion.diffusion.checkpoint import ENCODER_FORMAT, check_finite, mis
 from primdiffusion.encoder.config import EncoderConfig, config_from_json
 from primdiffusion.encoder.network import Encoder, motion_of
 from primdiffusion.encoder.unproject import Unprojected, unproject_texels, unproject_voxels
+from primdiffusion.formats.json_files import parse_json
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.staging import write_atomically
@@ -123,7 +124,7 @@ def load_encoder(path: Path | str | None = None, device: torch.device | str = "c
         raise FileNotFoundError(f"there is no encoder at {path}: give the path of a .safetensors file")
     tensors, metadata = read_tensors(path, (ENCODER_FORMAT,))
     with mismatches_named(path, ValueError):
-        encoder = Encoder(config_from_json(json.loads(metadata["config"])))
+        encoder = Encoder(config_from_json(parse_json(metadata["config"])))
         encoder.load_state_dict(tensors)
-        card = json.loads(metadata["card"])
+        card = parse_json(metadata["card"])
     return EncoderModel(encoder.eval().requires_grad_(False).to(device), card)

@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion.evaluation.portraits import PORTRAITS
+from primdiffusion.formats.json_files import parse_json
 from primdiffusion.staging import written_whole
 
 CATEGORIES = ("sex", "age", "outfit", "pattern", "shoes", "hair", "hair_colour", "hat")
@@ -242,7 +243,7 @@ def load_attribute_network(path: Path) -> AttributeNetwork:
         raise FileNotFoundError(f"no feature network at {path}: choose a folder to train one in")
     try:
         with safe_open(path, framework="pt") as file:
-            stated = json.loads(file.metadata()["answers"])
+            stated = parse_json(file.metadata()["answers"])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
         space = AttributeSpace(
             {name: tuple(values) for name, values in stated["categories"].items()},

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, mesh_portraits, portraits
 from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.formats.json_files import parse_json
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
@@ -137,7 +138,7 @@ def _cached(path: Path) -> tuple[Tensor, list[dict[str, Any]]] | None:
     """Pictures and attributes from an earlier run; None if they are damaged or of other views."""
     try:
         arrays = read_arrays(path, ("pictures", "attributes"))
-        pictures, attributes = torch.from_numpy(arrays["pictures"]), json.loads(str(arrays["attributes"]))
+        pictures, attributes = torch.from_numpy(arrays["pictures"]), parse_json(str(arrays["attributes"]))
     except ValueError:
         return None
     fits = tuple(pictures.shape[1:]) == (len(PORTRAITS), SIDE, SIDE, 4) and len(attributes) == len(pictures)
@@ -148,7 +149,7 @@ def read_attributes(path: Path) -> list[dict[str, Any]]:
     """Read the attributes of each colouring in a payload file. Raises ValueError if they are unreadable."""
     arrays = read_arrays(path, ("attributes", "voxels"))
     try:
-        stored = json.loads(str(arrays["attributes"]))
+        stored = parse_json(str(arrays["attributes"]))
     except ValueError as error:
         raise ValueError(f"{path}: its attributes are not JSON ({error}): make it again") from error
     return list(stored.get("variants", [stored] * len(arrays["voxels"])))

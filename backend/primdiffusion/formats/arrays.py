@@ -3,18 +3,40 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import math
+import struct
+import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .regular_files import open_regular
+
 LARGEST_BYTES = 512 * 2**20
-"""Largest size of an array: small files can claim petabytes. An hour of motion at 60 frames/s takes 285 MB."""
+"""Largest size of what one call reads: small files can claim petabytes. An hour of motion at 60 frames/s takes 285
+MB."""
+LARGEST_NUMBER = 1e30
+LARGEST_FILE = 2**31
+_LARGEST_DIRECTORY = 4 * 2**20
+"""Of a zip archive's list of names, bytes; also of a single read."""
+_LONGEST_HEADER = 10_000
+"""Of an array, bytes, as in numpy."""
+_CHUNK = 2**20
+_KINDS = "biufcUSmMV"
+_UNREADABLE = (
+    zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error, EOFError, OSError, NotImplementedError,
+    RuntimeError, ValueError, OverflowError, LookupError,
+)  # fmt: skip
+_NO_ARRAY = (
+    ValueError, KeyError, SyntaxError, TypeError, MemoryError, RecursionError, OverflowError, struct.error,
+    tokenize.TokenError,
+)  # fmt: skip
 
 
 class ArrayFileError(ValueError):
@@ -27,6 +49,16 @@ def array_names(path: str | Path) -> list[str]:
         return [name.removesuffix(".npy") for name in archive.namelist()]
 
 
+def array_shape(path: str | Path, name: str) -> tuple[int, ...]:
+    """Return the shape of an array without reading its values. Raises as `read_arrays`."""
+    with _archive(path) as archive:
+        member = _needed(archive, path, name)
+        what = f"{path}: {name!r}"
+        _check_size(member.file_size, what)
+        with archive.open(member) as stream:
+            return _header(stream, member.file_size, what)[0]
+
+
 def read_arrays(path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, NDArray]:
     """Read the arrays `required` of an .npz, and those of `optional` that it contains; others are not unpacked.
 
@@ -36,15 +68,16 @@ def read_arrays(path: str | Path, required: Sequence[str] = (), optional: Sequen
         ArrayFileError: the file is damaged, lacks an array, or one is pickled or larger than `LARGEST_BYTES`.
         OSError: it cannot be opened; FileNotFoundError if it does not exist.
     """
-    arrays = {}
+    arrays, total = {}, 0
     with _archive(path) as archive:
         for name in (*required, *optional):
-            member = _member(archive, f"{name}.npy") or _member(archive, name)
-            if member is not None:
-                with archive.open(member) as stream:
-                    arrays[name] = _read(stream, member.file_size, f"{path}: {name!r}")
-            elif name in required:
-                raise ArrayFileError(f"{path} holds no array {name!r}: make it again")
+            if name in optional and _member(archive, name) is None:
+                continue
+            member = _needed(archive, path, name)
+            total += member.file_size
+            _check_size(total, f"{path}: {name!r}")
+            with archive.open(member) as stream:
+                arrays[name] = _read(stream, member.file_size, f"{path}: {name!r}")
     return arrays
 
 
@@ -54,9 +87,14 @@ def read_numbers(path: str | Path, required: Sequence[str] = (), optional: Seque
     for name, values in arrays.items():
         if values.dtype.kind not in "biuf":
             raise ArrayFileError(f"{path}: {name!r} holds {values.dtype}, not numbers: save it as numbers")
-        if not np.isfinite(values).all():
+        if not all_finite(values):
             raise ArrayFileError(f"{path}: {name!r} holds NaN or infinite numbers: make it again")
     return arrays
+
+
+def all_finite(values: NDArray) -> bool:
+    """Whether no number is NaN, infinite, or too large for products in float32."""
+    return bool(np.isfinite(values).all() and (values.size == 0 or np.abs(values).max() <= LARGEST_NUMBER))
 
 
 def check_shapes(
@@ -80,32 +118,100 @@ def check_shapes(
 
 def read_npy(path: str | Path) -> NDArray:
     """Read an .npy file. Raises as `read_arrays`."""
-    with Path(path).open("rb") as stream:
-        return _read(stream, Path(path).stat().st_size, str(path))
+    with _npy(path) as (stream, size):
+        return _read(stream, size, str(path))
 
 
-def read_member(path: str | Path, name: str) -> bytes:
-    """Read a file in a zip archive. Raises as `read_arrays`."""
+def map_npy(path: str | Path) -> NDArray:
+    """Map an .npy file of any size into memory, read-only. Raises as `read_arrays`."""
+    with contextlib.closing(open_regular(path, 2**62)) as stream:
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(0)
+        shape, fortran, dtype = _header(stream, size, str(path))
+        order = "F" if fortran else "C"
+        return np.memmap(path, dtype, "r", stream.tell(), shape, order)  # type: ignore[call-overload]
+
+
+def read_pickled_bytes(path: str | Path, name: str) -> bytes:
+    """Return the pickle in an array of objects, for a reader that runs nothing of it. Raises as `read_arrays`."""
     with _archive(path) as archive:
-        member = _member(archive, name)
-        if member is None:
-            raise ArrayFileError(f"{path} holds no {name!r}: make it again")
-        _check_size(member.file_size, f"{path}: {name!r}")
-        return archive.read(member)
+        member, what = _needed(archive, path, name), f"{path}: {name!r}"
+        _check_size(member.file_size, what)
+        with archive.open(member) as stream:
+            _, _, dtype = _head(stream, what)
+            if not dtype.hasobject:
+                raise ArrayFileError(f"{what} holds {dtype}, not a dictionary of arrays: download it again")
+            return b"".join(iter(lambda: stream.read(_CHUNK), b""))
+
+
+def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write an .npz at the fastest level: higher ones take long and gain little. Raises OSError."""
+    _write(zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1), arrays)
+
+
+def write_stored(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write an uncompressed .npz, as numpy.savez does, but with one OSError where the disk is full."""
+    _write(zipfile.ZipFile(path, "w", zipfile.ZIP_STORED), arrays)
+
+
+def _write(archive: zipfile.ZipFile, arrays: Mapping[str, NDArray]) -> None:
+    try:
+        for name, values in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.asarray(values), allow_pickle=False)
+    except BaseException:
+        with contextlib.suppress(OSError, ValueError):  # closing writes again, which a full disk rejects again
+            archive.close()
+        raise
+    archive.close()
+
+
+class _Reads:
+    """A file whose single reads are limited: `zipfile` reads the whole list of names at once."""
+
+    def __init__(self, file: BinaryIO) -> None:
+        self._file, self.seek, self.tell, self.seekable = file, file.seek, file.tell, file.seekable
+
+    def read(self, size: int = -1) -> bytes:
+        data = self._file.read(size if 0 <= size <= _LARGEST_DIRECTORY else _LARGEST_DIRECTORY + 1)
+        if len(data) > _LARGEST_DIRECTORY:
+            raise zipfile.BadZipFile("it lists too many names")
+        return data
 
 
 @contextlib.contextmanager
 def _archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
-    with Path(path).open("rb") as file:
+    with open_regular(path, LARGEST_FILE) as file:
         try:
-            with zipfile.ZipFile(file) as archive:
+            with zipfile.ZipFile(_Reads(file)) as archive:  # type: ignore[arg-type]
                 yield archive
-        except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as e:
-            raise ArrayFileError(f"{path} is not a whole .npz file ({e}): copy or export it again") from e
+        except ArrayFileError:
+            raise
+        except _UNREADABLE as e:
+            raise ArrayFileError(f"{path} is not a whole .npz file ({str(e)[:100]}): copy or export it again") from e
+
+
+@contextlib.contextmanager
+def _npy(path: str | Path) -> Iterator[tuple[BinaryIO, int]]:
+    with open_regular(path, LARGEST_BYTES) as stream:
+        size = stream.seek(0, io.SEEK_END)
+        stream.seek(0)
+        yield stream, size
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo | None:
-    return archive.NameToInfo.get(name)
+    return archive.NameToInfo.get(f"{name}.npy") or archive.NameToInfo.get(name)
+
+
+def _needed(archive: zipfile.ZipFile, path: str | Path, name: str) -> zipfile.ZipInfo:
+    member = _member(archive, name)
+    if member is None:
+        raise ArrayFileError(f"{path} holds no array {name!r}: make it again")
+    if member.flag_bits & 1:
+        raise ArrayFileError(f"{path}: {name!r} is encrypted, which is not supported: save it without a password")
+    if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack without a limit
+        raise ArrayFileError(f"{path}: {name!r} is compressed in another way than numpy's: save it with numpy.savez")
+    return member
 
 
 def _check_size(size: int, what: str) -> None:
@@ -113,25 +219,49 @@ def _check_size(size: int, what: str) -> None:
         raise ArrayFileError(f"{what} unpacks to {size / 2**20:.0f} MB, more than {LARGEST_BYTES // 2**20}: cut it")
 
 
-def _read(stream: IO[bytes], size: int, what: str) -> NDArray:
-    """Read an array of `size` bytes including its header, which must agree with that size."""
-    _check_size(size, what)
+def _head(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """Read the header of an array: shape, column-major, dtype."""
     try:
-        version = np.lib.format.read_magic(stream)
-        read_header = {
-            (1, 0): np.lib.format.read_array_header_1_0,
-            (2, 0): np.lib.format.read_array_header_2_0,
-        }[version]
-        shape, fortran, dtype = read_header(stream)
-    except (ValueError, KeyError, SyntaxError) as e:
+        start = stream.read(8)
+        wide = {b"\x93NUMPY\x01\x00": 2, b"\x93NUMPY\x02\x00": 4}[start]
+        length = stream.read(wide)
+        count = int.from_bytes(length, "little")
+        if count > _LONGEST_HEADER:
+            raise ValueError("a long header")
+        text = io.BytesIO(length + stream.read(count))
+        read = np.lib.format.read_array_header_1_0 if wide == 2 else np.lib.format.read_array_header_2_0
+        shape, fortran, dtype = read(text)
+        usable = len(shape) <= 32 and all(0 <= side < 2**62 for side in shape)
+        usable = usable and (dtype.hasobject or (dtype.kind in _KINDS and dtype.itemsize > 0))
+        if not usable:
+            raise ValueError("an impossible shape or type")
+    except _NO_ARRAY as e:
         raise ArrayFileError(f"{what} is not an array of numpy's format: save it with numpy.save or savez") from e
+    return shape, fortran, dtype
+
+
+def _header(stream: IO[bytes], size: int, what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """As `_head`, of numbers or text that fit into `size` bytes."""
+    shape, fortran, dtype = _head(stream, what)
     if dtype.hasobject:
         raise ArrayFileError(f"{what} holds pickled Python objects, which are never read: save it as plain arrays")
     wanted = math.prod(shape) * dtype.itemsize
-    if not 0 <= wanted <= size:
-        raise ArrayFileError(f"{what} is cut short: its header promises {wanted} bytes, {size} are there")
-    data = stream.read(wanted)
-    if len(data) < wanted:
-        raise ArrayFileError(f"{what} is cut short: its header promises {wanted} bytes, {len(data)} are there")
-    array = np.frombuffer(data, dtype)
-    return (array.reshape(shape[::-1]).T if fortran else array.reshape(shape)).copy()
+    if wanted > size:
+        raise ArrayFileError(f"{what} is cut short: its header promises {wanted:.6g} bytes, {size} are there")
+    return shape, fortran, dtype
+
+
+def _read(stream: IO[bytes], size: int, what: str) -> NDArray:
+    """Read an array of `size` bytes including its header, which must agree with that size."""
+    _check_size(size, what)
+    shape, fortran, dtype = _header(stream, size, what)
+    raw = np.empty(math.prod(shape) * dtype.itemsize, np.uint8)  # memory is taken as it is filled
+    filled = 0
+    while filled < raw.size:
+        chunk = stream.read(min(_CHUNK, raw.size - filled))
+        if not chunk:
+            raise ArrayFileError(f"{what} is cut short: its header promises {raw.size} bytes, {filled} are there")
+        raw[filled : filled + len(chunk)] = np.frombuffer(chunk, np.uint8)
+        filled += len(chunk)
+    array = raw.view(dtype)
+    return array.reshape(shape[::-1]).T if fortran else array.reshape(shape)

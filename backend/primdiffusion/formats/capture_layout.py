@@ -38,6 +38,8 @@ from numpy.typing import NDArray
 
 from .arrays import ArrayFileError, read_numbers
 from .camera_rig import View
+from .json_files import parse_json, read_json
+from .removing import check_inside, remove_file
 from .whole_files import replacing
 
 FORMAT, VERSION = "primdiffusion-captures", 1
@@ -77,7 +79,7 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
 
     Raises CaptureFolderError if the folder contains another dataset or other files.
     """
-    wanted = {"format": FORMAT, "version": VERSION, **json.loads(json.dumps(about))}
+    wanted = {"format": FORMAT, "version": VERSION, **parse_json(json.dumps(about))}
     if not (root / DATASET_FILE).exists():
         if root.is_dir() and any(not path.name.startswith(".") for path in root.iterdir()):
             raise CaptureFolderError(
@@ -90,7 +92,7 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
             with contextlib.suppress(FileExistsError):
                 os.link(unlike, root / DATASET_FILE)
         finally:
-            unlike.unlink(missing_ok=True)
+            remove_file(unlike, root)
     present = read_about(root)
     differing = [key for key in {**present, **wanted} if present.get(key) != wanted.get(key)]
     if differing:
@@ -104,7 +106,7 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
 def read_about(root: Path) -> dict[str, Any]:
     """Read the settings of a dataset. Raises CaptureFolderError if they are missing or damaged."""
     try:
-        about = json.loads((root / DATASET_FILE).read_text(encoding="utf-8"))
+        about = read_json(root / DATASET_FILE)
     except FileNotFoundError:
         raise CaptureFolderError(f"{root} holds no captures: there is no {DATASET_FILE} in it") from None
     except (OSError, ValueError) as e:
@@ -155,7 +157,7 @@ def complete(subject: Path) -> None:
     Call it once, after all writing to the subject has ended.
     """
     for partial in subject.rglob(".*.partial.*"):
-        partial.unlink(missing_ok=True)
+        remove_file(partial, subject)
     files = {
         path.relative_to(subject).as_posix(): [path.stat().st_size, _crc(path)]
         for path in sorted(subject.rglob("*"))
@@ -172,7 +174,7 @@ def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
     file outside of the subject.
     """
     try:
-        files = json.loads((subject / COMPLETE_FILE).read_text(encoding="utf-8"))
+        files = read_json(subject / COMPLETE_FILE)
         noted = {_inside(subject, name): (int(size), int(crc)) for name, (size, crc) in files.items()}
     except (OSError, ValueError, AttributeError, TypeError):
         return {subject: "not finished"}
@@ -200,8 +202,9 @@ def _check_same_smpl(subject: Path, wanted: Mapping[str, NDArray]) -> None:
 
 
 def _inside(subject: Path, name: str) -> Path:
-    if Path(name).is_absolute() or ".." in Path(name).parts or "\\" in name:
+    if Path(name).is_absolute() or ".." in Path(name).parts or "\\" in name or not name.isprintable():
         raise ValueError(f"{name!r} is no file of {subject}")
+    check_inside(subject / name, subject)
     return subject / name
 
 

@@ -19,6 +19,10 @@ from .capture_layout import (
     write_list,
 )
 from .picture_files import is_whole_picture
+from .removing import check_inside, remove_file
+
+MOST_PICTURES = 1_000_000
+"""Of a subject."""
 
 
 def verify(root: Path, *, checksums: bool = True) -> dict[Path, str]:
@@ -42,24 +46,30 @@ def verify(root: Path, *, checksums: bool = True) -> dict[Path, str]:
 def repair(root: Path, wrong: Collection[Path]) -> None:
     """Remove the files that `verify` has found, with the completion marks of their subjects; rewrite the list.
 
-    The command that rendered the dataset then renders only those files again. Raises OSError.
+    The command that rendered the dataset then renders only those files again. Raises OutsideFolderError, before it
+    removes anything, where one of them lies behind a link out of its folder, and OSError.
     """
+    for path in wrong:
+        check_inside(path, root)
     for subject in subject_folders(root):
         partial = _partial_files(subject)
         damaged = [path for path in wrong if path.is_relative_to(subject) and path not in partial]
+        for path in damaged:
+            if path != subject:
+                check_inside(path, subject)
         if damaged:
             remove_damaged(subject, damaged)
         for path in partial:
-            path.unlink(missing_ok=True)
+            remove_file(path, subject)
     list_subjects(root)
 
 
 def remove_damaged(subject: Path, wrong: Collection[Path]) -> None:
     """Remove files of a subject, and first the completion mark; the subject's folder itself stays."""
-    (subject / COMPLETE_FILE).unlink(missing_ok=True)
+    remove_file(subject / COMPLETE_FILE, subject)
     for path in wrong:
         if path != subject:
-            path.unlink(missing_ok=True)
+            remove_file(path, subject)
 
 
 def subject_folders(root: Path) -> list[Path]:
@@ -91,14 +101,24 @@ def is_complete_view(subject: Path, passes: Sequence[str], camera: int, frame: i
 
 def _read_checked(root: Path) -> dict[str, Any]:
     about = read_about(root)
-    numbers = (about.get("frames"), (about.get("rig") or {}).get("count"))
-    passes = about.get("passes")
-    if not all(isinstance(n, int) and 0 < n <= 10**6 for n in numbers) or not isinstance(passes, list):
+    rig, passes = about.get("rig"), about.get("passes")
+    frames, cameras = about.get("frames"), rig.get("count") if isinstance(rig, dict) else None
+    counted = all(type(n) is int and n > 0 for n in (frames, cameras))
+    named = isinstance(passes, list) and all(isinstance(name, str) for name in passes)
+    if not counted or not named:
         raise CaptureFolderError(
             f"{root / DATASET_FILE} lacks the numbers of frames and cameras: render into a new folder"
         )
-    if not set(passes) <= set(ENDINGS):
-        raise CaptureFolderError(f"{root / DATASET_FILE} names passes that this program does not know: {passes}")
+    if not set(passes) <= set(ENDINGS) or len(passes) > len(ENDINGS):
+        raise CaptureFolderError(
+            f"{root / DATASET_FILE} names passes that this program does not know: {passes!r:.80}; render into a "
+            "new folder"
+        )
+    if frames * cameras * len(passes) > MOST_PICTURES:
+        raise CaptureFolderError(
+            f"{root / DATASET_FILE} names {frames} frames of {cameras} cameras, more than {MOST_PICTURES} pictures a "
+            "human: render into a new folder"
+        )
     return about
 
 

@@ -7,6 +7,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+from .removing import remove_file
+
 
 @contextlib.contextmanager
 def replacing(path: Path) -> Iterator[Path]:
@@ -16,6 +18,7 @@ def replacing(path: Path) -> Iterator[Path]:
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    remove_file(partial, partial.parent)  # a link of that name would be followed
     try:
         yield partial
         os.replace(partial, path)
@@ -24,4 +27,4 @@ def replacing(path: Path) -> Iterator[Path]:
             raise
         raise OSError(e.errno, e.strerror, str(path)) from e
     finally:
-        partial.unlink(missing_ok=True)
+        remove_file(partial, partial.parent)

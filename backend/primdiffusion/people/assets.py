@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from primdiffusion.geometry.pictures import PictureError, opened_picture
 from primdiffusion.people.mhclo import ObjMesh, Proxy, read_pair
 
 ENVIRONMENT_VARIABLE = "PRIMDIFFUSION_ASSETS"
@@ -134,9 +135,9 @@ def _picture_path(root: Path, name: str) -> Path | None:
 def _decoded(path: Path, size: int) -> UInt8[np.ndarray, "H W 4"]:
     """Decode and shrink an image; shrinking weights colour by alpha, so that edges keep their colour."""
     try:
-        with Image.open(path) as file:
+        with opened_picture(path) as file:
             picture = file.convert("RGBA")
-    except (OSError, SyntaxError) as error:
+    except (OSError, PictureError) as error:
         raise DamagedPictureError(f"{path} cannot be decoded ({error}): fetch it again") from error
     if picture.width > size:
         box = (size, round(picture.height * size / picture.width))

@@ -61,10 +61,8 @@ class BaseMesh:
 @functools.cache
 def load_base_mesh() -> BaseMesh:
     """Load the base mesh that ships with the package."""
-    with (
-        importlib.resources.as_file(importlib.resources.files("primdiffusion.people") / "data/hm08.npz") as path,
-        np.load(path) as f,
-    ):
+    with importlib.resources.as_file(importlib.resources.files("primdiffusion.people") / "data/hm08.npz") as path:
+        f = read_arrays(path, array_names(path))
         weight = f["joint_weight"].astype(np.float64)
         return BaseMesh(
             template=f["template"].astype(np.float64),

@@ -15,7 +15,6 @@ import hashlib
 import json
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -26,6 +25,8 @@ import torch
 
 from primdiffusion.body.model import default_body
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.json_files import read_json
+from primdiffusion.formats.removing import remove_folder
 from primdiffusion.people.assets import UNKNOWN, Assets, licence_of
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.gltf import Skeleton, glb
@@ -117,13 +118,13 @@ def write_person(assets: Assets, folder: Path, seed: int) -> None:
         partial.mkdir()
         (partial / GLB).write_bytes(binary)
         (partial / CARD).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
-        shutil.rmtree(folder, ignore_errors=True)
+        remove_folder(folder, folder.parent)
         partial.replace(folder)
     except OSError as error:
         # For a full disk, Python's error names no file.
         raise OSError(error.errno, error.strerror or "cannot be written", str(folder)) from error
     finally:
-        shutil.rmtree(partial, ignore_errors=True)
+        remove_folder(partial, partial.parent)
 
 
 def skeleton_of(person: Person) -> Skeleton:
@@ -151,7 +152,7 @@ def is_whole(folder: Path, seed: int) -> bool:
 
 def unknown_licences(root: Path) -> list[str]:
     """Assets in a folder's manifest whose licence is unknown."""
-    manifest = json.loads((root / MANIFEST).read_text(encoding="utf-8"))
+    manifest = read_json(root / MANIFEST)
     return [asset["path"] for asset in manifest["assets"] if asset["licence"] == UNKNOWN]
 
 
@@ -183,7 +184,7 @@ def _remove_leftovers(root: Path) -> None:
     for path in root.glob(".person_*.partial"):
         owner = PARTIAL.fullmatch(path.name)
         if owner and not psutil.pid_exists(int(owner[1])):
-            shutil.rmtree(path, ignore_errors=True)
+            remove_folder(path, path.parent)
 
 
 def _write_manifest(people: PeopleSet) -> None:
@@ -210,6 +211,6 @@ def _read_card(folder: Path) -> dict[str, Any] | None:
 def _read_json(path: Path) -> dict[str, Any] | None:
     """Read a JSON object; None if the file is missing or damaged."""
     with contextlib.suppress(OSError, ValueError):
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = read_json(path)
         return value if isinstance(value, dict) else None
     return None

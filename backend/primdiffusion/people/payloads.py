@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import json
 import math
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -26,7 +25,7 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from primdiffusion.body.model import default_body
-from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.formats.arrays import read_arrays, write_deflated
 from primdiffusion.formats.requests import Making
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
@@ -116,14 +115,10 @@ def coloured_people(assets: Assets, seed: int, variants: int) -> list[Person]:
 
 def store_person(path: Path, entries: Mapping[str, np.ndarray | str | int]) -> None:
     """Write a payload file, atomically, with `full_density` added. Raises OSError, which names the file."""
-    with (
-        written_whole(path) as unfinished,
-        zipfile.ZipFile(unfinished, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as z,
-    ):
-        # Level 1 compresses to a third; higher levels gain little and take longer than making the sample.
-        for key, value in {**entries, "full_density": FULL_DENSITY}.items():
-            with z.open(f"{key}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
+    with written_whole(path) as unfinished:
+        write_deflated(
+            unfinished, {key: np.asarray(value) for key, value in {**entries, "full_density": FULL_DENSITY}.items()}
+        )
 
 
 def rest_frames(betas: Float[np.ndarray, "10"]) -> Frames:

@@ -6,6 +6,7 @@ The license of such a body may not allow redistribution, so our files store its 
 from __future__ import annotations
 
 import dataclasses
+import errno
 import functools
 import hashlib
 import json
@@ -17,6 +18,9 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel
 from primdiffusion.body.smpl_files import load_body
+from primdiffusion.body.smpl_pickle import LARGEST_PICKLE
+from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import TooLargeError, check_regular, check_size, is_plain_path
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors, build_anchors
 from primdiffusion.primitives.primitives import K
@@ -56,10 +60,13 @@ class BodyFiles:
     def from_json(cls, text: str) -> BodyFiles:
         """Parse the result of `to_json`; ValueError if malformed."""
         try:
-            tree = json.loads(text)
-            return cls(FileFingerprint(**tree["smpl"]), tuple(FileFingerprint(**file) for file in tree["uv"]))
-        except (KeyError, TypeError) as error:
-            raise ValueError(f"malformed body metadata ({type(error).__name__}: {error})") from error
+            tree = parse_json(text)
+            files = cls(FileFingerprint(**tree["smpl"]), tuple(FileFingerprint(**file) for file in tree["uv"]))
+            if not all(isinstance(v, str) for file in (files.smpl, *files.uv) for v in (file.path, file.sha256)):
+                raise TypeError("a path or checksum is no text")
+        except (KeyError, TypeError, ValueError) as error:
+            raise ValueError(f"malformed body metadata ({type(error).__name__}: {str(error)[:100]})") from error
+        return files
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,20 +105,27 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
 
 
 def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> _Stamp:
-    name = PureWindowsPath(file.path).name  # also parses POSIX paths
-    paths = [Path(file.path), *(folder / name for folder in folders)]
-    there = [path for path in paths if path.is_file()]
-    for path in there:
-        stamp = _Stamp.of(path)
+    shown, name = f"{file.path!r:.120}".strip("'"), PureWindowsPath(file.path).name  # also parses POSIX paths
+    named = [Path(file.path)] if is_plain_path(file.path) else []
+    problem = "is missing" if named else "is not named by a path on this machine"
+    for path in (*named, *(folder / name for folder in folders if name and is_plain_path(name))):
+        try:
+            stamp = _Stamp.of(path)
+        except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
+            continue
+        except (OSError, TooLargeError) as error:
+            problem = f"cannot be read ({getattr(error, 'strerror', None) or 'it is too large'})"
+            continue
         if _sha256(stamp) == file.sha256:
             return stamp
-    if there:
+        shown, problem = f"{path!s:.120}", "has changed"
+    if problem == "has changed":
         raise BodySetupError(
-            f"the body file {there[0]} has changed (expected sha256 {file.sha256[:12]}...): restore it, or import the "
+            f"the body file {shown} has changed (expected sha256 {file.sha256[:12]}...): restore it, or import the "
             "checkpoint again with this file"
         )
     raise BodySetupError(
-        f"the body file {file.path} is missing (sha256 {file.sha256[:12]}...): restore it, or put a copy beside the "
+        f"the body file {shown} {problem} (sha256 {file.sha256[:12]}...): restore it, or put a copy beside the "
         "file that refers to it"
     )
 
@@ -126,7 +140,11 @@ class _Stamp:
 
     @classmethod
     def of(cls, path: Path) -> _Stamp:
-        stat = path.stat()
+        """Raises as `check_regular`, and TooLargeError; FileNotFoundError for an empty file."""
+        stat = check_regular(path)
+        if not stat.st_size:  # also endless files of /proc
+            raise FileNotFoundError(errno.ENOENT, "the file is empty", str(path))
+        check_size(path, stat.st_size, LARGEST_PICKLE)
         return cls(path, stat.st_mtime_ns, stat.st_size)
 
 

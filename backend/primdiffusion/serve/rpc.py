@@ -11,6 +11,8 @@ import math
 import threading
 from typing import Any, BinaryIO
 
+from primdiffusion.formats.json_files import parse_message
+
 PARSE_ERROR = -32700
 INVALID_REQUEST = -32600
 METHOD_NOT_FOUND = -32601
@@ -59,8 +61,8 @@ class MalformedRequest(RpcError):
 def parse_request(line: bytes) -> RpcRequest:
     """Parse a line. Raises MalformedRequest unless it is one JSON-RPC 2.0 request object."""
     try:
-        message = json.loads(line.decode("utf-8"))
-    except (ValueError, RecursionError) as e:
+        message = parse_message(line)
+    except ValueError as e:
         raise MalformedRequest(PARSE_ERROR, f"the line is not JSON in UTF-8 ({e}): send one JSON object a line") from e
     if isinstance(message, list):
         raise MalformedRequest(INVALID_REQUEST, "batches are not supported: send one request a line")

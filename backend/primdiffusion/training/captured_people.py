@@ -20,6 +20,8 @@ from primdiffusion.capture.reader import Captures
 from primdiffusion.capture.render import SubjectResult
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.failures import describe
+from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.formats.json_files import parse_json, read_json
 from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD
 from primdiffusion.people.payloads import store_person, voxels_from_payload
@@ -133,7 +135,7 @@ def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
         card = path.parent / CARD
         if path.name != f"{name}.glb" and card.is_file():
             try:
-                cards[name] = dict(json.loads(card.read_text(encoding="utf-8")))
+                cards[name] = dict(read_json(card))
             except (ValueError, TypeError) as error:
                 raise ValueError(f"{card} is damaged ({error}): make the human again") from error
     return cards
@@ -162,9 +164,7 @@ def _is_current(path: Path, source: str, attributes: Mapping[str, Any]) -> bool:
     """Return whether a file is intact and of the same source and attributes."""
     try:
         read_person(path)
-        with np.load(path, allow_pickle=False) as file:
-            return (
-                "source" in file and str(file["source"]) == source and json.loads(str(file["attributes"])) == attributes
-            )
+        stored = read_arrays(path, ("source", "attributes"))
+        return str(stored["source"]) == source and parse_json(str(stored["attributes"])) == attributes
     except (FileNotFoundError, ValueError, KeyError):
         return False

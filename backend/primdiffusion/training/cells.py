@@ -19,6 +19,7 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
+from primdiffusion.formats.json_files import parse_json
 from primdiffusion.staging import write_atomically
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
@@ -151,7 +152,7 @@ def _load_prepared(path: Path) -> Prepared:
             LinearCodec(**part("codec")),
             PersonPrior(**part("prior")),
             ShapePrior(**part("shapes")),
-            AttributeVocabulary.from_json(json.loads(about["vocabulary"])),
+            AttributeVocabulary.from_json(parse_json(about["vocabulary"])),
             float(about["full_density"]),
         )
     except (SafetensorError, KeyError, TypeError, ValueError) as error:

@@ -10,6 +10,7 @@ from typing import Any, Literal, Protocol
 
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
+from primdiffusion.formats.json_files import parse_json
 
 Weighting = Literal["whitened", "plain", "min_snr"]
 Levels = Literal["uniform", "log_uniform", "log_normal"]
@@ -206,10 +207,10 @@ class RunConfig(Protocol):
 def check_resumable(saved: str, config: RunConfig) -> None:
     """Raise ValueError, naming the settings in which a saved run differs from `config`, except those allowed to."""
     try:
-        before = _comparable(json.loads(saved))
+        before = _comparable(parse_json(saved))
     except (ValueError, AttributeError) as error:
         raise ValueError(f"the settings in {config.run} are damaged ({error}): give a new folder") from error
-    now = _comparable(json.loads(to_json(config)))
+    now = _comparable(parse_json(to_json(config)))
     changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if changed:
         differing = ", ".join(f"{key} ({before.get(key)}, not {now.get(key)})" for key in changed)

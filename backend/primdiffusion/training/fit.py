@@ -23,6 +23,7 @@ from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.failures import out_of_memory
+from primdiffusion.formats.json_files import parse_json
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
@@ -114,7 +115,7 @@ def steps(
     """Optimiser steps from where the state is to `config.steps`; the caller owns progress, saving and stopping."""
     accelerator = state.accelerator
     share = ProcessRank(accelerator.process_index, accelerator.num_processes)
-    start = Position(*json.loads(state.place.get("position", "[0, 0]")))
+    start = Position(*parse_json(state.place.get("position", "[0, 0]")))
     source = fit_batches(dataset, config, start, share)
     settings = MarchSettings(step=config.step)
     while state.step < config.steps:
@@ -189,7 +190,7 @@ def model_of(config: FitConfig, state: FitState, captures: Captures) -> EncoderM
         "seconds": round(state.seconds, 1),
         "device": str(state.accelerator.device),
         "seed": config.seed,
-        "loss": json.loads(json.dumps(dataclasses.asdict(config.loss), default=str)),
+        "loss": parse_json(json.dumps(dataclasses.asdict(config.loss), default=str)),
         "full_density": PRESETS[config.encoder].full_density,
         **versions(),
     }

@@ -17,6 +17,7 @@ from typing import Protocol
 import torch
 from tqdm import tqdm
 
+from primdiffusion.formats.json_files import parse_message
 from primdiffusion.training.state import TrainingState
 
 log = logging.getLogger(__name__)
@@ -76,7 +77,7 @@ class Recorder(ABC):
 
     def __init__(self, steps: int, every: Every, state: TrainingState, name: str | None = None) -> None:
         self.steps, self.every, self.state, self.name = steps, every, state, name
-        self.means: dict[str, float] = json.loads(state.place.get("means", "{}"))
+        self.means: dict[str, float] = parse_message(state.place.get("means", "{}"))
 
     def __enter__(self) -> Recorder:
         self.bar = tqdm(total=self.steps, initial=self.state.step, desc=self.name, unit="step", disable=None)

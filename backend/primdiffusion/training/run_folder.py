@@ -21,6 +21,8 @@ import psutil
 import torch
 
 from primdiffusion import __version__
+from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.removing import remove_file
 from primdiffusion.staging import write_atomically
 from primdiffusion.training.config import RunConfig, check_resumable, to_json
 
@@ -87,7 +89,7 @@ def versions() -> dict[str, str]:
 def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: int) -> list[Mapping[str, Any]]:
     """Return the earlier starts of the run. Raises ValueError for another training set."""
     try:
-        before = json.loads(saved)
+        before = parse_json(saved)
         known, starts = before["people"], before.get("starts", [])
         were = starts[-1]["processes"] if starts else processes
     except (ValueError, LookupError, TypeError, AttributeError) as error:
@@ -111,7 +113,7 @@ def _cut_metrics(path: Path, is_kept: Callable[[Mapping[str, Any]], bool]) -> No
 def _is_kept(line: str, is_kept: Callable[[Mapping[str, Any]], bool]) -> bool:
     """Also False for a truncated line."""
     try:
-        return is_kept(json.loads(line))
+        return is_kept(parse_json(line))
     except (ValueError, KeyError, TypeError):
         return False
 
@@ -121,7 +123,7 @@ def _remove_leftovers(run: Path) -> None:
     for path in run.glob(".*.partial"):
         process = path.name.split(".")[-2]
         if process.isdecimal() and not psutil.pid_exists(int(process)):
-            path.unlink(missing_ok=True)
+            remove_file(path, run)
 
 
 def _git(folder: Path, *arguments: str) -> str:

@@ -24,6 +24,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from primdiffusion.diffusion.conditioning import Attributes
+from primdiffusion.formats.json_files import read_json
 from primdiffusion.primitives.primitives import K
 from primdiffusion.staging import write_atomically, written_whole
 from primdiffusion.training.stored_people import PersonDataset, PersonFolder, PersonVariants, attributes_of
@@ -178,7 +179,7 @@ class PackedPeople:
 
 def _read_index(path: Path) -> dict[str, Any]:
     try:
-        index = json.loads(path.read_text(encoding="utf-8"))
+        index = read_json(path)
     except FileNotFoundError:
         raise FileNotFoundError(f"there is no {path}: pack humans with `primdiffusion payloads pack`") from None
     except ValueError as error:

@@ -3,27 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import zipfile
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, Protocol
+from typing import Any, Protocol
 
-import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from numpy.lib.npyio import NpzFile
+from numpy.typing import NDArray
 from torch import Tensor
 
 from primdiffusion.body.measures import measure
 from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
+from primdiffusion.formats.arrays import array_shape, read_arrays
+from primdiffusion.formats.json_files import parse_json
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.wardrobe import words_of
 from primdiffusion.primitives.primitives import K, Payload, S
 
-_DAMAGED = (OSError, KeyError, ValueError, TypeError, EOFError, zipfile.BadZipFile)
+_DAMAGED = (OSError, KeyError, ValueError, TypeError, OverflowError)
+_ABOUT = ("betas", "attributes", "full_density")
 _NO_PERSON = "{path} is not a payload file or is damaged ({error}): write it again with `primdiffusion payloads`"
 _VOXELS = (K, S, S, S, 4)
 
@@ -97,12 +98,12 @@ def attributes_of(stored: Mapping[str, Any], betas: Float[Tensor, "10"], count: 
 def read_person(path: Path) -> PersonVariants:
     """Read a file. Raises ValueError if it is damaged or of another shape."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            outline = _outline_of(file)
-            voxels = torch.from_numpy(file["voxels"])
-            scale = torch.from_numpy(file["delta_scale"]).float() if "delta_scale" in file else None
+        arrays = read_arrays(path, (*_ABOUT, "voxels"), ("delta_scale",))
+        outline = _outline_of(arrays, arrays["voxels"].shape)
+        voxels = torch.from_numpy(arrays["voxels"])
+        scale = torch.from_numpy(arrays["delta_scale"]).float() if "delta_scale" in arrays else None
     except _DAMAGED as error:
-        raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
+        raise ValueError(_NO_PERSON.format(path=path, error=str(error).removeprefix(f"{path}: ")[:150])) from error
     if voxels.dtype != torch.uint8 or tuple(voxels.shape[1:]) != _VOXELS:
         raise ValueError(
             f"{path} holds voxels {voxels.dtype} {tuple(voxels.shape)}; uint8 [n, {K}, {S}, {S}, {S}, 4] is needed"
@@ -131,29 +132,28 @@ class Outline:
 def read_outline(path: Path) -> Outline:
     """Read a file without its voxels. Raises ValueError if it is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return _outline_of(file)
+        return _outline_of(read_arrays(path, _ABOUT), array_shape(path, "voxels"))
     except _DAMAGED as error:
-        raise ValueError(_NO_PERSON.format(path=path, error=error)) from error
+        raise ValueError(_NO_PERSON.format(path=path, error=str(error).removeprefix(f"{path}: ")[:150])) from error
 
 
-def _outline_of(file: NpzFile) -> Outline:
-    with file.zip.open("voxels.npy") as member:
-        count = _length(member)
-    betas = torch.from_numpy(file["betas"]).float()
+def _outline_of(arrays: Mapping[str, NDArray], shape: tuple[int, ...]) -> Outline:
+    """Check what a file holds beside its voxels, which have `shape`."""
+    if tuple(shape[1:]) != _VOXELS or not shape[0]:
+        raise ValueError(f"voxels of shape {shape}, not [n, {K}, {S}, {S}, {S}, 4]")
+    betas = torch.from_numpy(arrays["betas"]).float()
     if tuple(betas.shape) != (BETAS,) or not torch.isfinite(betas).all():
         raise ValueError(f"betas of shape {tuple(betas.shape)}, not {BETAS} finite numbers")
-    stored = dict(json.loads(str(file["attributes"])))
-    if len(stored.get("variants", range(count))) != count:
-        raise ValueError(f"attributes of {len(stored['variants'])} colourings, voxels of {count}")
-    return Outline(count, betas, stored, float(file["full_density"]))
-
-
-def _length(member: IO[bytes]) -> int:
-    """Return the first dimension of an array from its header."""
-    major, _ = np.lib.format.read_magic(member)
-    read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-    return read(member)[0][0]
+    stored, count = parse_json(str(arrays["attributes"])), shape[0]
+    if not isinstance(stored, dict):
+        raise ValueError("attributes that are no JSON object")
+    variants = stored.get("variants", [stored] * count)
+    if not isinstance(variants, list) or len(variants) != count or not all(isinstance(v, dict) for v in variants):
+        raise ValueError(f"attributes that do not describe {count} colourings")
+    density = float(arrays["full_density"])
+    if not 0 < density < math.inf:
+        raise ValueError(f"a full density of {density}")
+    return Outline(count, betas, stored, density)
 
 
 class PersonFolder:

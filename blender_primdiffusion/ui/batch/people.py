@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 
 from ...engine.engine import ENGINE
+from ...formats.removing import remove_file
 from ...motion.files import read_motion
 from ...motion.motion import Motion
 from ...scene.armature import keyframe_poses, pose_from_joint_rotations
@@ -57,7 +58,7 @@ def person_blend(npz: Path, person: Path, blend: Path, name: str, movement: Move
     _save(blend)  # where the volumes go
     build_person(bpy.context, npz, person, name, movement)
     _save(blend)
-    blend.with_name(f"{blend.name}1").unlink(missing_ok=True)  # Blender's backup
+    remove_file(blend.with_name(f"{blend.name}1"), blend.parent)  # Blender's backup
 
 
 def new_file() -> None:

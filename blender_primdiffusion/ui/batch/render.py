@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
+from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
 from ...jobs import cycles_check
 from ...jobs.open_human import opened
@@ -205,7 +205,7 @@ class _Drawing:
                 self.say(f"{source.name}: picture {number + 1} of {len(shots)}")
         if not source.is_blend:
             new_file()
-            shutil.rmtree(humans_folder(""), ignore_errors=True)
+            remove_folder(humans_folder(""), humans_folder("").parent)
         return len(shots)
 
     def _last_frame(self) -> int:
@@ -236,7 +236,7 @@ class _Drawing:
     def _build(self, source: RenderSource) -> None:
         """The human of a file, in an empty .blend; the volumes lie in a temporary folder."""
         new_file()
-        shutil.rmtree(humans_folder(""), ignore_errors=True)
+        remove_folder(humans_folder(""), humans_folder("").parent)
         with tempfile.TemporaryDirectory(dir=bpy.app.tempdir or None) as folder:
             npz, person = source.path.with_name(NPZ_FILE), source.path
             if not (source.has_npz and npz.is_file()):
@@ -291,7 +291,7 @@ def _draw(scene: bpy.types.Scene, path: Path) -> None:
         try:
             bpy.ops.render.render(write_still=True)
         except RuntimeError:
-            unfinished.unlink(missing_ok=True)
+            remove_file(unfinished, unfinished.parent)
             raise
         if not unfinished.is_file():
             raise OSError(f"{path} was not written: is the disk full?")

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -30,6 +29,8 @@ from ...console import (
     separate_stdout,
     stopped_by_signals,
 )
+from ...formats.json_files import parse_json, read_json
+from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
 from ...places import EXTENSION, new_backend, preference
 
@@ -118,12 +119,12 @@ def ask(
 def staging(folder: Path) -> Iterator[Path]:
     """An empty folder beside `folder`, to be published; removed after the block. A killed run may have left one."""
     made = folder.with_name(f".{folder.name}.partial")
-    shutil.rmtree(made, ignore_errors=True)
+    remove_folder(made, made.parent)
     made.mkdir(parents=True)
     try:
         yield made
     finally:
-        shutil.rmtree(made, ignore_errors=True)
+        remove_folder(made, made.parent)
 
 
 def publish(made: Path, folder: Path, last: str) -> None:
@@ -134,7 +135,7 @@ def publish(made: Path, folder: Path, last: str) -> None:
     for piece in sorted(made.iterdir(), key=lambda path: path.name == last):
         target = folder / piece.name
         if target.is_dir():
-            shutil.rmtree(target)
+            remove_folder(target, folder)
         os.replace(piece, target)
 
 
@@ -147,10 +148,10 @@ def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> N
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise _unwritable(path.parent, error) from error
-    wanted = json.loads(json.dumps(settings))
+    wanted = parse_json(json.dumps(settings))
     if path.is_file() and not whatever_is_there:
         try:
-            there = dict(json.loads(path.read_text(encoding="utf-8")))
+            there = dict(read_json(path))
         except (ValueError, TypeError) as error:
             raise ValueError(f"{path} is damaged ({error}): choose another folder, or add --resume") from error
         for name in sorted({*wanted, *there}):
@@ -226,7 +227,7 @@ def begun(report: Report, claimed: Path, settings: Mapping[str, Any], whatever_i
         if not nothing:
             report.write(out, _ALL)
         else:
-            claimed.unlink(missing_ok=True)
+            remove_file(claimed, claimed.parent)
             if is_new_folder:
                 out.rmdir()
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import bpy
+
+from ...formats.json_files import read_json
 
 LANGUAGES = ("de_DE", "fr_FR")
 CONTEXT = "PrimDiffusion"
@@ -16,7 +17,7 @@ _CONTEXTS = ("*", "Operator", CONTEXT)
 
 def words_of(language: str) -> dict[str, str]:
     """English -> translation."""
-    return json.loads(Path(__file__).with_name(f"{language}.json").read_text(encoding="utf-8"))
+    return read_json(Path(__file__).with_name(f"{language}.json"))
 
 
 def register() -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import shutil
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import pytest
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.capture_repair import list_subjects, repair, verify
 from primdiffusion.formats.picture_files import write_png
+from primdiffusion.formats.removing import OutsideFolderError
 
 
 @pytest.fixture
@@ -57,3 +60,39 @@ def test_settings_that_do_not_describe_captures_are_rejected(tmp_path, about):
     capture_layout.claim(tmp_path, {"frames": 1, "rig": {"count": 1}, "passes": ["mask"], **about})
     with pytest.raises(capture_layout.CaptureFolderError):
         verify(tmp_path)
+
+
+@pytest.mark.parametrize("place", ["anna/extra", "anna/mask", "carl"])
+def test_no_file_behind_a_link_is_removed(root, tmp_path, place):
+    """complete.json names a file through a link; a pass or a subject is a link."""
+    outside = tmp_path / "outside"
+    (outside / "camera0000").mkdir(parents=True)
+    mine = outside / "camera0000" / "0000.png"
+    mine.write_text("mine")
+    (outside / capture_layout.COMPLETE_FILE).write_text('{"camera0000/0000.png": [9, 9]}')
+    if place == "anna/mask":
+        shutil.rmtree(root / place)
+    (root / place).symlink_to(outside)
+    if place == "anna/extra":
+        (root / "anna" / capture_layout.COMPLETE_FILE).write_text('{"extra/camera0000/0000.png": [9, 1]}')
+    wrong = verify(root)
+    with contextlib.suppress(OutsideFolderError):
+        repair(root, wrong)
+    assert mine.read_text() == "mine"
+    assert (outside / capture_layout.COMPLETE_FILE).exists()
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"a": [1e999, 2]}', '{"a\\u0000b": [1, 2]}', '{"a": 3}'])
+def test_a_mark_that_cannot_be_used_leaves_its_subject_unfinished(root, text):
+    (root / "anna" / capture_layout.COMPLETE_FILE).write_text(text)
+    assert "not finished" in verify(root)[root / "anna"]
+
+
+@pytest.mark.parametrize(
+    "about", [{"frames": 10**6, "rig": {"count": 10**6}}, {"rig": "x"}, {"passes": [["img"]]}, {"passes": ["img"] * 99}]
+)
+def test_a_dataset_that_cannot_be_is_named(root, about):
+    file = root / capture_layout.DATASET_FILE
+    file.write_text(json.dumps({**json.loads(file.read_text()), **about}))
+    with pytest.raises(capture_layout.CaptureFolderError, match=r"dataset\.json"):
+        verify(root)

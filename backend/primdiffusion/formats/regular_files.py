@@ -1,0 +1,58 @@
+"""Open regular files alone, within a size: no folders, pipes, devices or endless files. Needs no numpy."""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import stat
+from pathlib import Path
+from typing import BinaryIO
+
+_REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
+"""Starts of UNC paths, Windows' devices and URLs."""
+
+
+class TooLargeError(ValueError):
+    """A file is larger than its kind may be; the message names it."""
+
+
+def check_regular(path: str | Path) -> os.stat_result:
+    """Return the status of a regular file, without opening it.
+
+    Raises FileNotFoundError, IsADirectoryError, and PermissionError for pipes, sockets and devices.
+    """
+    try:
+        status = os.stat(path)
+    except ValueError as e:  # a null character
+        raise FileNotFoundError(errno.ENOENT, "no such file", str(path)[:200].replace("\0", "?")) from e
+    if stat.S_ISDIR(status.st_mode):
+        raise IsADirectoryError(errno.EISDIR, "this is a folder, not a file", str(path))
+    if not stat.S_ISREG(status.st_mode):
+        raise PermissionError(errno.EPERM, "this is not a regular file", str(path))
+    return status
+
+
+def open_regular(path: str | Path, limit: int) -> BinaryIO:
+    """Open a regular file of at most `limit` bytes for reading. Raises as `check_regular`, and TooLargeError."""
+    check_size(path, check_regular(path).st_size, limit)
+    return open(path, "rb")
+
+
+def read_regular(path: str | Path, limit: int) -> bytes:
+    """Read a regular file of at most `limit` bytes. Raises as `open_regular`."""
+    with open_regular(path, limit) as file:
+        data = file.read(limit + 1)  # some files grow, and those of /proc state no size
+    check_size(path, len(data), limit)
+    return data
+
+
+def check_size(path: str | Path, size: int, limit: int) -> None:
+    """Raise TooLargeError where `size` is over `limit`, bytes."""
+    if size > limit:
+        raise TooLargeError(f"{path} is larger than {limit / 2**20:.0f} MB, the most for its kind: use a smaller file")
+
+
+def is_plain_path(path: str) -> bool:
+    """Return whether a path named in a file may be looked up: no server, device, URL or control character."""
+    return 0 < len(path) <= 4096 and path.isprintable() and not _REMOTE.match(path)

@@ -1,0 +1,155 @@
+"""The reader of arrays on damaged and hostile files."""
+
+from __future__ import annotations
+
+import os
+import struct
+import tracemalloc
+import zipfile
+
+import numpy as np
+import pytest
+from primdiffusion.formats.arrays import (
+    ArrayFileError,
+    array_names,
+    array_shape,
+    map_npy,
+    read_arrays,
+    read_npy,
+    read_numbers,
+    write_deflated,
+    write_stored,
+)
+
+
+def npy(descr: str = "'<f4'", shape: str = "(3,)", data: bytes = b"") -> bytes:
+    header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + data
+
+
+def npz(path, member: bytes, method: int = zipfile.ZIP_DEFLATED):
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("pose.npy", member)
+    return path
+
+
+def patched(path, offset: int, value: int):
+    """Change a field of the member's two headers: `offset` of the local one."""
+    data = bytearray(path.read_bytes())
+    for mark, further in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
+        place = data.find(mark) + offset + further
+        data[place : place + 2] = struct.pack("<H", value)
+    path.write_bytes(data)
+    return path
+
+
+def assert_one_sentence(error: Exception, path) -> None:
+    assert str(path) in str(error)
+    assert len(str(error)) - len(str(path)) < 250
+    assert "\n" not in str(error)
+
+
+@pytest.mark.parametrize(
+    "member",
+    [
+        b"hello",
+        b"\x93NUMPY\x01\x00\x20\x00{'descr': '<f4', (",
+        b"\x93NUMPY\x01\x00\x88\x13" + b"(" * 5000,
+        b"\x93NUMPY\x02\x00\xff\xff\xff\xff",
+        npy(shape="(-3, -1)", data=bytes(12)),
+        npy(shape="'a'"),
+        npy(shape=f"({'9' * 400},)"),
+        npy(shape="(1000000000000,)"),
+        npy("'V0'", "(1000000000000,)"),
+        npy("'<f99'"),
+        npy("'|O'"),
+        npy(shape="(3,)", data=bytes(11)),
+    ],
+)
+def test_a_member_that_is_no_array_is_one_sentence(tmp_path, member):
+    path = npz(tmp_path / "poses.npz", member)
+    with pytest.raises(ArrayFileError) as raised:
+        read_arrays(path, ("pose",))
+    assert_one_sentence(raised.value, path)
+
+
+@pytest.mark.parametrize(("offset", "value"), [(8, 99), (8, 12), (6, 1)], ids=["unknown", "bzip2", "encrypted"])
+def test_members_packed_in_another_way_are_rejected(tmp_path, offset, value):
+    path = patched(npz(tmp_path / "poses.npz", npy(data=bytes(12))), offset, value)
+    with pytest.raises(ArrayFileError) as raised:
+        read_arrays(path, ("pose",))
+    assert_one_sentence(raised.value, path)
+
+
+def test_a_bomb_is_not_unpacked(tmp_path):
+    path = npz(tmp_path / "bomb.npz", npy(data=bytes(12)) + bytes(2**26), zipfile.ZIP_BZIP2)
+    tracemalloc.start()
+    with pytest.raises(ArrayFileError):
+        read_arrays(path, ("pose",))
+    assert tracemalloc.get_traced_memory()[1] < 2**23
+    tracemalloc.stop()
+
+
+def test_arrays_of_one_call_share_the_limit(tmp_path, monkeypatch):
+    monkeypatch.setattr("primdiffusion.formats.arrays.LARGEST_BYTES", 1000)
+    path = tmp_path / "two.npz"
+    np.savez(path, a=np.zeros(100), b=np.zeros(100, np.uint8))
+    with pytest.raises(ArrayFileError, match="unpacks to"):
+        read_arrays(path, ("a", "b"))
+    assert len(read_arrays(path, ("b",))["b"]) == 100
+
+
+def test_a_long_list_of_names_is_not_read(tmp_path):
+    entry = struct.pack("<4s4B4HL2L5H2L", b"PK\1\2", 20, 0, 20, 0, *[0] * 7, 1, *[0] * 6) + b"a"
+    count = 100_000
+    end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, len(entry) * count, 0, 0)
+    path = tmp_path / "many.npz"
+    path.write_bytes(entry * count + end)
+    with pytest.raises(ArrayFileError, match="too many names"):
+        array_names(path)
+
+
+@pytest.mark.parametrize("read", [read_npy, map_npy, array_names])
+def test_folders_and_pipes_are_not_opened(tmp_path, read):
+    with pytest.raises(IsADirectoryError):
+        read(tmp_path)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(PermissionError, match="not a regular file"):
+        read(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])
+def test_numbers_fit_float32(tmp_path, value):
+    np.savez(tmp_path / "a.npz", uv=np.array([0.0, value]))
+    with pytest.raises(ArrayFileError, match="NaN or infinite"):
+        read_numbers(tmp_path / "a.npz", ("uv",))
+
+
+@pytest.mark.parametrize("write", [write_deflated, write_stored])
+def test_what_is_written_is_read(tmp_path, write):
+    arrays = {"a": np.arange(6.0).reshape(2, 3).T, "b": np.array("text"), "c": np.zeros((0, 3), np.uint8)}
+    write(tmp_path / "a.npz", arrays)
+    found = read_arrays(tmp_path / "a.npz", tuple(arrays))
+    assert all(np.array_equal(found[name], values) for name, values in arrays.items())
+    assert array_shape(tmp_path / "a.npz", "a") == (3, 2)
+
+
+def test_a_shape_beyond_the_file_is_rejected_without_reading(tmp_path):
+    path = npz(tmp_path / "people.npz", npy("'|u1'", "(50000000, 1024, 8, 8, 8, 4)"))
+    with pytest.raises(ArrayFileError, match="cut short"):
+        array_shape(path, "pose")
+
+
+@pytest.mark.parametrize("write", [write_deflated, write_stored])
+def test_a_full_disk_is_one_error(write):
+    if not os.path.exists("/dev/full"):
+        pytest.skip("no device that is always full")
+    with pytest.raises(OSError, match="No space") as raised:
+        write("/dev/full", {"a": np.random.default_rng(0).random(100_000)})
+    assert raised.value.__context__ is None or isinstance(raised.value.__context__, (OSError, ValueError))
+
+
+def test_a_mapped_array_may_be_larger_than_what_is_read_at_once(tmp_path, monkeypatch):
+    np.save(tmp_path / "a.npy", np.arange(12, dtype=np.uint8).reshape(3, 4))
+    monkeypatch.setattr("primdiffusion.formats.arrays.LARGEST_BYTES", 10)
+    assert np.array_equal(map_npy(tmp_path / "a.npy"), np.arange(12).reshape(3, 4))

@@ -1,0 +1,68 @@
+"""Untrusted files are read, and files removed, by the modules made for it alone."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+BACKEND, EXTENSION = ROOT / "backend" / "primdiffusion", ROOT / "blender_primdiffusion"
+ALLOWED = {
+    "zipfile": {"formats/arrays.py"},
+    "numpy.load": set(),
+    "numpy.lib.format.read_array": set(),
+    "json.load": set(),
+    "json.loads": {"formats/json_files.py"},
+    "pickle": {"released/reading.py", "evaluation/pretrained_networks.py"},  # exceptions of torch.load, weights_only
+    "torch.load": {"released/reading.py", "evaluation/pretrained_networks.py"},
+    "PIL.Image.open": {"geometry/pictures.py"},
+    "shutil.rmtree": {"formats/removing.py", "staging.py", "capture/launch.py"},  # launch: Blender's own folder
+    "unlink": {"formats/removing.py", "staging.py"},
+    "os.unlink": {"backend/child_streams.py"},  # a temporary file while it is open
+    "os.remove": set(),
+}
+"""What only some modules may call or import."""
+_SHORT = {"np": "numpy", "Image": "PIL.Image"}
+
+
+def dotted(node: ast.AST) -> str:
+    if isinstance(node, ast.Attribute):
+        return f"{dotted(node.value)}.{node.attr}"
+    return _SHORT.get(node.id, node.id) if isinstance(node, ast.Name) else ""
+
+
+def used(tree: ast.AST) -> Iterator[str]:
+    """Names of `ALLOWED` that a module imports or calls."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield str(node.module)
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+        elif isinstance(node, ast.Call):
+            yield dotted(node.func)
+            if isinstance(node.func, ast.Attribute) and node.func.attr == "unlink" and not node.args:
+                yield "unlink"  # of a path: Blender's collections unlink an argument
+
+
+@pytest.mark.parametrize("root", [BACKEND, EXTENSION], ids=["backend", "extension"])
+def test_only_the_readers_open_archives_and_only_the_remover_removes(root):
+    found = {
+        (name, path.relative_to(root).as_posix())
+        for path in root.rglob("*.py")
+        for name in used(ast.parse(path.read_text(encoding="utf-8")))
+        if name in ALLOWED and path.relative_to(root).as_posix() not in ALLOWED[name]
+    }
+    assert not found
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["import zipfile", "np.load(x)", "json.load(file)", "json.loads(text)", "from json import loads", "import pickle",
+     "shutil.rmtree(path)", "path.unlink()", "path.unlink(missing_ok=True)", "os.remove(path)", "Image.open(path)"],
+)  # fmt: skip
+def test_the_rule_sees(line):
+    assert set(used(ast.parse(line))) & set(ALLOWED)
