@@ -31,7 +31,7 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.formats import compact_human
 from primdiffusion.formats.arrays import write_stored
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.json_files import LARGEST_INTEGER, parse_json
+from primdiffusion.formats.json_files import LARGEST_INTEGER, parse_message
 from primdiffusion.formats.regular_files import check_size
 from primdiffusion.human import Human, body_of
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
@@ -175,7 +175,7 @@ def _check_betas(human: Human) -> None:
 
 def _provenance(metadata: Mapping[str, str]) -> dict[str, Any]:
     try:
-        provenance = parse_json(metadata.get("provenance", ""))
+        provenance = parse_message(metadata.get("provenance", ""))
     except ValueError as e:
         raise ValueError(f"its provenance is not JSON ({e}): generate the human again") from e
     _check_provenance(provenance)

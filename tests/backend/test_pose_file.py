@@ -69,3 +69,12 @@ def test_a_frame_beyond_the_end_and_a_missing_file_are_errors(tmp_path):
     (tmp_path / "text.json").write_text("{")
     with pytest.raises(InvalidPoseError):
         read_pose(tmp_path / "text.json")
+
+
+@pytest.mark.parametrize("number", ["1e300", "1e30", "1e999", "NaN", "1" * 400, "true"])
+def test_numbers_that_become_no_rotation_are_rejected(tmp_path, number):
+    path = tmp_path / "pose.json"
+    path.write_text(f"[{','.join([number] * 72)}]")
+    with pytest.raises(InvalidPoseError, match=r"pose\.json") as caught:
+        read_pose(path)
+    assert len(str(caught.value)) < 300

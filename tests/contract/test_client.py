@@ -1,5 +1,6 @@
 """Blender's side of the pipe with the real child, and with children that misbehave."""
 
+import json
 import os
 import signal
 import sys
@@ -162,6 +163,33 @@ def test_lines_that_are_no_messages_are_kept_for_the_log_and_disturb_nothing(fak
     wait_for(client, lambda e: isinstance(e, Response))
     assert client.info["version"] == "x"
     assert any("Welcome to torch!" in line for line in client.stderr)
+
+
+@pytest.mark.parametrize(
+    ("message", "fault"),
+    [
+        ({"id": [1], "result": {}}, "id"),
+        ({"id": 1, "error": "all is lost"}, "error"),
+        ({"id": 1, "error": {"code": "x", "message": "y"}}, "error"),
+        ({"id": 1, "error": {"code": 1, "message": "y", "data": {"kind": 3}}}, "data of error"),
+        ({"id": 1, "result": 3}, "result"),
+        ({"id": 1}, "result"),
+        ({"id": 1, "result": {"memory_gb": "much"}}, "memory_gb"),
+        ({"method": 3}, "method"),
+        ({"method": "progress", "params": [1]}, "params"),
+        ({"method": "progress", "params": {"id": 1, "stage": 7}}, "stage"),
+        ({"method": "progress", "params": {"id": 1, "step": "3"}}, "step"),
+        ({"method": "progress", "params": {"id": 1, "picture": {}}}, "picture"),
+        ({"method": "progress", "params": {"id": 1, "eta_s": 1e999}}, "eta_s"),
+        ({"method": "ready", "params": {"ready": "yes"}}, "ready"),
+    ],
+)
+def test_a_malformed_message_ends_the_child_with_a_sentence(fake_child, message, fault):
+    client = fake_child(f"print({json.dumps(message)!r}, flush=True)\ntime.sleep(60)")
+    died = wait_for(client, lambda e: isinstance(e, Died))
+    assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
+    assert client.gone_within(10)
+    assert client.poll() == []
 
 
 def test_silence_is_reported_once(fake_child):

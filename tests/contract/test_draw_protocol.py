@@ -148,6 +148,8 @@ def test_drawing_needs_no_checkpoint(request_for):
         ({"world_to_camera": [[float("nan")] * 4] * 3}, "world_to_camera holds nan"),
         ({"people": [{"human": "h", "object": STILL, "joints": [[[float("nan")] * 4] * 3] * 24}]}, "joints holds nan"),
         ({"people": [{"human": "h"}]}, "'object'"),
+        ({"world_to_camera": [[10**400] * 4] * 3}, "world_to_camera holds inf"),
+        ({"intrinsics": [[10**40] * 3] * 3}, "intrinsics holds 1e+40"),
         ({"colour": 1}, "'colour'"),
     ],
 )
@@ -198,3 +200,12 @@ def test_betas_and_the_object_move_the_person(child, request_for):
     for change in ({"object": moved}, {"betas": [3.0] + [0.0] * 9}):
         ask(child, {**params, "people": [{**params["people"][0], **change}]})
         assert np.abs(frame_of(params)[0] - still).mean() > 0.005
+
+
+def test_matrices_of_integers_are_matrices(child, request_for):
+    request = request_for()
+    still = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+    whole = {"intrinsics": [[64, 0, 32], [0, 64, 32], [0, 0, 1]], "world_to_camera": still}
+    people = [{**one, "object": still, "joints": [still] * 24} for one in request["people"]]
+    answer, _ = ask(child, {**request, **whole, "people": people})
+    assert "error" not in answer

@@ -97,7 +97,7 @@ def test_the_same_seed_gives_the_same_person_and_another_seed_another(child, che
         (b"{", -32700, None),
         (b"\xff\xfe", -32700, None),
         (b"[" * 100_000, -32700, None),
-        (b'{"jsonrpc":"2.0","id":1' + b"1" * 5000 + b"}", -32700, None),
+        (b'{"jsonrpc":"2.0","id":1' + b"1" * 5000 + b"}", -32600, None),
         (b"[]", -32600, None),
         (b'{"jsonrpc": "2.0", "id": NaN, "method": "hello"}', -32600, None),
         (b'{"jsonrpc": "2.0", "id": 30, "method": "\\ud800"}', -32601, 30),
@@ -318,3 +318,22 @@ def test_out_of_memory_and_a_defect_fail_their_job_and_not_the_child(checkpoint,
     child.close()
     assert b"Traceback" in child.stderr
     assert child.process.returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("method", "params", "name"),
+    [
+        ("generate", b'{"seed": 1, "out_dir": "x", "guidance": 1e300}', "guidance"),
+        ("generate", b'{"seed": 1, "out_dir": "x", "guidance": 1000}', "guidance"),
+        ("generate", b'{"seed": 1%s, "out_dir": "x"}' % (b"0" * 400), "seed"),
+        ("generate", b'{"seed": 1, "out_dir": "x", "attributes": {"height": 1e300}}', "height"),
+        ("generate", b'{"seed": 1, "out_dir": "x", "size": 1000000000000}', "size"),
+        ("render", b'{"human": "h", "out": "o", "yaw": 1%s}' % (b"0" * 400), "yaw"),
+    ],
+)
+def test_numbers_that_overflow_are_rejected_by_the_parameters_name(child, method, params, name):
+    child.send_line(b'{"jsonrpc": "2.0", "id": 50, "method": "%s", "params": %s}' % (method.encode(), params))
+    error = child.answer(50)["error"]
+    assert error["code"] == -32602
+    assert name in error["message"]
+    assert len(error["message"]) < 300

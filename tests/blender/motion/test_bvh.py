@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import bpy
 import numpy as np
 import pytest
@@ -105,6 +107,20 @@ def test_blenders_own_export_comes_back(tmp_path, empty_scene):
         (lambda text: text.replace("MOTION", "MOVES"), "no HIERARCHY followed by MOTION"),
         (lambda text: text.replace("}\nMOTION", "MOTION"), "a brace is not closed"),
         (lambda text: text.replace("Frame Time: 0.0083333\n", "Frame Time: 0.0083333\nnan "), "NaN or infinite"),
+        (lambda text: text.replace("CHANNELS 3", "CHANNELS -2", 1), "-2 channels of a joint"),
+        (
+            lambda text: re.sub(r"CHANNELS .*", "CHANNELS 0", text).replace("Frames: 6", "Frames: 2000000"),
+            "no joint has",
+        ),
+        (lambda text: text.replace("Frames: 6", "Frames: 1000000000000"), "cut the motion"),
+        (lambda text: text.replace("Frames: 6", f"Frames: {'9' * 400}"), "Frames:"),
+        (lambda text: text.replace("Time: 0.0083333", "Time: 1e-320"), "a frame time of"),
+        (lambda text: text.replace("Time: 0.0083333", "Time: 1e300"), "a frame time of"),
+        (lambda text: text.replace("Time: 0.0083333", "Time: nan"), "a frame time of"),
+        (lambda text: text.replace("0.0083333\n", "0.0083333\n1e300 "), "no angles or lengths"),
+        (lambda text: text.replace("0.0083333\n", "0.0083333\nword "), "a word where"),
+        (lambda text: re.sub("OFFSET ", "OFFSET 1e200 ", text, count=1), "no angles or lengths"),
+        (lambda text: text.replace("MOTION", " JOINT a { " * 1001 + "MOTION"), "more than 1000 joints"),
     ],
 )
 def test_broken_files_are_named(tmp_path, change, message):

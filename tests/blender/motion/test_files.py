@@ -228,3 +228,26 @@ def test_a_damaged_member_is_named(tmp_path):
     (tmp_path / "m.npz").write_bytes(content)
     with pytest.raises(ArrayFileError, match="damaged"):
         read_arrays(tmp_path / "m.npz", ["poses"])
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"poses": np.full((2, 72), 1e300)}, "above 1e\\+06"),
+        ({"poses": np.zeros((2, 72)), "trans": np.full((2, 3), 1e300)}, "above 1e\\+06"),
+        ({"poses": np.zeros((2, 72)), "fps": np.array(1e-300)}, "frames per second"),
+        ({"poses": np.zeros((2, 72)), "fps": np.array(1e9)}, "above 1e\\+06"),
+    ],
+)
+def test_numbers_that_cannot_be_a_motion_are_rejected(tmp_path, arrays, message):
+    np.savez(tmp_path / "motion.npz", **arrays)
+    with pytest.raises(MotionFileError, match=message):
+        read_motion(tmp_path / "motion.npz")
+
+
+@pytest.mark.parametrize("text", ["[" * 100_000, "[" + ",".join(["1" * 400] * 72) + "]", "[1e999]", "[NaN]"])
+def test_json_that_overflows_is_one_sentence(tmp_path, text):
+    (tmp_path / "pose.json").write_text(text)
+    with pytest.raises(MotionFileError, match=r"pose\.json") as caught:
+        read_motion(tmp_path / "pose.json")
+    assert len(str(caught.value)) < 300
