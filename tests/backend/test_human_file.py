@@ -58,6 +58,18 @@ def test_a_person_with_nan_is_not_written(human, tmp_path):
 META = {"format": "primdiffusion.human", "format_version": "1", "provenance": "{}"}
 
 
+NAMED = {
+    "endless": "/proc/self/pagemap",
+    "device": "/dev/zero",
+    "server": r"\\\\server\\share\\smpl.pkl",
+    "long": "a" * 10_000,
+}
+
+
+def body_named(path: str | int) -> str:
+    return json.dumps({"smpl": {"path": path, "sha256": "0" * 64}, "uv": []})
+
+
 def damage(path, human, how):
     save_human(path, human)
     content = safetensors.torch.load_file(path)
@@ -81,6 +93,19 @@ def damage(path, human, how):
     elif how == "NaN":
         content["density"][3, 0, 0, 0] = float("nan")
         safetensors.torch.save_file(content, path, META)
+    elif how == "8 bits":
+        rgb = content["rgb"].to(torch.float8_e4m3fn)
+        safetensors.torch.save_file({**content, "rgb": rgb}, path, META)
+    elif how == "long version":
+        safetensors.torch.save_file(content, path, {**META, "format_version": "9" * 5000})
+    elif how == "deep":
+        safetensors.torch.save_file(content, path, {**META, "provenance": "[" * 100_000})
+    elif how == "deep body":
+        safetensors.torch.save_file(content, path, {**META, "body": "[" * 100_000})
+    elif how == "no path":
+        safetensors.torch.save_file(content, path, {**META, "body": body_named(3)})
+    elif how in NAMED:
+        safetensors.torch.save_file(content, path, {**META, "body": body_named(NAMED[how])})
     elif how == "giant":
         safetensors.torch.save_file({**content, "betas": torch.full((10,), 6.0)}, path, META)
 
@@ -98,6 +123,15 @@ def damage(path, human, how):
         ("whole numbers", "betas is torch.int64"),
         ("NaN", "'density' holds NaN"),
         ("giant", "largest beta is 6"),
+        ("8 bits", "rgb is torch.float8_e4m3fn"),
+        ("long version", "format version"),
+        ("deep", "nested more than 64 deep"),
+        ("deep body", "malformed body metadata"),
+        ("no path", "malformed body metadata"),
+        ("endless", "the body file /proc/self/pagemap is missing"),
+        ("device", "the body file /dev/zero cannot be read (this is not a regular file)"),
+        ("server", "is not named by a path on this machine"),
+        ("long", "is not named by a path on this machine"),
     ],
 )
 def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how, message):
@@ -106,6 +140,7 @@ def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how
     with pytest.raises(HumanFileError, match=r"bad\.human\.safetensors") as error:
         load_human(path)
     assert message in str(error.value)
+    assert len(str(error.value)) - len(str(path)) < 280
     assert "\n" not in str(error.value)
 
 

@@ -190,7 +190,7 @@ def _numpy_file(path: pathlib.Path) -> np.ndarray:
     try:
         array = read_npy(path)
     except ArrayFileError as error:
-        raise BodyFileError(f"{error}; download it again.") from error
+        raise BodyFileError(str(error)) from error
     if array.dtype.kind not in "iuf":
         raise BodyFileError(f"{path} does not hold one array of numbers; give the pair (vt.npy, ft.npy).")
     return array

@@ -273,5 +273,5 @@ def test_wrong_paths_and_texture_files_are_named(tmp_path, uv_pair):
     with pytest.raises(BodyFileError, match="out of range"):
         load_body(path, uv=(uv_pair[0], tmp_path / "far.npy"))
     np.save(tmp_path / "objects.npy", np.array([Hostile(print, "ran")]), allow_pickle=True)
-    with pytest.raises(BodyFileError, match=r"objects\.npy is not a whole \.npy file"):
+    with pytest.raises(BodyFileError, match=r"objects\.npy holds pickled Python objects"):
         load_body(path, uv=(uv_pair[0], tmp_path / "objects.npy"))

@@ -1,5 +1,6 @@
 """Parts of the body where an artist expects them, and paint as it was painted."""
 
+import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import default_body
@@ -9,6 +10,7 @@ from primdiffusion.editing.regions import (
     check_region,
     name_region,
     parts_of,
+    read_weights,
     region_from_weights,
     region_of,
 )
@@ -178,3 +180,10 @@ def test_another_bodys_people_have_parts_too():
     assert torch.stack([parts[name] for name in DISJOINT]).sum(0).eq(1).all()
     whole = torch.ones(len(body.template))
     assert region_from_weights(whole, body_setup=body_setup).all()
+
+
+@pytest.mark.parametrize("weights", [np.array([np.nan]), np.full(3, 1e39), np.array("text"), np.zeros((2, 2))])
+def test_painted_weights_are_finite_numbers(tmp_path, weights):
+    np.savez(tmp_path / "weights.npz", weights=weights)
+    with pytest.raises(ValueError, match=r"weights\.npz"):
+        read_weights(tmp_path / "weights.npz")

@@ -21,6 +21,11 @@ SPOILED = {
     "'primitive_weights'.*impossible": {"primitive_weights": np.full((4, 24), 0.5)},
     "'faces'.*impossible": {"faces": np.full((1104, 3), 10**6)},
     "version 3.*reads 1 to 2": {"format_version": np.array(3)},
+    "'uv_corner'.*NaN or infinite": {"uv_corner": np.full((1104, 3, 2), 1e39)},
+    "no full density": {"meta": np.array('{"full_density": -3}')},
+    "no provenance": {"meta": np.array("[]")},
+    "is damaged": {"format_version": np.array("two")},
+    "nested more than 64 deep": {"meta": np.array("[" * 100_000)},
     "not JSON": {"meta": np.array("{")},
     "not SMPL's 24 joints": {"joint_names": np.array(["bone"] * 24)},
 }

@@ -239,3 +239,13 @@ def test_missing_files_take_no_memory(person):
 
     volumes._memory_of.cache_clear()
     assert person_memory(person).files == 0
+
+
+@pytest.mark.parametrize("change", [{"density": np.nan}, {"colour": np.inf}, {"voxel": 0.0}, {"origin": 1e39}])
+def test_a_grid_of_impossible_numbers_is_rejected(tmp_path, change):
+    arrays = {"density": np.ones((2, 2, 2)), "colour": np.ones((2, 2, 2, 3)), "origin": np.zeros(3)}
+    arrays["voxel"] = np.array(0.01)
+    (name, value), *_ = change.items()
+    np.savez(tmp_path / "merged.npz", **{**arrays, name: np.full_like(arrays[name], value)})
+    with pytest.raises(ValueError, match=r"merged\.npz"):
+        read_grid(tmp_path / "merged.npz")
