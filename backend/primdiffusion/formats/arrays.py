@@ -247,9 +247,8 @@ def _header(stream: IO[bytes], size: int, what: str) -> tuple[tuple[int, ...], b
         raise ArrayFileError(f"{what} holds pickled Python objects, which are never read: save it as plain arrays")
     wanted = math.prod(shape) * dtype.itemsize
     if wanted > size:
-        raise ArrayFileError(
-            f"{what} is cut short: its header promises {wanted if wanted < 2**63 else 'too many'} bytes, {size} are there"
-        )
+        promised = wanted if wanted < 2**63 else "countless"
+        raise ArrayFileError(f"{what} is cut short: its header promises {promised} bytes, {size} are there")
     return shape, fortran, dtype
 
 
