@@ -61,7 +61,7 @@ META = {"format": "primdiffusion.human", "format_version": "1", "provenance": "{
 NAMED = {
     "endless": "/proc/self/pagemap",
     "device": "/dev/zero",
-    "server": r"\\\\server\\share\\smpl.pkl",
+    "server": r"\\server\share\smpl.pkl",
     "long": "a" * 10_000,
 }
 

@@ -26,8 +26,8 @@ from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkCon
 from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
-from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.formats.json_files import JsonError, parse_json
+from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetupError, find_body_setup
 from primdiffusion.staging import write_atomically
 
