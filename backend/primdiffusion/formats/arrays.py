@@ -21,6 +21,8 @@ from .regular_files import open_regular
 LARGEST_BYTES = 512 * 2**20
 """Largest size of what one call reads: small files can claim petabytes. An hour of motion at 60 frames/s takes 285
 MB."""
+MOST_REPEATED, LARGEST_RATIO = 64 * 2**20, 200
+"""Bytes from which on an array may not be larger than this many times its compressed size: arrays of zeros are."""
 LARGEST_NUMBER = 1e30
 LARGEST_FILE = 2**31
 _LARGEST_DIRECTORY = 4 * 2**20
@@ -211,6 +213,8 @@ def _needed(archive: zipfile.ZipFile, path: str | Path, name: str) -> zipfile.Zi
         raise ArrayFileError(f"{path}: {name!r} is encrypted, which is not supported: save it without a password")
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack without a limit
         raise ArrayFileError(f"{path}: {name!r} is compressed in another way than numpy's: save it with numpy.savez")
+    if member.file_size > max(MOST_REPEATED, LARGEST_RATIO * member.compress_size):
+        raise ArrayFileError(f"{path}: {name!r} unpacks to {member.file_size / 2**20:.0f} MB of the same: cut it")
     return member
 
 

@@ -90,6 +90,13 @@ def test_a_bomb_is_not_unpacked(tmp_path):
     tracemalloc.stop()
 
 
+def test_megabytes_of_zeros_are_not_unpacked(tmp_path):
+    size = 65 * 2**20
+    path = npz(tmp_path / "bomb.npz", npy("'|u1'", f"({size},)", bytes(size)))
+    with pytest.raises(ArrayFileError, match="65 MB of the same"):
+        read_arrays(path, ("pose",))
+
+
 def test_arrays_of_one_call_share_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr("primdiffusion.formats.arrays.LARGEST_BYTES", 1000)
     path = tmp_path / "two.npz"
