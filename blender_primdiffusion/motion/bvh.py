@@ -19,6 +19,7 @@ from .rotation import about_axis
 from .skeleton import REST_JOINTS, unchain
 
 LARGEST_BYTES = 64 * 2**20
+LONGEST_HIERARCHY = 2**20
 MOST_JOINTS = 1000
 MOST_ROTATIONS = 5_000_000
 """Joints times frames: 24 joints for an hour at 60 frames/s, 65 joints for 20 minutes."""
@@ -111,6 +112,8 @@ def parse_bvh(path: Path) -> Hierarchy:
     head, found, tail = text.partition("MOTION")
     if not found or "HIERARCHY" not in head:
         raise BvhError(f"{path} is not a BVH file: it has no HIERARCHY followed by MOTION")
+    if len(head) > LONGEST_HIERARCHY:
+        raise BvhError(f"{path} has a HIERARCHY of more than {LONGEST_HIERARCHY} characters: export it again")
     try:
         names, parents, offsets, channels = _parse_hierarchy(head.split("HIERARCHY", 1)[1].split())
         values, frame_time = _parse_motion(tail, sum(map(len, channels)), len(names))

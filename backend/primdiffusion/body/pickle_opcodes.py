@@ -206,7 +206,7 @@ class _Machine:
         _of(self._stack[-1], Inert).set_state(state)
 
 
-_METHODS: dict[bytes, Callable[[_Machine], None]] = {
+_METHODS: dict[bytes, Callable[[_Machine], object]] = {
     b"I": _Machine._int, b"L": _Machine._long, b"F": _Machine._float, b"S": _Machine._quoted, b"V": _Machine._unicode,
     b"p": lambda m: m._put(_integer(m._line())), b"q": lambda m: m._put(m._number("B")),
     b"r": lambda m: m._put(m._number("<I")), b"\x94": lambda m: m._put(len(m._memo)),

@@ -103,12 +103,12 @@ def _read_checked(root: Path) -> dict[str, Any]:
     about = read_about(root)
     rig, passes = about.get("rig"), about.get("passes")
     frames, cameras = about.get("frames"), rig.get("count") if isinstance(rig, dict) else None
-    counted = all(type(n) is int and n > 0 for n in (frames, cameras))
-    named = isinstance(passes, list) and all(isinstance(name, str) for name in passes)
-    if not counted or not named:
+    if not isinstance(frames, int) or not isinstance(cameras, int) or min(frames, cameras) < 1:
         raise CaptureFolderError(
             f"{root / DATASET_FILE} lacks the numbers of frames and cameras: render into a new folder"
         )
+    if not isinstance(passes, list) or not all(isinstance(name, str) for name in passes):
+        raise CaptureFolderError(f"{root / DATASET_FILE} names no passes: render into a new folder")
     if not set(passes) <= set(ENDINGS) or len(passes) > len(ENDINGS):
         raise CaptureFolderError(
             f"{root / DATASET_FILE} names passes that this program does not know: {passes!r:.80}; render into a "
