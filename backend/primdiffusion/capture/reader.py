@@ -249,20 +249,16 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
     """
     try:
         with opened_picture(path) as picture:
-            if picture.size != (width, height):
-                raise CaptureFileError(
-                    f"{path} has {picture.size[0]} x {picture.size[1]} pixels, its camera {width} x {height}: "
-                    "render it again"
-                )
-            if kind == "depth":
+            size = picture.size
+            if size == (width, height) and kind == "depth":
                 return np.asarray(picture).astype(np.uint16)
-            return np.array(picture.convert("RGB" if kind in ("img", "normal") else "L"))
+            if size == (width, height):
+                return np.array(picture.convert("RGB" if kind in ("img", "normal") else "L"))
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
-        if isinstance(e, CaptureFileError):
-            raise
         raise CaptureFileError(f"{path} is not a complete image ({e}): render it again") from e
+    raise CaptureFileError(f"{path} has {size[0]} x {size[1]} pixels, its camera {width} x {height}: render it again")
 
 
 def _read_views(folder: Path) -> list[View]:
