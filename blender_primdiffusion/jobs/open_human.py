@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
 import time
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from ..formats.arrays import read_arrays
 from ..formats.body_layout import half_extents, read_layout, stencils
 from ..formats.joints import JOINT_NAMES, PARENTS
+from ..formats.json_files import parse_json
 from ..places import body_data
 from ..scene.human import LARGEST_BETA, NPZ_FILE, PERSON_FILE
 from ..scene.human_file import payload_in, read_tensors, with_motion, write_tensors
@@ -53,7 +53,7 @@ def rest_arrays(source: Path) -> dict[str, Any]:
     if np.abs(payload.betas).max() > LARGEST_BETA:
         raise ValueError(f"{source.name!r} is damaged (betas above {LARGEST_BETA}); generate the human again")
     try:
-        json.loads(provenance := human.metadata["provenance"])
+        parse_json(provenance := human.metadata["provenance"])
     except (KeyError, ValueError) as error:
         raise ValueError(f"{source.name!r} is damaged (its provenance is no JSON); generate the human again") from error
     rest = model.rest(payload.betas)

@@ -7,6 +7,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from tiny_packages import until
+
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import (
     MARK,
@@ -21,7 +23,6 @@ from blender_primdiffusion.backend.environment import (
     tried,
 )
 from blender_primdiffusion.backend.requests import run_to_end
-from tiny_packages import until
 
 PYTHON = Path(sys.executable)
 

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from .json_files import parse_json
+
 FORMAT_VERSION = 3
 """Of compact .human files, on any body."""
 METADATA = "compact"
@@ -33,7 +35,7 @@ def compact(rgb: NDArray, density: NDArray) -> tuple[NDArray[np.uint8], NDArray[
 def expand(arrays: Mapping[str, NDArray], metadata: str) -> dict[str, NDArray]:
     """`arrays` with rgb and density as float32 again. Raises ValueError for metadata or arrays of another kind."""
     try:
-        stored = json.loads(metadata)
+        stored = parse_json(metadata)
         scales = {name: float(stored[name]) for name in ("rgb", "density")}
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"its metadata {METADATA!r} is {metadata:.60}, not two scales") from error
