@@ -88,7 +88,7 @@ def test_an_installed_program_is_tried_and_serves(tmp_path):
 
 
 def test_where_nothing_is_installed_one_sentence_says_what_to_do(monkeypatch):
-    monkeypatch.setattr("backend.environment.own_python_has_backend", lambda: False)
+    monkeypatch.setattr("blender_primdiffusion.backend.environment.own_python_has_backend", lambda: False)
     with pytest.raises(BackendNotFound) as error:
         run_to_end(search())
     assert str(error.value) == NOT_INSTALLED
