@@ -46,15 +46,6 @@ def figure_of(alpha: NDArray) -> tuple[float, float]:
     return rows[0] / len(alpha), (rows[-1] + 1) / len(alpha)
 
 
-def linear(pixels: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Linear and premultiplied, from RGBA [h, w, 4] encoded as sRGB after it was premultiplied, as Blender's previews
-    are."""
-    alpha = pixels[..., 3:]
-    straight = np.minimum(pixels[..., :3] / np.maximum(alpha, 1e-6), 1.0)
-    decoded = np.where(straight <= 0.04045, straight / 12.92, ((straight + 0.055) / 1.055) ** 2.4)
-    return np.concatenate([decoded * alpha, alpha], -1).astype(np.float32)
-
-
 def texture_of(picture: NDArray[np.float32]) -> gpu.types.GPUTexture:
     """A texture of RGBA [h, w, 4], bottom row first."""
     values = np.ascontiguousarray(picture, np.float32).ravel()
@@ -63,8 +54,10 @@ def texture_of(picture: NDArray[np.float32]) -> gpu.types.GPUTexture:
 
 
 def draw(texture: gpu.types.GPUTexture, places: NDArray) -> None:
-    """Draw a picture, linear and premultiplied, at its corners [4, 3], behind what is before it; for handlers of the
-    kind POST_VIEW."""
+    """Draw a picture at its corners [4, 3], behind what is before it; for handlers of the kind POST_VIEW.
+
+    Its colours are premultiplied and encoded as sRGB, which the built-in shader expects.
+    """
     shader = gpu.shader.from_builtin("IMAGE")
     gpu.state.blend_set("ALPHA_PREMULT")
     gpu.state.depth_test_set("LESS_EQUAL")

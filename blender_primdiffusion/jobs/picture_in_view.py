@@ -37,9 +37,7 @@ class PictureInView:
             return False
         self._version, self._pixels, self._texture, self._cursor = version, None, None, None
         if version is not None:
-            from ..engine.billboard import linear  # needs numpy
-
-            self._pixels = linear(so_far.pixels())
+            self._pixels = so_far.pixels()
         return True
 
     @property

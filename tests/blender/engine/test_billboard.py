@@ -10,7 +10,7 @@ import pytest
 from mathutils import Matrix
 
 from blender_primdiffusion.engine import billboard
-from blender_primdiffusion.engine.billboard import HEIGHT_M, corners, figure_of, linear
+from blender_primdiffusion.engine.billboard import HEIGHT_M, corners, figure_of
 
 PLACE = np.array([2.0, 3.0, 0.5])
 
@@ -61,14 +61,6 @@ def test_the_figure_ends_where_its_opaque_rows_do():
     assert figure_of(alpha) == (0.0, 1.0), "too low to be a human"
     alpha[2:17, 5] = 0.9
     assert figure_of(alpha) == (0.1, 0.85)
-
-
-def test_colours_become_linear_and_stay_premultiplied():
-    pixels = np.array([[[0.5, 0.25, 0.0, 0.5], [0.0, 0.0, 0.0, 0.0], [0.5, 0.5, 0.5, 1.0]]], np.float32)
-    found = linear(pixels)[0]
-    np.testing.assert_allclose(found[0], [0.5, 0.5 * 0.21404114, 0, 0.5], rtol=1e-5)
-    np.testing.assert_array_equal(found[1], 0)
-    np.testing.assert_allclose(found[2], [0.21404114] * 3 + [1], rtol=1e-5)
 
 
 @pytest.mark.skipif(not hasattr(gpu, "init"), reason="without a window Blender has a GPU context from 5.2 on")
