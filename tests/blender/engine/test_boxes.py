@@ -139,7 +139,7 @@ def damaged(path: Path, how: str) -> None:
             header = json.dumps({"__metadata__": []}).encode()
             path.write_bytes(len(header).to_bytes(8, "little") + header)
         case "newer":
-            write(path, HumanTensors({**metadata, "format_version": "3"}, arrays))
+            write(path, HumanTensors({**metadata, "format_version": "9"}, arrays))
         case "no density":
             del arrays["density"]
         case "other shape":
