@@ -28,7 +28,9 @@ class PRIMDIFFUSION_OT_add_from_gallery(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.add_from_gallery"
     bl_label = "Add from Gallery"
 
-    human: bpy.props.EnumProperty(name="Human", items=_items, options={"SKIP_SAVE"})
+    human: bpy.props.EnumProperty(
+        name="Human", description="Which human of the gallery", items=_items, options={"SKIP_SAVE"}
+    )
 
     def act(self, context: bpy.types.Context) -> set[str]:
         from ..jobs.export import ImportHumanJob  # needs numpy
