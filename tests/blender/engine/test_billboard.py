@@ -73,12 +73,12 @@ def test_what_is_before_the_picture_hides_it_and_its_background_is_clear():
     places = np.array([[-1.0, -1, 0], [1, -1, 0], [-1, 1, 0], [1, 1, 0]])
     for depth, left in ((0.9, [0.4, 0.2, 0.1]), (0.1, [0, 1, 0])):
         colour = gpu.types.GPUTexture((8, 8), format="RGBA16F")
-        frame = gpu.types.GPUFrameBuffer(
-            color_slots=colour, depth_slot=gpu.types.GPUTexture((8, 8), format="DEPTH_COMPONENT32F")
-        )
+        distance = gpu.types.GPUTexture((8, 8), format="DEPTH_COMPONENT32F")  # the buffer keeps no reference
+        frame = gpu.types.GPUFrameBuffer(color_slots=colour, depth_slot=distance)
         with frame.bind(), gpu.matrix.push_pop(), gpu.matrix.push_pop_projection():
             gpu.matrix.load_matrix(Matrix.Identity(4))
             gpu.matrix.load_projection_matrix(Matrix.Identity(4))
+            gpu.state.depth_mask_set(True)  # without it the depth is not cleared
             frame.clear(color=(0.0, 1.0, 0.0, 1.0), depth=depth)
             billboard.draw(texture, places)
             pixels = np.asarray(frame.read_color(0, 0, 8, 8, 4, 0, "FLOAT")).reshape(8, 8, 4)
