@@ -187,10 +187,10 @@ def _parse_motion(text: str, columns: int, joints: int) -> tuple[NDArray[np.floa
     if not (frame_time <= 0 or SHORTEST_FRAME_TIME <= frame_time <= LONGEST_FRAME_TIME):
         raise ValueError(f"a frame time of {frame_time:g} s")
     with warnings.catch_warnings():
-        warnings.simplefilter("error")  # numpy warns at the first word that is no number
+        warnings.simplefilter("error")  # numpy warns, or newer ones fail, at the first word that is no number
         try:
             numbers = np.fromstring(text[found.end() :], np.float64, sep=" ")
-        except DeprecationWarning as e:
+        except (DeprecationWarning, ValueError) as e:
             raise ValueError("a word where a number was expected") from e
     if frames < 1 or numbers.size < frames * columns:
         raise ValueError(f"{frames} frames of {columns} numbers are announced, but there are {numbers.size} numbers")
