@@ -65,7 +65,7 @@ def main() -> None:
           "--human", human, "--seed", str(arguments.seed), "--frames", str(FRAMES), "--shown", str(SHOWN))  # fmt: skip
     if not arguments.quick:
         frame = out / "cycles.png"
-        stage("Cycles, 192 x 192", "benchmarks/demo_blender.py", "cycles", "--blend", blend, "--out", frame)
+        stage("Cycles, 384 x 384", "benchmarks/demo_blender.py", "cycles", "--blend", blend, "--out", frame)
     walk = ("--frames", str(FRAMES), "--frame", str(SHOWN))
     stage("march five pictures", "benchmarks/demo_march.py", "--human", human, *walk, "--out", out)
     count = "4" if arguments.quick else "12"

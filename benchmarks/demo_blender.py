@@ -126,7 +126,7 @@ def main() -> None:
     drawing.set_defaults(stage=cycles)
     for name in ("blend", "out", "json"):
         drawing.add_argument(f"--{name}", type=Path, required=True)
-    drawing.add_argument("--size", type=int, default=192)
+    drawing.add_argument("--size", type=int, default=384)
     drawing.add_argument("--samples", type=int, default=1)
     drawing.add_argument("--yaw", type=float, default=0.5, help="radians around the person, 0 is the front")
     arguments = parser.parse_args()

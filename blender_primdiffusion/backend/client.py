@@ -10,7 +10,6 @@ import collections
 import dataclasses
 import itertools
 import json
-import math
 import os
 import subprocess
 import time
@@ -18,8 +17,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..formats.json_files import parse_message
 from .child_streams import LOG_LINES, Input, Output
+from .messages import fault_of, parsed
 
 PROGRAM = "primdiffusion"
 """The backend's package, and its command line."""
@@ -213,7 +212,7 @@ class BackendClient:
             self._input.flush()
         exit_code = self._process.poll()  # before reading: then all that it wrote is there
         for message in self._arrived():
-            if fault := _fault(message, self._hello):
+            if fault := fault_of(message, self._hello):
                 return [*events, *self._give_up(fault)]
             self._silence, self._reported_silence = 0.0, False
             if message.get("id") in self._abandoned and "method" not in message:
@@ -284,7 +283,7 @@ class BackendClient:
                 if not self._lines:
                     return
             line = self._lines.popleft()
-            message = _parse(line)
+            message = parsed(line)
             if message is not None:
                 yield message
             elif line.strip():
@@ -312,8 +311,8 @@ class BackendClient:
     def _end(self, exit_code: int) -> Iterator[Event]:
         """The end of the child, once, after its last messages."""
         self._ended = True
-        last = _parse(self._output.rest()) if self._output is not None else None
-        if last is not None and not _fault(last, self._hello):
+        last = parsed(self._output.rest()) if self._output is not None else None
+        if last is not None and not fault_of(last, self._hello):
             yield self._event(last)
         self._close_streams()
         if not self._expected_to_end:
@@ -339,64 +338,6 @@ class BackendClient:
     def _send(self, message: dict[str, Any]) -> None:
         if self._input is not None:
             self._input.send(json.dumps(message).encode("utf-8") + b"\n")
-
-
-def _parse(line: bytes) -> dict[str, Any] | None:
-    try:
-        message = parse_message(line)
-    except ValueError:
-        return None
-    return message if isinstance(message, dict) else None
-
-
-_KINDS: dict[str, tuple[type, ...]] = {
-    "step": (int,), "total": (int,), "index": (int,), "eta_s": (int, float, type(None)), "stage": (str,),
-    "picture": (str, type(None)), "ready": (bool,), "problem": (str, type(None)), "device": (str, type(None)),
-    "device_name": (str, type(None)), "version": (str,), "python": (str,), "executable": (str,), "pid": (int,),
-    "protocol": (int,), "memory_gb": (int, float), "memory_free_gb": (int, float),
-}  # fmt: skip
-"""Types of what the child reports, where it reports it (docs/design/protocol.md)."""
-
-
-def _fault(message: Mapping[str, Any], hello: int) -> str | None:
-    """What is wrong with a message, if anything: it names the member that is not of its type."""
-    id, method, error = message.get("id"), message.get("method"), message.get("error")
-    params, result = message.get("params"), message.get("result")
-    if not (id is None or type(id) is int):
-        return "id"
-    if "method" in message:
-        if not isinstance(method, str):
-            return "method"
-        if not isinstance(params, dict | None):
-            return "params"
-        return _faulty_member(params or {})
-    if "error" in message:
-        if (
-            not isinstance(error, dict)
-            or type(error.get("code")) is not int
-            or not isinstance(error.get("message"), str)
-        ):
-            return "error"
-        data = error.get("data")
-        if not (data is None or (isinstance(data, dict) and all(isinstance(data.get(k, ""), str) for k in _DATA))):
-            return "data of error"
-        return None
-    if "result" not in message or not isinstance(result, dict):
-        return "result"
-    return _faulty_member(result) if id == hello else None
-
-
-_DATA = ("kind", "remedy")
-
-
-def _faulty_member(members: Mapping[str, Any]) -> str | None:
-    for name, value in members.items():
-        kinds = _KINDS.get(name, (object,))
-        if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds and object not in kinds):
-            return name
-        if isinstance(value, float) and not math.isfinite(value):
-            return name
-    return None
 
 
 def death_sentence(exit_code: int) -> str:

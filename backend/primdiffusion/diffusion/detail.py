@@ -9,7 +9,6 @@ same humans. Diffusion stays in the latents (Rombach et al. 2022); the decoder r
 from __future__ import annotations
 
 import dataclasses
-import itertools
 
 import torch
 from jaxtyping import Float
@@ -17,7 +16,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, cells_from_payload, payload_from_cells
-from primdiffusion.diffusion.local_unet import LocalAttention, LocalBlock, LocalStage, zeroed
+from primdiffusion.diffusion.local_unet import GridUNet, zeroed
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import GRID, Payload
 
@@ -39,7 +38,7 @@ class DetailConfig:
     """Heads of the self-attention at 8 and 16 cells a side."""
 
 
-class DetailDecoder(nn.Module):
+class DetailDecoder(GridUNet):
     """Latents of the diffusion to those of a finer codec: a linear map of each cell, plus a U-Net that starts at 0."""
 
     latent_std: Tensor
@@ -56,14 +55,7 @@ class DetailDecoder(nn.Module):
         self.summary = nn.Sequential(nn.Linear(channels * SUMMARY**2, wide), nn.SiLU(), nn.Linear(wide, wide))
         self.inner = nn.Conv2d(channels + config.position_channels, widths[0], 1)
         self.gain, self.shift = (nn.Parameter(torch.full((widths[0], GRID, GRID), value)) for value in (1.0, 0.0))
-        self.down, self.up, self.shrink, self.grow, self.attend = (nn.ModuleList() for _ in range(5))
-        for level, width in enumerate(widths):
-            self.down.append(LocalStage([LocalBlock(width, width, wide)]))
-            self.up.append(LocalStage([LocalBlock(2 * width, width, wide)]))
-            self.attend.append(LocalAttention(width, config.heads) if level else nn.Identity())
-        for width, smaller in itertools.pairwise(widths):
-            self.shrink.append(nn.Conv2d(width, smaller, 2, stride=2))
-            self.grow.append(nn.Conv2d(smaller, width, 1))
+        self.add_levels(widths, 1, wide, config.heads)
         self.norm = nn.GroupNorm(8, widths[0])
         self.last_gain, self.last_shift = (
             nn.Parameter(torch.full((widths[0], GRID, GRID), value)) for value in (1.0, 0.0)
@@ -77,16 +69,7 @@ class DetailDecoder(nn.Module):
         position = self.position.expand(len(seen), -1, -1, -1)
         x = self.inner(torch.cat([seen, position], dim=1).contiguous(memory_format=torch.channels_last))
         x = x * self.gain + self.shift
-        skips = []
-        for level, stage in enumerate(self.down):
-            x = self.attend[level](stage(x, condition))
-            skips.append(x)
-            if level < len(self.shrink):
-                x = self.shrink[level](x)
-        for level in reversed(range(len(self.up))):
-            x = self.up[level](torch.cat([x, skips.pop()], dim=1), condition)
-            if level:
-                x = self.grow[level - 1](functional.interpolate(x, scale_factor=2.0, mode="nearest"))
+        x = self.through_levels(x, condition)
         x = self.norm(x) * self.last_gain + self.last_shift
         return self.linear(latents) + self.rest_std[:, None, None] * self.outer(functional.silu(x))
 

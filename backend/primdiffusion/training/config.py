@@ -92,28 +92,14 @@ class PhaseConfig:
         _check("ema", self.ema, 0 <= self.ema < 1, "0 or more, and below 1")
 
 
-@dataclasses.dataclass(frozen=True)
-class TrainingConfig:
-    """Train a diffusion model; the same command line resumes (docs/design/diffusion_training.md)."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RunSettings:
+    """How a run of stage 2 is stopped, measured and saved; the same for each of its networks."""
 
-    data: Path
-    """Training set of `primdiffusion payloads`: a folder of files, or of shards from `payloads pack`."""
-    run: Path
-    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
-    preset: Literal["default", "paper"] = "default"
-    """default: a light network on latents; paper: the paper's U-Net on whole slabs, for GPUs."""
-    made_of: Literal["makehuman", "own"] = "own"
-    """Data in the model card: makehuman, licence and limits of `payloads` from MakeHuman's CC0 assets; own, none."""
     minutes: float | None = None
     """Time limit, after which the run can be resumed."""
     seed: int = 0
     """Seed of all random numbers."""
-    schedule: Literal["linear", "sqrt_linear", "fine_linear"] | None = None
-    """Noise schedule over 1000 steps: linear (the paper's; for the paper preset), fine_linear (the same with less noise
-    at the start; for the default preset) or sqrt_linear (the released code's)."""
-    chain: Literal["trailing", "dense"] | None = None
-    """Timesteps in sampling: trailing (evenly spaced; for the paper preset) or dense (denser at low noise; for the
-    default preset)."""
     holdout: float = 0.05
     """Fraction of geometries, with all their colour variants, held out for evaluation."""
     save_every: float = 60.0
@@ -124,6 +110,36 @@ class TrainingConfig:
     """Steps between lines of metrics.jsonl, which are running means."""
     pictures_every: int = 1000
     """Steps between images of samples from the averaged weights."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for values out of range."""
+        for name in ("log_every", "pictures_every", "threads"):
+            value = getattr(self, name)
+            _check(name, value, value is None or value >= 1, "1 or more")
+        for name in ("minutes", "save_every"):
+            value = getattr(self, name)
+            _check(name, value, value is None or value >= 0, "0 or more")
+        _check("holdout", self.holdout, 0 < self.holdout < 1, "between 0 and 1")
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingConfig(RunSettings):
+    """Train a diffusion model; the same command line resumes (docs/design/diffusion_training.md)."""
+
+    data: Path
+    """Training set of `primdiffusion payloads`: a folder of files, or of shards from `payloads pack`."""
+    run: Path
+    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
+    preset: Literal["default", "paper"] = "default"
+    """default: a light network on latents; paper: the paper's U-Net on whole slabs, for GPUs."""
+    made_of: Literal["makehuman", "own"] = "own"
+    """Data in the model card: makehuman, licence and limits of `payloads` from MakeHuman's CC0 assets; own, none."""
+    schedule: Literal["linear", "sqrt_linear", "fine_linear"] | None = None
+    """Noise schedule over 1000 steps: linear (the paper's; for the paper preset), fine_linear (the same with less noise
+    at the start; for the default preset) or sqrt_linear (the released code's)."""
+    chain: Literal["trailing", "dense"] | None = None
+    """Timesteps in sampling: trailing (evenly spaced; for the paper preset) or dense (denser at low noise; for the
+    default preset)."""
     codec: CodecConfig = dataclasses.field(default_factory=CodecConfig)
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
@@ -153,13 +169,7 @@ class TrainingConfig:
         for name, value in zip(("schedule", "chain"), usual, strict=True):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
-        for name in ("log_every", "pictures_every", "threads"):
-            value = getattr(self, name)
-            _check(name, value, value is None or value >= 1, "1 or more")
-        for name in ("minutes", "save_every"):
-            value = getattr(self, name)
-            _check(name, value, value is None or value >= 0, "0 or more")
-        _check("holdout", self.holdout, 0 < self.holdout < 1, "between 0 and 1")
+        super().__post_init__()
         if self.preset == "paper" and self.slab.weighting == "whitened":
             raise ValueError("slab.weighting is whitened, for which slabs have no closed form: choose plain or min_snr")
 

@@ -9,29 +9,25 @@ from __future__ import annotations
 
 import dataclasses
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
 import tyro
 from accelerate import PartialState
-from jaxtyping import Float, Int
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
-from primdiffusion.diffusion.codec import CellCodec, LinearCodec, cells_from_voxels
+from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.detail import DetailCodec, DetailConfig, DetailDecoder, FineCodec
-from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.schedule import SCHEDULES
-from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import CHARTS, default_anchors
 from primdiffusion.primitives.primitives import GRID
-from primdiffusion.staging import write_atomically
-from primdiffusion.training.config import CodecConfig, PhaseConfig
-from primdiffusion.training.latents import fit_codec_to, split_people
+from primdiffusion.training.config import CodecConfig, PhaseConfig, RunSettings
+from primdiffusion.training.detail_latents import NOISE_LEVELS, PREPARED, PreparedDetail, prepare
+from primdiffusion.training.latents import split_people
 from primdiffusion.training.phase import state_path, train_phase
 from primdiffusion.training.recorder import Interrupt
 from primdiffusion.training.run_folder import begin
@@ -40,15 +36,9 @@ from primdiffusion.training.state import AcceleratedState, accelerator_of
 from primdiffusion.training.stored_people import PersonDataset
 
 PHASE = "detail"
-MODEL, PREPARED = "model.safetensors", "prepared.safetensors"
-NOISE_LEVELS = (60, 150, 300)
-"""Steps t of 1000 whose one-step guesses the decoder is trained on, besides clean latents (0)."""
+MODEL = "model.safetensors"
 HEAD_WEIGHT = 3.0
 """Weight of the head's cells in the loss; eyes look at faces first."""
-CHUNK = 16
-"""Samples that are converted from half precision at once."""
-RIDGE = 1e-3
-"""Of least squares, relative to the mean variance."""
 CODEC_LIMIT = "the codec keeps"
 DETAIL_LIMIT = (
     "A voxel is 6 to 17 mm wide, and detail that the latents do not hold is the decoder's guess from the rest: prints "
@@ -57,7 +47,7 @@ DETAIL_LIMIT = (
 
 
 @dataclasses.dataclass(frozen=True)
-class DetailTrainingConfig:
+class DetailTrainingConfig(RunSettings):
     """Train a decoder that adds detail to a model's humans; the same command line resumes."""
 
     data: Path
@@ -67,21 +57,7 @@ class DetailTrainingConfig:
     run: Path
     """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
     checkpoint: Path | None = None
-    """The model, of preset default; without it the package's."""
-    minutes: float | None = None
-    """Time limit, after which the run can be resumed."""
-    seed: int = 0
-    """Seed of all random numbers."""
-    holdout: float = 0.05
-    """Fraction of geometries, with all their colour variants, held out for evaluation."""
-    save_every: float = 60.0
-    """Seconds between checkpoints; 0 saves after every step."""
-    threads: int | None = None
-    """CPU threads; the default is torch's."""
-    log_every: int = 50
-    """Steps between lines of metrics.jsonl, which are running means."""
-    pictures_every: int = 1000
-    """Steps between images of samples from the averaged weights."""
+    """The model, of preset default; without it the package's. A detail decoder that it has is replaced."""
     codec: CodecConfig = dataclasses.field(default_factory=CodecConfig)
     """The finer codec."""
     model: DetailConfig = dataclasses.field(default_factory=DetailConfig)
@@ -91,39 +67,11 @@ class DetailTrainingConfig:
     """Training of the decoder. Levels, weighting and attributes do not apply."""
 
 
-@dataclasses.dataclass(frozen=True)
-class DetailSet(TensorRecord):
-    """Latents of N samples, float16."""
-
-    coarse: Float[Tensor, "n levels c 32 32"]
-    """Clean, and the model's guesses at NOISE_LEVELS."""
-    fine: Float[Tensor, "n d 32 32"]
-    geometry: Int[Tensor, "n"]
-    """Geometry of each sample; ascending."""
-
-
-@dataclasses.dataclass(frozen=True)
-class PreparedDetail(TensorRecord):
-    """What a run computes before training."""
-
-    train: DetailSet
-    held: DetailSet
-    codec: LinearCodec
-    """The finer codec."""
-    forward: Float[Tensor, "d c"]
-    """From coarse latents to fine ones, least squares."""
-    back: Float[Tensor, "c c"]
-    """From the coarse codec's latents of decoded fine payloads to latents of coarse ones, least squares."""
-    latent_std: Float[Tensor, "c"]
-    rest_std: Float[Tensor, "d"]
-    """Of what `forward` leaves."""
-
-
 def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
     """Run or resume a training run; returns the model with the decoder, which is also in run/model.safetensors.
 
     Raises:
-        ValueError: the model has no latents of cells; the two sets hold different humans or colourings; otherwise as
+        ValueError: the model diffuses slabs; the two sets hold different humans or colourings; otherwise as
             `train`.
         FileNotFoundError: there are fewer than two people, or no checkpoint.
         OSError: the disk is full; the last saved state remains.
@@ -132,8 +80,9 @@ def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
         torch.set_num_threads(config.threads)
     accelerator = accelerator_of()
     base = load_checkpoint(config.checkpoint, accelerator.device)
-    if type(base.codec) is not CellCodec:
-        raise ValueError(f"{config.checkpoint} has a detail decoder or no latents: give a model as `train` writes it")
+    if not isinstance(base.codec, CellCodec):
+        raise ValueError(f"{config.checkpoint} diffuses slabs, not latents of cells: give a model of preset default")
+    coarse_codec = base.codec.codec
     fine, coarse = open_people(config.data), open_people(config.coarse)
     _check_same(config, fine, coarse)
     chosen, held = split_people(range(len(fine.names)), config.holdout, config.seed)
@@ -145,8 +94,10 @@ def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
                 config, fine.names, about, {"step": done, "processes": accelerator.num_processes},
                 lambda row: row["step"] <= done,
             )  # fmt: skip
-        prepared = prepare(config, base, base.codec.codec, fine, coarse, chosen, held)
-    trainee = DetailTrainee(config, base, base.codec.codec, fine.full_density, prepared)
+        prepared = prepare(
+            config.run / PREPARED, base, coarse_codec, fine, coarse, (chosen, held), config.codec, config.seed
+        )
+    trainee = DetailTrainee(config, base, coarse_codec, fine.full_density, prepared)
     with Interrupt(config.minutes) as interrupt:
         state = train_phase(config, trainee, PHASE, accelerator, interrupt)
     model = trainee.model()
@@ -157,55 +108,6 @@ def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
         save_checkpoint(config.run / MODEL, model, schedule)
     accelerator.end_training()
     return model
-
-
-def prepare(
-    config: DetailTrainingConfig,
-    base: DiffusionModel,
-    coarse_codec: LinearCodec,
-    fine: PersonDataset,
-    coarse: PersonDataset,
-    train: Sequence[int],
-    held: Sequence[int],
-) -> PreparedDetail:
-    """Return latents of both sets and the linear maps between them; loaded from the run folder if they are saved there.
-
-    Raises ValueError for a person's file, or prepared ones, that are damaged; OSError.
-    """
-    path = config.run / PREPARED
-    if path.exists():
-        return _load_prepared(path)
-    codec = fit_codec_to(fine, train, config.codec, torch.Generator().manual_seed(config.seed))
-    codec, sets, again = codec.to(base.device), [], []
-    for indices in (train, held):
-        clean, guessed, wanted, geometry = [], [], [], []
-        for place, index in enumerate(indices):
-            one, other = coarse.person(index), fine.person(index)
-            latents = coarse_codec.encode(cells_from_voxels(one.voxels, one.delta_scale).to(base.device))
-            clean.append(latents)
-            guessed.append(_with_guesses(base, latents, config.seed + index).half().cpu())
-            wanted.append(codec.encode(cells_from_voxels(other.voxels, other.delta_scale).to(base.device)).half().cpu())
-            geometry.append(torch.full((len(latents),), place))
-            if indices is train:
-                again.append(coarse_codec.encode(codec.decode(wanted[-1].float().to(base.device))).half().cpu())
-        sets.append(DetailSet(torch.cat(guessed), torch.cat(wanted), torch.cat(geometry)))
-    known = sets[0]
-    forward = _least_squares(_chunks(known))
-    back = _least_squares(
-        zip(
-            (chunk.float() for chunk in torch.cat(again).split(CHUNK)),
-            (coarse for coarse, _ in _chunks(known)),
-            strict=True,
-        )
-    )
-    rest = [_moments(fine - torch.einsum("dc,nchw->ndhw", forward, coarse)) for coarse, fine in _chunks(known)]
-    scale = [_moments(coarse) for coarse, _ in _chunks(known)]
-    prepared = PreparedDetail(
-        known, sets[1], codec.to("cpu"), forward, back,
-        *(torch.stack(each).mean(0).sqrt().clamp_min(1e-6) for each in (scale, rest)),
-    )  # fmt: skip
-    _save_prepared(path, prepared)
-    return prepared
 
 
 class DetailTrainee:
@@ -304,39 +206,6 @@ def _check_same(config: DetailTrainingConfig, fine: PersonDataset, coarse: Perso
         )
 
 
-def _with_guesses(
-    base: DiffusionModel, latents: Float[Tensor, "n c 32 32"], seed: int
-) -> Float[Tensor, "n levels c 32 32"]:
-    """Clean latents, and the model's guesses of them from each of NOISE_LEVELS."""
-    generator, versions = seeded(seed), [latents]
-    for level in NOISE_LEVELS:
-        noise = torch.randn(latents.shape, generator=generator).to(latents.device)
-        noisy = base.schedule.q_sample(latents, torch.full((len(latents),), level, device=latents.device), noise)
-        versions.append(base.denoise(noisy, level))
-    return torch.stack(versions, dim=1)
-
-
-def _chunks(known: DetailSet) -> Iterator[tuple[Tensor, Tensor]]:
-    """Clean coarse latents and fine ones, in float32, some samples at a time."""
-    for coarse, fine in zip(known.coarse[:, 0].split(CHUNK), known.fine.split(CHUNK), strict=True):
-        yield coarse.float(), fine.float()
-
-
-def _least_squares(pairs: Iterable[tuple[Tensor, Tensor]]) -> Float[Tensor, "d c"]:
-    """The matrix that maps the cells [n, c, 32, 32] of the first of each pair to those [n, d, 32, 32] of the second."""
-    square, product = torch.zeros(()), torch.zeros(())
-    for one, other in pairs:
-        x, y = one.movedim(1, -1).flatten(0, -2), other.movedim(1, -1).flatten(0, -2)
-        square, product = square + (x.T @ x).double(), product + (x.T @ y).double()
-    ridge = RIDGE * square.diagonal().mean() * torch.eye(len(square), dtype=square.dtype)
-    return torch.linalg.solve(square + ridge, product).T.float().contiguous()
-
-
-def _moments(latents: Float[Tensor, "n c 32 32"]) -> Float[Tensor, "c"]:
-    """Mean square of each channel."""
-    return latents.square().mean((0, 2, 3))
-
-
 def _card(
     base: Mapping[str, Any],
     fine: PersonDataset,
@@ -356,7 +225,7 @@ def _card(
         "parameters": sum(parameter.numel() for parameter in state.network.parameters()),
     }
     errors = {"linear": trainee.linear_errors(), "decoder": trainee.errors()}
-    limits = [limit for limit in base.get("limits", ()) if CODEC_LIMIT not in limit]
+    limits = [limit for limit in base.get("limits", ()) if CODEC_LIMIT not in limit and limit != DETAIL_LIMIT]
     return {
         **base,
         "full_density": fine.full_density,
@@ -366,30 +235,6 @@ def _card(
         },
         **({"limits": [*limits, DETAIL_LIMIT]} if limits else {}),
     }
-
-
-def _save_prepared(path: Path, prepared: PreparedDetail) -> None:
-    tensors = {}
-    for field in dataclasses.fields(prepared):
-        value = getattr(prepared, field.name)
-        parts = {"": value} if isinstance(value, Tensor) else vars(value)
-        tensors |= {f"{field.name}.{key}": part.contiguous() for key, part in parts.items()}
-    write_atomically(path, save(tensors))
-
-
-def _load_prepared(path: Path) -> PreparedDetail:
-    try:
-        with safe_open(path, framework="pt") as file:
-            parts: dict[str, dict[str, Tensor]] = {}
-            for key in file.keys():  # noqa: SIM118 - safe_open is no mapping
-                name, _, part = key.partition(".")
-                parts.setdefault(name, {})[part] = file.get_tensor(key)
-        return PreparedDetail(
-            DetailSet(**parts["train"]), DetailSet(**parts["held"]), LinearCodec(**parts["codec"]),
-            *(parts[name][""] for name in ("forward", "back", "latent_std", "rest_std")),
-        )  # fmt: skip
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error}): remove it to compute it again") from error
 
 
 def run(arguments: Sequence[str] | None = None) -> None:
