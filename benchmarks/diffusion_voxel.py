@@ -23,9 +23,9 @@ import torch
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.payloads import rest_frames
-from primdiffusion.staging import written_whole
 from primdiffusion.training.config import PhaseConfig, PriorConfig
 from primdiffusion.training.latents import LatentSet, split_people, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective

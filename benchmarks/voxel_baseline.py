@@ -21,9 +21,9 @@ from primdiffusion.diffusion.local_unet import PersonNetworkConfig
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.diffusion.schedule import SCHEDULES, trailing_steps
 from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.staging import written_whole
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn

@@ -81,7 +81,10 @@ def generate(
     attributes: Attributes = MappingProxyType({}),
     guidance: float = requests.GUIDANCE,
 ) -> Human:
-    """A new human, on the CPU; deterministic in model, seed, steps, sampler, attributes, guidance and device.
+    """A new human, on the CPU, determined by model, seed, steps, sampler, attributes and guidance.
+
+    On one device, with one version of torch and number of threads, every bit is the same; otherwise, and in a batch,
+    values differ by rounding (below 1e-5 of their range on CPUs).
 
     `attributes` condition the sample on attributes in `model.vocabulary`; empty means unconditional, as in the paper.
     `on_step` is called after each step; raise an exception from it to cancel.

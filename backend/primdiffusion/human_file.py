@@ -23,7 +23,6 @@ from typing import Any, NoReturn
 
 import numpy as np
 import safetensors
-import safetensors.torch
 import torch
 
 from primdiffusion.body.measures import LARGEST_BETA
@@ -33,11 +32,12 @@ from primdiffusion.formats.arrays import write_stored
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import LARGEST_INTEGER, parse_message
 from primdiffusion.formats.regular_files import check_size
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, body_of
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
 from primdiffusion.primitives.primitives import K, Payload, S
-from primdiffusion.staging import written_whole
+from primdiffusion.tensor_file import save
 
 FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1
@@ -83,7 +83,7 @@ def save_human(path: str | Path, human: Human, *, compact: bool = False) -> None
         tensors |= {"rgb": torch.from_numpy(rgb), "density": torch.from_numpy(density)}
         metadata |= {"format_version": str(compact_human.FORMAT_VERSION), compact_human.METADATA: scales}
     with written_whole(path) as unfinished:
-        unfinished.write_bytes(safetensors.torch.save(tensors, metadata))
+        unfinished.write_bytes(save(tensors, metadata))
 
 
 def format_version(human: Human) -> int:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from ..formats.removing import remove_folder
+from ..formats.whole_files import remove_of_process
 from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
 
 
@@ -349,9 +349,9 @@ class ChildRequest:
             self._backend.part_with(client, self._clear_leftovers)
 
     def _clear_leftovers(self) -> None:
-        """Remove the folder of half-written files of a killed child (named by the backend's staging.py)."""
+        """Remove the folder of half-written files of a killed child (see formats/whole_files.py)."""
         if self._client is not None and self._out_dir is not None:
-            remove_folder(self._out_dir / f".primdiffusion-partial-{self._client.pid}", self._out_dir)
+            remove_of_process(self._out_dir, self._client.pid)
             if self._out_dir_is_new:
                 with contextlib.suppress(OSError):  # holds other files, or was never created
                     self._out_dir.rmdir()

@@ -19,7 +19,8 @@ from ..formats.camera_files import write_layouts
 from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
-from ..formats.removing import check_unlinked, remove_folder
+from ..formats.removing import check_unlinked
+from ..formats.whole_files import remove_abandoned, temporary_name
 from ..motion.files import MotionFileError, read_motion
 from ..motion.motion import Motion
 from ..motion.poses import built_in_poses, pick_poses
@@ -169,8 +170,8 @@ def _name_reference(root: Path, subject: str) -> None:
     try:
         os.symlink(subject, reference, target_is_directory=True)
     except OSError:  # Windows without the right to links, or a disk that has none
-        partial = root / f".{RELEASED_REFERENCE}.partial"
-        remove_folder(partial, partial.parent)
+        remove_abandoned(root, reference)
+        partial = temporary_name(reference)
         shutil.copytree(root / subject, partial)
         os.replace(partial, reference)
 

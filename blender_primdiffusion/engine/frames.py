@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.removing import remove_file, remove_folder
+from ..formats.whole_files import has_ended, writer
 
 SHARED_MEMORY = Path("/dev/shm")
 CHANNELS = 5
@@ -103,7 +104,7 @@ class SharedFrames:
 
 
 def _new_folder(within: Path | None) -> Path:
-    return Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{os.getpid()}_", dir=within))
+    return Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{writer()}_", dir=within))
 
 
 def _reserve(path: Path, size: int) -> Path:
@@ -123,12 +124,7 @@ def _reserve(path: Path, size: int) -> Path:
 
 def _sweep() -> None:
     """Remove what a killed Blender left in shared memory, which would otherwise stay until a restart."""
-    if os.name == "nt":
-        return
     for folder in SHARED_MEMORY.glob(f"{_PREFIX}*_*"):
-        pid = folder.name[len(_PREFIX) :].partition("_")[0]
-        with contextlib.suppress(OSError, ValueError):
-            try:
-                os.kill(int(pid), 0)
-            except ProcessLookupError:
+        if has_ended(folder.name):
+            with contextlib.suppress(OSError):
                 remove_folder(folder, folder.parent)

@@ -6,10 +6,8 @@ import ctypes
 import dataclasses
 import functools
 import hashlib
-import os
 import shutil
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +17,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.removing import remove_file, remove_folder
+from ..formats.removing import remove_folder
+from ..formats.whole_files import publish, remove_abandoned, temporary_name
 from .human import VolumeWriteError, folders_of, unwritten_in, volume_path
 
 VOXELS = 8
@@ -158,25 +157,18 @@ def staged(folder: Path) -> Iterator[Staging]:
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        hidden = Path(tempfile.mkdtemp(prefix=".writing_", dir=folder))
+        remove_abandoned(folder)
+        hidden = temporary_name(folder / "volumes")
+        hidden.mkdir()
     except OSError as error:
         remove_empty(folder, existing)
         raise write_error(folder, error) from error
-    published: list[Path] = []
     try:
-        staging = Staging(hidden, folder)
-        yield staging
-        for path in staging.paths:
-            if not path.exists():
-                published.append(path)
-            try:
-                os.replace(hidden / path.name, path)
-            except OSError as error:
-                raise write_error(folder, error) from error
-    except BaseException:
-        for path in published:
-            remove_file(path, folder)
-        raise
+        yield Staging(hidden, folder)
+        try:
+            publish([(hidden, folder)])
+        except OSError as error:
+            raise write_error(folder, error) from error
     finally:
         remove_folder(hidden, hidden.parent)
         remove_empty(folder, existing)

@@ -18,9 +18,11 @@ ALLOWED = {
     "json.loads": {"formats/json_files.py"},
     "pickle": {"released/reading.py", "evaluation/pretrained_networks.py"},  # exceptions of torch.load, weights_only
     "torch.load": {"released/reading.py", "evaluation/pretrained_networks.py"},
+    "safetensors.torch.save": {"tensor_file.py"},
+    "safetensors.torch.save_file": set(),
     "PIL.Image.open": {"geometry/pictures.py"},
-    "shutil.rmtree": {"formats/removing.py", "staging.py", "capture/launch.py"},  # launch: Blender's own folder
-    "unlink": {"formats/removing.py", "staging.py"},
+    "shutil.rmtree": {"formats/removing.py", "capture/launch.py"},  # launch: Blender's own folder
+    "unlink": {"formats/removing.py"},
     "os.unlink": {"backend/child_streams.py"},  # a temporary file while it is open
     "os.remove": set(),
 }

@@ -29,8 +29,8 @@ from primdiffusion.commands.request import (
 )
 from primdiffusion.formats import requests
 from primdiffusion.formats.requests import check_unit_interval
+from primdiffusion.formats.whole_files import staged
 from primdiffusion.machine import peak_memory_gb
-from primdiffusion.staging import staged
 
 if TYPE_CHECKING:
     from jaxtyping import Bool

@@ -28,10 +28,10 @@ from primdiffusion.evaluation.gallery import (
 from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real
 from primdiffusion.evaluation.image_metrics import load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import generate, place
 from primdiffusion.machine import best_device
 from primdiffusion.people.assets import open_assets
-from primdiffusion.staging import written_whole
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
 

@@ -13,7 +13,7 @@ import tyro
 from primdiffusion.commands.request import ReportProgress, check_betas, check_numbers, check_size, parse
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.staging import staged
+from primdiffusion.formats.whole_files import staged
 
 if TYPE_CHECKING:
     from primdiffusion.commands.session import Session

@@ -28,8 +28,8 @@ from primdiffusion.commands.request import (
 )
 from primdiffusion.formats import requests
 from primdiffusion.formats.requests import check_unit_interval
+from primdiffusion.formats.whole_files import staged, staged_together
 from primdiffusion.machine import peak_memory_gb
-from primdiffusion.staging import staged
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -109,7 +109,7 @@ def generate_humans(
 
     seeds, steps = list(folders), request.steps
     with contextlib.ExitStack() as files:
-        unfinished = [files.enter_context(staged(folder)) for folder in folders.values()]
+        unfinished = files.enter_context(staged_together(list(folders.values())))
         report("load", 0, steps, None)
         model = session.model(request.checkpoint)
         report("sample", 0, steps, None)

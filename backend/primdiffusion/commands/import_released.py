@@ -16,13 +16,13 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.capture.smpl_parameters import read_smpl
 from primdiffusion.diffusion.checkpoint import file_hash, under
 from primdiffusion.diffusion.model import BETAS
+from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K
 from primdiffusion.released.imported import Reference, write_imported
 from primdiffusion.released.inventory import PREFIX, Inventory, take_inventory
 from primdiffusion.released.reading import ReleasedFileError, read_weights
 from primdiffusion.released.stage_one import PREFIX as STAGE_ONE
-from primdiffusion.staging import write_atomically
 
 SMPL_CELLS_OUTSIDE = 214
 """Of 1024 grid points outside every chart with SMPL's own UV (SPEC 1.2)."""

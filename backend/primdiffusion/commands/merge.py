@@ -18,7 +18,7 @@ import tyro
 from primdiffusion.commands.frame import PosedPerson
 from primdiffusion.commands.request import Pace, ReportProgress, check_voxel, parse
 from primdiffusion.formats.requests import DENSITY_GAIN, VOXEL
-from primdiffusion.staging import written_whole
+from primdiffusion.formats.whole_files import written_whole
 
 if TYPE_CHECKING:
     from primdiffusion.commands.session import Session

@@ -15,8 +15,8 @@ from tqdm import tqdm
 
 from primdiffusion.commands.request import OutDir, ReportProgress, check_size, parse, progress_bar
 from primdiffusion.formats import requests
+from primdiffusion.formats.whole_files import staged
 from primdiffusion.machine import best_device, peak_memory_gb
-from primdiffusion.staging import staged
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -15,7 +15,7 @@ import tyro
 from primdiffusion.commands.frame import FrameSpec
 from primdiffusion.commands.request import ReportProgress, check_angle, check_sides, parse
 from primdiffusion.formats.requests import PICTURE_SIZE, RAY_STEP, VIEWS, View, check_step
-from primdiffusion.staging import written_whole
+from primdiffusion.formats.whole_files import written_whole
 
 if TYPE_CHECKING:
     from primdiffusion.commands.session import Session

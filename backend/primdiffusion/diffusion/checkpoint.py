@@ -13,7 +13,6 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from primdiffusion.body.measures import LARGEST_BETA
@@ -27,9 +26,10 @@ from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.json_files import JsonError, parse_json
+from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetupError, find_body_setup
-from primdiffusion.staging import write_atomically
+from primdiffusion.tensor_file import save
 
 FORMAT = "primdiffusion-checkpoint"
 RELEASED = "released"

@@ -117,7 +117,7 @@ def inpaint(
 
     The region starts from pure noise. Betas, and the payload outside the region, stay bit-identical: those primitives
     are never decoded. `attributes` condition the region; without any the result is unconditional. Costs nearly
-    2 * `steps` denoiser calls, twice as many with attributes. Deterministic for a model, human, seed and device.
+    2 * `steps` denoiser calls, twice as many with attributes. Deterministic as `human.generate`.
 
     Raises ValueError for a region that is empty, whole or not a mask of K, steps outside 1 ... T, a seed outside
     0 ... 2^63-1 and unknown attributes.

@@ -41,7 +41,7 @@ def vary(
     Amount 0 returns the payload unchanged; 1 keeps only what remains visible through the noise of step T-1. In between,
     coarse features (garments, colours) persist longer than fine ones. Detail that the codec drops is added back in
     proportion to the signal at the noise level, so small amounts change little. Betas are unchanged, so armature and
-    poses still fit. Deterministic for a model, human, seed and device.
+    poses still fit. Deterministic as `human.generate`.
 
     Raises ValueError for an amount outside 0 ... 1, steps outside 1 ... T, a seed outside 0 ... 2^63-1 and unknown
     attributes.

@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import save
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose, default_body
@@ -21,9 +20,10 @@ from primdiffusion.encoder.config import EncoderConfig, config_from_json
 from primdiffusion.encoder.network import Encoder, motion_of
 from primdiffusion.encoder.unproject import Unprojected, unproject_texels, unproject_voxels
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.staging import write_atomically
+from primdiffusion.tensor_file import save
 
 FORMAT_VERSION = 1
 

@@ -16,13 +16,13 @@ from typing import Any
 import torch
 from jaxtyping import Float, UInt8
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion.evaluation.portraits import PORTRAITS
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.staging import written_whole
+from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.tensor_file import save
 
 CATEGORIES = ("sex", "age", "outfit", "pattern", "shoes", "hair", "hair_colour", "hat")
 SCALARS = ("skin_tone", "height")

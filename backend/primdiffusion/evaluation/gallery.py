@@ -17,11 +17,11 @@ from torch import Tensor
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, mesh_portraits, portraits
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.staging import written_whole
 
 
 class StoredPerson(Protocol):

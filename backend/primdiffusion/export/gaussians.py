@@ -21,10 +21,10 @@ from torch import Tensor
 from primdiffusion.export.field import pack_field
 from primdiffusion.export.surface import depth_below
 from primdiffusion.formats.requests import GAUSSIANS
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
-from primdiffusion.staging import written_whole
 
 WIDTH = 1 / 6**0.5
 """Standard deviation of a voxel's trilinear kernel, in voxel spacings: the Gaussian has the kernel's own variance."""

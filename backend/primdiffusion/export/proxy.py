@@ -19,13 +19,13 @@ from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.whole_files import staged, written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
 from primdiffusion.human import Human, body_of, place
 from primdiffusion.people.gltf import Skeleton, glb
 from primdiffusion.primitives.anchors import anchor_skin_weights
 from primdiffusion.raster.uv_atlas import rasterise_uv
-from primdiffusion.staging import staged, written_whole
 from primdiffusion.worker_process import run_in_process
 
 OUTSIDE = 0.008

@@ -40,7 +40,7 @@ from .arrays import ArrayFileError, read_numbers
 from .camera_rig import View
 from .json_files import parse_json, read_json
 from .removing import check_inside, remove_file
-from .whole_files import replacing
+from .whole_files import replacing, temporary_name
 
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png", "rgba": ".png"}
@@ -86,7 +86,7 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
                 f"{root} is not empty and holds no {DATASET_FILE}: choose a new folder for the captures"
             )
         root.mkdir(parents=True, exist_ok=True)
-        unlike = root / f".{DATASET_FILE}.{os.getpid()}"
+        unlike = temporary_name(root / DATASET_FILE)
         unlike.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
         try:  # a link fails where another process was first, which a rename would not
             with contextlib.suppress(FileExistsError):

@@ -20,6 +20,7 @@ from .capture_layout import (
 )
 from .picture_files import is_whole_picture
 from .removing import check_inside, remove_file
+from .whole_files import is_abandoned
 
 MOST_PICTURES = 1_000_000
 """Of a subject."""
@@ -141,4 +142,4 @@ def _pictures(subject: Path, about: Mapping[str, Any]) -> Iterator[Path]:
 
 
 def _partial_files(subject: Path) -> list[Path]:
-    return sorted(subject.rglob(".*.partial*"))
+    return sorted(path for path in subject.rglob(".*.partial*") if is_abandoned(path))

@@ -13,25 +13,23 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import os
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import torch
 
 from primdiffusion.body.model import default_body
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.removing import remove_folder
+from primdiffusion.formats.whole_files import remove_abandoned, temporary_name, written_whole
 from primdiffusion.people.assets import UNKNOWN, Assets, licence_of
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.gltf import Skeleton, glb
 from primdiffusion.people.person import Person, make_person
-from primdiffusion.staging import written_whole
 from primdiffusion.worker_process import each
 
 FORMAT, VERSION = "primdiffusion-people", 1
@@ -40,7 +38,6 @@ BODY = "default"
 JOINT_GRID = 2.0**20
 """Joints are rounded to 1 / JOINT_GRID m, so that files do not depend on the order of summation."""
 PERSON = re.compile(r"person_\d{6,}")
-PARTIAL = re.compile(r"\.person_\d+\.(\d+)\.partial")
 
 
 class OtherPeopleError(ValueError):
@@ -92,7 +89,7 @@ def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int
         raise ValueError(f"workers is {workers}: give 1 or more")
     _check_folder(people)
     people.root.mkdir(parents=True, exist_ok=True)
-    _remove_leftovers(people.root)
+    remove_abandoned(people.root)
     missing = [seed for seed in people.seeds if not is_whole(people.folder(seed), seed)]
     done = people.count - len(missing)
     yield done
@@ -113,7 +110,7 @@ def write_person(assets: Assets, folder: Path, seed: int) -> None:
         "sources": [{"path": path, "licence": licence_of(assets.root, path)} for path in person.sources],
         "sha256": hashlib.sha256(binary).hexdigest(),
     }
-    partial = folder.with_name(f".{folder.name}.{os.getpid()}.partial")
+    partial = temporary_name(folder)
     try:
         partial.mkdir()
         (partial / GLB).write_bytes(binary)
@@ -177,14 +174,6 @@ def _check_folder(people: PeopleSet) -> None:
         raise OtherPeopleError(
             f"{people.root} contains {unexpected[0]} ({len(unexpected)} out of range), but {requested}: {remedy}"
         )
-
-
-def _remove_leftovers(root: Path) -> None:
-    """Remove partial folders of processes that no longer run."""
-    for path in root.glob(".person_*.partial"):
-        owner = PARTIAL.fullmatch(path.name)
-        if owner and not psutil.pid_exists(int(owner[1])):
-            remove_folder(path, path.parent)
 
 
 def _write_manifest(people: PeopleSet) -> None:

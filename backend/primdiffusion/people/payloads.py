@@ -27,6 +27,7 @@ from numpy import ndarray
 from primdiffusion.body.model import default_body
 from primdiffusion.formats.arrays import read_arrays, write_deflated
 from primdiffusion.formats.requests import Making
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -38,7 +39,6 @@ from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_fie
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_colours, fit_payload
-from primdiffusion.staging import written_whole
 from primdiffusion.worker_process import each
 
 VARIANT_STRIDE = 1 << 32

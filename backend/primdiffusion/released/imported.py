@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 import torch
 from jaxtyping import Float
-from safetensors.torch import save
 from torch import Tensor
 
 from primdiffusion.body.measures import LARGEST_BETA
@@ -22,11 +21,12 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import FORMAT, FORMAT_VERSION, RELEASED
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.diffusion.unet import UNetConfig
+from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import released_half_extent
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY
-from primdiffusion.staging import write_atomically
+from primdiffusion.tensor_file import save
 
 SCHEDULE = "sqrt_linear"
 """Name of the released schedule in `SCHEDULES`."""

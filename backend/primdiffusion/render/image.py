@@ -11,9 +11,9 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.render.compositing import Rendering
-from primdiffusion.staging import written_whole
 
 Background = tuple[float, float, float]
 NEAR_TO_FAR = ((1.0, 0.95, 0.75), (0.98, 0.62, 0.25), (0.80, 0.25, 0.33), (0.42, 0.12, 0.47), (0.10, 0.07, 0.28))

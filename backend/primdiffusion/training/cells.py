@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec
@@ -20,7 +19,8 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.staging import write_atomically
+from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.tensor_file import save
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors

@@ -9,13 +9,13 @@ from pathlib import Path
 import torch
 from jaxtyping import Float, Int
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec, cells_from_voxels
 from primdiffusion.diffusion.model import DiffusionModel, seeded
+from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.staging import write_atomically
+from primdiffusion.tensor_file import save
 from primdiffusion.training.config import CodecConfig
 from primdiffusion.training.latents import fit_codec_to
 from primdiffusion.training.stored_people import PersonDataset

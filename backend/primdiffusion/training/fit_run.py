@@ -18,9 +18,9 @@ from primdiffusion.encoder.blocks import UntiedConv
 from primdiffusion.encoder.model import EncoderModel, save_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import psnr
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.render.march import march
-from primdiffusion.staging import written_whole
 from primdiffusion.training import run_folder
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.recorder import Recorder

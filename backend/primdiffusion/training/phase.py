@@ -21,10 +21,10 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.failures import out_of_memory
 from primdiffusion.formats import requests
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, generate_batch, place
 from primdiffusion.render.march import MarchSettings, march
-from primdiffusion.staging import written_whole
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.recorder import Interrupt, Recorder, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import PICTURES, append_metrics

@@ -17,13 +17,11 @@ from pathlib import Path
 from typing import Any
 
 import accelerate
-import psutil
 import torch
 
 from primdiffusion import __version__
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.removing import remove_file
-from primdiffusion.staging import write_atomically
+from primdiffusion.formats.whole_files import remove_abandoned, write_atomically
 from primdiffusion.training.config import RunConfig, check_resumable, to_json
 
 log = logging.getLogger(__name__)
@@ -54,7 +52,7 @@ def begin(
         if noted.exists():
             started["starts"] = _earlier(config, people, noted.read_text(encoding="utf-8"), start["processes"])
         _cut_metrics(config.run / METRICS, is_kept)
-        _remove_leftovers(config.run)
+        remove_abandoned(config.run)
     now = {**start, "primdiffusion": __version__, **versions()}
     write_atomically(saved, to_json(config))
     write_atomically(noted, json.dumps({**started, "starts": [*started["starts"], now]}, indent=1))
@@ -116,14 +114,6 @@ def _is_kept(line: str, is_kept: Callable[[Mapping[str, Any]], bool]) -> bool:
         return is_kept(parse_json(line))
     except (ValueError, KeyError, TypeError):
         return False
-
-
-def _remove_leftovers(run: Path) -> None:
-    """Remove files that killed processes left while writing: `.NAME.PID.partial`."""
-    for path in run.glob(".*.partial"):
-        process = path.name.split(".")[-2]
-        if process.isdecimal() and not psutil.pid_exists(int(process)):
-            remove_file(path, run)
 
 
 def _git(folder: Path, *arguments: str) -> str:

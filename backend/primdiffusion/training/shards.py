@@ -20,13 +20,13 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 from torch import Tensor
 
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.formats.json_files import read_json
+from primdiffusion.formats.whole_files import write_atomically, written_whole
 from primdiffusion.primitives.primitives import K
-from primdiffusion.staging import write_atomically, written_whole
+from primdiffusion.tensor_file import save
 from primdiffusion.training.stored_people import PersonDataset, PersonFolder, PersonVariants, attributes_of
 
 INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1
@@ -86,7 +86,7 @@ def _write_shard(path: Path, people: Sequence[PersonVariants]) -> None:
     if (scales != 1).any():
         tensors["delta_scale"] = scales.half()
     with written_whole(path) as unfinished:
-        save_file(tensors, unfinished)
+        unfinished.write_bytes(save(tensors))
 
 
 def digest_of(path: Path) -> str:

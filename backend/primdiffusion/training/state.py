@@ -12,10 +12,10 @@ import torch
 from accelerate import Accelerator
 from accelerate.utils import InitProcessGroupKwargs
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 
-from primdiffusion.staging import write_atomically
+from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.tensor_file import save
 
 PATIENCE = datetime.timedelta(hours=3)
 """How long processes wait for the main process, which alone evaluates, renders and prepares data."""

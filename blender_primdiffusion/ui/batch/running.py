@@ -29,9 +29,10 @@ from ...console import (
     separate_stdout,
     stopped_by_signals,
 )
+from ...formats import whole_files
 from ...formats.json_files import parse_json, read_json
 from ...formats.removing import remove_file, remove_folder
-from ...formats.whole_files import replacing
+from ...formats.whole_files import remove_abandoned, replacing, temporary_name
 from ...places import EXTENSION, new_backend, preference
 
 _TICK_S = 0.03
@@ -118,8 +119,8 @@ def ask(
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
     """An empty folder beside `folder`, to be published; removed after the block. A killed run may have left one."""
-    made = folder.with_name(f".{folder.name}.partial")
-    remove_folder(made, made.parent)
+    made = temporary_name(folder)
+    remove_abandoned(folder.parent, folder)
     made.mkdir(parents=True)
     try:
         yield made
@@ -128,15 +129,11 @@ def staging(folder: Path) -> Iterator[Path]:
 
 
 def publish(made: Path, folder: Path, last: str) -> None:
-    """Move the content of `made` to `folder`: at once if that is new, else piece by piece, `last` last."""
-    if not folder.exists():
+    """Move the content of `made` to `folder`: at once if that is new, else all or nothing, `last` last."""
+    if folder.exists():
+        whole_files.publish([(made, folder)], last)
+    else:
         os.replace(made, folder)
-        return
-    for piece in sorted(made.iterdir(), key=lambda path: path.name == last):
-        target = folder / piece.name
-        if target.is_dir():
-            remove_folder(target, folder)
-        os.replace(piece, target)
 
 
 def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> None:

@@ -3,9 +3,11 @@ import dataclasses
 import pytest
 import torch
 from diffusion_people import small_model
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import WholeSlab
 from primdiffusion.diffusion.model import STANDARD_SHAPES, sample, seeded
 from primdiffusion.diffusion.schedule import trailing_steps
+from primdiffusion.human import generate_batch
 from primdiffusion.primitives.primitives import GRID, K, S
 
 
@@ -102,6 +104,25 @@ def test_seeds_out_of_range_are_rejected(model, seed):
 def test_people_are_the_same_in_any_company(model, sampler):
     together = result(model, [5, 6, 7], 4, sampler)
     assert torch.allclose(together[1:2], result(model, [6], 4, sampler), atol=1e-4)
+
+
+@pytest.mark.slow
+def test_threads_and_company_change_no_value_by_more_than_rounding():
+    shipped = load_checkpoint(None)
+
+    def payloads(seeds, threads):
+        before = torch.get_num_threads()
+        torch.set_num_threads(threads)
+        try:
+            person = generate_batch(shipped, seeds)[seeds.index(3)]
+        finally:
+            torch.set_num_threads(before)
+        return person.payload.rgb, person.payload.density
+
+    alone = payloads([3], 1)
+    for others in (payloads([3], 2), payloads([3], 4), payloads(list(range(8)), 2)):
+        for one, other in zip(alone, others, strict=True):
+            assert (one - other).abs().max() < 1e-5 * (one.max() - one.min())
 
 
 def test_guidance_extrapolates_from_unconditional_to_conditional(model):

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
+from primdiffusion.formats.whole_files import writer
 from primdiffusion.people import assets as assets_module
 from primdiffusion.people import folder as folder_module
 from primdiffusion.people import load_base_mesh, make_person, open_assets
@@ -104,7 +105,7 @@ def test_full_disk_is_named_and_leaves_nothing(assets, tmp_path, monkeypatch):
 def test_what_killed_processes_left_is_removed(assets, two):
     child = subprocess.Popen([sys.executable, "-c", ""])
     child.wait()
-    left = two / f".person_000009.{child.pid}.partial"
+    left = two / f".person_000009.{writer().replace(str(os.getpid()), str(child.pid))}.partial"
     left.mkdir()
     (left / "person.glb").write_bytes(b"half")
     list(make_people(assets, PeopleSet(two, 3, 2), 1))

@@ -22,7 +22,6 @@ from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.primitives import K, Payload, S
 from primdiffusion.render.march import march
-from primdiffusion.staging import STAGING_PREFIX
 from primdiffusion.training.refine import RefineSettings, refine
 from primdiffusion.training.refine_views import bare_body, view_psnr
 
@@ -237,7 +236,7 @@ def test_a_cancelled_command_leaves_nothing(line, tmp_path, monkeypatch):
         cli.main(line)
     assert end.value.code == 130
     assert not (tmp_path / "out").exists()
-    assert not list(tmp_path.rglob(f"{STAGING_PREFIX}*"))
+    assert not list(tmp_path.rglob(".*.partial"))
 
 
 @pytest.mark.parametrize(

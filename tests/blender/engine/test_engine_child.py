@@ -15,6 +15,7 @@ import bpy
 import numpy as np
 import pytest
 from backend_python import use_this_python
+from blender_primdiffusion.formats.whole_files import writer
 from engine_stage import pixels, set_up_render
 
 import blender_primdiffusion
@@ -307,7 +308,10 @@ def test_threads_share_one_folder():
 def test_what_a_killed_blender_left_in_memory_is_removed(tmp_path, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.engine.frames.SHARED_MEMORY", tmp_path)
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
-    left, ours = tmp_path / f"primdiffusion_{int(dead.stdout)}_x", tmp_path / f"primdiffusion_{os.getpid()}_x"
+    left, ours = (
+        tmp_path / f"primdiffusion_{writer().replace(str(os.getpid()), str(pid))}_x"
+        for pid in (int(dead.stdout), os.getpid())
+    )
     for folder in (left, ours):
         folder.mkdir()
     frames = SharedFrames()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from contextlib import contextmanager
 
 import bpy
@@ -9,7 +10,6 @@ import numpy as np
 import pytest
 import synthetic
 
-from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.cycles import max_overlap
 from blender_primdiffusion.scene.human import VolumeWriteError
 from blender_primdiffusion.scene.volumes import FAINTEST, bake, file_name, index_to_local, staged, window
@@ -136,7 +136,7 @@ def test_a_full_disk_half_way_keeps_earlier_files_and_drops_the_new(human, grids
         pass
     before = sorted(folder.iterdir())
     other = bake(human["density"] * 0.5, human["rgb"], human["half_extent"])
-    replace, calls = volumes.os.replace, []
+    replace, calls = os.replace, []
 
     def failing(source, target):
         calls.append(target)
@@ -144,7 +144,7 @@ def test_a_full_disk_half_way_keeps_earlier_files_and_drops_the_new(human, grids
             raise OSError(28, "No space left on device")
         replace(source, target)
 
-    monkeypatch.setattr(volumes.os, "replace", failing)
+    monkeypatch.setattr(os, "replace", failing)
     with pytest.raises(VolumeWriteError, match="No space left"), written(other, folder):
         pass
     assert sorted(folder.iterdir()) == before
