@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-import os
 import re
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,6 +14,7 @@ import numpy as np
 
 from ..formats.arrays import check_shapes, read_arrays
 from ..formats.removing import remove_file
+from ..formats.whole_files import replacing
 from .human import VolumeWriteError, folders_of
 from .shape import FIELDS, INTEGERS, OPTIONAL_FIELDS, ShapeModel, faulty_field
 
@@ -117,16 +116,10 @@ def _write(path: Path, model: ShapeModel) -> None:
     for name in INTEGERS:
         if arrays[name].max() < _SMALL_LIMIT:
             arrays[name] = arrays[name].astype(_SMALL)
-    unfinished = None
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".writing_", suffix=".npz", delete=False) as file:
-            unfinished = Path(file.name)
+        with replacing(path) as unfinished, unfinished.open("wb") as file:
             np.savez(file, **arrays)  # compressing takes half a second, and Blender waits
-        os.replace(unfinished, path)
     except OSError as error:
-        if unfinished is not None:
-            remove_file(unfinished, unfinished.parent)
         raise VolumeWriteError(
             f"the body's file could not be written to {str(path.parent)!r} ({error}); save the .blend in a folder with "
             "write permission and free space"

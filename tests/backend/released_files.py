@@ -57,15 +57,16 @@ def stage_one(template: Tensor) -> dict[str, Tensor]:
     """The 165 tensors by SPEC 2 and 6; names within the groups are ours."""
     found: dict[str, Tensor] = {"lbs_fn.template": template[None]}
     found |= {f"lbs_fn.part{i}": blank(3) for i in range(6)} | {f"geo_fn.part{i}": blank(3) for i in range(7)}
-    for group, i, o in (("local_pose_conv_block", 69, 32), ("joint_conv_block", 96, 64)):
-        for name, (a, b, k) in {"conv1": (i, o, 3), "conv2": (o, o, 3), "conv_resize": (i, o, 1)}.items():
-            found |= convolution(f"{group}.{name}", (b, a, k, k), (b, 32, 32))
-    sides = [(3, 4, 128), (4, 8, 64), (8, 16, 32), (16, 32, 16), (32, 64, 8), (64, 64, 4), (64, 64, 2), (64, 64, 1)]
+    for group, i, o, k in (("local_pose_conv_block", 69, 32, 1), ("joint_conv_block", 96, 64, 3)):
+        found |= convolution(f"{group}.conv1", (i, i, k, k), (i, 32, 32))
+        found |= convolution(f"{group}.conv2", (o, i, k, k), (o, 32, 32))
+        found |= convolution(f"{group}.conv_resize", (o, i, 1, 1), (o,))
+    sides = [(3, 4, 128), (4, 8, 64), (8, 16, 32), (16, 8, 16), (8, 16, 8), (16, 32, 4), (32, 64, 2), (64, 128, 1)]
     for n, (i, o, side) in enumerate(sides):
         found |= convolution(f"embs_encoder.down.{n}", (o, i, 4, 4), (o, side, side))
-    for n, (i, o, side) in enumerate([(64, 64, 2), (64, 64, 4), (64, 64, 8), (64, 32, 16), (32, 64, 32)]):
+    for n, (i, o, side) in enumerate([(128, 64, 2), (64, 32, 4), (32, 16, 8), (16, 8, 16), (8, 8, 32)]):
         found |= convolution(f"embs_encoder.up.{n}", (i, o, 4, 4), (o, side, side))
-    found |= convolution("embs_encoder.out", (64, 80, 1, 1), (64, 32, 32))
+    found |= convolution("embs_encoder.out", (64, 24, 1, 1), (64, 32, 32))
     for n, (i, o) in enumerate([(64, 64), (64, 128), (128, 64), (64, 64), (64, 9)]):
         found |= convolution(f"decoder_motion.{n}", (o, i, 3, 3), (o, 32, 32))
     for group, last in (("decoder_rgb", 24), ("decoder_alpha", 8)):

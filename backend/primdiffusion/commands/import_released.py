@@ -17,6 +17,7 @@ from primdiffusion.capture.smpl_parameters import read_smpl
 from primdiffusion.diffusion.checkpoint import file_hash, under
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.primitives.anchors import grid_points_outside
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K
 from primdiffusion.released.imported import Reference, write_imported
@@ -106,8 +107,7 @@ def _about_body(weights: Mapping[str, Tensor], body: BodyModel) -> list[str]:
 
 
 def _about_layout(body_setup: BodySetup) -> str:
-    centred = (body_setup.anchors.barycentric == 1 / 3).all(-1)  # where the rule puts those outside, on the last face
-    outside = int((centred & (body_setup.anchors.face == len(body_setup.body.faces) - 1)).sum())
+    outside = grid_points_outside(body_setup.body)
     return f"{outside} of {K} primitives lie outside of the UV charts; with SMPL's own UV {SMPL_CELLS_OUTSIDE} do"
 
 

@@ -224,8 +224,9 @@ def _released_model(
 
 
 def _unet_config(tree: Mapping[str, Any]) -> UNetConfig:
-    """Parse a U-Net's configuration."""
-    return UNetConfig(**{**tree, **{key: tuple(tree[key]) for key in ("multipliers", "attention_levels")}})
+    """Parse a U-Net's configuration; files older than `attention_context` have "input"."""
+    levels = {key: tuple(tree[key]) for key in ("multipliers", "attention_levels")}
+    return UNetConfig(**{"attention_context": "input", **tree, **levels})
 
 
 def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:

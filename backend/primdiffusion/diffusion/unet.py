@@ -7,6 +7,7 @@ The names and shapes are those of the released checkpoints' `diffusion.*` keys, 
 from __future__ import annotations
 
 import dataclasses
+from typing import Literal
 
 import torch
 from jaxtyping import Float, Int
@@ -33,6 +34,9 @@ class UNetConfig:
     its configuration meant, 129,996,856 parameters."""
     heads: int = 8
     """Attention heads of every transformer."""
+    attention_context: Literal["tokens", "input"] = "tokens"
+    """What the second attention of a transformer block reads: the block's own input tokens, as in the released code
+    (SPEC 3); or the transformer's raw input, as in runs of the first versions of this package."""
 
 
 PAPER = UNetConfig()
@@ -109,7 +113,7 @@ class FeedForward(nn.Module):
 
 
 class TransformerBlock(nn.Module):
-    """Self-attention, attention on a context, feed-forward, each normalised first and added."""
+    """Self-attention, attention on a context (its own input if None), feed-forward, each normalised first and added."""
 
     def __init__(self, channels: int, heads: int):
         super().__init__()
@@ -120,27 +124,31 @@ class TransformerBlock(nn.Module):
         )
         self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(channels) for _ in range(3))
 
-    def forward(self, x: Float[Tensor, "b n c"], context: Float[Tensor, "b m c"]) -> Float[Tensor, "b n c"]:
+    def forward(
+        self, x: Float[Tensor, "b n c"], context: Float[Tensor, "b m c"] | None = None
+    ) -> Float[Tensor, "b n c"]:
         """The transformed tokens."""
-        normalised = self.norm1(x)
+        normalised, context = self.norm1(x), x if context is None else context
         x = x + self.attn1(normalised, normalised)
         x = x + self.attn2(self.norm2(x), context)
         return x + self.ff(self.norm3(x))
 
 
 class SpatialTransformer(nn.Module):
-    """One transformer block over the pixels; its second attention reads the un-normalised input (SPEC 3)."""
+    """One transformer block over the pixels (SPEC 3)."""
 
-    def __init__(self, channels: int, heads: int):
+    def __init__(self, channels: int, config: UNetConfig):
         super().__init__()
+        self.reads_input = config.attention_context == "input"
         self.norm = nn.GroupNorm(32, channels, eps=1e-6)
         self.proj_in = nn.Conv2d(channels, channels, 1)
-        self.transformer_blocks = nn.ModuleList([TransformerBlock(channels, heads)])
+        self.transformer_blocks = nn.ModuleList([TransformerBlock(channels, config.heads)])
         self.proj_out = zeroed(nn.Conv2d(channels, channels, 1))
 
     def forward(self, x: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
         """The input plus what attention adds."""
-        tokens, context = (part.flatten(2).transpose(1, 2) for part in (self.proj_in(self.norm(x)), x))
+        tokens = self.proj_in(self.norm(x)).flatten(2).transpose(1, 2)
+        context = x.flatten(2).transpose(1, 2) if self.reads_input else None
         for block in self.transformer_blocks:
             tokens = block(tokens, context)
         return x + self.proj_out(tokens.transpose(1, 2).unflatten(-1, x.shape[2:]))
@@ -201,7 +209,7 @@ class SlabUNet(nn.Module):
                 skips.append(channels)
         self.middle_block = UNetStage(
             ResidualBlock(channels, channels, time_width),
-            SpatialTransformer(channels, config.heads),
+            SpatialTransformer(channels, config),
             ResidualBlock(channels, channels, time_width),
         )
         self.output_blocks = nn.ModuleList()
@@ -219,7 +227,7 @@ class SlabUNet(nn.Module):
     def _stage(self, channels: int, out_channels: int, level: int) -> UNetStage:
         stage = UNetStage(ResidualBlock(channels, out_channels, 4 * self.config.width))
         if level in self.config.attention_levels:
-            stage.append(SpatialTransformer(out_channels, self.config.heads))
+            stage.append(SpatialTransformer(out_channels, self.config))
         return stage
 
     def forward(self, x: Float[Tensor, "b c h w"], t: Int[Tensor, "b"]) -> Float[Tensor, "b c h w"]:

@@ -160,8 +160,9 @@ def build_anchors(body: BodyModel, rule: Literal["paper", "released"] = "paper")
     """Anchors for any body with UV coordinates; grid points are texels 4, 12, 20, ... of a 256 x 256 raster (SPEC 2).
 
     "paper": a grid point outside every chart maps to the closest chart point; sizes follow the UV gradient per axis.
-    "released": such points all map to the body's last face (SPEC 1.2), and sizes are isotropic; required by released
-    checkpoints. Tangent planes are those of the face under the grid point.
+    "released": such points all map to the body's last face, at the barycentric coordinates of the nearest texel that a
+    chart covers (SPEC 1.2), and sizes are isotropic; required by released checkpoints. Tangent planes are those of the
+    face under the grid point.
 
     Raises:
         ValueError: the body has no UV map, its template is not finite, or the rule is unknown.
@@ -173,17 +174,24 @@ def build_anchors(body: BodyModel, rule: Literal["paper", "released"] = "paper")
     if not torch.isfinite(body.template).all():
         raise ValueError("the body's template holds NaN or infinite values: load the body file again")
     corner_uv = body.uv[body.uv_faces].double().cpu().numpy()
-    raster = rasterise_uv(corner_uv, GRID * S, GRID * S).every(S, S // 2)
-    face, barycentric = raster.face.reshape(K).copy(), raster.barycentric.reshape(K, 3).copy()
+    raster = rasterise_uv(corner_uv, GRID * S, GRID * S)
+    points = raster.every(S, S // 2)
+    face, barycentric = points.face.reshape(K).copy(), points.barycentric.reshape(K, 3).copy()
     outside = np.flatnonzero(face < 0)
-    if rule == "released":
+    if rule == "released" and raster.covered.any():
         face[outside] = len(body.faces) - 1
-        barycentric[outside] = 1 / 3
+        barycentric[outside] = raster.filled().every(S, S // 2).barycentric.reshape(K, 3)[outside]
     elif len(outside):
         row, column = np.divmod(outside, GRID)
         points = (np.stack([column, row], -1) * S + S // 2 + 0.5) / (GRID * S)
         face[outside], barycentric[outside] = closest_in_uv(corner_uv, body.uv_faces.cpu().numpy(), points)
     return _face_anchors(body, torch.from_numpy(face), torch.from_numpy(barycentric), rule)
+
+
+def grid_points_outside(body: BodyModel) -> int:
+    """How many of the K grid points lie outside of every UV chart."""
+    corner_uv = body.uv[body.uv_faces].double().cpu().numpy()
+    return int((~rasterise_uv(corner_uv, GRID * S, GRID * S).every(S, S // 2).covered).sum())
 
 
 def _face_anchors(body: BodyModel, face: Tensor, barycentric: Tensor, rule: str) -> Anchors:

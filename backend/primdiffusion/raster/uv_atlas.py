@@ -33,6 +33,17 @@ class UvRaster:
         """The raster with only the rows and columns offset, offset + stride, ..."""
         return UvRaster(self.face[offset::stride, offset::stride], self.barycentric[offset::stride, offset::stride])
 
+    def filled(self) -> UvRaster:
+        """The raster in which a texel outside of every chart has the surface point of the nearest covered texel.
+
+        Raises ValueError if no texel is covered.
+        """
+        if not self.covered.any():
+            size = " x ".join(map(str, self.face.shape))
+            raise ValueError(f"no texel of {size} is covered: the mesh has no texture coordinates")
+        nearest = np.asarray(distance_transform_edt(~self.covered, return_distances=False, return_indices=True))
+        return UvRaster(self.face[tuple(nearest)], self.barycentric[tuple(nearest)])
+
 
 def rasterise_uv(corner_uv: Float[Array, "f 3 2"], height: int, width: int) -> UvRaster:
     """Rasterise the charts into height x width texels; where charts overlap, the later face wins.
@@ -107,8 +118,5 @@ def texel_map(corner_uv: Float[Array, "F 3 2"], size: int) -> TexelMap:
         ValueError: no texel's centre is inside a triangle.
     """
     raster = rasterise_uv(np.asarray(corner_uv, np.float64) * (1, -1) + (0, 1), size, size)
-    inside = raster.covered
-    if not inside.any():
-        raise ValueError(f"no texel of {size} x {size} is covered: the mesh has no texture coordinates")
-    nearest = np.asarray(distance_transform_edt(~inside, return_distances=False, return_indices=True))
-    return TexelMap(raster.face[tuple(nearest)], raster.barycentric[tuple(nearest)].astype(np.float32), inside)
+    filled = raster.filled()
+    return TexelMap(filled.face, filled.barycentric.astype(np.float32), raster.covered)

@@ -38,16 +38,22 @@ NOT_CARRIED_OVER = "has the layers of the encoder 'released'; stage 1 is not imp
 
 @dataclasses.dataclass(frozen=True)
 class DecoderLayer:
-    """A weight-normalised convolution with a bias per position: three tensors (SPEC 2)."""
+    """A weight-normalised convolution, mostly with a bias per position: three tensors (SPEC 2)."""
 
     weight: tuple[int | None, ...]
     """[out, in, k, k], or [in, out, k, k] if transposed; None where SPEC 2 does not specify it."""
     bias: tuple[int | None, ...]
-    """[out, side, side]."""
+    """[out, side, side], or [out] without positions."""
 
 
-def _same(outputs: int, inputs: int, kernel: int | None = None) -> DecoderLayer:
+def _same(outputs: int, inputs: int, kernel: int) -> DecoderLayer:
     return DecoderLayer((outputs, inputs, kernel, kernel), (outputs, 32, 32))
+
+
+def _residual(inputs: int, outputs: int, kernel: int) -> list[DecoderLayer]:
+    """A residual block: two convolutions, and a 1 x 1 one with an ordinary bias beside them."""
+    beside = DecoderLayer((outputs, inputs, 1, 1), (outputs,))
+    return [_same(inputs, inputs, kernel), _same(outputs, inputs, kernel), beside]
 
 
 def _up(inputs: int, outputs: int, side: int) -> DecoderLayer:
@@ -63,8 +69,8 @@ def _of_u_net(side: int) -> DecoderLayer:
 
 
 LAYERS: dict[str, list[DecoderLayer]] = {
-    "local_pose_conv_block": [_same(32, 69), _same(32, 32), _same(32, 69)],
-    "joint_conv_block": [_same(64, 96), _same(64, 64), _same(64, 96)],
+    "local_pose_conv_block": _residual(69, 32, 1),
+    "joint_conv_block": _residual(96, 64, 3),
     "embs_encoder": [
         *(DecoderLayer((o, i, 4, 4), (o, side, side)) for i, o, side in ((3, 4, 128), (4, 8, 64), (8, 16, 32))),
         DecoderLayer((64, None, 1, 1), (64, 32, 32)),
@@ -82,7 +88,8 @@ ATTENTION: list[tuple[int, ...]] = [(256, 96), (96, 256), *[(2048, 256), (256, 1
 def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> list[TensorEntry]:
     """Validate the tensors (names without `prefix`, which error messages include).
 
-    Raises ReleasedFileError, naming a tensor that is unknown or has a wrong shape, or an incomplete group.
+    Groups that are not used may be of any shape, incomplete or missing. Raises ReleasedFileError, naming a tensor that
+    is unknown or has a wrong shape, or an incomplete group.
     """
     groups: dict[str, dict[str, Tensor]] = {group: {} for group in TENSORS}
     for name, value in tensors.items():
@@ -93,6 +100,8 @@ def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> li
             )
         groups[group][f"{prefix}{name}"] = value
     for group, found in groups.items():
+        if group in NOT_USED:
+            continue
         if group in LAYERS:
             _check_layers(group, found)
         if len(found) != TENSORS[group]:
@@ -136,12 +145,12 @@ def _weight_and_bias(module: str, found: Mapping[str, Tensor]) -> tuple[str, str
     """Names of the weight and bias among a convolution's three tensors; the third is the per-channel gain."""
     weights = [key for key, value in found.items() if value.ndim == 4 and value.numel() > max(value.shape)]
     biases = [key for key, value in found.items() if value.ndim == 3]
+    if not biases:  # without positions it has the gain's shape, and only its name tells it
+        biases = [key for key, value in found.items() if value.ndim == 1 and key.rpartition(".")[2] == "bias"]
     gains = [key for key in found if key not in weights + biases]
     if not len(weights) == len(biases) == len(gains) == 1:
         given = ", ".join(f"{key!r} {tuple(value.shape)}" for key, value in found.items())
-        raise ReleasedFileError(
-            f"{module!r} is not a convolution with weight, gain and bias per position: it has {given}"
-        )
+        raise ReleasedFileError(f"{module!r} is not a convolution with weight, gain and bias: it has {given}")
     channels = found[biases[0]].shape[0]
     if found[gains[0]].numel() != channels:
         raise ReleasedFileError(

@@ -205,6 +205,10 @@ MAY_CHANGE = frozenset(
 learning rate's cosine."""
 
 
+_ADDED = {"unet.attention_context": "input"}
+"""Settings of the paper preset that earlier runs do not name, and what they were."""
+
+
 class RunConfig(Protocol):
     """Settings of a run of either stage: a dataclass with its folder and its data."""
 
@@ -221,6 +225,9 @@ def check_resumable(saved: str, config: RunConfig) -> None:
     except (ValueError, AttributeError) as error:
         raise ValueError(f"the settings in {config.run} are damaged ({error}): give a new folder") from error
     now = _comparable(parse_json(to_json(config)))
+    for name, value in _ADDED.items():
+        if name in now and name not in before:
+            before[name] = value if before.get("preset") == "paper" else now[name]
     changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if changed:
         differing = ", ".join(f"{key} ({before.get(key)}, not {now.get(key)})" for key in changed)

@@ -14,6 +14,7 @@ from primdiffusion.primitives.anchors import (
     attach,
     build_anchors,
     footprint_anchors,
+    grid_points_outside,
     released_half_extent,
     tangent_plane,
 )
@@ -102,8 +103,26 @@ def test_the_released_rule_puts_cells_outside_the_charts_on_the_last_face():
     assert (anchors.face[right] == len(body.faces) - 1).all()
     assert not (anchors.face[~right] == len(body.faces) - 1).all()
     assert torch.allclose(anchors.rest_half_extent[right], torch.tensor(0.005 * 2 / 3, dtype=torch.float64))
+    assert int(right.sum()) == grid_points_outside(body)
     frames = attach(anchors, body.template, body.faces)
     assert torch.isfinite(frames.rotation).all()
+
+
+def test_cells_outside_the_charts_take_the_place_in_the_face_of_the_nearest_covered_texel():
+    """A search over all 256 x 256 texels (SPEC 1.2), by corners that any point of the right half is nearest to."""
+    body = cylinder(0.0, 0.5)
+    anchors = build_anchors(body, "released")
+    raster = rasterise_uv(body.uv[body.uv_faces].double().numpy(), 256, 256)
+    rows, columns = np.nonzero(raster.face >= 0)
+    outside = [k for k in range(K) if raster.face[8 * (k // GRID) + 4, 8 * (k % GRID) + 4] < 0]
+    assert len(outside) == grid_points_outside(body) > 0
+    for k in outside[:: len(outside) // 40]:
+        distance = (rows - (8 * (k // GRID) + 4)) ** 2 + (columns - (8 * (k % GRID) + 4)) ** 2
+        nearest = np.flatnonzero(distance == distance.min())
+        among = raster.barycentric[rows[nearest], columns[nearest]]
+        found = anchors.barycentric[k].double().numpy()
+        assert anchors.face[k] == len(body.faces) - 1
+        assert np.abs(among - found).max(1).min() < 1e-6
 
 
 def test_released_sizes_are_two_thirds_of_the_mean_distance_to_23_neighbours():

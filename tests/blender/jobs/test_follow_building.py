@@ -54,7 +54,7 @@ def check_whole(person: bpy.types.Collection) -> None:
     assert all(path.is_file() and path.parent == folder_of(person) for path in shown)
     assert person_file(person).parent == folder_of(person)
     assert shape_model_of(person).template.shape[1] == 3
-    assert not list(folder_of(person).glob(".writing_*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
 
 
 def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):

@@ -76,7 +76,7 @@ def check_whole(person, count: int = COUNT) -> None:
     assert all(path.is_file() for path in files)
     assert all(obj.data.grids.load() for obj in person.all_objects if obj.type == "VOLUME")
     assert person_file(person).parent == next(iter(files)).parent
-    assert not list(person_file(person).parent.glob(".writing_*"))
+    assert not list(person_file(person).parent.glob(".*.partial*"))
 
 
 def check_drawn(person) -> None:

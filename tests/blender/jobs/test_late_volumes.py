@@ -98,7 +98,7 @@ def check_complete(person: bpy.types.Collection) -> None:
     assert len(paths) == COUNT
     assert all(path.is_file() for path in paths)
     assert not unwritten_in(paths[0].parent)
-    assert not list(paths[0].parent.glob(".writing_*"))
+    assert not list(paths[0].parent.glob(".*.partial*"))
 
 
 def test_the_human_stands_before_any_volume_is_written(person):
@@ -327,7 +327,7 @@ def test_both_a_render_and_the_timer_may_write_the_same(person):
         pass
     check_complete(person)
     assert not late_volumes.work(60.0)
-    assert not list(folder_of(person).glob(".writing_*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
 
 
 def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypatch, capsys):
@@ -339,7 +339,7 @@ def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypat
         pass
     assert "could not be written" in late_volumes.error
     assert capsys.readouterr().out.count("could not be written") == 1
-    assert not list(folder_of(person).glob(".writing_*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
     monkeypatch.undo()
     late_volumes.finish()
     assert late_volumes.error == ""
@@ -373,7 +373,7 @@ def test_a_changed_source_is_reported(person):
 def test_disabling_the_extension_leaves_no_unfinished_files(person):
     advance("half")
     blender_primdiffusion.unregister()
-    assert not list(folder_of(person).glob(".writing_*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
     assert len(unwritten_in(folder_of(person))) == 1
     blender_primdiffusion.register()
 
