@@ -40,6 +40,17 @@ def temporary_name(path: Path) -> Path:
     return path.with_name(f".{path.stem}.{writer()}.partial{path.suffix}")
 
 
+@contextlib.contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty folder with a temporary name beside `path`; it is removed after the block. Raises OSError."""
+    folder = temporary_name(path)
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        remove_folder(folder, folder.parent)
+
+
 def is_abandoned(path: Path) -> bool:
     """Whether a temporary file or folder belongs to no running process, as far as can be told."""
     named = _TEMPORARY.fullmatch(path.name)
