@@ -19,7 +19,6 @@ from primdiffusion.commands.request import (
     ReportProgress,
     check_attributes,
     check_picture_px,
-    check_seed,
     check_size,
     check_steps,
     parse,
@@ -27,7 +26,7 @@ from primdiffusion.commands.request import (
     step_reporter,
 )
 from primdiffusion.formats import requests
-from primdiffusion.formats.requests import check_unit_interval
+from primdiffusion.formats.requests import check_seed, check_unit_interval
 from primdiffusion.formats.whole_files import staged, staged_together
 from primdiffusion.machine import peak_memory_gb
 
@@ -150,6 +149,7 @@ class GenerateCommand(GenerateRequest):
         for name in ("count", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: choose 1 or more")
+        check_seed(self.seed + self.count - 1)
 
     def generate(self, session: Session) -> None:
         """Generate batch by batch; print the folder of each human."""

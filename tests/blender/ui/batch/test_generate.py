@@ -176,6 +176,7 @@ def test_a_folder_that_cannot_be_is_a_sentence(addon, tmp_path, capfd):
     ("words", "sentence"),
     [
         (["--count", "0"], "invalid whole number from 1 value: '0'"),
+        (["--count", "2", "--seed", str(2**63 - 1)], f"seed {2**63} is outside 0 ... 2^63-1"),
         (["--attributes", "tall"], "'tall' is not name=value"),
         (["--sampler", "euler"], "invalid choice: 'euler'"),
         (["--checkpoint", "/nowhere.safetensors"], "--checkpoint /nowhere.safetensors is no file"),
