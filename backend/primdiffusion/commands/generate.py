@@ -26,6 +26,7 @@ from primdiffusion.commands.request import (
     step_reporter,
 )
 from primdiffusion.formats import requests
+from primdiffusion.formats.removing import check_unlinked
 from primdiffusion.formats.requests import check_seed, check_unit_interval
 from primdiffusion.formats.whole_files import staged, staged_together
 from primdiffusion.machine import peak_memory_gb
@@ -157,6 +158,8 @@ class GenerateCommand(GenerateRequest):
         for first in range(self.seed, end, self.batch):
             began, seeds = time.perf_counter(), range(first, min(first + self.batch, end))
             folders = {seed: self.out_dir if self.count == 1 else self.out_dir / f"seed_{seed:06d}" for seed in seeds}
+            for folder in folders.values() if self.count > 1 else ():
+                check_unlinked(folder)
             with progress_bar(f"seed {', '.join(map(str, seeds))}") as report:
                 generate_humans(self, folders, session, report, compact=self.compact)
             seconds = (time.perf_counter() - began) / len(seeds)
