@@ -127,18 +127,18 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 @contextlib.contextmanager
-def staged(folder: str | Path) -> Iterator[Path]:
+def staged(folder: str | Path, last: str = "") -> Iterator[Path]:
     """Yield a temporary folder inside `folder`, to which its files move at the end, replacing files of the same names.
 
-    After an error everything is removed, including a newly created `folder`. Raises OSError, at once if `folder` cannot
-    be written to.
+    The file named `last` moves last. After an error everything is removed, including a newly created `folder`. Raises
+    OSError, naming the file in `folder`; at once if it cannot be written to.
     """
-    with staged_together([folder]) as (aside,):
+    with staged_together([folder], last) as (aside,):
         yield aside
 
 
 @contextlib.contextmanager
-def staged_together(folders: Sequence[str | Path]) -> Iterator[list[Path]]:
+def staged_together(folders: Sequence[str | Path], last: str = "") -> Iterator[list[Path]]:
     """`staged` for several folders, whose files move at the end in all of them or in none."""
     targets = [Path(folder) for folder in folders]
     made: list[Path] = []
@@ -150,8 +150,13 @@ def staged_together(folders: Sequence[str | Path]) -> Iterator[list[Path]]:
             asides.append(temporary_name(target / "files"))
             asides[-1].mkdir()
         yield asides
-        publish(list(zip(asides, targets, strict=True)))
+        publish(list(zip(asides, targets, strict=True)), last)
         made = []
+    except OSError as e:
+        for aside, target in zip(asides, targets, strict=False):
+            if isinstance(e.filename, str | Path) and (path := Path(e.filename)).is_relative_to(aside):
+                raise type(e)(e.errno, e.strerror, str(target / path.relative_to(aside))) from e
+        raise
     finally:
         for aside in asides:
             remove_folder(aside, aside.parent)
