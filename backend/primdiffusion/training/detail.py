@@ -22,7 +22,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.detail import DetailCodec, DetailConfig, DetailDecoder, FineCodec
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.diffusion.schedule import schedule_name
 from primdiffusion.primitives.anchors import CHARTS, default_anchors
 from primdiffusion.primitives.primitives import GRID
 from primdiffusion.training.config import CodecConfig, PhaseConfig, RunSettings
@@ -103,9 +103,7 @@ def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
     model = trainee.model()
     if accelerator.is_main_process:
         model = dataclasses.replace(model, card=_card(base.card, fine, chosen, held, trainee, state))
-        levels = base.schedule.alpha_bar.cpu()
-        schedule = next(name for name, make in SCHEDULES.items() if torch.equal(make().alpha_bar, levels))
-        save_checkpoint(config.run / MODEL, model, schedule)
+        save_checkpoint(config.run / MODEL, model, schedule_name(base.schedule))
     accelerator.end_training()
     return model
 
