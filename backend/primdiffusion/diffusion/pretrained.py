@@ -38,8 +38,8 @@ def load_pretrained(path: Path | str, device: torch.device | str = "cpu") -> Dif
     path = Path(path)
     if not path.exists():
         raise FileNotFoundError(
-            f"there is no file or folder {path}: models are read from this disk alone, so download it first, for example "
-            "with hf download"
+            f"there is no file or folder {path}: models are read from this disk alone, so download "
+            "it first, for example with hf download"
         )
     return load_checkpoint(_weights_in(path) if path.is_dir() else path, device)
 
