@@ -63,7 +63,7 @@ def describe(error: BaseException) -> ErrorDescription | None:
     if out_of_memory(error):
         amount = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", sentence, re.ASCII)
         wanted = f" when it asked for {amount[1]} more" if amount else ""
-        where = "graphics card" if "CUDA" in sentence else "machine"
+        where = "graphics card" if "CUDA" in sentence or "MPS" in sentence else "machine"
         return ErrorDescription("out_of_memory", f"the {where} ran out of memory{wanted}", MEMORY_REMEDY)
     if isinstance(error, MissingPackageError):
         return ErrorDescription("environment", sentence, "")
@@ -88,7 +88,9 @@ def out_of_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
     return isinstance(error, RuntimeError) and (
-        "not enough memory" in str(error) or "can't allocate memory" in str(error)
+        "not enough memory" in str(error)
+        or "can't allocate memory" in str(error)
+        or "MPS backend out of memory" in str(error)
     )
 
 

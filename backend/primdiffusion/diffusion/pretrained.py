@@ -23,7 +23,7 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.schedule import schedule_name
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import read_regular
-from primdiffusion.staging import staged
+from primdiffusion.formats.whole_files import staged
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 _COMMIT = re.compile(r"[0-9a-zA-Z_-]{1,64}", re.ASCII)

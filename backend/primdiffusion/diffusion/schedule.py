@@ -41,9 +41,10 @@ class Schedule(TensorRecord):
     def levels(self, t: Int[Tensor, "b"], like: Tensor) -> tuple[Tensor, Tensor]:
         """Signal and noise factors of a batch of steps, shaped [b, 1, ...] to multiply `like` [b, ...]."""
         # rounded before it moves, as Apple GPUs have no float64
-        signal, noise = (level.to(like)[t] for level in (self.alpha_bar.sqrt(), (1.0 - self.alpha_bar).sqrt()))
         shape = (-1, *([1] * (like.ndim - 1)))
-        return signal.reshape(shape), noise.reshape(shape)
+        every = self.alpha_bar.sqrt().to(like), (1.0 - self.alpha_bar).sqrt().to(like)
+        signal, noise = (level.index_select(0, t).reshape(shape) for level in every)
+        return signal, noise
 
     def q_sample(self, x0: Float[Tensor, "b *s"], t: Int[Tensor, "b"], noise: Float[Tensor, "b *s"]) -> Tensor:
         """Add noise of level t (paper eq. 5)."""

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.schedule import CHAINS
 from primdiffusion.failures import optional_package
-from primdiffusion.staging import written_whole
+from primdiffusion.formats.whole_files import written_whole
 
 EXTRA = "onnx"
 """Of pyproject.toml, with the packages that export needs."""

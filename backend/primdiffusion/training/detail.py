@@ -34,6 +34,7 @@ from primdiffusion.training.run_folder import begin
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.state import AcceleratedState, accelerator_of
 from primdiffusion.training.stored_people import PersonDataset
+from primdiffusion.training.trackers import check_tracker, tracking
 
 PHASE = "detail"
 MODEL = "model.safetensors"
@@ -78,6 +79,7 @@ def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
     """
     if config.threads:
         torch.set_num_threads(config.threads)
+    check_tracker(config.tracker)
     accelerator = accelerator_of()
     base = load_checkpoint(config.checkpoint, accelerator.device)
     if not isinstance(base.codec, CellCodec):
@@ -98,8 +100,9 @@ def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
             config.run / PREPARED, base, coarse_codec, fine, coarse, (chosen, held), config.codec, config.seed
         )
     trainee = DetailTrainee(config, base, coarse_codec, fine.full_density, prepared)
-    with Interrupt(config.minutes) as interrupt:
-        state = train_phase(config, trainee, PHASE, accelerator, interrupt)
+    tracker = config.tracker if accelerator.is_main_process else None
+    with Interrupt(config.minutes) as interrupt, tracking(tracker, config.run) as tracked:
+        state = train_phase(config, trainee, PHASE, accelerator, interrupt, tracked)
     model = trainee.model()
     if accelerator.is_main_process:
         model = dataclasses.replace(model, card=_card(base.card, fine, chosen, held, trainee, state))
