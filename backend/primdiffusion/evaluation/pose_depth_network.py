@@ -22,7 +22,7 @@ from torch.nn import functional
 from primdiffusion.evaluation.attribute_network import AttributeSpace, detail_energies
 from primdiffusion.evaluation.shots import JOINTS
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.staging import written_whole
+from primdiffusion.formats.whole_files import written_whole
 
 INPUT = 128
 """Width and height of what the network sees, pixels: pictures are averaged down to it."""

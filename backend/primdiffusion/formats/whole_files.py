@@ -94,11 +94,14 @@ def remove_of_process(folder: Path, pid: int) -> None:
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside `path` to write to; it is renamed at the end, or removed after an error.
 
-    Raises OSError, naming `path`; PermissionError if it is a folder or a device, which renaming would replace.
+    A `path` that is such a temporary name is yielded itself. Raises OSError, naming `path`; PermissionError if it is a folder or a device, which renaming would replace.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
         raise PermissionError(errno.EPERM, "this is not a regular file and will not be replaced", str(path))
+    if _TEMPORARY.fullmatch(path.name):  # its writer renames or removes it
+        yield path
+        return
     remove_abandoned(path.parent, path)
     unfinished = temporary_name(path)
     try:
