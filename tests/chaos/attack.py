@@ -79,11 +79,11 @@ class Attack:
                 self.outcome.filled.add(program.name)
                 return
 
-    def children(self, count: int, silence_s: float | None = None) -> None:
+    def children(self, count: int) -> None:
         """So many deaths of the child, and stops between them."""
         folder = self._folder / f"children{self.rng.getrandbits(32):08x}"
         folder.mkdir()
-        deaths = Deaths(folder, self.rng, **({} if silence_s is None else {"silence_s": silence_s}))
+        deaths = Deaths(folder, self.rng)
         deaths.tally = self.outcome.children
         end = self.outcome.children.count + count
         others = (deaths.stopped, deaths.killed_between_requests, deaths.stopped_and_cancelled, deaths.works,

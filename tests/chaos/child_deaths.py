@@ -36,8 +36,8 @@ NOTICED_S = 6.0
 class Deaths:
     """Requests to a child that dies, of one `Backend`."""
 
-    def __init__(self, folder: Path, rng: random.Random, silence_s: float = NOTICED_S) -> None:
-        self._folder, self._rng, self._silence_s = folder, rng, silence_s
+    def __init__(self, folder: Path, rng: random.Random) -> None:
+        self._folder, self._rng = folder, rng
         self._numbers = itertools.count()
         self._human = folder / "human.npz"
         self._human.write_bytes(b"a human")
@@ -48,7 +48,7 @@ class Deaths:
     def _fake(self) -> Generator[None, None, BackendClient]:
         yield
         human = {"FAKE_HUMAN": str(self._human)}
-        return BackendClient(Path(sys.executable), FAKE, human, silence_s=self._silence_s)
+        return BackendClient(Path(sys.executable), FAKE, human, silence_s=NOTICED_S)
 
     def killed(self) -> None:
         """A request whose child dies at a random time, by a random signal or by itself."""
@@ -97,7 +97,7 @@ class Deaths:
         """A child that is stopped for a moment goes on."""
         request = self._generate(SEED)
         self._until(request, lambda: self._send(signal.SIGSTOP), 0.1, leave=True)
-        end = time.monotonic() + self._silence_s / 4
+        end = time.monotonic() + NOTICED_S / 4
         while time.monotonic() < end:
             request.tick()
             time.sleep(TICK_S)

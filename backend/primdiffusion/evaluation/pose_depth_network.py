@@ -15,14 +15,14 @@ from typing import Any, NamedTuple
 import torch
 from jaxtyping import Float, UInt8
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion.evaluation.attribute_network import AttributeSpace, detail_energies
 from primdiffusion.evaluation.shots import JOINTS
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.tensor_file import save
 
 INPUT = 128
 """Width and height of what the network sees, pixels: pictures are averaged down to it."""
@@ -141,10 +141,9 @@ def cell_means(values: Float[Tensor, "h w"], mask: Tensor) -> Float[Tensor, "32 
 def save_pose_depth_network(path: Path, network: PoseDepthNetwork) -> None:
     """Write the network in half precision with its card, atomically."""
     tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
     space = {"categories": network.space.categories, "scalars": network.space.scalars}
-    with written_whole(path) as unfinished:
-        unfinished.write_bytes(save(tensors, metadata={"space": json.dumps(space), "card": json.dumps(network.card)}))
+    metadata = {"space": json.dumps(space), "card": json.dumps(network.card)}
+    write_atomically(path, save(tensors, metadata=metadata))
 
 
 def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:

@@ -97,8 +97,8 @@ def fit_pose_depth_network(
     shots: TrainingShots,
     *,
     epochs: int,
-    batch: int = 32,
-    learning_rate: float = 3e-3,
+    batch: int = 16,
+    learning_rate: float = 2e-3,
     seed: int = 0,
     report: Callable[[int, float], None] = lambda epoch, loss: None,
 ) -> PoseDepthNetwork:

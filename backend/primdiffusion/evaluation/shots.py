@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 from torch.nn import functional
 
@@ -20,6 +19,7 @@ from primdiffusion.formats.arrays import read_npy
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.pictures import PictureError, opened_picture
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
 from primdiffusion.people.person import Person
@@ -42,7 +42,7 @@ WHITE_DISTANCE = 6
 """Pictures without alpha: a pixel whose channels are all within this of white (255) is background."""
 SUPERSAMPLE = 2
 """Samples along a pixel's side in renders of meshes."""
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+SUFFIXES, FORMATS = (".png", ".jpg", ".jpeg", ".webp"), ("PNG", "JPEG", "WEBP")
 JOINTS_FILE = "joints.json"
 DEPTH_FOLDER = "depth"
 
@@ -154,13 +154,13 @@ def folder_shots(folder: Path) -> Iterator[Shot]:
 
 def _read_picture(path: Path) -> Float[Tensor, "h w 4"]:
     try:
-        with Image.open(path) as image:
-            width, height = image.size
-            if width != height:
-                raise ValueError(f"{path} has {width} x {height} pixels: pad it with white to a square")
-            array = np.asarray(image.convert("RGBA"), np.float32)
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError) as error:
+        with opened_picture(path, FORMATS) as picture:
+            width, height = picture.size
+            array = np.asarray(picture.convert("RGBA"), np.float32)
+    except (PictureError, OSError) as error:
         raise ValueError(f"{path} is not a readable picture ({error}): write it again or remove it") from error
+    if width != height:
+        raise ValueError(f"{path} has {width} x {height} pixels: pad it with white to a square")
     return torch.from_numpy(array) / 255
 
 

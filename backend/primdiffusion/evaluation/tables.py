@@ -251,4 +251,6 @@ def _text(cell: Cell | None) -> str:
 
 
 def _plain(value: Any) -> str:
+    if value is None:
+        return "not used"
     return ", ".join(str(one) for one in value) if isinstance(value, list | tuple) else str(value)

@@ -94,7 +94,8 @@ def remove_of_process(folder: Path, pid: int) -> None:
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside `path` to write to; it is renamed at the end, or removed after an error.
 
-    A `path` that is such a temporary name is yielded itself. Raises OSError, naming `path`; PermissionError if it is a folder or a device, which renaming would replace.
+    A `path` that is such a temporary name is yielded itself. Raises OSError, naming `path`; PermissionError if it is a
+    folder or a device, which renaming would replace.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
