@@ -4,9 +4,8 @@
 samples of each set with renders of held-out meshes. The --reference folder caches portraits and the feature network,
 which take some minutes to compute. Distances are Frechet distances of features; `distance_floor` is that of other
 meshes, the best that a model can reach; `from_mesh`, `payload` and `codec` are what stored humans lose before any
-network. `attribute_hit_*` is how often the feature network recognises the requested value of an attribute,
-`attribute_read_*` its accuracy on renders of held-out meshes. Figures that need an omitted option are null. Times are
-of two threads. --quick takes few samples of each.
+network. `attribute_read_*` is the feature network's accuracy on renders of held-out meshes. Figures that need an
+omitted option are null. Times are of two threads. --quick takes few samples of each.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from pathlib import Path
 
 import torch
 from diffusion_sets import (
-    asked,
     decoded,
     from_meshes,
     front,
@@ -33,7 +31,7 @@ from march import from_script
 from neighbours import nearest_stored
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.evaluation.attribute_network import category, features_of
+from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
 from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_of
 from primdiffusion.evaluation.generation import (
@@ -77,7 +75,6 @@ TITLES = {
 SETS = tuple(TITLES)
 REAL_SEED, HELD_SEED, OTHER_SEED = 0, 10_000_000, 20_000_000
 """First seeds of the meshes: the feature network's, those compared with, those that are made into payloads."""
-ASKED = ("sex", "outfit", "hair", "hat", "pattern")
 ATTRIBUTES = (
     "sex", "age", "outfit", "pattern", "shoes", "hair", "hair_colour", "hat", "skin_tone", "height"
 )  # fmt: skip
@@ -109,7 +106,6 @@ def main() -> None:
             arguments.reference, progress("portraits"), epoch,
         )  # fmt: skip
         rows = comparisons(reference, model, assets, arguments)
-        figures |= attribute_hits(reference, model, 1 if arguments.quick else arguments.hits)
     if arguments.people is not None:
         train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
         figures |= photograph_figures(model, held, arguments)
@@ -139,7 +135,6 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--inception", type=Path, help="weights for FID: pt_inception-2015-12-05-6726825d.pth")
     parser.add_argument("--clip", type=Path, help="weights for FID_CLIP: ViT-B/32 as .safetensors")
     parser.add_argument("--count", type=int, default=256, help="samples of each set")
-    parser.add_argument("--hits", type=int, default=6, help="samples of each value of an attribute")
     parser.add_argument("--quick", action="store_true", help="16 samples of each set, no search among latents")
     parser.add_argument("--json", type=Path, help="file for the figures")
     parser.add_argument("--table", type=Path, help="markdown file for the table")
@@ -183,25 +178,6 @@ def comparisons(
         rows[name] = compare(reference, features_of(reference.network, made_gallery(make())))
         print(name, rows[name], flush=True)
     return {name: rows[name] for name in SETS if name in rows}
-
-
-def attribute_hits(reference: ReferenceSet, model: DiffusionModel, each: int) -> Figures:
-    """How often the feature network recognises the requested value, over `each` samples of every value."""
-    network, figures = reference.network, {}
-    for name in ASKED:
-        values = model.vocabulary.categories.get(name, ())
-        labels = network.space.categories.get(name, ())
-        wanted = [(value, category({name: value}, name)) for value in values]
-        wanted = [(value, label) for value, label in wanted if label in labels]
-        hits = []
-        for number, (value, label) in enumerate(wanted):
-            made = made_gallery(placed(asked(model, seeds_of(each, 1000 + each * number), {name: value})))
-            read = network.predict(features_of(network, made))[name].argmax(-1)
-            hits.append(float((read == labels.index(label)).double().mean()))
-            print("asked for", name, value, hits[-1], flush=True)
-        figures[f"attribute_hit_{name}"] = round(sum(hits) / len(hits), 4) if hits else None
-    known = [value for value in figures.values() if value is not None]
-    return {**figures, "attribute_hit_min": min(known, default=None)}
 
 
 def photograph_figures(model: DiffusionModel, held: list[Path], arguments: argparse.Namespace) -> Figures:

@@ -30,6 +30,10 @@ SOURCES = {
         "benchmarks/diffusion.py --people DIR --reference DIR --voxel FILE --json docs/results/diffusion.json "
         "--table docs/results/diffusion_table.md",
     ),
+    "attribute_hits": (
+        "Attributes that were asked for",
+        "benchmarks/attribute_hits.py --assets DIR --reference DIR --json docs/results/attribute_hits.json",
+    ),
     "coverage_rooms": (
         "Line coverage of the tests by room",
         "benchmarks/coverage_by_room.py before.json after.json --json docs/results/coverage_rooms.json",

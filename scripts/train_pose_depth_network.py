@@ -27,13 +27,13 @@ class Training:
     """File for the weights."""
     assets: Path | None = None
     """MakeHuman's assets."""
-    people: int = 84
+    people: int = 164
     """Number of meshes to train on."""
     held_out: int = 20
     """Number of meshes to measure errors on."""
     pictures: int = 32
     """Pictures of each mesh; half as many of held-out ones."""
-    epochs: int = 20
+    epochs: int = 40
     """Passes over all pictures."""
     seed: int = 0
     """Seed of weights and batches."""
