@@ -33,7 +33,7 @@ class Training:
     """Number of meshes to measure errors on."""
     pictures: int = 32
     """Pictures of each mesh; half as many of held-out ones."""
-    epochs: int = 40
+    epochs: int = 18
     """Passes over all pictures."""
     seed: int = 0
     """Seed of weights and batches."""

@@ -252,8 +252,8 @@ def test_payloads_are_stored_whole_and_mended(assets, tmp_path):
 def test_fitted_payloads_look_more_like_the_mesh_in_each_colouring_from_sides_that_were_not_shown(
     assets, people, monkeypatch
 ):
-    monkeypatch.setattr(payloads_module, "BODY_VIEWS", 8)
-    monkeypatch.setattr(payloads_module, "HEAD_VIEWS", 6)
+    monkeypatch.setattr(payloads_module, "BODY_VIEWS", 6)
+    monkeypatch.setattr(payloads_module, "HEAD_VIEWS", 4)
     colourings = [people[0].mesh, recolour(people[0], 77).mesh]
     frames = rest_frames(people[0].betas)
     low, high = people[0].mesh.bounds

@@ -30,7 +30,9 @@ def run_cases(chosen: str, **environment: str) -> None:
 
 
 @with_triton
-@pytest.mark.parametrize("chosen", ["gradient", "not gradient"])
+@pytest.mark.parametrize(
+    "chosen", ["overlapping or inside_boxes or one_pixel", pytest.param("", marks=pytest.mark.slow)]
+)
 def test_the_kernels_do_what_the_reference_does_in_the_interpreter(chosen):
     run_cases(chosen, TRITON_INTERPRET="1")
 

@@ -307,8 +307,13 @@ def test_bfloat16_computes_the_network_in_it_and_nothing_else(few):
         few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=1, weighting="plain", bfloat16=True)
     )
     trainee = SlabTrainee(config, PersonFolder(few), [0], [1], torch.device("cpu"))
-    seen = []
-    trainee.denoiser.input_blocks[0][0].register_forward_hook(lambda module, given, out: seen.append(out.dtype))
+    seen, layer = [], torch.nn.Conv2d(56, 56, 1)  # processors are slow at convolutions in bfloat16
+
+    def network(x, t):
+        seen.append((out := layer(x)).dtype)
+        return out
+
+    trainee.denoiser = network
     loss = trainee.loss("slab", torch.Generator().manual_seed(0))
     assert seen == [torch.bfloat16]
     assert loss.dtype == torch.float32
