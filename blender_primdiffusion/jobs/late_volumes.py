@@ -18,7 +18,7 @@ ALWAYS, WHEN_RENDERING = "ALWAYS", "WHEN_RENDERING"
 """Values of the preference `volumes`."""
 PAUSE_S = 0.02
 """Between two slices, at least."""
-SHORTEST_S, LONGEST_S = 0.05, 0.15
+SHORTEST_S, LONGEST_S = 0.05, 0.1
 """Of a slice. In between, it is as long as the pause before it, in which Blender may have drawn."""
 BLOCKED_S = 0.25
 

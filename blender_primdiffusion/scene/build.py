@@ -212,6 +212,7 @@ def attach_volumes(
     labels = [f"{name}_prim_{k:04d}" for k in range(len(files))]
     volumes = [bpy.data.volumes.new(label) for label in labels]
     objects = [bpy.data.objects.new(label, volume) for label, volume in zip(labels, volumes, strict=True)]
+    prototypes: dict[tuple[str, ...], bpy.types.ArmatureConstraint] = {}
     for k, primitive in enumerate(objects):  # a loop of its own: new data make these changes slow
         volume = volumes[k]
         folder, file = paths[k]
@@ -222,15 +223,31 @@ def attach_volumes(
         primitive.rotation_mode = "QUATERNION"
         primitive.location = positions[k]
         primitive.rotation_quaternion = quaternions[k]
-        constraint = primitive.constraints.new("ARMATURE")
-        constraint.use_deform_preserve_volume = False
-        for bone, weight in targets[k]:
-            target = constraint.targets.new()
-            target.target = armature
-            target.subtarget = bone
-            target.weight = weight
+        bones = tuple(bone for bone, _ in targets[k])
+        if bones in prototypes:
+            constraint = primitive.constraints.copy(prototypes[bones])
+        else:
+            constraint = prototypes[bones] = _armature_constraint(primitive, armature, bones)
+        constraint.targets.foreach_set("weight", [weight for _, weight in targets[k]])
         collection.objects.link(primitive)
     return objects
+
+
+def _armature_constraint(
+    primitive: bpy.types.Object, armature: bpy.types.Object, bones: Sequence[str]
+) -> bpy.types.ArmatureConstraint:
+    """A new constraint of `primitive` with these targets.
+
+    Each value set here takes a time in proportion to the number of objects in the file. Copies of the constraint, and
+    weights set together, do not.
+    """
+    constraint = primitive.constraints.new("ARMATURE")
+    constraint.use_deform_preserve_volume = False
+    for bone in bones:
+        target = constraint.targets.new()
+        target.target = armature
+        target.subtarget = bone
+    return constraint
 
 
 def _targets(weights: NDArray) -> list[list[tuple[str, float]]]:
