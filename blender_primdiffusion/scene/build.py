@@ -210,15 +210,13 @@ def attach_volumes(
     folders = {folder: stored_path(Path(folder)) for folder in {folder for folder, _ in paths}}
     targets = _targets(weights)
     labels = [f"{name}_prim_{k:04d}" for k in range(len(files))]
-    volumes = [bpy.data.volumes.new(label) for label in labels]
+    volumes = _volumes(f"{name}_prim", material, len(files))
     objects = [bpy.data.objects.new(label, volume) for label, volume in zip(labels, volumes, strict=True)]
     prototypes: dict[tuple[str, ...], bpy.types.ArmatureConstraint] = {}
     for k, primitive in enumerate(objects):  # a loop of its own: new data make these changes slow
         volume = volumes[k]
         folder, file = paths[k]
         volume.filepath = os.path.join(folders[folder], file)
-        volume.render.space = "WORLD"
-        volume.materials.append(material)
         primitive.parent = armature
         primitive.rotation_mode = "QUATERNION"
         primitive.location = positions[k]
@@ -233,14 +231,21 @@ def attach_volumes(
     return objects
 
 
+def _volumes(name: str, material: bpy.types.Material, count: int) -> list[bpy.types.Volume]:
+    """New volume data without files, which Blender numbers.
+
+    Appending a material takes a time in proportion to the number of objects in the file; copies do not.
+    """
+    first = bpy.data.volumes.new(name)
+    first.render.space = "WORLD"
+    first.materials.append(material)
+    return [first, *(first.copy() for _ in range(count - 1))][:count]
+
+
 def _armature_constraint(
     primitive: bpy.types.Object, armature: bpy.types.Object, bones: Sequence[str]
 ) -> bpy.types.ArmatureConstraint:
-    """A new constraint of `primitive` with these targets.
-
-    Each value set here takes a time in proportion to the number of objects in the file. Copies of the constraint, and
-    weights set together, do not.
-    """
+    """A new constraint of `primitive` with these targets, which copies have too: setting them takes longer."""
     constraint = primitive.constraints.new("ARMATURE")
     constraint.use_deform_preserve_volume = False
     for bone in bones:
