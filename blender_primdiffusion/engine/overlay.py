@@ -230,7 +230,7 @@ class Overlay:
                 candidates.append((obj, owner, pose_of(armature, matrix, owner)))
             except (ValueError, OSError) as error:
                 candidates.append((obj, owner, error))
-        for obj, owner, pose in candidates:
+        for number, (obj, owner, pose) in enumerate(candidates, 1):
             if drawn and not drawn.isdisjoint(owner.all_objects):
                 continue
             try:
@@ -245,7 +245,7 @@ class Overlay:
                 self.error = str(error)
                 continue
             humans[key] = ShownHuman(obj, pose, placed)
-            if not known and time.monotonic() > end:
+            if not known and number < len(candidates) and time.monotonic() > end:
                 complete = False
                 break
         studio.gpu_humans().keep_only(human.pose for human in humans.values())
