@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterator
 
 import gpu
 import numpy as np
@@ -155,6 +156,13 @@ def _triangles(bones: NDArray, width: float, radius: float) -> NDArray[np.float6
     circle = np.stack([np.cos(turns), np.sin(turns)], 1) * radius
     fan = np.stack([np.zeros((_CORNERS, 2)), circle[:-1], circle[1:]], 1).reshape(-1, 2)
     return np.concatenate([sticks, (bones.reshape(-1, 1, 2) + fan).reshape(-1, 2)])
+
+
+def compile_shaders() -> Iterator[None]:
+    """Compile what `draw_picture` and `keep_bones` draw with, a shader a step."""
+    for shader in (_picture_shader, _bones_shader):
+        shader()
+        yield
 
 
 def restore() -> None:

@@ -98,7 +98,7 @@ class GpuMarch:
         self._boxes = _texture(_padded(records), "RGBA32F")
         fine = _tiles(records, view, TILE)
         wide = _tiles(records, view, fine.side * WIDER)
-        self._tile_side = fine.side
+        self._tile_side, self._work = fine.side, _work_of_rows(fine, self._rows)
         wide_tiles, wide_entries = self._list(shaders["list"], wide, len(records), None)
         self._tiles, self._entries = self._list(shaders["list"], fine, -1, (wide_tiles, wide_entries))
         focal = (view.intrinsics[0, 0], view.intrinsics[1, 1])
@@ -132,9 +132,13 @@ class GpuMarch:
         gpu.compute.dispatch(shader, -(-columns // TILE), -(-rows // TILE), 1)
         return spans, entries
 
-    def advance(self, tile_rows: int | None = None) -> bool:
-        """March as many rows of tiles, all by default, from the top; True when the picture is complete."""
-        rows = min(tile_rows or self._rows, self._rows - self._done)
+    def advance(self, work: float = np.inf) -> bool:
+        """March rows of tiles of about this `work`, one at least, from the top; True when the picture is complete.
+
+        Work is what rays may meet: pixels times boxes in their tile.
+        """
+        wanted = int(np.searchsorted(self._work, self._work[self._done] + work, side="right")) - 1
+        rows = min(max(wanted - self._done, 1), self._rows - self._done)
         if rows > 0:
             shader = self._shader
             shader.bind()
@@ -251,6 +255,12 @@ def _tiles(records: NDArray[np.float64], view: PinholeView, side: int) -> _Tiles
         if count.sum() <= MOST_ENTRIES or count.size == 1:
             return _Tiles(side, np.cumsum(count + 1).reshape(count.shape) - (count + 1), count)
         side *= 2
+
+
+def _work_of_rows(tiles: _Tiles, rows: int) -> NDArray[np.float64]:
+    """Work of the first n dispatched rows [rows + 1], each TILE pixels high; a pixel without boxes is work too."""
+    row = ((tiles.count + 1) * tiles.side * TILE).sum(1)[np.arange(rows) * TILE // tiles.side]
+    return np.concatenate([[0.0], np.cumsum(row)])
 
 
 def _counts(reach: NDArray[np.int64], across: NDArray[np.int64]) -> NDArray[np.int64]:

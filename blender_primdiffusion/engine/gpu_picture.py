@@ -129,9 +129,9 @@ class GpuPicture:
         """The humans alone."""
         return self._march
 
-    def advance(self, tile_rows: int | None = None) -> bool:
+    def advance(self, work: float = np.inf) -> bool:
         """As `GpuMarch.advance`."""
-        return self._march.advance(tile_rows)
+        return self._march.advance(work)
 
     def wait(self) -> None:
         """As `GpuMarch.wait`."""

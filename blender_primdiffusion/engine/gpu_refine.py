@@ -21,15 +21,15 @@ SAMPLES = 8
 """Pictures that are averaged when nothing moves, each with its rays elsewhere in the pixels."""
 SLOW_S, SLOW_SAMPLES = 0.5, 4
 """Where a full picture takes longer, fewer are averaged."""
-_FIRST_ROWS = 4
+_FIRST_WORK = 2.0**15
 _GROWTH = 4.0
 
 
 class Pass(Protocol):
     """One picture that is being marched, such as a `GpuMarch`."""
 
-    def advance(self, tile_rows: int) -> bool:
-        """March some rows of tiles; True when the picture is complete."""
+    def advance(self, work: float) -> bool:
+        """March for about this work, in pixels times boxes; True when the picture is complete."""
         ...
 
     def wait(self) -> None:
@@ -73,7 +73,7 @@ class GpuRefinement:
         self._pending: ShownMarch | None = None
         self._seconds, self._pixel_seconds = 0.0, np.inf
         """Of the pending picture so far, and of a pixel of the last one."""
-        self._rows = _FIRST_ROWS
+        self._work = _FIRST_WORK
         self.shown: ShownMarch | None = None
 
     def want(self, request: MarchRequest) -> None:
@@ -138,12 +138,13 @@ class GpuRefinement:
     def _march(self, pending: ShownMarch) -> bool:
         """A slice of the pending picture; True when it is complete."""
         began = self._clock()
-        done = pending.picture.advance(self._rows)
+        done = pending.picture.advance(self._work)
         pending.picture.wait()
         seconds = self._clock() - began
         self._seconds += seconds
         growth = SLICE_S / 2 / max(seconds, 1e-6)
-        self._rows = max(int(self._rows * min(max(growth, 1 / _GROWTH), _GROWTH)), 1)
+        if growth < 1 or not done:  # the last slice is a rest
+            self._work *= min(max(growth, 1 / _GROWTH), _GROWTH)
         if done:
             view = pending.request.view
             self._pixel_seconds = self._seconds * pending.coarseness**2 / (view.width * view.height)

@@ -23,7 +23,7 @@ from ..scene.human_file import file_version
 from ..scene.proxy import PROXY_MARK
 from . import studio
 from .boxes import Boxes, EarlierVersionError
-from .composite import NO_PLANES, PictureTextures, ViewLook, draw_picture, keep_bones
+from .composite import NO_PLANES, PictureTextures, ViewLook, compile_shaders, draw_picture, keep_bones
 from .gpu_march import GpuMarcher, GpuPayload
 from .gpu_refine import GpuRefinement, MarchRequest
 from .picture import PosedHuman, human_armatures, pose_of
@@ -103,16 +103,25 @@ class Overlay:
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the humans into the region that Blender draws now."""
+        marcher = self.prepare()
+        if marcher is not None:
+            with self._noting_faults():
+                self._draw(context, marcher)
+
+    def prepare(self) -> GpuMarcher | None:
+        """The marcher; None until its shaders are compiled, which a timer does, and where the GPU cannot march.
+
+        For draw handlers. Called before the first human stands, it saves them the wait.
+        """
         marcher = self._fault or studio.gpu_marcher()
         if isinstance(marcher, str):
             self.error = f"{marcher}: show the volumes instead (tab Output, Volumes in Viewport)"
-            return
-        if not self._ready:
-            self._start = self._start or self._starting(marcher)
-            follow()
-            return
-        with self._noting_faults():
-            self._draw(context, marcher)
+            return None
+        if self._ready:
+            return marcher
+        self._start = self._start or self._starting(marcher)
+        follow()
+        return None
 
     @contextlib.contextmanager
     def _noting_faults(self) -> Iterator[None]:
@@ -176,6 +185,8 @@ class Overlay:
         boxes = Boxes(np.array([[0.0, 0.0, 1.0]]), np.eye(3)[None], np.full((1, 3), 0.1))
         view = PinholeView(np.diag([8.0, 8.0, 1.0]), np.eye(3, 4), (0.0, 2.0), 8, 8)
         yield
+        for _ in compile_shaders():
+            yield
         picture = marcher.march([(payload, boxes)] * 2, view, 0.1)
         yield
         picture.advance()
@@ -219,7 +230,7 @@ class Overlay:
                 candidates.append((obj, owner, pose_of(armature, matrix, owner)))
             except (ValueError, OSError) as error:
                 candidates.append((obj, owner, error))
-        for obj, owner, pose in candidates:
+        for number, (obj, owner, pose) in enumerate(candidates, 1):
             if drawn and not drawn.isdisjoint(owner.all_objects):
                 continue
             try:
@@ -234,7 +245,7 @@ class Overlay:
                 self.error = str(error)
                 continue
             humans[key] = ShownHuman(obj, pose, placed)
-            if not known and time.monotonic() > end:
+            if not known and number < len(candidates) and time.monotonic() > end:
                 complete = False
                 break
         studio.gpu_humans().keep_only(human.pose for human in humans.values())

@@ -18,9 +18,11 @@ ALWAYS, WHEN_RENDERING = "ALWAYS", "WHEN_RENDERING"
 """Values of the preference `volumes`."""
 PAUSE_S = 0.02
 """Between two slices, at least."""
-SHORTEST_S, LONGEST_S = 0.05, 0.15
+SHORTEST_S, LONGEST_S = 0.05, 0.1
 """Of a slice. In between, it is as long as the pause before it, in which Blender may have drawn."""
 BLOCKED_S = 0.25
+FIRST_S = 1.0
+"""After a human has entered, until writing begins: views draw the human first."""
 
 
 class LateVolumes:
@@ -110,7 +112,7 @@ def keep_writing() -> None:
     if bpy.app.background or preferred() != ALWAYS or not any_humans():
         return
     if not bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.register(_tick, first_interval=BLOCKED_S, persistent=True)
+        bpy.app.timers.register(_tick, first_interval=FIRST_S, persistent=True)
 
 
 def _tick() -> float | None:

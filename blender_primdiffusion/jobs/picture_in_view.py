@@ -68,10 +68,17 @@ class PictureInView:
         return corners(self._place, to_view, figure_of(self._pixels[..., 3]))
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the picture into the region that Blender draws now, if it belongs there; uploads it once."""
+        """Draw the picture into the region that Blender draws now, if it belongs there; uploads it once.
+
+        The human's own shaders are compiled meanwhile.
+        """
         if not self.drawn_in(context):
             return
-        from ..engine import billboard  # needs numpy
+        # these need numpy
+        from ..engine import billboard
+        from ..engine.overlay import overlay
+
+        overlay.prepare()
 
         self._texture = self._texture or billboard.texture_of(self._pixels)
         billboard.draw(self._texture, self.corners(context))

@@ -210,27 +210,49 @@ def attach_volumes(
     folders = {folder: stored_path(Path(folder)) for folder in {folder for folder, _ in paths}}
     targets = _targets(weights)
     labels = [f"{name}_prim_{k:04d}" for k in range(len(files))]
-    volumes = [bpy.data.volumes.new(label) for label in labels]
+    volumes = _volumes(f"{name}_prim", material, len(files))
     objects = [bpy.data.objects.new(label, volume) for label, volume in zip(labels, volumes, strict=True)]
+    prototypes: dict[tuple[str, ...], bpy.types.ArmatureConstraint] = {}
     for k, primitive in enumerate(objects):  # a loop of its own: new data make these changes slow
         volume = volumes[k]
         folder, file = paths[k]
         volume.filepath = os.path.join(folders[folder], file)
-        volume.render.space = "WORLD"
-        volume.materials.append(material)
         primitive.parent = armature
         primitive.rotation_mode = "QUATERNION"
         primitive.location = positions[k]
         primitive.rotation_quaternion = quaternions[k]
-        constraint = primitive.constraints.new("ARMATURE")
-        constraint.use_deform_preserve_volume = False
-        for bone, weight in targets[k]:
-            target = constraint.targets.new()
-            target.target = armature
-            target.subtarget = bone
-            target.weight = weight
+        bones = tuple(bone for bone, _ in targets[k])
+        if bones in prototypes:
+            constraint = primitive.constraints.copy(prototypes[bones])
+        else:
+            constraint = prototypes[bones] = _armature_constraint(primitive, armature, bones)
+        constraint.targets.foreach_set("weight", [weight for _, weight in targets[k]])
         collection.objects.link(primitive)
     return objects
+
+
+def _volumes(name: str, material: bpy.types.Material, count: int) -> list[bpy.types.Volume]:
+    """New volume data without files, which Blender numbers.
+
+    Appending a material takes a time in proportion to the number of objects in the file; copies do not.
+    """
+    first = bpy.data.volumes.new(name)
+    first.render.space = "WORLD"
+    first.materials.append(material)
+    return [first, *(first.copy() for _ in range(count - 1))][:count]
+
+
+def _armature_constraint(
+    primitive: bpy.types.Object, armature: bpy.types.Object, bones: Sequence[str]
+) -> bpy.types.ArmatureConstraint:
+    """A new constraint of `primitive` with these targets, which copies have too: setting them takes longer."""
+    constraint = primitive.constraints.new("ARMATURE")
+    constraint.use_deform_preserve_volume = False
+    for bone in bones:
+        target = constraint.targets.new()
+        target.target = armature
+        target.subtarget = bone
+    return constraint
 
 
 def _targets(weights: NDArray) -> list[list[tuple[str, float]]]:

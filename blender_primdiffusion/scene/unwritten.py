@@ -38,12 +38,14 @@ def write_unwritten(source: Path) -> Generator[None, None, None]:
     yield
     grids = bake(human.density, human.rgb, human.half_extent)
     yield
-    named = {unwritten_name(file_names(grids, version)): version for version in _VERSIONS}
-    if source.name not in named:
+    for version in _VERSIONS:
+        names = file_names(grids, version)
+        yield
+        if unwritten_name(names) == source.name:
+            break
+    else:
         raise HumanNpzError(f"{str(source)!r} was changed: press Find Missing Volumes after deleting it")
-    version = named[source.name]
-    paths = [source.parent / name for name in file_names(grids, version)]
-    yield
+    paths = [source.parent / name for name in names]
     try:
         for k, path in enumerate(paths):
             if not path.is_file():

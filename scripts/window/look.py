@@ -25,6 +25,8 @@ ROOT = Path(__file__).resolve().parents[2]
 HERE = Path(__file__).resolve().parent
 REQUEST = "request"
 """File in which drive.py requests a screenshot, a click or a key."""
+FIGURES = "figures.json"
+"""What scenes have measured, beside the pictures; for `benchmarks/first_sight.py --window`."""
 _QUIET = "import bpy; bpy.context.preferences.view.show_splash = False; bpy.ops.wm.save_userpref()"
 """At its first start, Blender would show the splash screen with its quick set-up over everything."""
 
@@ -63,7 +65,10 @@ def serve(blender: subprocess.Popen, scratch: Path, out: Path, display: str, tim
 
 
 def do(request: dict, out: Path, display: str) -> None:
-    """Take a screenshot, click, drag, or press a key. Blender's own screenshots are black with software OpenGL."""
+    """Take a screenshot, note figures, click, drag, or press a key.
+
+    Blender's own screenshots are black with software OpenGL.
+    """
     hand = ["xdotool"]
     environment = {**os.environ, "DISPLAY": f":{display}"}
     if "picture" in request:
@@ -71,6 +76,11 @@ def do(request: dict, out: Path, display: str) -> None:
         subprocess.run(["import", "-display", f":{display}", "-window", "root", str(path)], check=True)
         path.with_suffix(".json").write_text(json.dumps(request["where"]))
         print(f"saved {path.name}", flush=True)
+    if "figures" in request:
+        path = out / FIGURES
+        before = json.loads(path.read_text()) if path.is_file() else {}
+        path.write_text(json.dumps({**before, **request["figures"]}, indent=2) + "\n")
+        print(request["figures"], flush=True)
     if "point" in request:
         x, y = map(str, request["point"])
         subprocess.run([*hand, "mousemove", x, y], check=True, env=environment)

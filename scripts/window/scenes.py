@@ -14,7 +14,7 @@ import bpy
 from panels import show, sidebar, view
 from press import Steps, invoke, press, wait
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, cancel_all, people_file, queue_of, select, with_people
-from view_scenes import denoising_in_view, dragging, rendered, rendered_view, shadings, stalls
+from view_scenes import denoising_in_view, dragging, redraw, rendered, rendered_view, shadings, stalls
 
 
 def set_up(module: str, python: str) -> Steps:
@@ -362,4 +362,5 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "missing": missing,
     "languages": languages,
     "stalls": stalls,
+    "redraw": redraw,
 }

@@ -2,42 +2,106 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import time
+from collections.abc import Callable, Mapping
+from importlib import import_module
 
 import bpy
 
 _EVERY_S = 0.005
 _SHOWN = 5
 _NOTICED_S = 0.1
+_OURS = (
+    ("jobs.follow", "Building", "advance"),
+    ("jobs.follow", "", "enter"),
+    ("jobs.late_volumes", "LateVolumes", "work"),
+    ("jobs.picture_in_view", "PictureInView", "draw"),
+    ("engine.overlay", "Overlay", "advance"),
+    ("engine.overlay", "Overlay", "draw"),
+)
+"""Module, class and function of what the extension does in the main loop and in draw handlers while a human enters."""
+_ours_s = [0.0]
+
+
+@dataclasses.dataclass(frozen=True)
+class Gap:
+    """An interval between two calls of the timer; all times in seconds."""
+
+    end: float
+    wall: float
+    worked: float
+    """Processor time of the main thread."""
+    ours: float
+    """Within the functions of `_OURS`; the rest is Blender's events, evaluation and drawing."""
+
+
+def measure_extension(module: str) -> None:
+    """From now on, count the time within the extension's functions. Call it once in a session."""
+    for name, owner, function in _OURS:
+        found = import_module(f"{module}.{name}")
+        found = getattr(found, owner) if owner else found
+        setattr(found, function, _counted(getattr(found, function)))
+
+
+def _counted(function: Callable) -> Callable:
+    @functools.wraps(function)
+    def call(*given: object, **named: object) -> object:
+        began = time.perf_counter()
+        try:
+            return function(*given, **named)
+        finally:
+            _ours_s[0] += time.perf_counter() - began
+
+    return call
 
 
 class Stalls:
     """Measures from its creation until `end`. Everything that blocks Blender's main loop counts, ours or not."""
 
-    def __init__(self) -> None:
-        self._gaps: list[tuple[float, float]] = []
+    def __init__(self, events: Mapping[str, Callable[[], bool]] | None = None) -> None:
+        """`events`: conditions, of which the first time each is met is noted."""
+        self.gaps: list[Gap] = []
+        self.met: dict[str, float] = {}
+        """By the name of the event."""
+        self._events = dict(events or {})
         self._last = self._now()
         self._timer = self._tick  # one object, because Blender identifies timers by identity
         bpy.app.timers.register(self._timer, first_interval=0.0, persistent=True)
 
     def end(self) -> str:
-        """A summary: the longest gaps in ms, and the processor time of the main thread in each.
+        """A summary: the longest gaps in ms, and in each the processor time of the main thread and, if it is measured,
+        the time within the extension.
 
-        The two differ on a busy machine, where the thread waits for a core.
+        Gap and processor time differ on a busy machine, where the thread waits for a core, and while software OpenGL
+        draws in its own threads.
         """
         self._tick()
         bpy.app.timers.unregister(self._timer)
-        longest = sorted(self._gaps, reverse=True)[:_SHOWN]
-        gaps = ", ".join(f"{1000 * wall:.0f} ({1000 * worked:.0f})" for wall, worked in longest)
-        noticed = sum(wall for wall, _ in self._gaps if wall > _NOTICED_S)
-        return f"longest {gaps} ms; {noticed:.1f} s of {sum(wall for wall, _ in self._gaps):.1f} s in gaps above 0.1 s"
+        longest = sorted(self.gaps, key=lambda gap: -gap.wall)[:_SHOWN]
+        gaps = ", ".join(f"{_ms(gap.wall)} ({_ms(gap.worked)}; {_ms(gap.ours)})" for gap in longest)
+        noticed = sum(gap.wall for gap in self.gaps if gap.wall > _NOTICED_S)
+        whole = sum(gap.wall for gap in self.gaps)
+        return f"longest {gaps} ms; {noticed:.1f} s of {whole:.1f} s in gaps above 0.1 s"
+
+    def between(self, first: str, last: str) -> list[Gap]:
+        """Gaps after the event `first` until `last`."""
+        return [gap for gap in self.gaps if self.met[first] < gap.end <= self.met[last]]
 
     @staticmethod
-    def _now() -> tuple[float, float]:
-        return time.perf_counter(), time.thread_time()
+    def _now() -> tuple[float, float, float]:
+        return time.perf_counter(), time.thread_time(), _ours_s[0]
 
     def _tick(self) -> float:
         now = self._now()
-        self._gaps.append((now[0] - self._last[0], now[1] - self._last[1]))
+        self.gaps.append(Gap(now[0], *(after - before for after, before in zip(now, self._last, strict=True))))
         self._last = now
+        for name in [name for name, met in self._events.items() if met()]:
+            self.met[name] = now[0]
+            del self._events[name]
         return _EVERY_S
+
+
+def _ms(seconds: float) -> str:
+    return f"{1000 * seconds:.0f}"

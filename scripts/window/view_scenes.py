@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import statistics
 import time
+from collections.abc import Callable
 from importlib import import_module
 
 import bpy
+import gpu
 from bpy_extras.view3d_utils import location_3d_to_region_2d
 from mathutils import Quaternion
 from panels import show, view, wide_view
 from press import Steps, press, wait
-from stalls import Stalls
+from stalls import Stalls, measure_extension
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, queue_of, select, with_people
+
+REDRAW_ROUNDS, REDRAWS = 5, 6
+"""Rounds of all states, and redraws in each."""
 
 
 def shadings(module: str, python: str) -> Steps:
@@ -150,15 +156,9 @@ def stalls(module: str, python: str) -> Steps:
     yield from begin(module, python)
     yield from show("PRIMDIFFUSION_PT_generate")
     queue = queue_of(module)
-    for seed in (FIRST_SEED, SECOND_SEED):
-        measured = Stalls()
-        press("primdiffusion.generate", seed=seed)
-        yield from wait(lambda: queue.ready or not queue.busy, 240)
-        answered, entering = time.monotonic(), Stalls()
-        yield from wait(lambda: not queue.busy, 240)
-        print(f"stands {time.monotonic() - answered:.2f} s after the answer: {entering.end()}", flush=True)
-        yield 3.0
-        print(f"adding a person: {measured.end()}", flush=True)
+    measure_extension(module)
+    yield from entering(module, FIRST_SEED, "")
+    yield from entering(module, SECOND_SEED, "second_")
     yield "stalls_person"
     select(armatures()[0])
     measured = Stalls()
@@ -173,6 +173,80 @@ def stalls(module: str, python: str) -> Steps:
         settings.betas[0] = 0.2 * move
         yield 0.01
     print(f"dragging a slider: {measured.end()}", flush=True)
+
+
+def entering(module: str, seed: int, prefix: str) -> Steps:
+    """Generate a person and measure from the child's answer until a view shows them."""
+    queue, overlay = queue_of(module), import_module(f"{module}.engine.overlay").overlay
+    humans = len(armatures()) + 1
+
+    def in_view() -> bool:
+        shown = [picture.shown for picture in overlay._regions.values() if picture.shown is not None]
+        return any(len(march.request.key[0]) == humans for march in shown)  # a picture's key begins with its humans
+
+    events = {"answered": lambda: queue.ready, "standing": lambda: not queue.busy, "in view": in_view}
+    press("primdiffusion.generate", seed=seed)
+    measured = Stalls(events)
+    yield from wait(lambda: "in view" in measured.met, 240)
+    yield 8.0
+    print(f"adding a person: {measured.end()}", flush=True)
+    answered = measured.met["answered"]
+    gaps = measured.between("answered", "in view")
+    figures = {
+        "stand_seconds_window": measured.met["standing"] - answered,
+        "in_view_seconds_window": measured.met["in view"] - answered,
+        "longest_stall_s": max(gap.wall for gap in gaps),
+        "longest_stall_extension_s": max(gap.ours for gap in measured.gaps if gap.end > answered),
+    }
+    yield {"figures": {prefix + name: value for name, value in figures.items()}}
+
+
+def redraw(module: str, python: str) -> Steps:
+    """Measures a redraw of the 3D view in Solid: of an empty scene, with a person whose volumes are hidden, with that
+    person's armature alone, and the extension's drawing alone."""
+    yield from with_people(module, python, FIRST_SEED)
+    wide_view()
+    view()[1].spaces.active.shading.type = "SOLID"
+    overlay = import_module(f"{module}.engine.overlay")
+    (person,) = [layer for layer in bpy.context.view_layer.layer_collection.children if layer.name == "Human"]
+    settings = bpy.context.scene.primdiffusion_render
+    states = {"empty": (True, False), "armature": (False, False), "person": (False, True)}
+    """Whether the person's collection is excluded, and whether humans are drawn."""
+    measured = {name: [] for name in (*states, "drawing")}
+    draw = overlay.Overlay.draw
+
+    def timed(self, context) -> None:
+        measured["drawing"].append(finished_ms(lambda: draw(self, context)))
+
+    yield from wait(lambda: overlay.overlay.resting and bool(overlay.overlay._regions), 120)
+    for _ in range(REDRAW_ROUNDS):
+        for name, (person.exclude, settings.in_viewports) in states.items():
+            yield 1.0
+            yield from wait(lambda: overlay.overlay.resting, 60)
+            measured[name] += [finished_ms(redraw_view) for _ in range(REDRAWS)]
+        overlay.Overlay.draw = timed
+        redraw_view()
+        overlay.Overlay.draw = draw
+    found = {f"redraw_{name}_ms": statistics.median(times) for name, times in measured.items()}
+    found["redraw_ratio"] = found["redraw_person_ms"] / (found["redraw_empty_ms"] + found["redraw_drawing_ms"])
+    yield {"figures": found}
+
+
+def redraw_view() -> None:
+    press("wm.redraw_timer", type="DRAW", iterations=1)
+
+
+def finished_ms(draw: Callable[[], object]) -> float:
+    """Milliseconds of drawing, with what the GPU has left to do after it."""
+    _finish()
+    began = time.perf_counter()
+    draw()
+    _finish()
+    return 1000 * (time.perf_counter() - began)
+
+
+def _finish() -> None:
+    gpu.state.active_framebuffer_get().read_color(0, 0, 1, 1, 4, 0, "UBYTE")
 
 
 def rendered_view() -> Steps:

@@ -1,6 +1,9 @@
 """Run by test_viewer in a Blender of its own: install the viewer, use a human of its gallery, report as JSON.
 
-python installed_viewer.py ZIP FOLDER
+python installed_viewer.py ZIP FOLDER [PROGRAM]
+
+Without PROGRAM, the backend's command line as pip installed it, there is no backend; with it, a human is generated
+with the program on the PATH, and another with the program named in the preferences.
 """
 
 import json
@@ -14,6 +17,7 @@ import bpy
 import numpy as np
 
 archive, folder = sys.argv[1], Path(sys.argv[2])
+program = Path(sys.argv[3]) if len(sys.argv) > 3 else None
 sys.modules["primdiffusion"] = None  # as in a Blender whose Python has no backend
 os.environ["PATH"] = ""
 bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
@@ -60,5 +64,15 @@ try:
     press.generate(seed=7)
 except RuntimeError as error:
     report["generate"] = str(error)
+if program is not None:
+    os.environ["PATH"] = str(program.parent)
+    report["generated"] = [sorted(press.generate(seed=7, steps=2))]
+    os.environ["PATH"] = ""
+    bpy.context.preferences.addons[module].preferences.backend_python = str(program)
+    report["generated"].append(sorted(press.generate(seed=8, steps=2)))
+    made = human.humans(bpy.context.scene)[2:]
+    report["boxes"] = [sum(obj.type == "VOLUME" for obj in one.all_objects) for one in made]
+    report["provenance"] = [json.loads(one[human.MARK])["seed"] for one in made]
+    report["standing"] = [human.armature_of(one).name in bpy.context.view_layer.objects for one in made]
 bpy.ops.preferences.addon_disable(module=module)
 print("REPORT " + json.dumps(report), flush=True)

@@ -76,16 +76,21 @@ def test_a_human_too_large_for_the_gallery_is_rejected(gallery, tmp_path):
 
 @pytest.fixture(scope="module")
 def used(archive, tmp_path_factory) -> tuple[dict, Path]:
-    """What the viewer did in a Blender of its own, and the folder of its files."""
+    """What the viewer did in a Blender of its own without a backend, and the folder of its files."""
     folder = tmp_path_factory.mktemp("used")
+    return use(archive, folder), folder
+
+
+def use(archive: Path, folder: Path, *program: Path) -> dict:
+    """The report of installed_viewer.py."""
     (folder / "user").mkdir()
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "user")}
     environment = {name: text for name, text in environment.items() if not name.startswith(("PYTHON", "PRIMDIFFUSION"))}
-    command = [sys.executable, str(PROGRAM), str(archive), str(folder)]
+    command = [sys.executable, *map(str, (PROGRAM, archive, folder, *program))]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=folder)
     reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
     assert reports, done.stdout[-3000:] + done.stderr[-3000:]
-    return json.loads(reports[0].removeprefix("REPORT ")), folder
+    return json.loads(reports[0].removeprefix("REPORT "))
 
 
 def test_a_human_of_the_gallery_is_added_posed_and_reshaped_without_a_backend(used):
@@ -107,3 +112,12 @@ def test_its_export_is_compact_and_comes_back(used):
 def test_generate_without_a_backend_says_in_one_sentence_what_to_do(used):
     report, _ = used
     assert report["generate"].removeprefix("Error: ").strip().rstrip(".").lower() == NOT_INSTALLED.lower()
+
+
+@pytest.mark.slow
+def test_generate_runs_in_the_backend_that_pip_installed(archive, tmp_path):
+    program = Path(sys.executable).with_name("primdiffusion")
+    report = use(archive, tmp_path, program)
+    assert report["generated"] == [["FINISHED"], ["FINISHED"]]
+    assert (report["provenance"], report["boxes"]) == ([7, 8], [1024, 1024])
+    assert report["standing"] == [True, True]

@@ -166,7 +166,10 @@ def test_slices_and_larger_tiles_give_the_same_picture(marcher, backend, payload
     view = pinhole(fields["position"].mean(0), (0.0, 0.2, 2.0), size=(75, 101))
     whole, depth = marched(marcher, people, view)
     march = marcher.march(people, view, STEP)
-    assert [march.advance(5) for _ in range(3)] == [False, False, True]
+    part, slices = 0.3 * march._work[-1], 1
+    while not march.advance(part):
+        slices += 1
+    assert slices > 2
     assert np.array_equal(read(march.colour, view), whole)
     monkeypatch.setattr(gpu_march, "MOST_ENTRIES", 1500)
     larger = marcher.march(people, view, STEP)

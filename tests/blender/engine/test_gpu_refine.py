@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -21,17 +23,15 @@ VIEW = PinholeView(np.eye(3), np.eye(3, 4), (0.1, 10.0), 640, 480)
 
 
 class SlowGpu:
-    """A clock that pictures turn forward: `pixel_s` seconds a pixel."""
+    """A clock that pictures turn forward: `pixel_s` seconds a pixel, and as much for each box in its way."""
 
-    def __init__(self, pixel_s: float):
-        self.now, self._pixel_s, self.sizes, self.longest = 0.0, pixel_s, [], 0.0
+    def __init__(self, pixel_s: float, boxes: Callable[[float], int] = lambda _height: 0):
+        """`boxes` by the height in the picture, from 0 at the top to 1."""
+        self.now, self.pixel_s, self.boxes, self.sizes, self.longest = 0.0, pixel_s, boxes, [], 0.0
 
     def begin(self, view: PinholeView) -> OnePass:
         self.sizes.append((view.width, view.height))
         return OnePass(self, view)
-
-    def march(self, pixels: int) -> None:
-        self.now += pixels * self._pixel_s
 
     def refine_to_the_end(self, refinement: GpuRefinement) -> list[tuple[int, int]]:
         """Coarseness and sample of the pictures that appear."""
@@ -49,13 +49,15 @@ class SlowGpu:
 
 class OnePass:
     def __init__(self, gpu: SlowGpu, view: PinholeView):
-        self._gpu, self._view, self._left = gpu, view, -(-view.height // 8)
+        rows = -(-view.height // 8)
+        self._gpu, self._work = gpu, [8 * view.width * (1 + gpu.boxes(row / rows)) for row in range(rows)]
 
-    def advance(self, tile_rows: int) -> bool:
-        rows = min(tile_rows, self._left)
-        self._gpu.march(rows * 8 * self._view.width)
-        self._left -= rows
-        return self._left == 0
+    def advance(self, work: float) -> bool:
+        done = 0
+        while self._work and (done == 0 or done + self._work[0] <= work):
+            done += self._work.pop(0)
+        self._gpu.now += done * self._gpu.pixel_s
+        return not self._work
 
     def wait(self) -> None:
         pass
@@ -102,6 +104,14 @@ def test_a_slow_gpu_is_never_waited_for_and_shows_pictures_while_the_view_moves(
         gpu.longest = max(gpu.longest, gpu.now - began)
     assert shown > 5
     assert gpu.longest < 0.3
+
+
+def test_a_human_below_empty_rows_does_not_stall_the_window():
+    gpu = SlowGpu(2e-7, lambda height: 40 if height > 0.5 else 0)
+    refinement = GpuRefinement(lambda: gpu.now)
+    refinement.want(request(gpu, "a"))
+    gpu.refine_to_the_end(refinement)
+    assert gpu.longest < 2 * SLICE_S
 
 
 def test_a_slow_gpu_averages_fewer_pictures():

@@ -154,9 +154,20 @@ def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
     assert not people.overlay.resting
     assert people.overlay.advance()
     assert len(people.overlay.reading(context()).humans) == 2
-    assert people.overlay.advance()
-    assert people.overlay.reading(context()).complete
+    assert people.overlay.reading(context()).complete, "the last one needs no reading of its own"
     assert people.overlay.resting
+
+
+def test_shaders_are_compiled_in_steps_before_a_human_stands(addon, monkeypatch):
+    marcher, own, followed = object(), Overlay(), []
+    monkeypatch.setattr(studio, "gpu_marcher", lambda: marcher)
+    monkeypatch.setattr(module, "follow", lambda: followed.append(own.resting))
+    monkeypatch.setattr(own, "_starting", lambda _marcher: iter([None, None]))
+    assert own.prepare() is None
+    assert followed == [False]
+    assert [own.advance() for _ in range(3)] == [False, False, True]
+    assert own.prepare() is marcher
+    assert own.resting
 
 
 def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):

@@ -62,11 +62,11 @@ def test_a_slice_is_as_long_as_the_drawing_before_it_within_limits(person, monke
     given, now = [], [100.0]
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(late_volumes, "work", lambda seconds: given.append(round(seconds, 3)) or True)
-    for drawing in (0.0, 0.1, 3.0):
+    for drawing in (0.0, 0.07, 3.0):
         late_volumes._ended = now[0]
         now[0] += module.PAUSE_S + drawing
         assert late_volumes.tick() == module.PAUSE_S
-    assert given == [module.SHORTEST_S, 0.1, module.LONGEST_S]
+    assert given == [module.SHORTEST_S, 0.07, module.LONGEST_S]
 
 
 def test_the_timer_waits_for_what_the_user_holds_and_ends_with_the_work(person, monkeypatch):

@@ -12,6 +12,7 @@ from jobs_driven import drive, error_of, until_running
 
 import blender_primdiffusion
 from blender_primdiffusion.engine import billboard
+from blender_primdiffusion.engine.overlay import overlay
 from blender_primdiffusion.jobs import picture_in_view as module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
@@ -109,9 +110,10 @@ def test_only_views_that_show_humans_of_the_jobs_scene_show_the_picture(denoisin
 
 
 def test_a_picture_is_uploaded_once_and_drawn_where_the_human_will_stand(denoising, tmp_path, monkeypatch):
-    uploaded, drawn = [], []
+    uploaded, drawn, prepared = [], [], []
     monkeypatch.setattr(billboard, "texture_of", lambda pixels: uploaded.append(pixels.shape) or "texture")
     monkeypatch.setattr(billboard, "draw", lambda texture, corners: drawn.append(corners))
+    monkeypatch.setattr(overlay, "prepare", lambda: prepared.append(len(drawn)))
     bpy.context.scene.cursor.location = (3, 4, 0.5)
     picture_in_view.draw(context())
     np.testing.assert_allclose(drawn[0].mean(0)[:2], [3, 4], atol=1e-6)
@@ -119,6 +121,7 @@ def test_a_picture_is_uploaded_once_and_drawn_where_the_human_will_stand(denoisi
     picture_in_view.draw(context())
     np.testing.assert_allclose(drawn[1].mean(0)[:2], [5, 4], atol=1e-6)
     assert uploaded == [(8, 8, 4)]
+    assert prepared == [0, 1], "the human's shaders are compiled meanwhile"
     build_human(bpy.context, synthetic.write(tmp_path / "one.npz", 4))
     bpy.context.scene.cursor.location = (0.5, 0, 0)
     picture_in_view.draw(context())
