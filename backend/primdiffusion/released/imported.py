@@ -18,7 +18,7 @@ from torch import Tensor
 
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyPose
-from primdiffusion.diffusion.checkpoint import FORMAT, FORMAT_VERSION, RELEASED
+from primdiffusion.diffusion.checkpoint import FORMAT, FORMAT_VERSION, RELEASED, anchor_tensors
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.diffusion.unet import UNetConfig
 from primdiffusion.formats.whole_files import write_atomically
@@ -64,6 +64,14 @@ def reference_extents(body_setup: BodySetup, reference: Reference) -> Float[Tens
     return rest_half_extent(surface_points(vertices, body_setup.body.faces, anchors.face, anchors.barycentric))
 
 
+def sized(body_setup: BodySetup, reference: Reference) -> BodySetup:
+    """The body setup with the rest half extents of `reference_extents`."""
+    extents = reference_extents(body_setup, reference)
+    return dataclasses.replace(
+        body_setup, anchors=dataclasses.replace(body_setup.anchors, rest_half_extent=extents)
+    )
+
+
 def write_imported(
     out: Path,
     denoiser: Mapping[str, Tensor],
@@ -75,12 +83,8 @@ def write_imported(
 ) -> None:
     """Write the file, atomically; `denoiser` uses the names of `SlabUNet`. Raises OSError."""
     tensors = {f"denoiser.{name}": value.float().contiguous() for name, value in denoiser.items()}
-    tensors |= {
-        "stand.face": body_setup.anchors.face,
-        "stand.barycentric": body_setup.anchors.barycentric,
-        "stand.rest_half_extent": reference_extents(body_setup, reference),
-        "stand.betas": reference.betas.clamp(-LARGEST_BETA, LARGEST_BETA),
-    }
+    tensors |= anchor_tensors(sized(body_setup, reference).anchors)
+    tensors["stand.betas"] = reference.betas.clamp(-LARGEST_BETA, LARGEST_BETA)
     architecture = {
         "kind": RELEASED,
         "schedule": SCHEDULE,
