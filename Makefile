@@ -32,7 +32,7 @@ PYTEST_BLENDER := $(PYTEST) tests/blender --confcutdir tests/blender -m "not slo
 # Containers set it, and hundreds of child processes would each compile the backend again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help demo test test-5.0 test-4.5 test-5.2 test-all lint setup clean
+.PHONY: help demo test test-5.0 test-4.5 test-5.2 test-all fuzz chaos lint setup clean
 
 ## demo: generate a human in Blender, walk it, render it: see demo_out/
 demo: $(READY)
@@ -71,6 +71,15 @@ endif
 ## test-all: all tests, with the slow ones, on Blender 5.0
 test-all: $(READY_TO_TEST)
 	$(BIN)/python -m pytest -m "not gpu" $(TEST_ARGS)
+
+## fuzz: feed damaged files and messages to every reader for MINUTES=30; see tests/fuzz
+fuzz: $(READY_TO_TEST)
+	cd tests && $(ONE_THREAD) ../$(BIN)/python -m fuzz --minutes $(MINUTES)
+
+## chaos: kill programs, fill disks, break environments for MINUTES=30; see tests/chaos
+MINUTES ?= 30
+chaos: $(READY_TO_TEST)
+	$(ONE_THREAD) $(BIN)/python -m tests.chaos --minutes $(MINUTES)
 
 ## lint: ruff, import contracts, types
 lint: $(READY_TO_TEST)

@@ -13,9 +13,10 @@ from collections.abc import Sequence
 
 from primdiffusion import __version__
 from primdiffusion.failures import describe
-from primdiffusion.machine import share_processors
+from primdiffusion.machine import DEVICES, choose_device, share_processors
 
 TRACEBACK = "--traceback"
+DEVICE = "--device"
 USAGE = 2
 DEFECT = 70
 INTERRUPTED = 130
@@ -28,7 +29,9 @@ COMMANDS = {
     "reconstruct": ("commands.reconstruct:run", "Reconstruct a human from captures: images from several sides"),
     "refine": ("commands.reconstruct:run_refine", "Optimise a captured human to match the images"),
     "render": ("commands.render:run", "Render a human in a pose"),
+    "view": ("commands.view:run", "Show a human in a browser, with sliders for the pose"),
     "export": ("commands.export:run", "Export a human to other programs: .glb, .obj or .ply"),
+    "export-onnx": ("commands.export_onnx:run", "Export the denoiser of a model to ONNX"),
     "merge": ("commands.merge:run", "Merge humans into one voxel grid: .vdb or .npz"),
     "serve": ("serve.server:run", "Be the backend of the Blender extension: answer JSON-RPC requests"),
     "info": ("commands.info:run", "Describe this installation, a checkpoint or a human, as JSON"),
@@ -57,11 +60,14 @@ PrimDiffusion {__version__}: 3D humans as 1024 volumetric primitives, generated 
 commands (each has its own --help):
 {chr(10).join(lines)}
 
-{TRACEBACK} prints the traceback of an error."""
+options of every command:
+  {DEVICE} {"|".join(DEVICES):<8} Where networks run; the default is cuda where there is one, otherwise cpu
+  {TRACEBACK:<21} Print the traceback of an error"""
 
 
 def run(arguments: Sequence[str]) -> None:
     """Run a command line; raises its errors, exits on a usage error."""
+    arguments = _with_device(arguments)
     if not arguments or arguments[0] in ("-h", "--help"):
         print(help_text())
         return
@@ -71,6 +77,24 @@ def run(arguments: Sequence[str]) -> None:
         sys.exit(USAGE)
     module, _, function = COMMANDS[name][0].partition(":")
     getattr(importlib.import_module(f"primdiffusion.{module}"), function)(arguments[1:])
+
+
+def _with_device(arguments: Sequence[str]) -> list[str]:
+    """Choose the device that the arguments name; return the others. Exits on a usage error."""
+    others = list(arguments)
+    named = [argument for argument in others if argument == DEVICE or argument.startswith(f"{DEVICE}=")]
+    if not named:
+        return others
+    index = others.index(named[0])
+    _, equals, name = others.pop(index).partition("=")
+    if not equals:
+        name = others.pop(index) if index < len(others) else ""
+    if len(named) > 1 or name not in DEVICES:
+        given = f"{name!r} was given" if len(named) == 1 else "it was given more than once"
+        print(f"primdiffusion: {DEVICE} takes one of {', '.join(DEVICES)}: {given}", file=sys.stderr)
+        sys.exit(USAGE)
+    choose_device(name)
+    return others
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

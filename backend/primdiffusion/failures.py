@@ -7,7 +7,9 @@ traceback. Imports no torch, because the child answers `hello` before torch is l
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import re
+from types import ModuleType
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,6 +32,25 @@ class PictureOutOfMemory(MemoryError):
         super().__init__(f"there is not enough memory for a picture of {width} x {height} pixels")
 
 
+class MissingPackageError(ImportError):
+    """An optional package that is not installed; the message has the line that installs it."""
+
+
+def optional_package(module: str, extra: str) -> ModuleType:
+    """Import a module of an optional package, which `extra` of pyproject.toml installs.
+
+    Raises MissingPackageError if it is not installed.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module.partition(".")[0]:
+            raise
+        raise MissingPackageError(
+            f'this needs {error.name}, which is not installed: run pip install "primdiffusion[{extra}]"'
+        ) from error
+
+
 PICTURE_REMEDY = "choose a smaller resolution, or close other programs, then try again"
 MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture, then try again"
 
@@ -42,8 +63,10 @@ def describe(error: BaseException) -> ErrorDescription | None:
     if out_of_memory(error):
         amount = re.search(r"[Tt]ried to allocate ([\d.]+ \w+)", sentence, re.ASCII)
         wanted = f" when it asked for {amount[1]} more" if amount else ""
-        where = "graphics card" if "CUDA" in sentence else "machine"
+        where = "graphics card" if "CUDA" in sentence or "MPS" in sentence else "machine"
         return ErrorDescription("out_of_memory", f"the {where} ran out of memory{wanted}", MEMORY_REMEDY)
+    if isinstance(error, MissingPackageError):
+        return ErrorDescription("environment", sentence, "")
     if isinstance(error, ImportError):
         remedy = "install the backend's packages into the Python that runs it, or choose another Python"
         return ErrorDescription("environment", f"a package of the backend could not be loaded: {sentence}", remedy)
@@ -65,7 +88,9 @@ def out_of_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":
         return True
     return isinstance(error, RuntimeError) and (
-        "not enough memory" in str(error) or "can't allocate memory" in str(error)
+        "not enough memory" in str(error)
+        or "can't allocate memory" in str(error)
+        or "MPS backend out of memory" in str(error)
     )
 
 

@@ -12,6 +12,9 @@ if TYPE_CHECKING:
     import torch
 
 GB = 1e9
+DEVICES = ("cpu", "cuda", "mps")
+_CHOSEN = "PRIMDIFFUSION_DEVICE"
+"""Environment variable, so that processes that this one starts use the same device."""
 
 
 def share_processors() -> None:
@@ -39,11 +42,37 @@ def peak_memory_gb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / GB
 
 
+def choose_device(name: str) -> None:
+    """Make `best_device` return this device; call before importing torch. ValueError for a name not in DEVICES.
+
+    Operations that torch does not have on Apple GPUs (mps) then run on the CPU.
+    """
+    if name not in DEVICES:
+        raise ValueError(f"there is no device {name!r}: choose one of {', '.join(DEVICES)}")
+    os.environ[_CHOSEN] = name
+    if name == "mps":
+        os.environ["PYTORCH_ENABLE_MPS_FALLBACK"] = "1"
+
+
 def best_device() -> torch.device:
-    """Return CUDA if available, otherwise the CPU."""
+    """Return the chosen device, or else CUDA if available, otherwise the CPU.
+
+    Raises ValueError if this machine does not have the chosen device.
+    """
     import torch  # late: `memory` does not need it
 
-    return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    name = os.environ.get(_CHOSEN) or ("cuda" if torch.cuda.is_available() else "cpu")
+    if name == "mps" and not torch.backends.mps.is_available():
+        raise ValueError(
+            "the device mps, an Apple GPU, is not available: it needs macOS 14 on Apple silicon and a torch built for "
+            "it; choose cpu"
+        )
+    if name == "cuda" and not torch.cuda.is_available():
+        raise ValueError(
+            "the device cuda is not available: it needs an NVIDIA GPU, its driver and a torch built for CUDA; "
+            "choose cpu"
+        )
+    return torch.device(name)
 
 
 def device_info(device: torch.device) -> dict[str, Any]:
@@ -57,6 +86,14 @@ def device_info(device: torch.device) -> dict[str, Any]:
             "device_name": torch.cuda.get_device_name(device),
             "device_memory_gb": round(total / GB, 2),
             "device_memory_free_gb": round(free / GB, 2),
+        }
+    if device.type == "mps":
+        total, used = torch.mps.recommended_max_memory(), torch.mps.driver_allocated_memory()
+        return {
+            "device": str(device),
+            "device_name": "Apple GPU",
+            "device_memory_gb": round(total / GB, 2),
+            "device_memory_free_gb": round((total - used) / GB, 2),
         }
     threads = torch.get_num_threads()
     name = f"CPU, {threads} {'thread' if threads == 1 else 'threads'}"

@@ -19,7 +19,7 @@ from typing import IO
 READ_BYTES = 1 << 18
 """Of a child's output, taken in at once."""
 LONGEST_LINE = 1 << 22
-"""Longer ones, which take too long to parse, are dropped."""
+"""Longer ones, which take too long to parse, are dropped; see `Output.lost_message`."""
 LOG_BYTES = 1 << 16
 LOG_LINES = 200
 
@@ -37,6 +37,8 @@ class Output:
             os.unlink(self._name)
         self._line = bytearray()
         self._dropping = False
+        self.lost_message = False
+        """A dropped line began with a brace, as messages do."""
         self.at_end = True
         """The last read has met the end of the file."""
 
@@ -54,6 +56,7 @@ class Output:
                 del whole[0]
         self._dropping = (self._dropping and not whole) or len(self._line) + len(rest) > LONGEST_LINE
         if self._dropping:
+            self.lost_message |= self._line.startswith(b"{")
             self._line.clear()
         else:
             self._line += rest

@@ -7,6 +7,7 @@ silence. All public methods are for one thread at a time.
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import itertools
 import json
@@ -17,8 +18,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from .child_streams import LOG_LINES, Input, Output
-from .messages import fault_of, parsed
+from .child_streams import LOG_LINES, LONGEST_LINE, Input, Output
+from .messages import MessageError, fault_of, parsed
 
 PROGRAM = "primdiffusion"
 """The backend's package, and its command line."""
@@ -211,14 +212,15 @@ class BackendClient:
         if self._input is not None:
             self._input.flush()
         exit_code = self._process.poll()  # before reading: then all that it wrote is there
-        for message in self._arrived():
-            if fault := fault_of(message, self._hello):
-                return [*events, *self._give_up(fault)]
-            self._silence, self._reported_silence = 0.0, False
-            if message.get("id") in self._abandoned and "method" not in message:
-                self._abandoned.discard(message["id"])
-            elif message.get("method") != "heartbeat":
-                events.append(self._event(message))
+        try:
+            for message in self._arrived():
+                self._silence, self._reported_silence = 0.0, False
+                if message.get("id") in self._abandoned and "method" not in message:
+                    self._abandoned.discard(message["id"])
+                elif message.get("method") != "heartbeat":
+                    events.append(self._event(message))
+        except MessageError as fault:
+            return [*events, *self._give_up(str(fault))]
         if exit_code is not None and not self._lines and self._output is not None and self._output.at_end:
             events.extend(self._end(exit_code))
         elif self.alive and self._silence > self._silence_s and not self._reported_silence:
@@ -275,21 +277,28 @@ class BackendClient:
     # what has arrived
 
     def _arrived(self) -> Iterator[dict[str, Any]]:
-        """Messages, for POLL_S at most."""
+        """Messages, for POLL_S at most. Raises MessageError for a malformed one."""
         end = time.monotonic() + POLL_S
         while self._output is not None:
             if not self._lines:
                 self._lines.extend(self._output.lines())
+                if self._output.lost_message:
+                    raise MessageError(f"longer than {LONGEST_LINE >> 20} MB")
                 if not self._lines:
                     return
             line = self._lines.popleft()
             message = parsed(line)
             if message is not None:
-                yield message
+                yield self._checked(message)
             elif line.strip():
                 self._stray.append(f"[not a message] {line[:300].decode('utf-8', 'replace').rstrip()}")
             if time.monotonic() > end:
                 return
+
+    def _checked(self, message: dict[str, Any]) -> dict[str, Any]:
+        if fault := fault_of(message, self._hello):
+            raise MessageError(fault)
+        return message
 
     def _event(self, message: dict[str, Any]) -> Event:
         method, params, id = message.get("method"), message.get("params") or {}, message.get("id")
@@ -311,9 +320,10 @@ class BackendClient:
     def _end(self, exit_code: int) -> Iterator[Event]:
         """The end of the child, once, after its last messages."""
         self._ended = True
-        last = parsed(self._output.rest()) if self._output is not None else None
-        if last is not None and not fault_of(last, self._hello):
-            yield self._event(last)
+        with contextlib.suppress(MessageError):  # cut off by its death
+            last = parsed(self._output.rest()) if self._output is not None else None
+            if last is not None:
+                yield self._event(self._checked(last))
         self._close_streams()
         if not self._expected_to_end:
             yield Died(exit_code, death_sentence(exit_code), self.stderr)

@@ -9,13 +9,21 @@ from typing import Any
 from ..formats.json_files import parse_message
 
 
+class MessageError(ValueError):
+    """A line of the child that cannot be read; the message says why."""
+
+
 def parsed(line: bytes) -> dict[str, Any] | None:
-    """The message in a line of the child; None for other output."""
-    try:
-        message = parse_message(line)
-    except ValueError:
+    """The message in a line of the child; None for a line that does not begin with a brace, which is other output.
+
+    Raises MessageError for a message that is not JSON.
+    """
+    if not line.lstrip().startswith(b"{"):
         return None
-    return message if isinstance(message, dict) else None
+    try:
+        return parse_message(line)
+    except ValueError as error:
+        raise MessageError("not JSON") from error
 
 
 _KINDS: dict[str, tuple[type, ...]] = {

@@ -12,7 +12,7 @@ import numpy as np
 from ..console import UsageError
 from ..formats.camera_rig import Arrangement, Rig, View
 from ..formats.json_files import read_json
-from ..formats.requests import LAYOUTS, PASSES
+from ..formats.requests import LAYOUTS, PASSES, check_seed
 from .blender_camera import CameraError
 from .settings import Background, CaptureSettings, Device, Light
 
@@ -33,7 +33,7 @@ def parser() -> argparse.ArgumentParser:
     add = made.add_argument
     add("--people", type=Path, nargs="+", default=[], help="folders of scans, or of what `primdiffusion people` made")
     add("--out", type=Path, required=True, help="the dataset's folder; an unfinished one is resumed")
-    add("--seed", type=int, default=0)
+    add("--seed", type=_seed, default=0, help="of the choice of poses and of the noise (default %(default)s)")
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
     add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
@@ -142,6 +142,14 @@ def _files_of_poses(paths: Sequence[Path]) -> Iterator[Path]:
 
 def _raise_usage_error(message: str) -> NoReturn:
     raise UsageError(message)
+
+
+def _seed(text: str) -> int:
+    try:
+        check_seed(seed := int(text))
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return seed
 
 
 def _shard(text: str) -> tuple[int, int]:

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import bpy
 
-from ..formats.removing import remove_file, remove_folder
-from ..formats.whole_files import temporary_name
+from ..formats.removing import remove_file
+from ..formats.whole_files import temporary_folder
 from .human import MARK, folders_of, unwritten_in
 from .human_npz import HumanNpzError, file_names, read_human, unwritten_name
 from .volumes import bake, write_error, write_file
@@ -44,18 +44,15 @@ def write_unwritten(source: Path) -> Generator[None, None, None]:
     version = named[source.name]
     paths = [source.parent / name for name in file_names(grids, version)]
     yield
-    hidden = temporary_name(source.parent / "volumes")
     try:
-        hidden.mkdir()
         for k, path in enumerate(paths):
             if not path.is_file():
-                os.replace(hidden / write_file(grids, k, hidden, version), path)
+                with temporary_folder(source.parent / "volume") as hidden:
+                    os.replace(hidden / write_file(grids, k, hidden, version), path)
                 yield
         remove_file(source, source.parent)
     except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
         raise write_error(source.parent, error) from error
-    finally:
-        remove_folder(hidden, source.parent)
 
 
 def write_all_unwritten() -> None:

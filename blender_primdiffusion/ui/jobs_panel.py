@@ -75,10 +75,9 @@ def _names() -> set[str]:
     """Names of the user, the home folder and the machine."""
     # for reports alone
     import getpass
-    import socket
 
     home = os.path.basename(os.path.expanduser("~"))
-    names = {home, os.environ.get("USER", ""), os.environ.get("USERNAME", ""), socket.gethostname(), platform.node()}
+    names = {home, os.environ.get("USER", ""), os.environ.get("USERNAME", ""), platform.node()}
     with contextlib.suppress(OSError, KeyError, ImportError):  # no such user on this system (containers)
         names.add(getpass.getuser())
     return names

@@ -24,7 +24,7 @@ class PRIMDIFFUSION_OT_click_human(bpy.types.Operator):
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Leave the click to Blender where no human is, or another object in front."""
+        """Leave the click to Blender where no human is, or another object in front; a press may begin a drag."""
         if context.mode != "OBJECT" or context.region_data is None or not shows_humans(context):
             return {"PASS_THROUGH"}
         from ..engine.overlay import overlay  # needs numpy
@@ -41,7 +41,20 @@ class PRIMDIFFUSION_OT_click_human(bpy.types.Operator):
         else:
             obj.select_set(True)
             context.view_layer.objects.active = obj
-        return {"FINISHED"}
+        if event.value != "PRESS":
+            return {"FINISHED"}
+        context.window_manager.modal_handler_add(self)
+        return {"RUNNING_MODAL", "PASS_THROUGH"}
+
+    def modal(self, _context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        """Wait for the release of the button, or leave a drag to Blender, which moves what is selected.
+
+        After a press with both results of `invoke` Blender calls no other operator (its own would deselect everything)
+        but still reports a drag. The release is consumed: Blender would deselect at a click, too.
+        """
+        if event.value == "CLICK_DRAG":
+            return {"FINISHED", "PASS_THROUGH"}
+        return {"FINISHED"} if event.type == "LEFTMOUSE" else {"PASS_THROUGH"}
 
 
 def draw_switch(menu: bpy.types.Panel, context: bpy.types.Context) -> None:

@@ -1,7 +1,7 @@
 """Runs inside Blender's window: installs the zip, then plays the scenes of `scenes.py` from a timer, step by step.
 
 A scene is a generator. It yields seconds to wait, the name of a screenshot to take, or an input:
-{"point": [x, y], "click": True} or {"key": "Escape"}.
+{"point": [x, y], "click": True}, {"point": [x, y], "drag": [dx, dy]} or {"key": "Escape"}.
 """
 
 from __future__ import annotations

@@ -63,7 +63,7 @@ def serve(blender: subprocess.Popen, scratch: Path, out: Path, display: str, tim
 
 
 def do(request: dict, out: Path, display: str) -> None:
-    """Take a screenshot, click, or press a key. Blender's own screenshots are black with software OpenGL."""
+    """Take a screenshot, click, drag, or press a key. Blender's own screenshots are black with software OpenGL."""
     hand = ["xdotool"]
     environment = {**os.environ, "DISPLAY": f":{display}"}
     if "picture" in request:
@@ -77,6 +77,15 @@ def do(request: dict, out: Path, display: str) -> None:
     if request.get("click"):
         time.sleep(0.3)
         subprocess.run([*hand, "click", "1"], check=True, env=environment)
+    if "drag" in request:
+        time.sleep(0.3)
+        subprocess.run([*hand, "mousedown", "1"], check=True, env=environment)
+        step = [str(pixels // 10) for pixels in request["drag"]]
+        for _ in range(10):
+            time.sleep(0.1)
+            subprocess.run([*hand, "mousemove_relative", "--", *step], check=True, env=environment)
+        time.sleep(0.3)
+        subprocess.run([*hand, "mouseup", "1"], check=True, env=environment)
     if "key" in request:
         subprocess.run([*hand, "key", request["key"]], check=True, env=environment)
 

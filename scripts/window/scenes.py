@@ -14,7 +14,7 @@ import bpy
 from panels import show, sidebar, view
 from press import Steps, invoke, press, wait
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, cancel_all, people_file, queue_of, select, with_people
-from view_scenes import denoising_in_view, rendered, rendered_view, shadings, stalls
+from view_scenes import denoising_in_view, dragging, rendered, rendered_view, shadings, stalls
 
 
 def set_up(module: str, python: str) -> Steps:
@@ -353,6 +353,7 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "motion": motion,
     "render": render,
     "shadings": shadings,
+    "dragging": dragging,
     "rendered": rendered,
     "denoising_in_view": denoising_in_view,
     "captures": captures,

@@ -51,6 +51,38 @@ def shadings(module: str, python: str) -> Steps:
     yield "shadings_quad"
 
 
+def dragging(module: str, python: str) -> Steps:
+    """With the tool Tweak a press on a human selects it, a drag moves it, and each is one undo step."""
+    yield from with_people(module, python, FIRST_SEED)
+    wide_view()
+    window, area = view()
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    area.spaces.active.shading.type = "SOLID"
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.wm.tool_set_by_id(name="builtin.select", space_type="VIEW_3D")
+        bpy.ops.object.select_all(action="DESELECT")
+        bpy.ops.ed.undo_push(message="Before")
+    yield 15.0
+    (armature,) = armatures()
+    start = armature.location.copy()
+    chest = armature.matrix_world @ armature.pose.bones["spine3"].head
+    x, y = location_3d_to_region_2d(region, area.spaces.active.region_3d, chest)
+    point = [int(region.x + x) + 9, int(window.height - region.y - y)]
+    yield {"point": point, "drag": [200, 0]}
+    yield 3.0
+    yield "dragging"
+    moved = (armatures()[0].location - start).length
+    yield {"key": "ctrl+z"}
+    yield 3.0
+    (armature,) = armatures()
+    if moved < 0.1 or armature.location != start or not armature.select_get():
+        raise RuntimeError(f"moved by {moved:.3f} m; after undo at {armature.location[:]}, {armature.select_get()}")
+    yield {"point": point, "click": True}
+    yield 2.0
+    if armatures()[0].location != start:
+        raise RuntimeError("a click moved the human")
+
+
 def rendered(module: str, python: str) -> Steps:
     """The engine's view: a human among solids, turned step by step, from the side in parallel, cut by a border."""
     yield from with_people(module, python, FIRST_SEED)

@@ -3,8 +3,22 @@
 import os
 
 import numpy as np
+import pytest
 import torch
-from primdiffusion.machine import best_device, device_info, memory, peak_memory_gb, share_processors
+from primdiffusion import cli
+from primdiffusion.machine import (
+    best_device,
+    choose_device,
+    device_info,
+    memory,
+    peak_memory_gb,
+    share_processors,
+)
+from tiny_model import tiny_model
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
 
 
 def test_peak_memory_keeps_what_was_given_back():
@@ -27,3 +41,86 @@ def test_waiting_threads_sleep_unless_the_user_wants_otherwise(monkeypatch):
     monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
     share_processors()
     assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
+
+
+@pytest.fixture
+def undecided(monkeypatch):
+    """Environment variables as they were after the test."""
+    for name in ("PRIMDIFFUSION_DEVICE", "PYTORCH_ENABLE_MPS_FALLBACK"):
+        monkeypatch.setenv(name, "")
+
+
+@pytest.mark.usefixtures("undecided")
+def test_an_apple_gpu_is_used_where_asked_for_and_lends_the_cpu_what_it_cannot(monkeypatch):
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    choose_device("mps")
+    assert best_device() == torch.device("mps")
+    assert os.environ["PYTORCH_ENABLE_MPS_FALLBACK"] == "1"
+    monkeypatch.setattr(torch.mps, "recommended_max_memory", lambda: 12e9)
+    monkeypatch.setattr(torch.mps, "driver_allocated_memory", lambda: 2e9)
+    assert device_info(best_device())["device_memory_free_gb"] == 10
+
+
+@pytest.mark.usefixtures("undecided")
+@pytest.mark.parametrize(("name", "of"), [("mps", torch.backends.mps), ("cuda", torch.cuda)])
+def test_a_device_that_is_not_there_is_one_sentence(name, of, monkeypatch, capsys):
+    monkeypatch.setattr(of, "is_available", lambda: False)
+    for line in (["--device", name, "info"], ["info", f"--device={name}"]):
+        with pytest.raises(SystemExit) as end:
+            cli.main(line)
+        error = capsys.readouterr().err
+        assert (end.value.code, error.count("\n")) == (1, 1)
+        assert f"the device {name}" in error
+        assert "not available" in error
+        assert "choose cpu" in error
+
+
+@pytest.mark.usefixtures("undecided")
+def test_a_device_by_another_name_is_a_usage_error(capsys):
+    for line in (["info", "--device", "tpu"], ["info", "--device"], ["info", "--device", "cpu", "--device=mps"]):
+        with pytest.raises(SystemExit) as end:
+            cli.main(line)
+        assert end.value.code == cli.USAGE
+        assert "cpu, cuda, mps" in capsys.readouterr().err
+    cli.main(["info", "--device", "cpu"])
+    assert '"device": "cpu"' in capsys.readouterr().out
+
+
+class NoFloat64(TorchDispatchMode):
+    """Apple GPUs have no float64."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for tensor in tree_leaves(out):
+            if isinstance(tensor, torch.Tensor):
+                assert (tensor.device.type, tensor.dtype) != ("mps", torch.float64), func
+        return out
+
+
+class PlainIndices(TorchFunctionMode):
+    """Indexing by slices and None without a device guard, which torch built for other devices lacks."""
+
+    def __init__(self, simulated):
+        super().__init__()
+        self.simulated = simulated
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if func is not torch.Tensor.__getitem__ or args[0].device.type != "mps":
+            return func(*args, **(kwargs or {}))
+        shape = np.empty(args[0].shape, bool)[args[1]].shape
+        with unset_fake_temporarily():
+            return self.simulated(torch.empty(shape, dtype=args[0].dtype, device="meta"))
+
+
+def test_the_denoiser_needs_no_float64_on_an_apple_gpu():
+    fake, model = FakeTensorMode(allow_non_fake_inputs=True), tiny_model()
+
+    def simulated(tensor):
+        return FakeTensor(fake, tensor.to("meta"), torch.device("mps"))
+
+    for name, buffer in model.denoiser.named_buffers():
+        model.denoiser._buffers[name] = simulated(buffer)
+    x, t = simulated(torch.empty(2, *model.codec.shape)), simulated(torch.tensor([0, 1]))
+    with fake, NoFloat64(), PlainIndices(simulated):
+        x0 = model.denoiser(x, t)
+    assert (x0.device.type, x0.dtype, x0.shape) == ("mps", torch.float32, x.shape)

@@ -192,6 +192,31 @@ def test_a_malformed_message_ends_the_child_with_a_sentence(fake_child, message,
     assert client.poll() == []
 
 
+@pytest.mark.parametrize(
+    ("line", "fault"),
+    [
+        ('\'{"id": 1, "result": {"version"\'', "not JSON"),
+        ("'{' * 1000", "not JSON"),
+        ("'{\"id\": 1, \"result\": \"' + 'x' * 5_000_000 + '\"}'", "longer than 4 MB"),
+    ],
+    ids=["cut off", "nested", "long"],
+)
+def test_a_line_that_begins_as_a_message_and_cannot_be_read_ends_the_child(fake_child, line, fault):
+    client = fake_child(f"print({line}, flush=True)\ntime.sleep(60)")
+    died = wait_for(client, lambda e: isinstance(e, Died))
+    assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
+    assert client.gone_within(10)
+
+
+def test_a_message_cut_off_by_the_childs_death_is_reported_as_its_death(fake_child):
+    client = fake_child("""
+        sys.stdout.write('{"id": 1, "resu')
+        sys.stdout.flush()
+        os._exit(3)
+    """)
+    assert wait_for(client, lambda e: isinstance(e, Died)).exit_code == 3
+
+
 def test_silence_is_reported_once(fake_child):
     client = fake_child("time.sleep(60)", silence_s=0.4)
     silent = wait_for(client, lambda e: isinstance(e, Silent), 10)

@@ -81,14 +81,13 @@ def pack_subject(subject: Subject) -> None:
         )
     stamp = source_stamp(subject)
     shape = (subject.frames, len(subject.views), *sizes.pop(), 4)
-    with replacing(pack_path(subject)) as path:
-        array = np.lib.format.open_memmap(path, mode="w+", dtype=np.uint8, shape=shape)
+    with replacing(pack_path(subject)) as path, path.open("wb") as file:  # a full disk kills a writer of mapped memory
+        header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(file, header)
         for frame in range(shape[0]):
             for camera in range(shape[1]):
-                array[frame, camera, ..., :3] = subject.picture("img", frame, camera)
-                array[frame, camera, ..., 3] = subject.picture("mask", frame, camera)
-        array.flush()
-        del array
+                colour, mask = (subject.picture(kind, frame, camera) for kind in ("img", "mask"))
+                file.write(np.dstack([colour, mask]).tobytes())
     with replacing(pack_path(subject).with_suffix(".json")) as path:
         path.write_text(json.dumps({"format": PACK_FORMAT, "version": PACK_VERSION, "source": stamp}), encoding="utf-8")
 

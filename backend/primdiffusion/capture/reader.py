@@ -194,7 +194,8 @@ class Captures:
                 f"{subject} has {person.frames} frames and {len(person.views)} cameras, not frame {frame} of camera "
                 f"{camera}"
             )
-        pictures = {kind: person.picture(kind, frame, camera) for kind in self.passes if kind in _KINDS}
+        known = [kind for kind in self.passes if isinstance(kind, str) and kind in _KINDS]
+        pictures = {kind: person.picture(kind, frame, camera) for kind in known}
         values = {kind: torch.from_numpy(_KINDS[kind](picture)) for kind, picture in pictures.items()}
         view = person.views[camera]
         return CapturedView(

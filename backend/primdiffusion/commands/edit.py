@@ -20,7 +20,6 @@ from primdiffusion.commands.request import (
     ReportProgress,
     check_attributes,
     check_picture_px,
-    check_seed,
     check_size,
     check_steps,
     parse,
@@ -28,7 +27,7 @@ from primdiffusion.commands.request import (
     step_reporter,
 )
 from primdiffusion.formats import requests
-from primdiffusion.formats.requests import check_unit_interval
+from primdiffusion.formats.requests import check_seed, check_unit_interval
 from primdiffusion.formats.whole_files import staged
 from primdiffusion.machine import peak_memory_gb
 

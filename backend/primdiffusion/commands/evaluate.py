@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from primdiffusion import __version__
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.commands.evaluate_tables import Generated, TableOptions, measure
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation import generation, reconstruction
@@ -97,12 +98,13 @@ class EvaluateReconstruction:
 class EvaluateGeneration:
     """Compare generated humans with ones held out from training, in a feature space of human attributes.
 
-    Also reports whether they are copies: their distance to the training set, relative to that of held-out humans.
+    Also reports whether they are copies: their distance to the training set, relative to that of held-out humans. With
+    --table, measure what the paper's tables have instead.
     """
 
-    people: Path
+    people: Path | None = None
     """Folder of the payloads that the model was trained on, those held out among them."""
-    reference: Path
+    reference: Path | None = None
     """Folder for portraits and feature network; what is missing is computed, which takes minutes."""
     assets: Path | None = None
     """MakeHuman's assets, if the training set was made from them: the reference is then renders of the meshes, so that
@@ -121,6 +123,7 @@ class EvaluateGeneration:
     """Seed of the training run."""
     json: Path | None = None
     """File for the figures."""
+    tables: tyro.conf.OmitArgPrefixes[TableOptions] = dataclasses.field(default_factory=TableOptions)
 
     def run(self) -> None:
         """Evaluate, and print a table.
@@ -128,6 +131,15 @@ class EvaluateGeneration:
         Raises:
             ValueError, FileNotFoundError: people or checkpoint are missing, damaged or too few.
         """
+        if self.tables.table is not None:
+            generated = Generated(self.checkpoint, self.first_seed, self.count, self.steps)
+            record, text = measure(self.tables, generated, self.assets)
+            if self.json is not None:
+                _write(self.json, record)
+            print(text)
+            return
+        if self.people is None or self.reference is None:
+            raise ValueError("give --people and --reference, or --table 1 or 2 for the paper's tables")
         if self.count <= NEIGHBOURS:
             raise ValueError(
                 f"count is {self.count}: ask for more than {NEIGHBOURS} humans, or nothing can be compared"

@@ -19,7 +19,6 @@ from primdiffusion.commands.request import (
     ReportProgress,
     check_attributes,
     check_picture_px,
-    check_seed,
     check_size,
     check_steps,
     parse,
@@ -27,7 +26,8 @@ from primdiffusion.commands.request import (
     step_reporter,
 )
 from primdiffusion.formats import requests
-from primdiffusion.formats.requests import check_unit_interval
+from primdiffusion.formats.removing import check_unlinked
+from primdiffusion.formats.requests import check_seed, check_unit_interval
 from primdiffusion.formats.whole_files import staged, staged_together
 from primdiffusion.machine import peak_memory_gb
 
@@ -150,6 +150,7 @@ class GenerateCommand(GenerateRequest):
         for name in ("count", "batch"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: choose 1 or more")
+        check_seed(self.seed + self.count - 1)
 
     def generate(self, session: Session) -> None:
         """Generate batch by batch; print the folder of each human."""
@@ -157,6 +158,8 @@ class GenerateCommand(GenerateRequest):
         for first in range(self.seed, end, self.batch):
             began, seeds = time.perf_counter(), range(first, min(first + self.batch, end))
             folders = {seed: self.out_dir if self.count == 1 else self.out_dir / f"seed_{seed:06d}" for seed in seeds}
+            for folder in folders.values() if self.count > 1 else ():
+                check_unlinked(folder)
             with progress_bar(f"seed {', '.join(map(str, seeds))}") as report:
                 generate_humans(self, folders, session, report, compact=self.compact)
             seconds = (time.perf_counter() - began) / len(seeds)

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol, TypeVar
 import tyro
 from tqdm import tqdm
 
+from primdiffusion.formats.json_files import LARGEST_INTEGER
+
 if TYPE_CHECKING:
     from primdiffusion.commands.session import Session
     from primdiffusion.diffusion.samplers import SamplerStep
@@ -22,7 +24,6 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 AnyRequest = TypeVar("AnyRequest", bound="RequestRecord")
 AnyChecked = TypeVar("AnyChecked", bound="Checked")
-LARGEST_SEED = 2**63 - 1
 STEP_LIMIT = 1000
 """The schedule's length: a sampler cannot take more steps."""
 LARGEST_PREVIEW = 1024
@@ -110,6 +111,8 @@ def _value(kind: Any, value: Any, name: str) -> Any:
         return value
     if kind in (bool, int, str, list, types.NoneType) and type(value) is kind:
         return value
+    if kind is int and isinstance(value, float) and abs(value) > LARGEST_INTEGER:  # a longer integer, see `json_files`
+        raise ParameterError(f"{name} is {value:.6g}: integers go {'up to 2^63-1' if value > 0 else 'down to 1-2^63'}")
     raise ParameterError(f"{name} must be {_in_words(kind)}: {value!r:.80} was given")
 
 
@@ -210,12 +213,6 @@ def progress_bar(label: str | None = None) -> Iterator[ReportProgress]:
                 bar.update(step - bar.n)
 
         yield report
-
-
-def check_seed(seed: int) -> None:
-    """Raise ValueError outside 0 ... 2^63-1."""
-    if not 0 <= seed <= LARGEST_SEED:
-        raise ValueError(f"seed {seed} is outside 0 ... 2^63-1")
 
 
 def check_steps(steps: int) -> None:

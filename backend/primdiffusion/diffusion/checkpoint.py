@@ -308,24 +308,18 @@ def under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 def model_card(card: Mapping[str, Any]) -> str:
     """Return the card as Markdown, for docs/model_card.md."""
+    title = card.get("name", "unnamed")
     facts = {key: value for key, value in card.items() if key not in ("name", "attributes", *_SECTIONS)}
     return "\n".join(
         [
-            f"# Model card: {card['name']}",
+            f"# Model card: {title}",
             "",
             "Generated from the checkpoint by `python -m primdiffusion.diffusion.checkpoint`; do not edit.",
             "",
             *(f"- {key.replace('_', ' ')}: {_plain(value)}" for key, value in facts.items()),
             "",
             *_attribute_section(card.get("attributes", {})),
-            "## Held-out error",
-            "",
-            "Root mean square error of x0 predictions in latent units at steps t of 1000, on people with held-out",
-            "geometry and the same noise. `gaussian`: the closed-form denoiser of one Gaussian fitted to",
-            "the training set; `mixture`: of a mixture of Gaussians; `denoiser`: this checkpoint.",
-            "",
-            *_error_table(card["held_out_rms_x0_error"]),
-            "",
+            *_error_section(card.get("held_out_rms_x0_error")),
             *_detail_section(card.get("held_out_rms_detail_error")),
             "## Limits",
             "",
@@ -333,6 +327,22 @@ def model_card(card: Mapping[str, Any]) -> str:
             "",
         ]
     )
+
+
+def _error_section(errors: Mapping[str, Mapping[str, float]] | None) -> list[str]:
+    """Lines of the section on the denoiser's errors; empty where they were not measured."""
+    if errors is None:
+        return []
+    return [
+        "## Held-out error",
+        "",
+        "Root mean square error of x0 predictions in latent units at steps t of 1000, on people with held-out",
+        "geometry and the same noise. `gaussian`: the closed-form denoiser of one Gaussian fitted to",
+        "the training set; `mixture`: of a mixture of Gaussians; `denoiser`: this checkpoint.",
+        "",
+        *_error_table(errors),
+        "",
+    ]
 
 
 def _error_table(errors: Mapping[str, Mapping[str, float]]) -> list[str]:

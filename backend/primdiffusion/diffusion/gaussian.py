@@ -80,11 +80,12 @@ class PersonPrior(TensorRecord):
     ) -> Float[Tensor, "b r"]:
         """E[c | y = signal c + noise eps]; `signal` and `noise` are [b, 1].
 
-        Computed in float64: distances to centres are squares of numbers up to a hundred over noise down to 0.01.
+        Computed in float64: distances to centres are squares of numbers up to a hundred over noise down to 0.01;
+        on the CPU for Apple GPUs, which have no float64.
         """
-        dtype, (y, signal, noise) = y.dtype, (part.double() for part in (y, signal, noise))
-        axes, variance = self.axes.double(), self.variance.double()
-        centre = torch.einsum("gmr,gir->gmi", self.centre.double(), axes)
+        given, (y, signal, noise) = y, (_double(part) for part in (y, signal, noise))
+        axes, variance = _double(self.axes), _double(self.variance)
+        centre = torch.einsum("gmr,gir->gmi", _double(self.centre), axes)
         in_axes = torch.einsum("br,gir->bgi", y, axes)
         total = signal[:, :, None] ** 2 * variance + noise[:, :, None] ** 2
         distance = (
@@ -92,12 +93,12 @@ class PersonPrior(TensorRecord):
             - 2 * signal[:, :, None] * torch.einsum("bgi,gmi->bgm", in_axes / total, centre)
             + signal[:, :, None] ** 2 * torch.einsum("bgi,gmi->bgm", 1 / total, centre.square())
         )
-        evidence = self.log_weights(condition).double() - 0.5 * (distance + total.log().sum(-1)[..., None])
+        evidence = _double(self.log_weights(condition)) - 0.5 * (distance + total.log().sum(-1)[..., None])
         share = evidence.flatten(1).softmax(-1).view_as(evidence)
         expected = torch.einsum("bgm,gmi->bgi", share, centre)
         gain = signal[:, :, None] * variance / total
         mean = gain * (share.sum(-1)[..., None] * in_axes - signal[:, :, None] * expected) + expected
-        return torch.einsum("bgi,gir->br", mean, axes).to(dtype)
+        return torch.einsum("bgi,gir->br", mean, axes).to(given)
 
     def denoise_rest(self, rest: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor) -> Float[Tensor, "b c h w"]:
         """E[r | rest = signal r + noise eps]; `signal` and `noise` are [b, 1, 1, 1]."""
@@ -151,3 +152,7 @@ class PersonPrior(TensorRecord):
             variance=variance.clamp_min(0)[None],
             kind=self.kind[:1, :1] * 0,
         )
+
+
+def _double(tensor: Tensor) -> Tensor:
+    return tensor.cpu().double() if tensor.device.type == "mps" else tensor.double()

@@ -237,7 +237,7 @@ class LocalUNet(GridUNet):
     ) -> Float[Tensor, "b c h w"]:
         """Return the correction for a noisy rest, given denoised person components and their contribution `picture`."""
         condition = functional.silu(embedded(self.time(t), self.asked, condition) + self.person(person))
-        position = self.position.expand(len(noisy), -1, -1, -1)
+        position = self.position.expand(noisy.shape[0], -1, -1, -1)  # len would fix the batch of an exported graph
         x = self.inner(
             torch.cat([noisy, picture[:, : self.picture_channels], position], dim=1).contiguous(
                 memory_format=torch.channels_last

@@ -43,10 +43,14 @@ def ddpm(
     """Ancestral sampling with the posterior's variance (paper eq. 6-7) down the descending `steps`."""
     for index, (t, t_prev) in enumerate(pairwise((*steps, CLEAN))):
         x0 = denoise(x, t)
-        x = schedule.posterior_mean(x, x0, t, t_prev)
-        if t_prev != CLEAN:
-            x = x + schedule.posterior_std(t, t_prev) * gaussian_noise(x, generators)
+        x = ddpm_step(schedule, x, x0, t, t_prev, generators)
         yield SamplerStep(index, len(steps), t, x0, x)
+
+
+def ddpm_step(schedule: Schedule, x: Tensor, x0: Tensor, t: int, t_prev: int, generators: Generators) -> Tensor:
+    """The sample at t_prev from x [b, ...] at t and its clean guess x0: one step of `ddpm`."""
+    x = schedule.posterior_mean(x, x0, t, t_prev)
+    return x if t_prev == CLEAN else x + schedule.posterior_std(t, t_prev) * gaussian_noise(x, generators)
 
 
 def ddim(
@@ -59,15 +63,20 @@ def ddim(
     """
     for index, (t, t_prev) in enumerate(pairwise((*steps, CLEAN))):
         x0 = denoise(x, t)
-        if t_prev == CLEAN:
-            x = x0
-        else:
-            added = eta * schedule.posterior_std(t, t_prev)
-            implied = (schedule.noise(t_prev) ** 2 - added**2) ** 0.5
-            x = schedule.signal(t_prev) * x0 + implied * schedule.epsilon(x, x0, t)
-            if added > 0:
-                x = x + added * gaussian_noise(x, generators)
+        x = ddim_step(schedule, x, x0, t, t_prev, generators, eta)
         yield SamplerStep(index, len(steps), t, x0, x)
+
+
+def ddim_step(
+    schedule: Schedule, x: Tensor, x0: Tensor, t: int, t_prev: int, generators: Generators, eta: float = 0.0
+) -> Tensor:
+    """The sample at t_prev from x [b, ...] at t and its clean guess x0: one step of `ddim`."""
+    if t_prev == CLEAN:
+        return x0
+    added = eta * schedule.posterior_std(t, t_prev)
+    implied = (schedule.noise(t_prev) ** 2 - added**2) ** 0.5
+    x = schedule.signal(t_prev) * x0 + implied * schedule.epsilon(x, x0, t)
+    return x + added * gaussian_noise(x, generators) if added > 0 else x
 
 
 def dpmpp_2m(
@@ -82,15 +91,24 @@ def dpmpp_2m(
     before: tuple[Tensor, float] | None = None
     for index, (t, t_prev) in enumerate(pairwise((*steps, CLEAN))):
         x0 = denoise(x, t)
-        gain = schedule.half_log_snr_gain(t, t_prev)
-        if t_prev == CLEAN:
-            x = x0
-        else:
-            middle = x0 if before is None else x0 + gain / (2 * before[1]) * (x0 - before[0])
-            ratio = schedule.noise(t_prev) / schedule.noise(t)
-            x = ratio * x - schedule.signal(t_prev) * math.expm1(-gain) * middle
-        before = x0, gain
+        x = dpmpp_2m_step(schedule, x, x0, t, t_prev, before)
+        before = x0, schedule.half_log_snr_gain(t, t_prev)
         yield SamplerStep(index, len(steps), t, x0, x)
+
+
+def dpmpp_2m_step(
+    schedule: Schedule, x: Tensor, x0: Tensor, t: int, t_prev: int, before: tuple[Tensor, float] | None
+) -> Tensor:
+    """The sample at t_prev from x [b, ...] at t and its clean guess x0: one step of `dpmpp_2m`.
+
+    `before` is the clean guess of the previous step and that step's length in half log SNR; None in the first step.
+    """
+    if t_prev == CLEAN:
+        return x0
+    gain = schedule.half_log_snr_gain(t, t_prev)
+    middle = x0 if before is None else x0 + gain / (2 * before[1]) * (x0 - before[0])
+    ratio = schedule.noise(t_prev) / schedule.noise(t)
+    return ratio * x - schedule.signal(t_prev) * math.expm1(-gain) * middle
 
 
 def gaussian_noise(like: Tensor, generators: Generators) -> Tensor:

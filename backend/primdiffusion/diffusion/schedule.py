@@ -40,8 +40,11 @@ class Schedule(TensorRecord):
 
     def levels(self, t: Int[Tensor, "b"], like: Tensor) -> tuple[Tensor, Tensor]:
         """Signal and noise factors of a batch of steps, shaped [b, 1, ...] to multiply `like` [b, ...]."""
-        alpha_bar = self.alpha_bar.to(t.device)[t].reshape(-1, *([1] * (like.ndim - 1)))
-        return alpha_bar.sqrt().to(like), (1.0 - alpha_bar).sqrt().to(like)
+        # rounded before it moves, as Apple GPUs have no float64
+        shape = (-1, *([1] * (like.ndim - 1)))
+        every = self.alpha_bar.sqrt().to(like), (1.0 - self.alpha_bar).sqrt().to(like)
+        signal, noise = (level.index_select(0, t).reshape(shape) for level in every)
+        return signal, noise
 
     def q_sample(self, x0: Float[Tensor, "b *s"], t: Int[Tensor, "b"], noise: Float[Tensor, "b *s"]) -> Tensor:
         """Add noise of level t (paper eq. 5)."""
@@ -104,6 +107,15 @@ def fine_linear(length: int = 1000, last: float = 2e-2) -> Schedule:
 
 SCHEDULES = {"linear": linear, "sqrt_linear": sqrt_linear, "fine_linear": fine_linear}
 """Schedules by their name in configurations and checkpoints."""
+
+
+def schedule_name(schedule: Schedule) -> str:
+    """Name of a schedule in `SCHEDULES`; ValueError for any other."""
+    levels = schedule.alpha_bar.cpu()
+    for name, make in SCHEDULES.items():
+        if torch.equal(make().alpha_bar, levels):
+            return name
+    raise ValueError(f"this schedule has no name, which files need: choose one of {', '.join(SCHEDULES)}")
 
 
 def trailing_steps(length: int, steps: int) -> list[int]:

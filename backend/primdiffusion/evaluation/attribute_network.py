@@ -178,7 +178,7 @@ def fit_attribute_network(
             losses = []
             for chosen in torch.randperm(len(attributes), generator=generator).split(batch):
                 predicted = network.predict(network.learned(_shifted(pictures[chosen], generator)))
-                loss = _loss(predicted, {name: values[chosen] for name, values in labels.items()}, space)
+                loss = attribute_loss(predicted, {name: values[chosen] for name, values in labels.items()}, space)
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
@@ -198,7 +198,8 @@ def _shifted(pictures: Tensor, generator: torch.Generator) -> Tensor:
     return padded[:, :, SHIFT - down : SHIFT - down + height, SHIFT - right : SHIFT - right + width]
 
 
-def _loss(predicted: Mapping[str, Tensor], labels: Mapping[str, Tensor], space: AttributeSpace) -> Tensor:
+def attribute_loss(predicted: Mapping[str, Tensor], labels: Mapping[str, Tensor], space: AttributeSpace) -> Tensor:
+    """Cross entropy of categories plus squared error of scalars, over the labels that are known."""
     total = torch.zeros(())
     for name in space.categories:
         known = labels[name] != UNKNOWN

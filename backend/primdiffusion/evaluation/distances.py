@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -51,6 +52,35 @@ def kernel_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -
         table = kernel(features, features)
         within += float((table.sum() - table.trace()) / (len(features) * (len(features) - 1)))
     return within - 2 * float(kernel(first, second).mean())
+
+
+class KernelDistances(NamedTuple):
+    """The kernel distance over random subsets."""
+
+    mean: float
+    std: float
+    """Of the subsets' distances, biased, as published after +-."""
+
+
+def kernel_distance_of_subsets(
+    first: Float[Tensor, "n d"], second: Float[Tensor, "m d"], subsets: int, size: int, seed: int
+) -> KernelDistances:
+    """KID as torch-fidelity computes and draws it: `kernel_distance` of `subsets` random subsets of `size` samples.
+
+    Raises ValueError as `frechet_distance`, and if a set has fewer than `size` samples.
+    """
+    _check(first, second)
+    if not 2 <= size <= min(len(first), len(second)) or subsets < 1:
+        raise ValueError(
+            f"{subsets} subsets of {size} do not fit sets of {len(first)} and {len(second)} samples: choose a subset "
+            "size from 2 to the smaller set's"
+        )
+    draws = np.random.RandomState(seed)  # torch-fidelity draws from it
+    distances = []
+    for _ in range(subsets):
+        chosen = [torch.from_numpy(draws.choice(len(one), size, replace=False)) for one in (first, second)]
+        distances.append(kernel_distance(first[chosen[0]], second[chosen[1]]))
+    return KernelDistances(float(np.mean(distances)), float(np.std(distances)))
 
 
 class PrecisionRecall(NamedTuple):

@@ -10,6 +10,7 @@ import dataclasses
 import pickle
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 import torch
 from jaxtyping import Float
@@ -158,6 +159,28 @@ def fill(network: nn.Module, weights: Mapping[str, Tensor], what: str, source: s
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
 
 
+Resize = Literal["torch-fidelity", "antialiased"]
+"""How pictures reach the size that a network sees: bilinear between the two nearest pixels from the corner of each, as
+TensorFlow 1 and torch-fidelity do, or bicubic with antialiasing, as CLIP and clean-fid do."""
+
+
+def resized(pictures: Float[Tensor, "n h w 3"], side: int, resize: Resize) -> Float[Tensor, "n 3 side side"]:
+    """Pictures of side x side pixels. Raises ValueError for an unknown `resize`."""
+    x = pictures.movedim(-1, 1)
+    if resize == "antialiased":
+        moved = functional.interpolate(x, (side, side), mode="bicubic", align_corners=False, antialias=True)
+        return moved.clamp(0, 1)
+    if resize != "torch-fidelity":
+        raise ValueError(f"unknown resize {resize!r}: choose torch-fidelity or antialiased")
+    for dimension in (2, 3):
+        position = torch.arange(side, device=x.device) * (x.shape[dimension] / side)
+        low = position.long()
+        high = (low + 1).clamp_max(x.shape[dimension] - 1)
+        share = (position - low).reshape([-1 if d == dimension else 1 for d in range(4)])
+        x = x.index_select(dimension, low).lerp(x.index_select(dimension, high), share)
+    return x
+
+
 Size = int | tuple[int, int]
 Layer = tuple[int, Size] | tuple[int, Size, Size]
 """Channels and kernel of a convolution, or of two side by side."""
@@ -229,13 +252,14 @@ class Inception(nn.Module):
     """Inception-V3 as FID uses it, 2048 features (Szegedy et al. 2016, Heusel et al. 2017).
 
     Matches pt_inception-2015-12-05-6726825d.pth, the file behind published FIDs. Weights are random until
-    `load_inception` fills them.
+    `load_inception` fills them. Features equal torch-fidelity's on bytes if `resize` is "torch-fidelity".
     """
 
     SIDE = 299
 
-    def __init__(self) -> None:
+    def __init__(self, resize: Resize = "torch-fidelity") -> None:
         super().__init__()
+        self.resize: Resize = resize
         self.Conv2d_1a_3x3, self.Conv2d_2a_3x3 = NormalisedConvolution(3, 32, 3, 2), NormalisedConvolution(32, 32, 3)
         self.Conv2d_2b_3x3 = NormalisedConvolution(32, 64, 3, padding=1)
         self.Conv2d_3b_1x1, self.Conv2d_4a_3x3 = NormalisedConvolution(64, 80, 1), NormalisedConvolution(80, 192, 3)
@@ -266,9 +290,8 @@ class Inception(nn.Module):
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 2048"]:
         """Features of sRGB-encoded pictures in [0, 1]."""
-        size = (self.SIDE, self.SIDE)
-        x = functional.interpolate(pictures.movedim(-1, 1), size, mode="bilinear", align_corners=False)
-        x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(2 * x - 1)))
+        x = (255 * resized(pictures, self.SIDE, self.resize) - 128) / 128  # of bytes, as in the TensorFlow graph
+        x = self.Conv2d_2b_3x3(self.Conv2d_2a_3x3(self.Conv2d_1a_3x3(x)))
         x = self.Conv2d_4a_3x3(self.Conv2d_3b_1x1(functional.max_pool2d(x, 3, 2)))
         x = functional.max_pool2d(x, 3, 2)
         for name in ("5b", "5c", "5d", "6a", "6b", "6c", "6d", "6e", "7a", "7b", "7c"):
@@ -276,9 +299,9 @@ class Inception(nn.Module):
         return x.mean((2, 3))
 
 
-def load_inception(path: Path | str) -> Inception:
+def load_inception(path: Path | str, resize: Resize = "torch-fidelity") -> Inception:
     """Load the encoder from a weights file. Raises FileNotFoundError and WeightsFileError."""
-    network = Inception()
+    network = Inception(resize)
     # Older files lack num_batches_tracked, which evaluation mode does not use.
     own = {name: value for name, value in network.state_dict().items() if name.endswith("num_batches_tracked")}
     fill(network, {**own, **read_weights(path)}, "Inception-V3 as FID uses it", str(path))
@@ -299,8 +322,9 @@ class ClipVision(nn.Module):
     SIDE, PATCH, WIDTH, LAYERS, HEADS, FEATURES = 224, 32, 768, 12, 12, 512
     MEAN, STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
 
-    def __init__(self) -> None:
+    def __init__(self, resize: Resize = "antialiased") -> None:
         super().__init__()
+        self.resize: Resize = resize
         width = self.WIDTH
         self.conv1 = nn.Conv2d(3, width, self.PATCH, self.PATCH, bias=False)
         self.class_embedding = nn.Parameter(torch.randn(width) / width**0.5)
@@ -315,10 +339,9 @@ class ClipVision(nn.Module):
 
     def forward(self, pictures: Float[Tensor, "n h w 3"]) -> Float[Tensor, "n 512"]:
         """Features of sRGB-encoded square pictures in [0, 1]."""
-        size = (self.SIDE, self.SIDE)
-        x = functional.interpolate(pictures.movedim(-1, 1), size, mode="bicubic", align_corners=False, antialias=True)
+        x = resized(pictures, self.SIDE, self.resize)
         mean, std = (x.new_tensor(values)[:, None, None] for values in (self.MEAN, self.STD))
-        patches = self.conv1((x.clamp(0, 1) - mean) / std).flatten(2).mT
+        patches = self.conv1((x - mean) / std).flatten(2).mT
         first = self.class_embedding.expand(len(x), 1, -1)
         tokens = self.ln_pre(torch.cat([first, patches], dim=1) + self.positional_embedding)
         return self.ln_post(self.transformer(tokens)[:, 0]) @ self.proj
@@ -335,7 +358,7 @@ CLIP_NAMES = {
 """Parts of OpenAI's names of layers, and torch's."""
 
 
-def load_clip_vision(path: Path | str) -> ClipVision:
+def load_clip_vision(path: Path | str, resize: Resize = "antialiased") -> ClipVision:
     """Load the encoder from a weights file with OpenAI's names, with or without the text encoder.
 
     OpenAI's own file is a TorchScript program and is not run: save its state_dict() as .safetensors. Raises
@@ -348,6 +371,6 @@ def load_clip_vision(path: Path | str) -> ClipVision:
         for theirs, ours in CLIP_NAMES.items():
             name = name.replace(f".{theirs}.", f".{ours}.")
         weights[name] = value.float()
-    network = ClipVision()
+    network = ClipVision(resize)
     fill(network, weights, "CLIP's ViT-B/32", str(path))
     return network

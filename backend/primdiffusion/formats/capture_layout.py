@@ -40,7 +40,7 @@ from .arrays import ArrayFileError, read_numbers
 from .camera_rig import View
 from .json_files import parse_json, read_json
 from .removing import check_inside, remove_file
-from .whole_files import replacing, temporary_name
+from .whole_files import remove_abandoned, replacing, temporary_name
 
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png", "rgba": ".png"}
@@ -80,6 +80,7 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
     Raises CaptureFolderError if the folder contains another dataset or other files.
     """
     wanted = {"format": FORMAT, "version": VERSION, **parse_json(json.dumps(about))}
+    remove_abandoned(root, root / DATASET_FILE)
     if not (root / DATASET_FILE).exists():
         if root.is_dir() and any(not path.name.startswith(".") for path in root.iterdir()):
             raise CaptureFolderError(
@@ -87,8 +88,8 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
             )
         root.mkdir(parents=True, exist_ok=True)
         unlike = temporary_name(root / DATASET_FILE)
-        unlike.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
         try:  # a link fails where another process was first, which a rename would not
+            unlike.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
             with contextlib.suppress(FileExistsError):
                 os.link(unlike, root / DATASET_FILE)
         finally:

@@ -69,6 +69,15 @@ def check_unit_interval(name: str, value: float) -> None:
         raise ValueError(f"{name} is {value}: choose a number from 0 to 1")
 
 
+LARGEST_SEED = 2**63 - 1
+
+
+def check_seed(seed: int) -> None:
+    """Raise ValueError outside 0 ... 2^63-1."""
+    if not 0 <= seed <= LARGEST_SEED:
+        raise ValueError(f"seed {seed} is outside 0 ... 2^63-1")
+
+
 FINEST_STEP = 1e-4
 """Metres; a finer step takes hours without visible gain."""
 COARSEST_STEP = 1.0

@@ -40,6 +40,17 @@ def temporary_name(path: Path) -> Path:
     return path.with_name(f".{path.stem}.{writer()}.partial{path.suffix}")
 
 
+@contextlib.contextmanager
+def temporary_folder(path: Path) -> Iterator[Path]:
+    """Yield an empty folder with a temporary name beside `path`; it is removed after the block. Raises OSError."""
+    folder = temporary_name(path)
+    folder.mkdir(parents=True)
+    try:
+        yield folder
+    finally:
+        remove_folder(folder, folder.parent)
+
+
 def is_abandoned(path: Path) -> bool:
     """Whether a temporary file or folder belongs to no running process, as far as can be told."""
     named = _TEMPORARY.fullmatch(path.name)
@@ -83,11 +94,15 @@ def remove_of_process(folder: Path, pid: int) -> None:
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Yield a temporary name beside `path` to write to; it is renamed at the end, or removed after an error.
 
-    Raises OSError, naming `path`; PermissionError if it is a folder or a device, which renaming would replace.
+    A `path` that is such a temporary name is yielded itself. Raises OSError, naming `path`; PermissionError if it is a
+    folder or a device, which renaming would replace.
     """
     path = Path(path)
     if path.exists() and not path.is_file():
         raise PermissionError(errno.EPERM, "this is not a regular file and will not be replaced", str(path))
+    if _TEMPORARY.fullmatch(path.name):  # its writer renames or removes it
+        yield path
+        return
     remove_abandoned(path.parent, path)
     unfinished = temporary_name(path)
     try:
@@ -116,18 +131,18 @@ def write_atomically(path: Path, content: str | bytes) -> None:
 
 
 @contextlib.contextmanager
-def staged(folder: str | Path) -> Iterator[Path]:
+def staged(folder: str | Path, last: str = "") -> Iterator[Path]:
     """Yield a temporary folder inside `folder`, to which its files move at the end, replacing files of the same names.
 
-    After an error everything is removed, including a newly created `folder`. Raises OSError, at once if `folder` cannot
-    be written to.
+    The file named `last` moves last. After an error everything is removed, including a newly created `folder`. Raises
+    OSError, naming the file in `folder`; at once if it cannot be written to.
     """
-    with staged_together([folder]) as (aside,):
+    with staged_together([folder], last) as (aside,):
         yield aside
 
 
 @contextlib.contextmanager
-def staged_together(folders: Sequence[str | Path]) -> Iterator[list[Path]]:
+def staged_together(folders: Sequence[str | Path], last: str = "") -> Iterator[list[Path]]:
     """`staged` for several folders, whose files move at the end in all of them or in none."""
     targets = [Path(folder) for folder in folders]
     made: list[Path] = []
@@ -139,8 +154,13 @@ def staged_together(folders: Sequence[str | Path]) -> Iterator[list[Path]]:
             asides.append(temporary_name(target / "files"))
             asides[-1].mkdir()
         yield asides
-        publish(list(zip(asides, targets, strict=True)))
+        publish(list(zip(asides, targets, strict=True)), last)
         made = []
+    except OSError as e:
+        for aside, target in zip(asides, targets, strict=False):
+            if isinstance(e.filename, str | Path) and (path := Path(e.filename)).is_relative_to(aside):
+                raise type(e)(e.errno, e.strerror, str(target / path.relative_to(aside))) from e
+        raise
     finally:
         for aside in asides:
             remove_folder(aside, aside.parent)

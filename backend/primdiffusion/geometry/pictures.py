@@ -1,4 +1,4 @@
-"""Decode untrusted PNG and JPEG files of a limited size."""
+"""Decode untrusted picture files of a limited size."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class PictureError(ValueError):
 
 
 @contextlib.contextmanager
-def opened_picture(source: Path | BinaryIO) -> Iterator[Image.Image]:
-    """Open a PNG or JPEG; errors of decoding it in the block are PictureErrors too.
+def opened_picture(source: Path | BinaryIO, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Iterator[Image.Image]:
+    """Open a picture of one of Pillow's `formats`; errors of decoding it in the block are PictureErrors too.
 
     Raises PictureError, and OSError for a file that cannot be opened.
     """
@@ -37,7 +37,7 @@ def opened_picture(source: Path | BinaryIO) -> Iterator[Image.Image]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit below is smaller
-            with Image.open(source, formats=("PNG", "JPEG")) as picture:
+            with Image.open(source, formats=formats) as picture:
                 if picture.width * picture.height > MOST_PIXELS:
                     raise PictureError(f"{picture.width} x {picture.height} pixels, more than {MOST_PIXELS}")
                 yield picture

@@ -25,6 +25,7 @@ from primdiffusion.body.model import default_body
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.removing import remove_folder
+from primdiffusion.formats.requests import check_seed
 from primdiffusion.formats.whole_files import remove_abandoned, temporary_name, written_whole
 from primdiffusion.people.assets import UNKNOWN, Assets, licence_of
 from primdiffusion.people.base_mesh import load_base_mesh
@@ -53,11 +54,11 @@ class PeopleSet:
     count: int
 
     def __post_init__(self) -> None:
-        """Raise ValueError if count is not positive or seed is negative."""
+        """Raise ValueError if count is not positive, or a seed is outside 0 ... 2^63-1."""
         if self.count < 1:
             raise ValueError(f"count is {self.count}: give 1 or more")
-        if self.seed < 0:
-            raise ValueError(f"seed is {self.seed}: give 0 or more")
+        check_seed(self.seed)
+        check_seed(self.seed + self.count - 1)
 
     @property
     def seeds(self) -> range:

@@ -41,10 +41,12 @@ def march(
     extent of zero or less are not rendered.
 
     Differentiable in every tensor except the span. float32 runs on the fast back end of its device (`march_cpu`, or
-    `march_cuda` if Triton is installed), everything else on `march_reference`, which is slow. Raises ValueError as
-    `check_scene` does, and if leading dimensions do not broadcast.
+    `march_cuda` if Triton is installed; for Apple GPUs `march_cpu`), everything else on `march_reference`, which is
+    slow. Raises ValueError as `check_scene` does, and if leading dimensions do not broadcast.
     """
     check_one_device(primitives, camera, span)
+    if _borrows_cpu(primitives.position.device):
+        return _march_on_cpu(primitives, camera, settings, span, background)
     if camera.intrinsics.device.type == "cpu":  # on GPUs the kernels check it, as reading it here would synchronise
         check_camera(camera)
     if settings.pixel_centre != 0.5:
@@ -56,6 +58,24 @@ def march(
     else:
         rendering = _march_one_by_one(primitives, camera, settings, span, batch)
     return rendering if background is None else _over(rendering, background)
+
+
+def _borrows_cpu(device: torch.device) -> bool:
+    return device.type == "mps"  # no back end of its own, and no float64
+
+
+def _march_on_cpu(
+    primitives: Primitives,
+    camera: Camera,
+    settings: MarchSettings,
+    span: Span | None,
+    background: Float[Tensor, "*h w 3"] | Sequence[float] | None,
+) -> Rendering:
+    """Render there, differentiably, and return the images on the device of the primitives."""
+    behind = background.cpu() if isinstance(background, Tensor) else background
+    limits = None if span is None else span.to("cpu")
+    rendering = march(primitives.to("cpu"), camera.to("cpu"), settings, span=limits, background=behind)
+    return rendering.to(primitives.position.device)
 
 
 def _march_one_by_one(

@@ -13,6 +13,7 @@ from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.formats.json_files import parse_json
 
 Weighting = Literal["whitened", "plain", "min_snr"]
+Tracker = Literal["tensorboard", "wandb"]
 Levels = Literal["uniform", "log_uniform", "log_normal"]
 
 
@@ -110,6 +111,8 @@ class RunSettings:
     """Steps between lines of metrics.jsonl, which are running means."""
     pictures_every: int = 1000
     """Steps between images of samples from the averaged weights."""
+    tracker: Tracker | None = None
+    """Where metrics go besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values out of range."""
@@ -198,6 +201,7 @@ MAY_CHANGE = frozenset(
         "evaluate_every",
         "pictures_every",
         "log_every",
+        "tracker",
         "loss.perceptual_weights",
     )
 )

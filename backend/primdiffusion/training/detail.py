@@ -22,7 +22,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.detail import DetailCodec, DetailConfig, DetailDecoder, FineCodec
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.diffusion.schedule import schedule_name
 from primdiffusion.primitives.anchors import CHARTS, default_anchors
 from primdiffusion.primitives.primitives import GRID
 from primdiffusion.training.config import CodecConfig, PhaseConfig, RunSettings
@@ -34,6 +34,7 @@ from primdiffusion.training.run_folder import begin
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.state import AcceleratedState, accelerator_of
 from primdiffusion.training.stored_people import PersonDataset
+from primdiffusion.training.trackers import check_tracker, tracking
 
 PHASE = "detail"
 MODEL = "model.safetensors"
@@ -78,6 +79,7 @@ def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
     """
     if config.threads:
         torch.set_num_threads(config.threads)
+    check_tracker(config.tracker)
     accelerator = accelerator_of()
     base = load_checkpoint(config.checkpoint, accelerator.device)
     if not isinstance(base.codec, CellCodec):
@@ -98,14 +100,13 @@ def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
             config.run / PREPARED, base, coarse_codec, fine, coarse, (chosen, held), config.codec, config.seed
         )
     trainee = DetailTrainee(config, base, coarse_codec, fine.full_density, prepared)
-    with Interrupt(config.minutes) as interrupt:
-        state = train_phase(config, trainee, PHASE, accelerator, interrupt)
+    tracker = config.tracker if accelerator.is_main_process else None
+    with Interrupt(config.minutes) as interrupt, tracking(tracker, config.run) as tracked:
+        state = train_phase(config, trainee, PHASE, accelerator, interrupt, tracked)
     model = trainee.model()
     if accelerator.is_main_process:
         model = dataclasses.replace(model, card=_card(base.card, fine, chosen, held, trainee, state))
-        levels = base.schedule.alpha_bar.cpu()
-        schedule = next(name for name, make in SCHEDULES.items() if torch.equal(make().alpha_bar, levels))
-        save_checkpoint(config.run / MODEL, model, schedule)
+        save_checkpoint(config.run / MODEL, model, schedule_name(base.schedule))
     accelerator.end_training()
     return model
 

@@ -15,6 +15,7 @@ from primdiffusion import __version__
 from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.machine import device_info
 from primdiffusion.training.cells import CellTrainee, prepare
 from primdiffusion.training.config import TrainingConfig
 from primdiffusion.training.latents import split_people
@@ -25,6 +26,7 @@ from primdiffusion.training.shards import open_people
 from primdiffusion.training.slabs import SlabTrainee
 from primdiffusion.training.state import AcceleratedState, accelerator_of
 from primdiffusion.training.stored_people import PersonDataset
+from primdiffusion.training.trackers import check_tracker, tracking
 
 MODEL = "model.safetensors"
 DATA = "humans dressed from MakeHuman's CC0 assets, in T pose, as primitives fitted to renders of their meshes"
@@ -53,10 +55,12 @@ def train(config: TrainingConfig) -> DiffusionModel:
             of different full densities; a loss or gradient that is not finite (NotFiniteError); out of memory; a
             damaged file (ShardError among them).
         FileNotFoundError: there are fewer than two people.
+        MissingPackageError: the tracker's package is not installed.
         OSError: the disk is full; the last saved state remains.
     """
     if config.threads:
         torch.set_num_threads(config.threads)
+    check_tracker(config.tracker)
     accelerator = accelerator_of()
     people = open_people(config.data)
     chosen, held = split_people(range(len(people.names)), config.holdout, config.seed)
@@ -64,8 +68,9 @@ def train(config: TrainingConfig) -> DiffusionModel:
         if accelerator.is_main_process:
             _begin(config, people, held, accelerator)
         trainee = _trainee(config, people, chosen, held, accelerator)
-    with Interrupt(config.minutes) as interrupt:
-        states = {name: train_phase(config, trainee, name, accelerator, interrupt) for name in trainee.phases}
+    tracker = config.tracker if accelerator.is_main_process else None
+    with Interrupt(config.minutes) as interrupt, tracking(tracker, config.run) as tracked:
+        states = {name: train_phase(config, trainee, name, accelerator, interrupt, tracked) for name in trainee.phases}
     model = trainee.model()
     if accelerator.is_main_process:
         model = dataclasses.replace(model, card=_card(config, people, chosen, held, trainee, states))
@@ -142,7 +147,7 @@ def _rounded(errors: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, f
 
 
 def _device_name(device: torch.device) -> str:
-    return torch.cuda.get_device_name(device) if device.type == "cuda" else "CPU"
+    return "CPU" if device.type == "cpu" else device_info(device)["device_name"]
 
 
 def run(arguments: Sequence[str] | None = None) -> None:

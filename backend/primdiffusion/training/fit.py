@@ -34,6 +34,7 @@ from primdiffusion.training.fit_run import MODEL, STATE, FitRecorder, FitState, 
 from primdiffusion.training.recorder import Interrupt, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import versions
 from primdiffusion.training.state import NotFiniteError, accelerator_of, agreed
+from primdiffusion.training.trackers import check_tracker, tracking
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -61,6 +62,7 @@ def fit(config: FitConfig) -> EncoderModel:
     """
     if config.threads:
         torch.set_num_threads(config.threads)
+    check_tracker(config.tracker)
     accelerator = accelerator_of(config.mixed_precision)
     perceptual = _features(config, accelerator.device)
     captures = open_captures(config.data)
@@ -78,8 +80,9 @@ def fit(config: FitConfig) -> EncoderModel:
         state = FitState(Encoder(PRESETS[config.encoder]), config, accelerator)
         if (config.run / STATE).exists():
             state.load(config.run / STATE)
-    recorder = FitRecorder(config, captures, held, state) if accelerator.is_main_process else None
-    _run(config, state, dataset, recorder, perceptual)
+    with tracking(config.tracker if accelerator.is_main_process else None, config.run) as tracker:
+        recorder = FitRecorder(config, captures, held, state, tracker) if accelerator.is_main_process else None
+        _run(config, state, dataset, recorder, perceptual)
     accelerator.end_training()
     return model_of(config, state, captures)
 

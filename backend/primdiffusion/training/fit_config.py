@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from primdiffusion.encoder.config import PRESETS
+from primdiffusion.training.config import Tracker
 
 Preset = Literal["default", "shared_scale", "template_rt", "no_attention", "paper", "released"]
 AT_LEAST_ONE = (
@@ -109,6 +110,8 @@ class FitConfig:
     """Steps between evaluations on a few subjects of `data` and `held`."""
     pictures_every: int = 500
     """Steps between images."""
+    tracker: Tracker | None = None
+    """Where metrics go besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values out of range."""

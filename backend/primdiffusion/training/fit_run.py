@@ -26,6 +26,7 @@ from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.recorder import Recorder
 from primdiffusion.training.run_folder import PICTURES, append_metrics
 from primdiffusion.training.state import AcceleratedState
+from primdiffusion.training.trackers import RunTracker
 
 STATE, MODEL = "state.safetensors", "encoder.safetensors"
 SIZE = 256
@@ -116,8 +117,16 @@ def _compared(
 class FitRecorder(Recorder):
     """Records PSNR and images of a few subjects."""
 
-    def __init__(self, config: FitConfig, captures: Captures, held: Captures | None, state: FitState) -> None:
+    def __init__(
+        self,
+        config: FitConfig,
+        captures: Captures,
+        held: Captures | None,
+        state: FitState,
+        tracker: RunTracker | None = None,
+    ) -> None:
         super().__init__(config.steps, config, state)
+        self.tracker = tracker
         self.run, self.captures, self.held, self.fit_state = config.run, captures, held, state
 
     def measured(self) -> dict[str, float]:
@@ -133,6 +142,8 @@ class FitRecorder(Recorder):
     def append(self, row: Mapping[str, float]) -> None:
         """Append a line to metrics.jsonl."""
         append_metrics(self.run, row)
+        if self.tracker is not None:
+            self.tracker.log(row, self.state.step)
 
     def _model(self) -> EncoderModel:
         return EncoderModel(self.fit_state.encoder, {})

@@ -29,6 +29,7 @@ from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.recorder import Interrupt, Recorder, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import PICTURES, append_metrics
 from primdiffusion.training.state import AcceleratedState, NotFiniteError, agreed
+from primdiffusion.training.trackers import RunTracker
 
 SEEDS = (0, 1, 2, 3)
 """Of the samples in images."""
@@ -84,7 +85,12 @@ class Trainee(Protocol):
 
 
 def train_phase(
-    config: PhaseRun, trainee: Trainee, name: str, accelerator: Accelerator, interrupt: Interrupt
+    config: PhaseRun,
+    trainee: Trainee,
+    name: str,
+    accelerator: Accelerator,
+    interrupt: Interrupt,
+    tracker: RunTracker | None = None,
 ) -> AcceleratedState:
     """Train one network until its last step or an interrupt, and install its average.
 
@@ -97,7 +103,7 @@ def train_phase(
     state = AcceleratedState(trainee.network(name).requires_grad_(True), phase, config.seed, accelerator)
     if path.exists():
         state.load(path)
-    recorder = PhaseRecorder(config, trainee, name, state) if accelerator.is_main_process else None
+    recorder = PhaseRecorder(config, trainee, name, state, tracker) if accelerator.is_main_process else None
     trainee.put(name, state.prepared)
     began = saved = time.monotonic()
     before, first = state.seconds, state.step
@@ -162,11 +168,20 @@ class _Every:
 class PhaseRecorder(Recorder):
     """Records a phase: held-out error, and people generated with the averaged weights."""
 
-    def __init__(self, config: PhaseRun, trainee: Trainee, name: str, state: AcceleratedState) -> None:
+    def __init__(
+        self,
+        config: PhaseRun,
+        trainee: Trainee,
+        name: str,
+        state: AcceleratedState,
+        tracker: RunTracker | None = None,
+    ) -> None:
         phase = trainee.phases[name]
         every = _Every(config.log_every, phase.evaluate_every, config.pictures_every)
         super().__init__(phase.steps, every, state, name)
         self.run, self.trainee, self.phase, self.prepared = config.run, trainee, name, state.prepared
+        names = list(trainee.phases)
+        self.tracker, self.before = tracker, sum(trainee.phases[one].steps for one in names[: names.index(name)])
 
     def measured(self) -> dict[str, float]:
         """RMS x0 error at each level."""
@@ -180,7 +195,10 @@ class PhaseRecorder(Recorder):
 
     def append(self, row: Mapping[str, float]) -> None:
         """Append a line to metrics.jsonl, with the phase."""
-        append_metrics(self.run, {"phase": self.phase, **row})
+        line = {"phase": self.phase, **row}
+        append_metrics(self.run, line)
+        if self.tracker is not None:
+            self.tracker.log(line, self.before + self.state.step)
 
     @contextlib.contextmanager
     def _averaged(self) -> Iterator[None]:

@@ -53,6 +53,8 @@ class StepTimer:
         """End a lap."""
         if self.device.type == "cuda":
             torch.cuda.synchronize(self.device)
+        elif self.device.type == "mps":
+            torch.mps.synchronize()
         now = time.perf_counter()
         self.seconds[name] = now - self._last
         self._last = now

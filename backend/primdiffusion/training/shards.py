@@ -24,7 +24,7 @@ from torch import Tensor
 
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.whole_files import write_atomically, written_whole
+from primdiffusion.formats.whole_files import staged, write_atomically, written_whole
 from primdiffusion.primitives.primitives import K
 from primdiffusion.tensor_file import save
 from primdiffusion.training.stored_people import PersonDataset, PersonFolder, PersonVariants, attributes_of
@@ -48,33 +48,33 @@ def open_people(folder: Path) -> PersonDataset:
 
 
 def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iterator[int]:
-    """Write the people of a folder as shards; yields the number packed so far. A second run starts over.
+    """Write the people of a folder as shards; yields the number packed so far. After an error nothing is left.
 
     Raises:
         ValueError: `out` holds packed people already, or a person's file is damaged (it is named); no people a shard.
         FileNotFoundError: there are fewer than two people.
-        OSError: there is no room; no index is written then.
+        OSError: there is no room.
     """
     if people_each < 1:
         raise ValueError(f"{people_each} humans per shard: choose 1 or more")
     if (out / INDEX).exists():
         raise ShardError(f"{out} already contains shards: choose another folder, or remove it")
     people = PersonFolder(folder)
-    out.mkdir(parents=True, exist_ok=True)
-    shards, done = [], 0
-    for number, first in enumerate(range(0, len(people.names), people_each)):
-        indices = range(first, min(first + people_each, len(people.names)))
-        path = out / f"shard_{number:04d}.safetensors"
-        _write_shard(path, [people.person(index) for index in indices])
-        about = [
-            {"name": people.names[i], "variants": people.variants[i], "attributes": dict(people.outlines[i].stored)}
-            for i in indices
-        ]
-        shards.append({"file": path.name, "sha256": digest_of(path), "people": about})
-        done += len(indices)
-        yield done
-    index = {"format": FORMAT, "version": VERSION, "full_density": people.full_density, "shards": shards}
-    write_atomically(out / INDEX, json.dumps(index, indent=1))
+    with staged(out, last=INDEX) as unfinished:
+        shards, done = [], 0
+        for number, first in enumerate(range(0, len(people.names), people_each)):
+            indices = range(first, min(first + people_each, len(people.names)))
+            path = unfinished / f"shard_{number:04d}.safetensors"
+            _write_shard(path, [people.person(index) for index in indices])
+            about = [
+                {"name": people.names[i], "variants": people.variants[i], "attributes": dict(people.outlines[i].stored)}
+                for i in indices
+            ]
+            shards.append({"file": path.name, "sha256": digest_of(path), "people": about})
+            done += len(indices)
+            yield done
+        index = {"format": FORMAT, "version": VERSION, "full_density": people.full_density, "shards": shards}
+        write_atomically(unfinished / INDEX, json.dumps(index, indent=1))
 
 
 def _write_shard(path: Path, people: Sequence[PersonVariants]) -> None:

@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
 from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.machine import best_device
 from primdiffusion.tensor_file import save
 
 PATIENCE = datetime.timedelta(hours=3)
@@ -143,9 +144,10 @@ def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
 
 
 def accelerator_of(mixed_precision: str = "no") -> Accelerator:
-    """Return the accelerator of this process; on the CPU if there is no GPU."""
+    """Return the accelerator of this process, on `best_device`; ValueError if a chosen device is not available."""
     patience = InitProcessGroupKwargs(timeout=PATIENCE)
-    return Accelerator(mixed_precision=mixed_precision, cpu=not torch.cuda.is_available(), kwargs_handlers=[patience])
+    on_cpu = best_device().type == "cpu"
+    return Accelerator(mixed_precision=mixed_precision, cpu=on_cpu, kwargs_handlers=[patience])
 
 
 class AcceleratedState(TrainingState):

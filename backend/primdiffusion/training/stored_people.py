@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
-from primdiffusion.body.measures import measure
+from primdiffusion.body.measures import LARGEST_BETA, measure
 from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
@@ -144,6 +144,8 @@ def _outline_of(arrays: Mapping[str, NDArray], shape: tuple[int, ...]) -> Outlin
     betas = torch.from_numpy(arrays["betas"]).float()
     if tuple(betas.shape) != (BETAS,) or not torch.isfinite(betas).all():
         raise ValueError(f"betas of shape {tuple(betas.shape)}, not {BETAS} finite numbers")
+    if betas.abs().max() > LARGEST_BETA:
+        raise ValueError(f"a beta of {betas.abs().max():.3g}, beyond {LARGEST_BETA:g}")
     stored, count = parse_json(str(arrays["attributes"])), shape[0]
     if not isinstance(stored, dict):
         raise ValueError("attributes that are no JSON object")

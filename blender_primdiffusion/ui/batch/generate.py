@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from ...backend.requests import Backend, ChildRequest
 from ...capture.report import Report
 from ...console import Stop, duration
+from ...formats.removing import check_unlinked
 from ...places import missing_packages, preference
 from ...scene.human import NPZ_FILE, PERSON_FILE
 from ..attributes import Attributes, parsed
@@ -97,6 +98,7 @@ class _Person:
 
         Where the .blend cannot be made the human stays.
         """
+        check_unlinked(self._folder)
         if not (self._folder / PERSON_FILE).is_file():
             with staging(self._folder) as made:
                 ask(backend, "generate", {**self._params, "out_dir": str(made)}, self._stop, self._print_progress)

@@ -31,8 +31,8 @@ from ...console import (
 )
 from ...formats import whole_files
 from ...formats.json_files import parse_json, read_json
-from ...formats.removing import remove_file, remove_folder
-from ...formats.whole_files import remove_abandoned, replacing, temporary_name
+from ...formats.removing import remove_file
+from ...formats.whole_files import remove_abandoned, replacing, temporary_folder
 from ...places import EXTENSION, new_backend, preference
 
 _TICK_S = 0.03
@@ -119,13 +119,9 @@ def ask(
 @contextmanager
 def staging(folder: Path) -> Iterator[Path]:
     """An empty folder beside `folder`, to be published; removed after the block. A killed run may have left one."""
-    made = temporary_name(folder)
     remove_abandoned(folder.parent, folder)
-    made.mkdir(parents=True)
-    try:
+    with temporary_folder(folder) as made:
         yield made
-    finally:
-        remove_folder(made, made.parent)
 
 
 def publish(made: Path, folder: Path, last: str) -> None:

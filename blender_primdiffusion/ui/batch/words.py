@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from ...console import UsageError
-from ...formats.requests import GUIDANCE, PICTURE_SIZE, SAMPLERS, STEPS
+from ...formats.requests import GUIDANCE, PICTURE_SIZE, SAMPLERS, STEPS, check_seed
 
 ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
 """Names of render engines on the command line -> Blender's."""
@@ -41,6 +41,10 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     _add_python(made)
     add("--resume", action="store_true", help="keep humans in the folder that were generated with other settings")
     options = made.parse_args(list(argv))
+    try:
+        check_seed(options.seed + options.count - 1)
+    except ValueError as error:
+        raise UsageError(str(error)) from error
     if options.blend is not None and (Path(options.blend).name != options.blend or not options.blend.strip(".")):
         raise UsageError(f"--blend {options.blend!r} is no file name: name one without folders")
     if options.blend is not None and not options.blend.endswith(".blend"):

@@ -1,6 +1,7 @@
 """Captures read back, ours and in the released layout, whole and damaged."""
 
 import json
+import os
 import pickle
 import shutil
 import zipfile
@@ -223,13 +224,15 @@ def test_frames_and_cameras_that_are_not_there_are_rejected(root):
 def test_damage_is_found_and_repaired_so_that_only_it_is_made_again(root, capsys):
     cli.main(["captures", "verify", str(root)])
     cut, altered, stray = (
-        root / NAME / file for file in ("depth/camera0001/0002.png", "part/camera0003/0000.png", ".x.9.partial.png")
+        root / NAME / file
+        for file in ("depth/camera0001/0002.png", "part/camera0003/0000.png", ".x.0a1b2c3d-9-4e5f6a7b.partial.png")
     )
     cut.write_bytes(cut.read_bytes()[:-4])
     data = bytearray(altered.read_bytes())
     data[50] ^= 1
     altered.write_bytes(data)
     stray.touch()
+    os.utime(stray, (0, 0))  # old: its writer has ended
     assert list(verify(root)) == [cut, altered, stray]
     assert list(verify(root, checksums=False)) == [cut, stray]
     with pytest.raises(SystemExit) as end:

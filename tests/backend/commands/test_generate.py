@@ -71,6 +71,20 @@ def test_a_request_can_be_ended_at_every_report(checkpoint, tmp_path):
         assert not (tmp_path / "out").exists()
 
 
+def test_seeds_beyond_the_range_are_rejected_before_the_first_human(tmp_path):
+    with pytest.raises(ValueError, match=rf"seed {2**63} is outside 0 \.\.\. 2\^63-1"):
+        run(["--seed", str(2**63 - 1), "--count", "2", "--out", str(tmp_path / "out")])
+
+
+def test_nothing_is_written_through_a_link_in_the_folder_of_several_humans(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "out" / "seed_000003").symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(ValueError, match="seed_000003 is a link to another folder"):
+        run(["--seed", "3", "--count", "2", "--out", str(tmp_path / "out")])
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
 def test_the_command_line_writes_compact_files(checkpoint, tmp_path):
     run(
         [

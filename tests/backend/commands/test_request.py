@@ -1,6 +1,7 @@
 """Requests read from JSON: types, defaults, and the name of what is wrong."""
 
 import dataclasses
+import math
 from pathlib import Path
 from typing import Literal
 
@@ -38,6 +39,9 @@ def test_parameters_get_their_defaults_and_whole_numbers_pass_for_floats():
         ({"count": 1, "colour": 2}, "colour"),
         ({"count": "1"}, "count"),
         ({"count": 1.0}, "count"),
+        ({"count": 2.0**63}, r"m\.count is 9\.22337e\+18: integers go up to 2\^63-1"),
+        ({"count": -math.inf}, r"m\.count is -inf: integers go down to 1-2\^63"),
+        ({"count": math.nan}, "count must be an integer"),
         ({"count": True}, "count"),
         ({"count": None}, "count"),
         ({"count": 1, "scale": "2"}, "scale"),

@@ -187,6 +187,14 @@ def test_a_single_file_is_written_whole_or_not_at_all(tmp_path):
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_temporary_file_needs_no_other(tmp_path):
+    with written_whole(tmp_path / "a.png") as outer:
+        with written_whole(outer) as inner:
+            inner.write_text("x")
+        assert (inner, list(tmp_path.iterdir())) == (outer, [outer])
+    assert contents(tmp_path) == {"a.png": "x"}
+
+
 def test_errors_name_the_file_that_was_asked_for(tmp_path):
     with pytest.raises(FileNotFoundError) as missing, written_whole(tmp_path / "no" / "a") as unfinished:
         unfinished.write_text("x")

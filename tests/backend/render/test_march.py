@@ -290,3 +290,13 @@ def test_a_scene_far_from_the_origin_is_drawn_as_it_is_there(offset):
     exact = march(there.to(dtype=torch.float64), view.to(dtype=torch.float64))
     assert exact.alpha.max() > 0.9
     torch.testing.assert_close(march(there, view).rgb.double(), exact.rgb, atol=2e-5, rtol=0)
+
+
+def test_a_device_without_a_back_end_borrows_the_cpu_s(monkeypatch):
+    primitives, camera = one(people(0), 0), one(views(1), 0)
+    expected = march(primitives, camera, background=(1.0, 0.5, 0.0))
+    asked = iter((True, False))
+    monkeypatch.setattr("primdiffusion.render.march._borrows_cpu", lambda _device: next(asked))
+    found = march(primitives, camera, background=torch.tensor([1.0, 0.5, 0.0]))
+    assert torch.equal(found.rgb, expected.rgb)
+    assert next(asked, None) is None

@@ -1,4 +1,7 @@
+import errno
+import itertools
 import json
+import pathlib
 
 import numpy as np
 import pytest
@@ -130,6 +133,22 @@ def test_a_damaged_person_is_named_and_leaves_no_index(folder, tmp_path):
     with pytest.raises(ValueError, match="person_000003"):
         list(pack_people(tmp_path, tmp_path / "out", people_each=2))
     assert not (tmp_path / "out" / INDEX).exists()
+
+
+@pytest.mark.parametrize("written", [1, 3], ids=["a shard", "the index"])
+def test_a_full_disk_while_packing_is_named_and_leaves_nothing(folder, tmp_path, monkeypatch, written):
+    write, calls = pathlib.Path.write_bytes, itertools.count()
+
+    def until_full(path, data):
+        if next(calls) == written:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, data)
+
+    monkeypatch.setattr(pathlib.Path, "write_bytes", until_full)
+    with pytest.raises(OSError, match="No space left") as full:
+        list(pack_people(folder, tmp_path / "out", people_each=2))
+    assert full.value.filename == str(tmp_path / "out" / ("shard_0001.safetensors" if written == 1 else INDEX))
+    assert not (tmp_path / "out").exists()
 
 
 def test_packing_into_packed_people_is_rejected(folder, copied):

@@ -8,7 +8,7 @@ import pytest
 
 from blender_primdiffusion.capture import command
 from blender_primdiffusion.capture.options import parse, settings_of
-from blender_primdiffusion.console import CANCELLED, DONE
+from blender_primdiffusion.console import CANCELLED, DONE, UsageError
 
 pytestmark = pytest.mark.any_blender
 
@@ -62,3 +62,9 @@ def test_the_estimate_grows_with_pixels_and_samples_and_counts_the_shards_own_pe
     _, sentence = command.estimate(settings_of(parse([*options, "--size", "1024", "1024", "--samples", "32"])), 5)
     assert "2 people" in sentence
     assert f"{2.2 * 20 * 4 * 2 // 60:.0f} min" in sentence
+
+
+@pytest.mark.parametrize("seed", ["-1", str(2**63)])
+def test_a_seed_out_of_range_is_named(tmp_path, seed):
+    with pytest.raises(UsageError, match=rf"seed {seed} is outside 0 \.\.\. 2\^63-1"):
+        parse(["--out", str(tmp_path), f"--seed={seed}"])

@@ -234,6 +234,7 @@ def test_a_click_on_an_object_in_front_or_on_nothing_is_blenders(people):
 def test_clicks_select_extend_and_deselect(people, monkeypatch):
     monkeypatch.setattr(module, "overlay", people.overlay)
     event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
+    event["value"] = "CLICK"
 
     def click(extend: bool) -> list[str]:
         around = clickable(people)
@@ -255,6 +256,23 @@ def test_clicks_select_extend_and_deselect(people, monkeypatch):
     people.overlay._regions.clear()
     pass_through = PRIMDIFFUSION_OT_click_human.invoke(SimpleNamespace(), context(), SimpleNamespace(**event))
     assert pass_through == {"PASS_THROUGH"}
+
+
+def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
+    monkeypatch.setattr(module, "overlay", people.overlay)
+    click, held, begun = PRIMDIFFUSION_OT_click_human, SimpleNamespace(extend=False), []
+    around = clickable(people)
+    around.selected_objects, around.window_manager = [], SimpleNamespace(modal_handler_add=begun.append)
+    event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
+    assert click.invoke(held, around, SimpleNamespace(value="PRESS", **event)) == {"RUNNING_MODAL", "PASS_THROUGH"}
+    assert begun == [held]
+    assert armature_of(people.anna).select_get()
+    for kind, value, result in (
+        ("MOUSEMOVE", "NOTHING", {"PASS_THROUGH"}),
+        ("LEFTMOUSE", "CLICK_DRAG", {"FINISHED", "PASS_THROUGH"}),
+        ("LEFTMOUSE", "RELEASE", {"FINISHED"}),
+    ):
+        assert click.modal(held, around, SimpleNamespace(type=kind, value=value)) == result
 
 
 def test_without_a_window_nothing_is_drawn(addon):

@@ -1,104 +1,32 @@
-"""Volumes written after their human stands, and all that can happen before, during and after."""
+"""Volumes written after their human stands: by the timer, by renders, when shown, and what stops them."""
 
 from __future__ import annotations
 
-import shutil
 import time
-from pathlib import Path
 
 import bpy
 import pytest
-import synthetic_shape
-from jobs_driven import drive
+from late_volumes_stage import COUNT, advance, check_complete, generated, on_disk, paths_of
 
 import blender_primdiffusion
 from blender_primdiffusion.jobs import late_volumes as module
-from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.late_volumes import late_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
-from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene import attachment, unwritten
+from blender_primdiffusion.scene import unwritten
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.collect import unused
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
-from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import (
     armature_of,
     folder_of,
-    folders_of,
     humans,
-    humans_folder,
     person_file,
     unwritten_in,
-    volume_path,
     volumes_of,
 )
 from blender_primdiffusion.scene.unwritten import write_all_unwritten, write_unwritten
 from blender_primdiffusion.scene.volumes import person_memory
 
-COUNT = 12
-"""Primitives of the synthetic person."""
 ops = bpy.ops.primdiffusion
-
-
-@pytest.fixture
-def hidden(addon, tmp_path, monkeypatch):
-    """Volumes are written as with a window."""
-    monkeypatch.setattr("blender_primdiffusion.jobs.queue.volumes_may_wait", lambda: True)
-    monkeypatch.setattr(
-        "blender_primdiffusion.scene.edit.volumes_may_wait", lambda person: not attachment.in_viewport(person)
-    )
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
-    return addon
-
-
-@pytest.fixture
-def person(hidden):
-    """A human who stands, without a volume on disk."""
-    bpy.ops.ed.undo_push(message="before")
-    return generated()
-
-
-STATES = ("unwritten", "half", "written")
-
-
-@pytest.fixture(params=STATES)
-def in_each_state(person, request):
-    advance(request.param)
-    return person
-
-
-def generated(seed: int = 7) -> bpy.types.Collection:
-    queue.add(bpy.context, GenerateJob(seed, 1))
-    drive()
-    return humans(bpy.context.scene)[-1]
-
-
-def advance(state_wanted: str) -> None:
-    """Write no volumes, about half of them, or all."""
-    if state_wanted == "half":
-        while len(on_disk()) < COUNT // 2:
-            assert late_volumes.work(0.0)
-    elif state_wanted == "written":
-        while late_volumes.work(0.0):
-            pass
-
-
-def on_disk(root: Path | None = None) -> list[Path]:
-    return sorted((root or humans_folder()).rglob("prim_*.vdb"))
-
-
-def paths_of(person: bpy.types.Collection) -> list[Path]:
-    return [volume_path(obj.data) for objects in volumes_of(person).values() for obj in objects]
-
-
-def check_complete(person: bpy.types.Collection) -> None:
-    """Every volume of the human has its file, and nothing is left to write."""
-    paths = paths_of(person)
-    assert len(paths) == COUNT
-    assert all(path.is_file() for path in paths)
-    assert not unwritten_in(paths[0].parent)
-    assert not list(paths[0].parent.glob(".*.partial*"))
 
 
 def test_the_human_stands_before_any_volume_is_written(person):
@@ -173,132 +101,6 @@ def test_the_first_picture_by_cycles_shows_the_human(person, tmp_path):
     assert max(list(picture.pixels)[3::4]) > 0.2
 
 
-def test_undo_redo_and_work_again(in_each_state):
-    bpy.ops.ed.undo()
-    assert not humans(bpy.context.scene)
-    assert not late_volumes.work(0.0), "no human is left to write"
-    bpy.ops.ed.redo()
-    (person,) = humans(bpy.context.scene)
-    advance("written")
-    check_complete(person)
-
-
-def test_a_deleted_human_is_not_written_on_and_comes_back_with_undo(in_each_state):
-    before = on_disk()
-    bpy.ops.ed.undo_push(message="stands")
-    ops.delete_human(human=in_each_state.name)
-    bpy.ops.ed.undo_push(message="deleted")
-    assert not late_volumes.work(0.0)
-    assert on_disk() == before
-    bpy.ops.ed.undo()
-    advance("written")
-    check_complete(*humans(bpy.context.scene))
-
-
-def test_saved_and_opened_again_the_rest_is_written(in_each_state):
-    bpy.ops.wm.save_mainfile()
-    late_volumes.stop()
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    (person,) = humans(bpy.context.scene)
-    look()
-    assert state.summary == ""
-    advance("written")
-    check_complete(person)
-
-
-@pytest.mark.parametrize("reached", STATES)
-def test_the_first_save_takes_the_volumes_along_however_many_are_written(hidden, tmp_path, reached):
-    bpy.ops.wm.read_homefile(use_empty=True)
-    person = generated()
-    temporary = folder_of(person)
-    while reached != "unwritten" and len(on_disk(temporary)) < (COUNT if reached == "written" else COUNT // 2):
-        assert late_volumes.work(0.0)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
-    assert folders_of(person)[0] == tmp_path / "film_humans" / "Human"
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "film.blend"))
-    shutil.rmtree(temporary, ignore_errors=True)
-    advance("written")
-    check_complete(*humans(bpy.context.scene))
-
-
-def test_the_blend_and_its_folder_may_be_moved_before_they_are_written(in_each_state, tmp_path):
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    (tmp_path / "away").mkdir()
-    shutil.move(tmp_path / "shot.blend", tmp_path / "away")
-    shutil.move(tmp_path / "shot_humans", tmp_path / "away")
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "away" / "shot.blend"))
-    advance("written")
-    check_complete(*humans(bpy.context.scene))
-
-
-@pytest.mark.parametrize("link", [False, True])
-def test_appended_or_linked_the_rest_is_written(in_each_state, tmp_path, link):
-    bpy.ops.wm.save_mainfile()
-    source = bpy.data.filepath
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(source, link=link) as (_, wanted):
-        wanted.collections = ["Human"]
-    bpy.context.scene.collection.children.link(bpy.data.collections["Human"])
-    (person,) = humans(bpy.context.scene)
-    advance("written")
-    check_complete(person)
-
-
-def test_a_library_override_of_a_human_is_written(in_each_state):
-    bpy.ops.wm.save_mainfile()
-    source = bpy.data.filepath
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(source, link=True) as (_, wanted):
-        wanted.collections = ["Human"]
-    linked = bpy.data.collections["Human"]
-    bpy.context.scene.collection.children.link(linked)
-    linked.override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
-    person = next(person for person in humans(bpy.context.scene) if person.override_library is not None)
-    advance("written")
-    check_complete(person)
-
-
-def test_an_edit_in_each_state_ends_with_the_volumes_of_the_edit(in_each_state):
-    before = set(paths_of(in_each_state))
-    assert ops.vary(human=in_each_state.name, seed=8, steps=1) == {"FINISHED"}
-    drive()
-    after = set(paths_of(in_each_state))
-    assert before.isdisjoint(after)
-    advance("written")
-    check_complete(in_each_state)
-    bpy.ops.ed.undo()
-    (person,) = humans(bpy.context.scene)
-    assert set(paths_of(person)) == before
-    advance("written")
-    check_complete(person)
-
-
-def test_a_duplicate_shares_what_is_still_to_be_written(in_each_state):
-    twin = duplicate_human(in_each_state)
-    assert armature_of(twin).name in twin.children[0].objects
-    advance("written")
-    for person in (in_each_state, twin):
-        check_complete(person)
-    assert all(obj.parent == armature_of(twin) for objects in volumes_of(twin).values() for obj in objects)
-
-
-def test_collected_files_include_what_is_still_to_be_written(in_each_state, tmp_path):
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
-    assert ops.collect_files() == {"FINISHED"}
-    shutil.rmtree(tmp_path / "shot_humans")
-    advance("written")
-    check_complete(in_each_state)
-    assert paths_of(in_each_state)[0].parent == tmp_path / "other_humans" / "Human"
-
-
-def test_the_source_of_unwritten_volumes_is_unused_once_no_human_needs_it(person):
-    source = unwritten_in(folder_of(person))
-    assert not unused(humans_folder())
-    ops.delete_human(human=person.name)
-    assert set(source) <= set(unused(humans_folder()))
-
-
 def test_shown_in_the_viewport_they_are_written_and_drawn(in_each_state):
     assert ops.volumes_in_viewport() == {"FINISHED"}
     check_complete(in_each_state)
@@ -344,22 +146,6 @@ def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypat
     late_volumes.finish()
     assert late_volumes.error == ""
     check_complete(person)
-
-
-def test_what_failed_is_tried_again_when_the_file_is_opened(person, monkeypatch):
-    def full(*_: object) -> str:
-        raise OSError(28, "No space left on device")
-
-    bpy.ops.wm.save_mainfile()
-    monkeypatch.setattr(unwritten, "write_file", full)
-    while late_volumes.work(0.0):
-        pass
-    monkeypatch.undo()
-    assert not late_volumes.work(0.0)
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    assert late_volumes.error == ""
-    advance("written")
-    check_complete(*humans(bpy.context.scene))
 
 
 def test_a_changed_source_is_reported(person):

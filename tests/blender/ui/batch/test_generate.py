@@ -172,10 +172,21 @@ def test_a_folder_that_cannot_be_is_a_sentence(addon, tmp_path, capfd):
     assert "choose another folder with --out" in errors
 
 
+def test_nothing_is_written_through_a_link_in_the_folder(out, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    out.mkdir()
+    (out / "person_000007").symlink_to(tmp_path / "elsewhere")
+    assert generate(out, "--count", 2, "--seed", 7) == FAILED
+    assert not list((tmp_path / "elsewhere").iterdir())
+    assert report(out)["done"] == ["person_000008"]
+    assert "is a link to another folder" in report(out)["failed"][0]["why"]
+
+
 @pytest.mark.parametrize(
     ("words", "sentence"),
     [
         (["--count", "0"], "invalid whole number from 1 value: '0'"),
+        (["--count", "2", "--seed", str(2**63 - 1)], f"seed {2**63} is outside 0 ... 2^63-1"),
         (["--attributes", "tall"], "'tall' is not name=value"),
         (["--sampler", "euler"], "invalid choice: 'euler'"),
         (["--checkpoint", "/nowhere.safetensors"], "--checkpoint /nowhere.safetensors is no file"),

@@ -1,0 +1,176 @@
+"""A small network of joints, depth and attributes of a human in a picture, trained on renders of MakeHuman meshes.
+
+It needs no weights of others: `weights/pose_depth.safetensors` ships with the package. Trained by
+scripts/train_pose_depth_network (`pose_depth_training`); its card states its errors on renders of held-out meshes.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import itertools
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float, UInt8
+from safetensors import SafetensorError, safe_open
+from torch import Tensor, nn
+from torch.nn import functional
+
+from primdiffusion.evaluation.attribute_network import AttributeSpace, detail_energies
+from primdiffusion.evaluation.shots import JOINTS
+from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.tensor_file import save
+
+INPUT = 128
+"""Width and height of what the network sees, pixels: pictures are averaged down to it."""
+CELLS = 32
+"""Width and height of heatmaps and depth."""
+WIDTHS = (24, 48, 96, 120, 112)
+"""Channels at 64, 32, 16, 8 and 4 cells."""
+FEATURES = 64
+WINDOW = 2
+"""Cells to each side of a heatmap's maximum over which the joint's position is averaged."""
+DETAIL_SIDE = 256
+"""Size of the pictures whose fine detail is measured."""
+
+
+class Seen(NamedTuple):
+    """What the network reads from pictures."""
+
+    heatmaps: Float[Tensor, "n 12 32 32"]
+    """Logits of each joint's cell."""
+    depth: Float[Tensor, "n 32 32"]
+    """Inverted depth up to scale and offset."""
+    features: Float[Tensor, "n 64"]
+    """Learned features, of unit variance over the training pictures."""
+
+
+class Stage(nn.Module):
+    """A convolution that halves width and height, then one that keeps them, with batch normalisation."""
+
+    def __init__(self, channels: int, out: int, convolutions: int) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        for number in range(convolutions):
+            stride = 2 if number == 0 else 1
+            layers += [nn.Conv2d(channels, out, 3, stride, 1, bias=False), nn.BatchNorm2d(out), nn.ReLU()]
+            channels = out
+        self.layers = nn.Sequential(*layers)
+
+    def forward(self, x: Tensor) -> Tensor:
+        return self.layers(x)
+
+
+class PoseDepthNetwork(nn.Module):
+    """A U-Net from 128 x 128 pictures to 32 x 32 cells, with attributes predicted from its coarsest stages."""
+
+    def __init__(self, space: AttributeSpace) -> None:
+        super().__init__()
+        self.space = space
+        self.card: dict[str, Any] = {}
+        self.down = nn.ModuleList(
+            Stage(before, out, count) for before, out, count in zip((3, *WIDTHS), WIDTHS, (1, 1, 2, 2, 2), strict=False)
+        )
+        lower = WIDTHS[:0:-1]
+        self.lateral = nn.ModuleList(nn.Conv2d(before, out, 1) for before, out in itertools.pairwise(lower))
+        self.up = nn.ModuleList(
+            nn.Sequential(nn.Conv2d(out, out, 3, 1, 1, bias=False), nn.BatchNorm2d(out), nn.ReLU()) for out in lower[1:]
+        )
+        self.cells = nn.Conv2d(WIDTHS[1], len(JOINTS) + 1, 1)
+        # Batch normalisation gives each feature unit variance over the training set: the unit of distances.
+        self.features = nn.Sequential(
+            nn.Dropout(0.2), nn.Linear((WIDTHS[3] + WIDTHS[4]) * 4, FEATURES), nn.BatchNorm1d(FEATURES, affine=False)
+        )
+        sizes = {name: len(values) for name, values in space.categories.items()} | dict.fromkeys(space.scalars, 1)
+        self.heads = nn.ModuleDict({name: nn.Linear(FEATURES, size) for name, size in sizes.items()})
+
+    def forward(self, pictures: Float[Tensor, "n 3 128 128"]) -> Seen:
+        """Read sRGB-encoded pictures in [0, 1]."""
+        x, stages = 2 * pictures - 1, []
+        for stage in self.down:
+            x = stage(x)
+            stages.append(x)
+        pooled = [functional.adaptive_avg_pool2d(one, 2).flatten(1) for one in stages[-2:]]
+        for lateral, up, skip in zip(self.lateral, self.up, stages[-2:0:-1], strict=True):
+            x = up(functional.interpolate(lateral(x), scale_factor=2.0, mode="nearest") + skip)
+        cells = self.cells(x)
+        return Seen(cells[:, :-1], cells[:, -1], self.features(torch.cat(pooled, 1)))
+
+    def predict(self, features: Float[Tensor, "n 64"]) -> dict[str, Tensor]:
+        """Logits of each category and standardised scalars."""
+        active = functional.relu(features)
+        return {name: head(active) for name, head in self.heads.items()}
+
+
+def shrunk(rgb: UInt8[Tensor, "h w 3"]) -> UInt8[Tensor, "3 128 128"]:
+    """A square picture averaged down to what the network sees."""
+    values = functional.interpolate(rgb.movedim(-1, 0)[None].float(), (INPUT, INPUT), mode="area")[0]
+    return values.round().to(torch.uint8)
+
+
+def joint_positions(heatmaps: Float[Tensor, "n k c c"]) -> Float[Tensor, "n k 2"]:
+    """x, y of each joint in [0, 1] of the picture: the mean of the heatmap within WINDOW cells of its maximum."""
+    count, joints, height, width = heatmaps.shape
+    best = heatmaps.flatten(2).argmax(-1)
+    row, column = torch.arange(height)[:, None], torch.arange(width)
+    top, left = (best // width)[..., None, None], (best % width)[..., None, None]
+    near = ((row - top).abs() <= WINDOW) & ((column - left).abs() <= WINDOW)
+    weight = heatmaps.masked_fill(~near, -torch.inf).flatten(2).softmax(-1).unflatten(2, (height, width))
+    x = (weight.sum(-2) * (column + 0.5)).sum(-1) / width
+    y = (weight.sum(-1) * (row[:, 0] + 0.5)).sum(-1) / height
+    return torch.stack([x, y], -1).reshape(count, joints, 2)
+
+
+def detail_of(rgb: UInt8[Tensor, "h w 3"], mask: Tensor) -> Float[Tensor, "3"]:
+    """Logarithm of the energy of fine detail inside the human, at DETAIL_SIDE pixels (`detail_energies`)."""
+    rgba = torch.cat([rgb.float() * mask[..., None], 255.0 * mask[..., None]], -1)
+    rgba = functional.interpolate(rgba.movedim(-1, 0)[None], (DETAIL_SIDE, DETAIL_SIDE), mode="area")
+    return detail_energies(rgba.movedim(1, -1)[:, None].round().to(torch.uint8))[0]
+
+
+def cell_means(values: Float[Tensor, "h w"], mask: Tensor) -> Float[Tensor, "32 32"]:
+    """Mean over the masked pixels of each cell; 0 where less than half of a cell is masked."""
+    share = functional.adaptive_avg_pool2d(mask[None, None].float(), CELLS)[0, 0]
+    means = functional.adaptive_avg_pool2d((values * mask)[None, None], CELLS)[0, 0]
+    return torch.where(share >= 0.5, means / share.clamp_min(1e-6), 0.0)
+
+
+def save_pose_depth_network(path: Path, network: PoseDepthNetwork) -> None:
+    """Write the network in half precision with its card, atomically."""
+    tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
+    space = {"categories": network.space.categories, "scalars": network.space.scalars}
+    metadata = {"space": json.dumps(space), "card": json.dumps(network.card)}
+    write_atomically(path, save(tensors, metadata=metadata))
+
+
+def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
+    """Load the network that ships with the package, or another file.
+
+    Raises FileNotFoundError, and ValueError for an unreadable file.
+    """
+    if path is None:
+        packaged = importlib.resources.files("primdiffusion.weights") / "pose_depth.safetensors"
+        with importlib.resources.as_file(packaged) as found:
+            return load_pose_depth_network(found)
+    if not path.is_file():
+        raise FileNotFoundError(f"no network of joints and depth at {path}: install the package again")
+    try:
+        with safe_open(path, framework="pt") as file:
+            metadata = file.metadata()
+            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
+        stated = parse_json(metadata["space"])
+        network = PoseDepthNetwork(
+            AttributeSpace(
+                {name: tuple(values) for name, values in stated["categories"].items()},
+                {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
+            )
+        )
+        network.load_state_dict(tensors)
+        network.card = dict(parse_json(metadata["card"]))
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        reason = " ".join(str(error).split())[:200]
+        raise ValueError(f"{path} is not a network of joints and depth of this version ({reason})") from error
+    return network.eval().requires_grad_(False)

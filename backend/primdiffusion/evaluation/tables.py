@@ -1,0 +1,256 @@
+"""The paper's Tables 1 and 2 of any pictures of humans, beside the measures of our own network (SPEC 7).
+
+FID, FID_CLIP, KID, PCKh and depth errors of published networks need weights that the user names; without them a
+cell is empty and says why. The own network's distance, PCKh and depth error are always there.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets
+from primdiffusion.evaluation.onnx_networks import DepthNetwork, PoseNetwork
+from primdiffusion.evaluation.pose_depth_metrics import correct_joints, depth_error
+from primdiffusion.evaluation.pose_depth_network import (
+    PoseDepthNetwork,
+    cell_means,
+    detail_of,
+    joint_positions,
+    shrunk,
+)
+from primdiffusion.evaluation.pretrained_networks import ClipVision, Inception
+from primdiffusion.evaluation.shots import Shot
+
+BATCH = 16
+SMALLEST = 8
+"""Fewest pictures of each set: fewer fit no Gaussian worth comparing."""
+DETAIL_FLOOR = 0.05
+"""Smallest standard deviation of fine detail among real pictures, as in `attribute_network`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Networks:
+    """The networks that look at pictures; None where no weights file was named."""
+
+    own: PoseDepthNetwork
+    inception: Inception | None = None
+    clip: ClipVision | None = None
+    pose: PoseNetwork | None = None
+    depth: DepthNetwork | None = None
+
+
+class Cell(NamedTuple):
+    """A figure of a table."""
+
+    value: float | None
+    spread: float | None = None
+    """What stands after +-: the standard deviation over KID's subsets, or over pictures."""
+    why: str | None = None
+    """Why there is no value."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged:
+    """What the networks found in one set of pictures."""
+
+    pictures: int
+    features: Mapping[str, Float[Tensor, "n d"]]
+    """Of "inception", "clip", "own" and "detail"."""
+    correct: Mapping[str, Sequence[float]]
+    """Share of correct joints of each picture with known joints, of "pose" and "own"."""
+    depth: Mapping[str, Sequence[float]]
+    """Depth error of each picture with known depth, of "depth" and "own"."""
+
+
+def judge(shots: Iterable[Shot], networks: Networks, report: Callable[[int], None] = lambda done: None) -> Judged:
+    """Look at every picture once. A picture in which a network finds no human has no correct joint.
+
+    Raises ValueError for a network that does not fit, and what `shots` raises.
+    """
+    features: dict[str, list[Tensor]] = {"own": [], "detail": []}
+    correct: dict[str, list[float]] = {"own": [], "pose": []}
+    depth: dict[str, list[float]] = {"own": [], "depth": []}
+    count = 0
+    iterator = iter(shots)
+    while batch := list(itertools.islice(iterator, BATCH)):
+        with torch.inference_mode():
+            seen = networks.own(torch.stack([shrunk(shot.rgb) for shot in batch]).float() / 255)
+            features["own"].append(seen.features)
+            features["detail"].append(torch.stack([detail_of(shot.rgb, shot.mask) for shot in batch]))
+            pictures = torch.stack([shot.rgb for shot in batch]).float() / 255
+            for name, network in (("inception", networks.inception), ("clip", networks.clip)):
+                if network is not None:
+                    features.setdefault(name, []).append(network(pictures))
+        found = joint_positions(seen.heatmaps)
+        for number, shot in enumerate(batch):
+            side = shot.rgb.shape[0]
+            if shot.joints is not None and shot.head_size is not None:
+                joints: dict[str, Tensor | None] = {"own": found[number] * side}
+                if networks.pose is not None:
+                    joints["pose"] = networks.pose.joints(shot)
+                for name, own in joints.items():
+                    right = (
+                        0.0 if own is None else float(correct_joints(own, shot.joints, shot.head_size).double().mean())
+                    )
+                    correct[name].append(right)
+            if shot.depth is not None:
+                cells = cell_means(torch.where(shot.mask, 1 / shot.depth, 0.0), shot.mask)
+                errors = {"own": depth_error(seen.depth[number], 1 / cells, cells > 0)}
+                if networks.depth is not None:
+                    errors["depth"] = depth_error(networks.depth.inverted(shot), shot.depth, shot.mask)
+                for name, error in errors.items():
+                    if error is not None:
+                        depth[name].append(error)
+        count += len(batch)
+        report(count)
+    stacked = {name: torch.cat(parts).clone() for name, parts in features.items() if parts}
+    return Judged(count, stacked, correct, depth)
+
+
+def check_counts(fakes: int, reals: int) -> None:
+    """Raise ValueError if either set is too small to compare."""
+    for what, count in (("generated", fakes), ("real", reals)):
+        if count < SMALLEST:
+            raise ValueError(
+                f"{fakes} generated and {reals} real pictures: {SMALLEST} of each are the fewest that can be compared; "
+                f"give more {what} ones"
+            )
+
+
+def compare_pictures(
+    fake: Judged, real: Judged, kid_subsets: int, kid_subset_size: int, seed: int
+) -> dict[str, dict[str, Cell]]:
+    """The cells of the rows "generated" and "real". Raises ValueError for too few pictures, and features with NaN.
+
+    Distances of the row "real" are between its two halves.
+    """
+    check_counts(fake.pictures, real.pictures)
+    for name, values in itertools.chain(fake.features.items(), real.features.items()):
+        if not torch.isfinite(values).all():
+            raise ValueError(f"the {name} network gives NaN or infinite features: its weights are damaged")
+    generated, own = _own_distances(fake, real)
+    rows = {"generated": {}, "real": {}}
+    rows["generated"]["fid_clip"] = _frechet(fake, real, "clip", "--clip")
+    rows["generated"]["fid"] = _frechet(fake, real, "inception", "--inception")
+    rows["generated"]["kid"] = _kid(fake, real, kid_subsets, kid_subset_size, seed)
+    rows["real"] |= dict.fromkeys(
+        ("fid_clip", "fid", "kid"), Cell(None, why="the real pictures are what is compared with")
+    )
+    for row, judged in (("generated", fake), ("real", real)):
+        rows[row]["pckh"] = _mean(judged.correct["pose"], bool(judged.correct["own"]), "joints", "--pose", 100)
+        rows[row]["depth"] = _mean(judged.depth["depth"], bool(judged.depth["own"]), "depth", "--depth", 100)
+        rows[row]["fps"] = Cell(None, why="pictures of a folder or of meshes have no frame rate")
+        rows[row]["own_pckh"] = _mean(judged.correct["own"], bool(judged.correct["own"]), "joints", None, 100)
+        rows[row]["own_depth"] = _mean(judged.depth["own"], bool(judged.depth["own"]), "depth", None, 100)
+    rows["generated"]["own_distance"], rows["real"]["own_distance"] = generated, own
+    return rows
+
+
+def _frechet(fake: Judged, real: Judged, name: str, option: str) -> Cell:
+    if name not in fake.features:
+        return Cell(None, why=f"no weights file: name one with {option}")
+    return Cell(frechet_distance(fake.features[name], real.features[name]))
+
+
+def _kid(fake: Judged, real: Judged, subsets: int, size: int, seed: int) -> Cell:
+    if "inception" not in fake.features:
+        return Cell(None, why="no weights file: name one with --inception")
+    if min(fake.pictures, real.pictures) < size:
+        return Cell(
+            None,
+            why=f"subsets of {size} need as many pictures, there are {fake.pictures} generated and {real.pictures} "
+            "real: raise --count or lower --kid-subset-size",
+        )
+    found = kernel_distance_of_subsets(fake.features["inception"], real.features["inception"], subsets, size, seed)
+    return Cell(100 * found.mean, 100 * found.std)
+
+
+def _mean(values: Sequence[float], has_truth: bool, truth: str, option: str | None, factor: float) -> Cell:
+    """Mean over pictures and its standard deviation."""
+    if not has_truth:
+        return Cell(
+            None, why=f"the {truth} of these pictures are not known: docs/design/evaluation.md says where to put them"
+        )
+    if not values:
+        return Cell(None, why=f"no weights file: name one with {option}")
+    found = factor * torch.tensor(values, dtype=torch.float64)
+    return Cell(float(found.mean()), float(found.std(correction=0)))
+
+
+def _own_distances(fake: Judged, real: Judged) -> tuple[Cell, Cell]:
+    """Frechet distances of generated pictures, and of the first half of the real ones, to the second half.
+
+    All three sets have the same size, since the distance falls with it. Pictures of one human follow each other, so
+    halves are of different humans. Learned features, and detail in units of its spread among real pictures.
+    """
+    mean = real.features["detail"].mean(0)
+    std = real.features["detail"].std(0, correction=0).clamp_min(DETAIL_FLOOR)
+    made, true = (torch.cat([one.features["own"], (one.features["detail"] - mean) / std], 1) for one in (fake, real))
+    count = min(len(made), len(true) // 2)
+    spread = torch.linspace(0, len(made) - 1, count).long()
+    second = true[-count:]
+    distances = (frechet_distance(made[spread], second), frechet_distance(true[:count], second))
+    generated, own = (Cell(distance) for distance in distances)
+    return generated, own
+
+
+COLUMNS = {
+    "fid_clip": "FID_CLIP",
+    "fid": "FID",
+    "kid": "KID x 100",
+    "pckh": "PCKh@0.5",
+    "depth": "depth x 100",
+    "fps": "FPS",
+    "own_distance": "own distance",
+    "own_pckh": "own PCKh@0.5",
+    "own_depth": "own depth x 100",
+}
+OWN = ("own_distance", "own_pckh", "own_depth")
+OF_TABLE = {
+    1: ("fid_clip", "fid", "kid", "pckh", "depth", "fps", *OWN),
+    2: ("fid_clip", "fid", "kid", "depth", *OWN),
+}
+"""Columns of the paper's tables, then our own network's."""
+
+
+def floor_cells(card: Mapping[str, Any]) -> dict[str, Cell]:
+    """The own network's errors on renders of held-out meshes, from its card: no model can be expected to have less."""
+    errors = card["errors"]
+    return {"own_pckh": Cell(errors["pckh"]), "own_depth": Cell(errors["depth"])}
+
+
+def table(
+    number: int, rows: Mapping[str, Mapping[str, Cell]], choices: Mapping[str, Any], resolution: str | None = None
+) -> str:
+    """Format as Markdown: the table, every choice, and a sentence for each empty column of the first row."""
+    columns = OF_TABLE[number]
+    names = ["pictures", *(["resolution"] if number == 2 else []), *(COLUMNS[column] for column in columns)]
+    lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
+    for row, cells in rows.items():
+        texts = [row, *([(resolution or "-") if row == "generated" else "-"] if number == 2 else [])]
+        lines.append(f"| {' | '.join(texts + [_text(cells.get(column)) for column in columns])} |")
+    lines += ["", *(f"{name}: {_plain(value)}" for name, value in choices.items())]
+    first = next(iter(rows.values()))
+    missing = {COLUMNS[column]: first[column].why for column in columns if first[column].value is None}
+    if missing:
+        lines += ["", *(f"{name} is empty: {why}." for name, why in missing.items())]
+    return "\n".join(lines)
+
+
+def _text(cell: Cell | None) -> str:
+    if cell is None or cell.value is None:
+        return "-"
+    return f"{cell.value:.4g}" if cell.spread is None else f"{cell.value:.4g} +- {cell.spread:.2g}"
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return "not used"
+    return ", ".join(str(one) for one in value) if isinstance(value, list | tuple) else str(value)

@@ -1,0 +1,81 @@
+"""The adapter, beside diffusers' own schedulers with the same betas."""
+
+import pytest
+import torch
+from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
+from primdiffusion.diffusion.diffusers_scheduler import PrimDiffusionScheduler
+from primdiffusion.diffusion.model import sample
+from tiny_model import tiny_model
+
+SHAPE = (2, 3, 4, 4)
+TRAILING = {"beta_schedule": "linear", "beta_start": 1e-4, "beta_end": 0.02, "timestep_spacing": "trailing"}
+
+
+def noise(seed):
+    return torch.randn(SHAPE, generator=torch.Generator().manual_seed(seed))
+
+
+def looped(scheduler, prediction, seed=1, **extra):
+    """diffusers' loop with a made-up network, tanh of its input."""
+    scheduler.set_timesteps(20)
+    x, generator = noise(seed), torch.Generator().manual_seed(7)
+    for t in scheduler.timesteps:
+        seen = scheduler.scale_model_input(x, t)
+        output = seen.tanh() if prediction == "sample" else 0.9 * seen
+        x = scheduler.step(output, t, x, generator=generator, **extra).prev_sample
+    return x
+
+
+@pytest.mark.parametrize("prediction", ["sample", "epsilon"])
+@pytest.mark.parametrize(
+    ("sampler", "theirs", "settings"),
+    [
+        ("ddpm", DDPMScheduler, {"clip_sample": False}),
+        ("ddim", DDIMScheduler, {"clip_sample": False}),
+        ("dpmpp_2m", DPMSolverMultistepScheduler, {"algorithm_type": "dpmsolver++", "solver_order": 2}),
+    ],
+)
+def test_the_loop_ends_where_diffusers_own_scheduler_does(sampler, theirs, settings, prediction):
+    expected = looped(theirs(prediction_type=prediction, **TRAILING, **settings), prediction)
+    ours = looped(PrimDiffusionScheduler(sampler=sampler, prediction_type=prediction), prediction)
+    torch.testing.assert_close(ours, expected, atol=2e-4, rtol=2e-4)  # diffusers keeps its levels in float32
+
+
+def test_eta_adds_the_noise_that_diffusers_adds():
+    expected = looped(DDIMScheduler(prediction_type="sample", clip_sample=False, **TRAILING), "sample", eta=0.7)
+    ours = looped(PrimDiffusionScheduler(eta=0.7), "sample")
+    torch.testing.assert_close(ours, expected, atol=2e-4, rtol=2e-4)
+
+
+def test_noise_is_added_as_diffusers_adds_it():
+    t = torch.tensor([3, 900])
+    expected = DDPMScheduler(**TRAILING).add_noise(noise(1), noise(2), t)
+    torch.testing.assert_close(PrimDiffusionScheduler().add_noise(noise(1), noise(2), t), expected)
+
+
+@pytest.mark.parametrize("sampler", ["ddim", "dpmpp_2m", "ddpm"])
+def test_diffusers_loop_draws_the_model_s_own_samples(sampler):
+    model = tiny_model()
+    *_, last = sample(model, [5], steps=6, sampler=sampler)
+    scheduler = PrimDiffusionScheduler.of(model, sampler)
+    scheduler.set_timesteps(6)
+    generators = [torch.Generator().manual_seed(5)]
+    x = model.start(generators, int(scheduler.timesteps[0]))
+    for t in scheduler.timesteps:
+        x, x0 = scheduler.step(model.denoise(x, int(t)), t, x, generators, return_dict=False)
+    assert torch.equal(x0, last.x0)
+
+
+def test_settings_are_saved_and_loaded_as_diffusers_does(tmp_path):
+    PrimDiffusionScheduler("fine_linear", "dense", "dpmpp_2m").save_pretrained(tmp_path)
+    again = PrimDiffusionScheduler.from_pretrained(tmp_path)
+    assert (again.config["schedule"], again.config["chain"], again.sampler) == ("fine_linear", "dense", "dpmpp_2m")
+
+
+def test_wrong_names_and_steps_are_refused():
+    with pytest.raises(ValueError, match="choose one of ddim, ddpm, dpmpp_2m"):
+        PrimDiffusionScheduler(sampler="euler")
+    scheduler = PrimDiffusionScheduler()
+    scheduler.set_timesteps(10)
+    with pytest.raises(ValueError, match="timestep 3 is not one of this scheduler's 10"):
+        scheduler.step(noise(1), 3, noise(1))

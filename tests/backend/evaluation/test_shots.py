@@ -1,0 +1,111 @@
+"""Pictures that are judged: joints and depth lie where the picture shows them, folders say what models do."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from primdiffusion.capture.poses import choose_poses
+from primdiffusion.evaluation.shots import JOINTS, SIDE, body_camera, folder_shots, human_shots, mesh_shots
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.human import generate, pose_body
+from primdiffusion.people.assets import AssetsMissingError, open_assets
+from primdiffusion.people.base_mesh import load_base_mesh
+from primdiffusion.people.person import make_person
+from primdiffusion.render.march import MarchSettings
+from tiny_model import tiny_model
+
+
+@pytest.fixture(scope="module")
+def human():
+    return generate(tiny_model(), 0, 2)
+
+
+@pytest.fixture(scope="module")
+def shot(human):
+    """The left side of a human, which has views at 0, 90, 180 and 270 degrees."""
+    shots = human_shots(human, choose_poses([], 1, 0), 4, "person", MarchSettings(step=0.02), torch.device("cpu"))
+    return [next(shots), next(shots)][1]
+
+
+def test_a_camera_holds_the_body_from_every_side(human):
+    vertices = pose_body(human.betas).vertices
+    for yaw in (0.0, 0.7, 2.0):
+        pixels, depth = body_camera(vertices, yaw).project(vertices)
+        assert 0 < pixels.min() < pixels.max() < SIDE
+        assert depth.min() > 1
+
+
+def test_depth_is_along_the_optical_axis_and_joints_are_of_the_view(human, shot):
+    vertices = pose_body(human.betas, choose_poses([], 1, 0).map(lambda t: t[0])).vertices
+    _, depth = body_camera(vertices, np.pi / 2).project(vertices)
+    inside = shot.mask & torch.isfinite(shot.depth)
+    assert inside.sum() > 1000
+    assert float(depth.min()) - 0.2 < float(shot.depth[inside].min()) < float(shot.depth[inside].max())
+    assert float(shot.depth[inside].max()) < float(depth.max()) + 0.2
+    assert not torch.isfinite(shot.depth[~shot.mask]).any()
+    # From the left, the face looks to the left of the picture and both hips coincide.
+    left, right = (shot.joints[JOINTS.index(f"{side}_hip")] for side in ("left", "right"))
+    assert (left - right).norm() < 12
+    assert 8 < shot.head_size < 60
+
+
+def test_a_folder_gives_what_was_drawn(shot, tmp_path):
+    (tmp_path / "depth").mkdir()
+    Image.fromarray(shot.rgb.numpy()).save(tmp_path / "one.png")
+    alpha = (255 * shot.mask).to(torch.uint8)[..., None]
+    Image.fromarray(torch.cat([shot.rgb, alpha], -1).numpy()).save(tmp_path / "two.png")
+    np.save(tmp_path / "depth" / "two.npy", shot.depth.numpy())
+    joints = np.zeros((24, 2))
+    joints[[JOINT_NAMES.index(name) for name in JOINTS]] = shot.joints.numpy()
+    joints[JOINT_NAMES.index("head")] = (0, shot.head_size)
+    (tmp_path / "joints.json").write_text(json.dumps({"two.png": joints.tolist()}))
+    one, two = folder_shots(tmp_path)
+    assert torch.equal(one.rgb, shot.rgb)
+    assert (one.joints, one.head_size, one.depth) == (None, None, None)
+    assert torch.equal(two.mask, shot.mask)
+    assert torch.equal(two.depth, shot.depth)
+    assert torch.allclose(two.joints, shot.joints)
+    assert two.head_size == pytest.approx(shot.head_size)
+    assert (two.rgb[~two.mask] == 255).all()
+
+
+def test_pictures_of_other_sizes_are_resized_with_their_truth(tmp_path):
+    Image.new("RGB", (256, 256), "white").save(tmp_path / "a.png")
+    (tmp_path / "depth").mkdir()
+    np.save(tmp_path / "depth" / "a.npy", np.pad(np.full((128, 256), 3, np.float32), ((0, 128), (0, 0))))
+    (tmp_path / "joints.json").write_text(json.dumps({"a.png": [[100, 50]] * 23 + [[128, 128]]}))
+    (shot,) = folder_shots(tmp_path)
+    assert shot.rgb.shape == (SIDE, SIDE, 3)
+    assert shot.joints[0].tolist() == [200, 100]
+    assert torch.isfinite(shot.depth).sum() == SIDE * SIDE / 2
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (lambda folder: (folder / "a.png").unlink(), "no pictures"),
+        (lambda folder: Image.new("RGB", (8, 9)).save(folder / "a.png"), "8 x 9"),
+        (lambda folder: (folder / "a.png").write_bytes(b"no picture"), r"a\.png"),
+        (lambda folder: (folder / "joints.json").write_text('{"a.png": [[1, 2]]}'), "24 finite rows"),
+    ],
+)
+def test_a_folder_that_does_not_fit_is_one_sentence(tmp_path, spoil, words):
+    Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
+    spoil(tmp_path)
+    with pytest.raises(ValueError, match=words):
+        list(folder_shots(tmp_path))
+
+
+def test_meshes_are_drawn_around_their_joints():
+    try:
+        assets = open_assets()
+    except AssetsMissingError as error:
+        pytest.skip(str(error))
+    person = make_person(assets, load_base_mesh(), 7)
+    (shot,) = mesh_shots(person, choose_poses([], 1, 0), [[0.0]], "7", 256)
+    column, row = shot.joints.round().long().unbind(-1)
+    assert shot.mask[row, column].all()
+    side = [JOINTS.index(f"{side}_shoulder") for side in ("left", "right")]
+    assert shot.joints[side[0], 0] > shot.joints[side[1], 0] + 20  # seen from the front

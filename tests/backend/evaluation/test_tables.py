@@ -1,0 +1,159 @@
+"""The paper's tables: of a model and of folders, repeatable, empty columns with a reason, too few pictures."""
+
+import dataclasses
+import json
+import math
+
+import pytest
+import torch
+from PIL import Image
+from primdiffusion.commands import evaluate as command
+from primdiffusion.commands import evaluate_tables
+from primdiffusion.evaluation.pose_depth_network import joint_positions, load_pose_depth_network, shrunk
+from primdiffusion.evaluation.shots import JOINTS, SIDE, Shot
+from primdiffusion.evaluation.tables import (
+    COLUMNS,
+    OF_TABLE,
+    Judged,
+    Networks,
+    check_counts,
+    compare_pictures,
+    judge,
+    table,
+)
+from tiny_model import tiny_model
+
+
+def judged(count: int, seed: int, shift: float = 0.0, **lists: list[float]) -> Judged:
+    generator = torch.Generator().manual_seed(seed)
+    widths = {"own": 6, "detail": 3, "inception": 8, "clip": 5}
+    features = {name: torch.randn(count, width, generator=generator) + shift for name, width in widths.items()}
+    values = {"own": lists.get("own", []), "pose": lists.get("pose", []), "depth": lists.get("depth", [])}
+    return Judged(count, features, values, values)
+
+
+def shots(count: int, seed: int) -> list[Shot]:
+    """Boxes in random places; a plane of depth."""
+    generator = torch.Generator().manual_seed(seed)
+    found = []
+    for number in range(count):
+        left, top = torch.randint(50, 200, (2,), generator=generator).tolist()
+        mask = torch.zeros(SIDE, SIDE, dtype=torch.bool)
+        mask[top : top + 250, left : left + 150] = True
+        shade = torch.randint(0, 200, (SIDE, SIDE, 3), generator=generator, dtype=torch.uint8)
+        depth = torch.where(mask, torch.linspace(3, 4, SIDE)[:, None], torch.inf)
+        joints = torch.tensor([left, top]) + 100 * torch.rand(len(JOINTS), 2, generator=generator)
+        found.append(Shot(str(number), torch.where(mask[..., None], shade, 255), mask, joints, 30.0, depth))
+    return found
+
+
+def folder(path, count: int, seed: int):
+    path.mkdir()
+    for shot in shots(count, seed):
+        Image.fromarray(shot.rgb.numpy()).save(path / f"{shot.name}.png")
+    return path
+
+
+def test_distances_grow_with_the_shift_and_reals_are_compared_with_themselves():
+    real = judged(40, 0)
+    near, far = (compare_pictures(judged(40, 1, shift), real, 5, 20, 0)["generated"] for shift in (0.0, 1.0))
+    for column in ("fid", "fid_clip", "kid", "own_distance"):
+        assert near[column].value < far[column].value
+    halves = compare_pictures(judged(40, 1), real, 5, 20, 0)["real"]["own_distance"].value
+    assert halves == pytest.approx(near["own_distance"].value, rel=0.5)
+
+
+def test_own_distances_are_of_sets_of_one_size():
+    """Frechet distances fall with the number of pictures: more generated ones do not lower it."""
+    few, many = (compare_pictures(judged(count, 1), judged(40, 0), 5, 8, 0) for count in (20, 2000))
+    assert few["generated"]["own_distance"].value == pytest.approx(many["generated"]["own_distance"].value, rel=0.5)
+
+
+def test_a_known_share_of_joints_is_the_pckh():
+    rows = compare_pictures(judged(10, 1, pose=[1.0] * 9 + [0.5], own=[0.25] * 10), judged(10, 0), 5, 8, 0)
+    assert rows["generated"]["pckh"].value == pytest.approx(95)
+    assert rows["generated"]["pckh"].spread == pytest.approx(15)
+    assert rows["generated"]["own_pckh"][:2] == pytest.approx((25, 0))
+
+
+def test_empty_columns_say_why():
+    fake = judged(10, 1)
+    bare = Judged(10, {name: fake.features[name] for name in ("own", "detail")}, fake.correct, fake.depth)
+    cells = compare_pictures(bare, bare, 5, 8, 0)["generated"]
+    assert all(cells[column].value is None for column in OF_TABLE[1] if column != "own_distance")
+    assert "--inception" in cells["fid"].why
+    assert "--clip" in cells["fid_clip"].why
+    assert "joints" in cells["pckh"].why
+    assert "100 need" in compare_pictures(fake, fake, 5, 100, 0)["generated"]["kid"].why
+    text = table(1, {"generated": cells}, {"poses": ["a", "b"], "FPS": None})
+    assert f"FID is empty: {cells['fid'].why}." in text
+    assert "poses: a, b" in text
+
+
+def test_ten_fakes_against_five_reals_are_one_sentence(tmp_path):
+    with pytest.raises(ValueError, match="10 generated and 5 real pictures"):
+        check_counts(10, 5)
+    fake, real = folder(tmp_path / "fake", 10, 0), folder(tmp_path / "real", 5, 1)
+    with pytest.raises(ValueError, match="10 generated and 5 real pictures"):
+        command.run(["generation", "--table", "1", "--fake", str(fake), "--real", str(real)])
+
+
+def test_weights_with_nan_are_one_sentence():
+    fake = judged(10, 1)
+    fake.features["inception"][0, 0] = torch.nan
+    with pytest.raises(ValueError, match="inception network gives NaN"):
+        compare_pictures(fake, judged(10, 0), 5, 8, 0)
+
+
+def test_joints_are_judged_against_the_truth_of_each_picture():
+    network = load_pose_depth_network()
+    given = shots(3, 0)
+    seen = joint_positions(network(torch.stack([shrunk(shot.rgb) for shot in given]).float() / 255).heatmaps)
+    right = judge(
+        [dataclasses.replace(shot, joints=SIDE * own) for shot, own in zip(given, seen, strict=True)], Networks(network)
+    )
+    assert right.correct["own"] == [1.0] * 3
+    first = judge(given, Networks(network))
+    assert first.pictures == len(first.correct["own"]) == len(first.depth["own"]) == 3
+    assert (len(first.correct["pose"]), len(first.depth["depth"])) == (0, 0)
+    assert first.features["own"].shape == (3, 64)
+    assert torch.equal(judge(given, Networks(network)).features["own"], first.features["own"])
+
+
+def test_folders_are_compared_twice_with_the_same_bits(tmp_path, capsys):
+    fake, real = folder(tmp_path / "fake", 9, 0), folder(tmp_path / "real", 16, 1)
+    for name in ("one", "two"):
+        line = ["generation", "--table", "2", "--fake", str(fake), "--real", str(real), "--kid-subset-size", "4"]
+        command.run([*line, "--json", str(tmp_path / f"{name}.json")])
+    first, second = ((tmp_path / f"{name}.json").read_bytes() for name in ("one", "two"))
+    assert first == second
+    record = json.loads(first)
+    assert record["choices"]["generated pictures"] == f"9: {fake}"
+    assert record["rows"]["generated"]["own_pckh"]["value"] is None
+    assert math.isfinite(record["rows"]["generated"]["own_distance"]["value"])
+    printed = capsys.readouterr().out
+    assert "| pictures | resolution | FID_CLIP |" in printed
+    assert all(f"{name}: " in printed for name in record["choices"])
+
+
+def test_a_model_has_all_of_our_own_measures_and_a_frame_rate(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(evaluate_tables, "load_checkpoint", lambda path, device: tiny_model())
+    real = folder(tmp_path / "real", 8, 1)
+    line = ["generation", "--table", "1", "--real", str(real), "--count", "2", "--poses", "2", "--views", "2"]
+    records = []
+    for name in ("one", "two"):
+        command.run([*line, "--steps", "2", "--json", str(tmp_path / f"{name}.json")])
+        records.append(json.loads((tmp_path / f"{name}.json").read_text()))
+        assert records[-1]["rows"]["generated"].pop("fps")["value"] > 0
+    assert records[0] == records[1]
+    cells = records[0]["rows"]["generated"]
+    assert all(cells[column]["value"] is not None for column in ("own_distance", "own_pckh", "own_depth"))
+    assert set(cells) == set(COLUMNS) - {"fps"}
+    assert records[0]["resolution"] == "256 x 256 x 8"
+    assert records[0]["rows"]["floor"]["own_pckh"]["value"] == load_pose_depth_network().card["errors"]["pckh"]
+    assert "| floor |" in capsys.readouterr().out
+
+
+def test_without_a_table_the_people_are_asked_for():
+    with pytest.raises(ValueError, match="--people and --reference"):
+        command.run(["generation"])

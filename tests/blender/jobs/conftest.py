@@ -1,0 +1,34 @@
+"""A human whose volumes are written later, and as many of them written as a test asks for."""
+
+from __future__ import annotations
+
+import bpy
+import pytest
+import synthetic_shape
+from late_volumes_stage import COUNT, STATES, advance, generated
+
+from blender_primdiffusion.scene import attachment
+
+
+@pytest.fixture
+def hidden(addon, tmp_path, monkeypatch):
+    """Volumes are written as with a window."""
+    monkeypatch.setattr("blender_primdiffusion.jobs.queue.volumes_may_wait", lambda: True)
+    monkeypatch.setattr(
+        "blender_primdiffusion.scene.edit.volumes_may_wait", lambda person: not attachment.in_viewport(person)
+    )
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
+    return addon
+
+
+@pytest.fixture
+def person(hidden):
+    """A human who stands, without a volume on disk."""
+    bpy.ops.ed.undo_push(message="before")
+    return generated()
+
+
+@pytest.fixture(params=STATES)
+def in_each_state(person, request):
+    advance(request.param)
+    return person

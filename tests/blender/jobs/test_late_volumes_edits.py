@@ -1,0 +1,169 @@
+"""A human with unwritten volumes is undone, saved, moved, appended, edited and duplicated."""
+
+from __future__ import annotations
+
+import shutil
+
+import bpy
+import pytest
+from jobs_driven import drive
+from late_volumes_stage import COUNT, STATES, advance, check_complete, generated, on_disk, paths_of
+
+from blender_primdiffusion.jobs.late_volumes import late_volumes
+from blender_primdiffusion.jobs.missing_files import look, state
+from blender_primdiffusion.scene import unwritten
+from blender_primdiffusion.scene.collect import unused
+from blender_primdiffusion.scene.duplicate import duplicate_human
+from blender_primdiffusion.scene.human import (
+    armature_of,
+    folder_of,
+    folders_of,
+    humans,
+    humans_folder,
+    unwritten_in,
+    volumes_of,
+)
+
+ops = bpy.ops.primdiffusion
+
+
+def test_undo_redo_and_work_again(in_each_state):
+    bpy.ops.ed.undo()
+    assert not humans(bpy.context.scene)
+    assert not late_volumes.work(0.0), "no human is left to write"
+    bpy.ops.ed.redo()
+    (person,) = humans(bpy.context.scene)
+    advance("written")
+    check_complete(person)
+
+
+def test_a_deleted_human_is_not_written_on_and_comes_back_with_undo(in_each_state):
+    before = on_disk()
+    bpy.ops.ed.undo_push(message="stands")
+    ops.delete_human(human=in_each_state.name)
+    bpy.ops.ed.undo_push(message="deleted")
+    assert not late_volumes.work(0.0)
+    assert on_disk() == before
+    bpy.ops.ed.undo()
+    advance("written")
+    check_complete(*humans(bpy.context.scene))
+
+
+def test_saved_and_opened_again_the_rest_is_written(in_each_state):
+    bpy.ops.wm.save_mainfile()
+    late_volumes.stop()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    (person,) = humans(bpy.context.scene)
+    look()
+    assert state.summary == ""
+    advance("written")
+    check_complete(person)
+
+
+@pytest.mark.parametrize("reached", STATES)
+def test_the_first_save_takes_the_volumes_along_however_many_are_written(hidden, tmp_path, reached):
+    bpy.ops.wm.read_homefile(use_empty=True)
+    person = generated()
+    temporary = folder_of(person)
+    while reached != "unwritten" and len(on_disk(temporary)) < (COUNT if reached == "written" else COUNT // 2):
+        assert late_volumes.work(0.0)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
+    assert folders_of(person)[0] == tmp_path / "film_humans" / "Human"
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "film.blend"))
+    shutil.rmtree(temporary, ignore_errors=True)
+    advance("written")
+    check_complete(*humans(bpy.context.scene))
+
+
+def test_the_blend_and_its_folder_may_be_moved_before_they_are_written(in_each_state, tmp_path):
+    bpy.ops.wm.save_mainfile()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    (tmp_path / "away").mkdir()
+    shutil.move(tmp_path / "shot.blend", tmp_path / "away")
+    shutil.move(tmp_path / "shot_humans", tmp_path / "away")
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "away" / "shot.blend"))
+    advance("written")
+    check_complete(*humans(bpy.context.scene))
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_appended_or_linked_the_rest_is_written(in_each_state, tmp_path, link):
+    bpy.ops.wm.save_mainfile()
+    source = bpy.data.filepath
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(source, link=link) as (_, wanted):
+        wanted.collections = ["Human"]
+    bpy.context.scene.collection.children.link(bpy.data.collections["Human"])
+    (person,) = humans(bpy.context.scene)
+    advance("written")
+    check_complete(person)
+
+
+def test_a_library_override_of_a_human_is_written(in_each_state):
+    bpy.ops.wm.save_mainfile()
+    source = bpy.data.filepath
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(source, link=True) as (_, wanted):
+        wanted.collections = ["Human"]
+    linked = bpy.data.collections["Human"]
+    bpy.context.scene.collection.children.link(linked)
+    linked.override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    person = next(person for person in humans(bpy.context.scene) if person.override_library is not None)
+    advance("written")
+    check_complete(person)
+
+
+def test_an_edit_in_each_state_ends_with_the_volumes_of_the_edit(in_each_state):
+    before = set(paths_of(in_each_state))
+    assert ops.vary(human=in_each_state.name, seed=8, steps=1) == {"FINISHED"}
+    drive()
+    after = set(paths_of(in_each_state))
+    assert before.isdisjoint(after)
+    advance("written")
+    check_complete(in_each_state)
+    bpy.ops.ed.undo()
+    (person,) = humans(bpy.context.scene)
+    assert set(paths_of(person)) == before
+    advance("written")
+    check_complete(person)
+
+
+def test_a_duplicate_shares_what_is_still_to_be_written(in_each_state):
+    twin = duplicate_human(in_each_state)
+    assert armature_of(twin).name in twin.children[0].objects
+    advance("written")
+    for person in (in_each_state, twin):
+        check_complete(person)
+    assert all(obj.parent == armature_of(twin) for objects in volumes_of(twin).values() for obj in objects)
+
+
+def test_collected_files_include_what_is_still_to_be_written(in_each_state, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
+    assert ops.collect_files() == {"FINISHED"}
+    shutil.rmtree(tmp_path / "shot_humans")
+    advance("written")
+    check_complete(in_each_state)
+    assert paths_of(in_each_state)[0].parent == tmp_path / "other_humans" / "Human"
+
+
+def test_the_source_of_unwritten_volumes_is_unused_once_no_human_needs_it(person):
+    source = unwritten_in(folder_of(person))
+    assert not unused(humans_folder())
+    ops.delete_human(human=person.name)
+    assert set(source) <= set(unused(humans_folder()))
+
+
+def test_what_failed_is_tried_again_when_the_file_is_opened(person, monkeypatch):
+    def full(*_: object) -> str:
+        raise OSError(28, "No space left on device")
+
+    bpy.ops.wm.save_mainfile()
+    monkeypatch.setattr(unwritten, "write_file", full)
+    while late_volumes.work(0.0):
+        pass
+    monkeypatch.undo()
+    assert not late_volumes.work(0.0)
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    assert late_volumes.error == ""
+    advance("written")
+    check_complete(*humans(bpy.context.scene))

@@ -1,0 +1,56 @@
+"""A human whose volumes are written later: made, written by halves, and whole."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+from jobs_driven import drive
+
+from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.late_volumes import late_volumes
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.scene.human import (
+    humans,
+    humans_folder,
+    unwritten_in,
+    volume_path,
+    volumes_of,
+)
+
+COUNT = 12
+"""Primitives of the synthetic person."""
+STATES = ("unwritten", "half", "written")
+
+
+def generated(seed: int = 7) -> bpy.types.Collection:
+    queue.add(bpy.context, GenerateJob(seed, 1))
+    drive()
+    return humans(bpy.context.scene)[-1]
+
+
+def advance(state_wanted: str) -> None:
+    """Write no volumes, about half of them, or all."""
+    if state_wanted == "half":
+        while len(on_disk()) < COUNT // 2:
+            assert late_volumes.work(0.0)
+    elif state_wanted == "written":
+        while late_volumes.work(0.0):
+            pass
+
+
+def on_disk(root: Path | None = None) -> list[Path]:
+    return sorted((root or humans_folder()).rglob("prim_*.vdb"))
+
+
+def paths_of(person: bpy.types.Collection) -> list[Path]:
+    return [volume_path(obj.data) for objects in volumes_of(person).values() for obj in objects]
+
+
+def check_complete(person: bpy.types.Collection) -> None:
+    """Every volume of the human has its file, and nothing is left to write."""
+    paths = paths_of(person)
+    assert len(paths) == COUNT
+    assert all(path.is_file() for path in paths)
+    assert not unwritten_in(paths[0].parent)
+    assert not list(paths[0].parent.glob(".*.partial*"))

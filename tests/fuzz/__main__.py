@@ -1,0 +1,26 @@
+"""Fuzz every reader: python -m fuzz --minutes 10, with tests in PYTHONPATH (`make fuzz`). Prints the counts as JSON."""
+
+import argparse
+import json
+import sys
+
+from fuzz.run import FINDINGS, run
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--minutes", type=float, help="how long; otherwise --inputs decides")
+    parser.add_argument("--inputs", type=int, default=20_000)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", default="", help="part of the name of a kind of input")
+    arguments = parser.parse_args()
+    report = run(arguments.seed, arguments.inputs, minutes=arguments.minutes, only=arguments.only)
+    for finding in report.findings:
+        print(finding)
+    print(json.dumps(report.figures()))
+    if report.findings:
+        sys.exit(f"{len(report.findings)} findings: their inputs are in {FINDINGS}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,473 @@
+"""Every kind of file and message that the programs read: a valid one, how it is damaged, how it is read."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from fuzz import mutations
+from fuzz.mutations import Mutation
+
+Read = Callable[[Path], None]
+
+
+class Garbage(AssertionError):
+    """A value that no reader should let through."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Target:
+    """A kind of input."""
+
+    name: str
+    make: Callable[[Path], Path]
+    """Writes a valid file into a folder and returns its path."""
+    mutations: Sequence[Mutation]
+    read: Read
+    """Reads the damaged file. Raises Garbage for values that should have been refused."""
+
+
+def finite(*values: Any) -> None:
+    """Raises Garbage for an array with NaN, infinities or numbers that no quantity here has."""
+    for value in values:
+        array = np.asarray(value.detach() if isinstance(value, torch.Tensor) else value)
+        if array.dtype.kind in "fc" and array.size and not (np.abs(array) < 1e12).all():
+            raise Garbage(f"{array.dtype} {array.shape} with {array.flat[np.abs(array).argmax()]}")
+
+
+# --- humans and models
+
+
+def tiny_human():
+    from primdiffusion.human import generate
+    from tiny_model import tiny_model
+
+    return generate(tiny_model(), seed=3, steps=2)
+
+
+def make_human(folder: Path, compact: bool = False) -> Path:
+    from primdiffusion.human_file import save_human
+
+    save_human(folder / "a.human.safetensors", tiny_human(), compact=compact)
+    return folder / "a.human.safetensors"
+
+
+def make_compact(folder: Path) -> Path:
+    return make_human(folder, compact=True)
+
+
+def read_human(path: Path) -> None:
+    from primdiffusion.human_file import load_human
+
+    human = load_human(path)
+    finite(human.payload.rgb, human.payload.density, human.payload.delta_scale, human.betas)
+    if (human.payload.density < 0).any():
+        raise Garbage("density below zero")
+
+
+def make_npz(folder: Path) -> Path:
+    from primdiffusion.human_file import export_for_blender
+
+    export_for_blender(folder / "human.npz", tiny_human())
+    return folder / "human.npz"
+
+
+def make_synthetic_npz(folder: Path) -> Path:
+    import synthetic
+
+    return synthetic.write(folder / "human.npz", count=6)
+
+
+def read_npz(path: Path) -> None:
+    from blender_primdiffusion.scene.human_npz import read_human as read
+
+    found = read(path)
+    finite(*(value for value in vars(found).values() if isinstance(value, np.ndarray)))
+
+
+def make_checkpoint(folder: Path) -> Path:
+    from primdiffusion.diffusion.checkpoint import save_checkpoint
+    from tiny_model import tiny_model
+
+    save_checkpoint(folder / "model.safetensors", tiny_model(), "linear")
+    return folder / "model.safetensors"
+
+
+def read_checkpoint(path: Path) -> None:
+    from primdiffusion.diffusion.checkpoint import load_checkpoint, model_card
+
+    model = load_checkpoint(path)
+    finite(*model.denoiser.state_dict().values(), model.full_density)
+    if not model.full_density > 0:
+        raise Garbage(f"full density {model.full_density}")
+    model_card({"held_out_rms_x0_error": {"x": {"0": 1.0}}, **model.card})
+
+
+def make_released(folder: Path) -> Path:
+    from released_files import TINY, random_network, state, template
+
+    tensors = state(dict(random_network(TINY).state_dict()), template())
+    small = {
+        name: value if value.numel() < 9999 else value.new_zeros(()).expand(value.shape)
+        for name, value in tensors.items()
+    }
+    torch.save({"model_state_dict": small, "optimizer": {"state": {}}}, folder / "released.pt")
+    return folder / "released.pt"
+
+
+def read_released(path: Path) -> None:
+    from primdiffusion.released.inventory import take_inventory
+    from primdiffusion.released.reading import read_weights
+
+    take_inventory(read_weights(path))
+
+
+# --- bodies, poses, motions
+
+
+def make_smpl_npz(folder: Path) -> Path:
+    from released_files import body_arrays
+
+    arrays = body_arrays()
+    arrays["J_regressor"] = arrays["J_regressor"].toarray()  # pyright: ignore[reportAttributeAccessIssue]
+    np.savez(folder / "body.npz", **arrays)  # pyright: ignore[reportArgumentType]
+    return folder / "body.npz"
+
+
+def make_smpl_pickle(folder: Path) -> Path:
+    from released_files import save_body
+
+    return save_body(folder)[0]
+
+
+def make_uv(folder: Path) -> Path:
+    from released_files import save_body
+
+    return save_body(folder)[1]
+
+
+def read_body(path: Path) -> None:
+    from primdiffusion.body.smpl_files import load_body
+
+    body = load_body(path)
+    finite(body.template, body.skin_weights, body.shape_basis, body.joint_regressor)
+
+
+def read_uv(path: Path) -> None:
+    from primdiffusion.body.smpl_files import load_body
+
+    finite(load_body(path.with_name("SMPL_NEUTRAL.pkl"), uv=path).uv)
+
+
+HOSTILE = (
+    b"cos\nsystem\n(S'touch CANARY'\ntR.", b"cposix\nsystem\n(S'touch CANARY'\ntR.", b"Np300000000\n.",
+    b"\x80\x04\x94.", b"(" * 100_000 + b".", b"cbuiltins\neval\n(S'1'\ntR.", b"\x8d" + b"\xff" * 7 + b"\x00.",
+    b"cnumpy\nload\n(S'x'\ntR.",
+)  # fmt: skip
+"""Calls, imports and endless memos."""
+
+
+def opcodes(content: bytes, rng: np.random.Generator) -> bytes:
+    """Opcodes of a pickle become those that call, import or remember."""
+    place = int(rng.integers(len(content)))
+    return content[:place] + mutations.pick(rng, HOSTILE) + (content[place:] if rng.random() < 0.5 else b"")
+
+
+def make_pose(folder: Path) -> Path:
+    pose = np.random.default_rng(0).normal(0, 0.3, (24, 3)).round(3).tolist()
+    (folder / "pose.json").write_text(json.dumps({"pose": pose, "translation": [0, 0.5, 0]}))
+    return folder / "pose.json"
+
+
+def make_own_pose(folder: Path) -> Path:
+    pose = np.random.default_rng(0).normal(0, 0.3, (24, 3)).round(3).tolist()
+    (folder / "pose.json").write_text(json.dumps({"pose": pose, "transl": [0, 0.5, 0]}))
+    return folder / "pose.json"
+
+
+def read_pose_file(path: Path) -> None:
+    from primdiffusion.pose_file import read_pose
+
+    pose = read_pose(path)
+    finite(*(value for value in vars(pose).values() if isinstance(value, torch.Tensor)))
+
+
+def read_own_pose(path: Path) -> None:
+    from blender_primdiffusion.motion.own_poses import load_pose
+
+    finite(*load_pose(path))
+
+
+def make_bvh(folder: Path) -> Path:
+    from bvh_files import motion_of, write_bvh
+    from primdiffusion.formats.joints import JOINT_NAMES
+
+    from blender_primdiffusion.motion.skeleton import REST_JOINTS
+
+    return write_bvh(folder / "a.bvh", REST_JOINTS, *motion_of(), {name: name for name in JOINT_NAMES})
+
+
+def make_amass(folder: Path) -> Path:
+    from amass_files import write_amass
+
+    write_amass(folder / "a.npz", frames=4)
+    return folder / "a.npz"
+
+
+def read_motion_file(path: Path) -> None:
+    from blender_primdiffusion.motion.files import read_motion
+
+    motion = read_motion(path)
+    finite(motion.rotations, motion.translations, motion.fps)
+    turns = np.einsum("...ij,...kj->...ik", motion.rotations, motion.rotations)
+    if np.abs(turns - np.eye(3)).max() > 1e-3:
+        raise Garbage("rotations that are none")
+
+
+# --- training data, captures, meshes
+
+
+def make_payload(folder: Path) -> Path:
+    from diffusion_people import write_people
+
+    write_people(folder, 1, variants=1)
+    return next(folder.glob("person_*.npz"))
+
+
+def read_payload(path: Path) -> None:
+    from primdiffusion.training.stored_people import read_person
+
+    person = read_person(path)
+    finite(person.delta_scale, person.betas, person.full_density)
+
+
+def make_glb(folder: Path) -> Path:
+    from capture_scenes import save_person
+
+    save_person(folder / "person.glb")
+    return folder / "person.glb"
+
+
+def glb_header(content: bytes, rng: np.random.Generator) -> bytes:
+    """A value of the .glb's JSON becomes another."""
+    length = int.from_bytes(content[12:16], "little")
+    text = mutations.as_json(content[20 : 20 + length], rng)
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length :]
+    size = (20 + len(text) + len(rest)).to_bytes(4, "little")
+    return content[:8] + size + len(text).to_bytes(4, "little") + content[16:20] + text + rest
+
+
+def read_glb_person(path: Path) -> None:
+    from primdiffusion.capture.people_files import read_person
+
+    person = read_person(path)
+    for part in person.mesh.parts:
+        finite(*(value for value in vars(part).values() if isinstance(value, np.ndarray)))
+
+
+_DATASET: dict[str, Path] = {}
+
+
+def of_dataset(name: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        from capture_scenes import captured
+
+        if "root" not in _DATASET:
+            _DATASET["root"] = captured(folder / "dataset", people=1, frames=1)
+        shutil.copytree(_DATASET["root"], folder / name.replace("/", "_") / "captures")
+        return next((folder / name.replace("/", "_") / "captures").rglob(name))
+
+    return make
+
+
+def read_dataset(path: Path) -> None:
+    from primdiffusion.formats.capture_repair import verify
+
+    root = next(parent for parent in path.parents if parent.name == "captures")
+    for each in (verify, view_of, pose_of):
+        try:
+            each(root)
+        except Garbage:
+            raise
+        except Exception as error:
+            if not said(error):
+                raise
+
+
+def person_in(root: Path) -> Path:
+    return next(path for path in sorted(root.iterdir()) if (path / "img").is_dir())
+
+
+def pose_of(root: Path) -> None:
+    from primdiffusion.capture.smpl_parameters import read_smpl
+
+    finite(read_smpl(person_in(root)).pose(0).translation)
+
+
+def view_of(root: Path) -> None:
+    from primdiffusion.capture.reader import open_captures
+
+    captures = open_captures(root)
+    view = captures.view(person_in(root).name, 0, 0)
+    finite(*(value for value in vars(view).values() if isinstance(value, np.ndarray)))
+
+
+def make_mhclo(folder: Path) -> Path:
+    head = ["name x", "obj_file x.obj", "x_scale 1 2 0.1", "verts 0"]
+    fits = [f"{n} {n + 1} {n + 2} 0.3 0.3 0.4 0 0 0.1" for n in range(9)]
+    (folder / "x.mhclo").write_text("\n".join(head + fits))
+    vertices, corners = [f"v {n} {n * n} 1" for n in range(9)], [f"vt 0.{n} 0.5" for n in range(9)]
+    (folder / "x.obj").write_text("\n".join([*vertices, *corners, "f 1/1 2/2 3/3", "f 4/4 5/5 6/6 7/7"]))
+    return folder / "x.mhclo"
+
+
+def make_obj(folder: Path) -> Path:
+    return make_mhclo(folder).with_suffix(".obj")
+
+
+def read_proxy(path: Path) -> None:
+    from primdiffusion.people.mhclo import read_pair
+
+    proxy, mesh = read_pair(path.with_suffix(".mhclo"), path.with_suffix(".obj"))
+    finite(*(value for one in (proxy, mesh) for value in vars(one).values() if isinstance(value, np.ndarray)))
+
+
+def make_picture(folder: Path) -> Path:
+    from PIL import Image
+
+    Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 24, 3), np.uint8)).save(folder / "a.png")
+    return folder / "a.png"
+
+
+def read_picture(path: Path) -> None:
+    from primdiffusion.geometry.pictures import opened_picture
+
+    with opened_picture(path) as picture:
+        np.asarray(picture)
+
+
+def make_grid(folder: Path) -> Path:
+    rng = np.random.default_rng(0)
+    density, colour = rng.random((4, 5, 6), np.float32), rng.random((4, 5, 6, 3), np.float32)
+    np.savez(folder / "grid.npz", density=density, colour=colour, origin=np.zeros(3), voxel=np.array(0.01))
+    return folder / "grid.npz"
+
+
+def read_merged(path: Path) -> None:
+    from blender_primdiffusion.scene.merged import read_grid
+
+    grid = read_grid(path)
+    finite(*(value for value in vars(grid).values() if isinstance(value, np.ndarray)))
+
+
+# --- messages
+
+
+def make_request(folder: Path) -> Path:
+    attributes = {"outfit": "suit", "height": 1.7}
+    params = {"seed": 3, "steps": 4, "out_dir": "out", "size": 64, "guidance": 1.5, "attributes": attributes}
+    message = {"jsonrpc": "2.0", "id": 1, "method": "generate", "params": params}
+    (folder / "request.json").write_text(json.dumps(message))
+    return folder / "request.json"
+
+
+def make_draw(folder: Path) -> Path:
+    near = np.eye(4)[:3].tolist()
+    params = {
+        "frame": "a.frame", "width": 64, "height": 64, "intrinsics": [[100.0, 0, 32], [0, 100.0, 32], [0, 0, 1]],
+        "world_to_camera": near, "people": [{"human": "a.human.safetensors", "object": near, "joints": [near] * 24}],
+    }  # fmt: skip
+    (folder / "draw.json").write_text(json.dumps({"jsonrpc": "2.0", "id": 1, "method": "draw", "params": params}))
+    return folder / "draw.json"
+
+
+def other_method(content: bytes, rng: np.random.Generator) -> bytes:
+    """The same parameters for another method, some of them damaged."""
+    from primdiffusion.serve.server import REQUESTS
+
+    message = json.loads(content)
+    message["method"] = mutations.pick(rng, list(REQUESTS))
+    known = [field.name for field in dataclasses.fields(REQUESTS[message["method"]])]
+    for name in known:
+        if rng.random() < 0.7:
+            message["params"][name] = mutations.pick(rng, (*mutations.VALUES, 0.5, 3, "a.human.safetensors", ["face"]))
+    message["params"] = {
+        name: value for name, value in message["params"].items() if name in known or rng.random() < 0.1
+    }
+    return json.dumps(message).encode()
+
+
+def read_message(path: Path) -> None:
+    from primdiffusion.commands.request import read_request
+    from primdiffusion.serve.rpc import parse_request
+    from primdiffusion.serve.server import REQUESTS
+
+    request = parse_request(path.read_bytes())
+    if request.method in REQUESTS:
+        read_request(REQUESTS[request.method], request.params, request.method)
+
+
+def make_answer(folder: Path) -> Path:
+    message = {
+        "jsonrpc": "2.0", "method": "progress",
+        "params": {"id": 1, "stage": "sample", "step": 1, "total": 4, "eta_s": 0.5, "picture": None},
+    }  # fmt: skip
+    (folder / "answer.json").write_text(json.dumps(message))
+    return folder / "answer.json"
+
+
+def read_answer(path: Path) -> None:
+    from blender_primdiffusion.backend.messages import fault_of, parsed
+
+    message = parsed(path.read_bytes())
+    if message is not None and fault_of(message, 0) is None and isinstance(message.get("params"), dict):
+        step, total = message["params"].get("step", 0), message["params"].get("total", 1)
+        f"{float(step) / max(float(total), 1.0):.0%}"
+
+
+TARGETS = (
+    Target("human", make_human, mutations.SAFETENSORS, read_human),
+    Target("compact human", make_compact, mutations.SAFETENSORS, read_human),
+    Target("human.npz", make_npz, mutations.NPZ, read_npz),
+    Target("small human.npz", make_synthetic_npz, mutations.NPZ, read_npz),
+    Target("checkpoint", make_checkpoint, mutations.SAFETENSORS, read_checkpoint),
+    Target("released checkpoint", make_released, (*mutations.NPZ, *mutations.PLAIN), read_released),
+    Target("SMPL .npz", make_smpl_npz, mutations.NPZ, read_body),
+    Target("SMPL .pkl", make_smpl_pickle, (*mutations.PLAIN, opcodes, opcodes), read_body),
+    Target("UV .obj", make_uv, mutations.TEXT, read_uv),
+    Target("pose", make_pose, mutations.JSON, read_pose_file),
+    Target("own pose", make_own_pose, mutations.JSON, read_own_pose),
+    Target("BVH", make_bvh, mutations.TEXT, read_motion_file),
+    Target("AMASS", make_amass, mutations.NPZ, read_motion_file),
+    Target("payload", make_payload, mutations.NPZ, read_payload),
+    Target("glb", make_glb, (*mutations.PLAIN, glb_header, glb_header, glb_header), read_glb_person),
+    Target("dataset.json", of_dataset("dataset.json"), mutations.JSON, read_dataset),
+    Target("complete.json", of_dataset("complete.json"), mutations.JSON, read_dataset),
+    Target("cameras.json", of_dataset("cameras.json"), mutations.JSON, read_dataset),
+    Target("mhclo", make_mhclo, mutations.TEXT, read_proxy),
+    Target("obj", make_obj, mutations.TEXT, read_proxy),
+    Target("picture", make_picture, mutations.PLAIN, read_picture),
+    Target("merged grid", make_grid, mutations.NPZ, read_merged),
+    Target("request", make_request, (*mutations.JSON, other_method, other_method, other_method), read_message),
+    Target("draw request", make_draw, (*mutations.JSON, other_method), read_message),
+    Target("child's message", make_answer, mutations.JSON, read_answer),
+)
+
+
+def said(error: BaseException) -> str | None:
+    """The sentence that a user reads for this error; None for one that is shown with a traceback."""
+    from primdiffusion.failures import describe
+    from primdiffusion.serve.rpc import RpcError
+
+    if isinstance(error, RpcError):
+        return str(error)
+    description = describe(error)
+    return None if description is None else str(description)
