@@ -49,8 +49,8 @@ def convolution(name: str, weight: tuple[int, ...], bias: tuple[int, ...]) -> di
 
 
 def blank(*shape: int) -> Tensor:
-    """Zeros of any shape that take no memory."""
-    return torch.zeros(()).expand(shape)
+    """Ones of any shape that take no memory."""
+    return torch.ones(()).expand(shape)
 
 
 def stage_one(template: Tensor) -> dict[str, Tensor]:

@@ -153,9 +153,7 @@ def conditioning_views(
     return views
 
 
-def spread_cameras(
-    subject: Subject, frame: int, count: int, body: BodyModel | None = None
-) -> tuple[int, ...]:
+def spread_cameras(subject: Subject, frame: int, count: int, body: BodyModel | None = None) -> tuple[int, ...]:
     """Indices of `count` cameras around a subject, sorted; all if there are fewer.
 
     The first faces the subject most directly; each next is the farthest in angle from those chosen.
@@ -191,8 +189,9 @@ def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
         ArrayFileError: joints.npz is damaged.
     """
     betas, components = torch.from_numpy(subject.smpl.betas), body.shape_basis.shape[-1]
-    name, remedy = "default body", (
-        "render the human again on the default body (primdiffusion captures, or Blender's without a body file)"
+    name, remedy = (
+        "default body",
+        ("render the human again on the default body (primdiffusion captures, or Blender's without a body file)"),
     )
     if body is not default_body():
         name, remedy = "encoder's body", "use captures that are fitted to the SMPL file that the encoder refers to"

@@ -80,7 +80,8 @@ def sample_both_sides(
 ) -> tuple[Float32[Tensor, "n 3"], Float32[Tensor, "n"]]:
     """Mean colour (0 ... 255) at points over the views that see them, and the fraction of views that do.
 
-    `depth` is the body surface's depth in each view, inf beside it. Colour and depth are bilinear; NaN points are black.
+    `depth` is the body surface's depth in each view, inf beside it. Colour and depth are bilinear. NaN points are
+    black.
     """
     rgba = np.ascontiguousarray(views.rgba.cpu().numpy())
     world_to_pixel = (views.camera.intrinsics.double() @ views.camera.world_to_camera.double()).cpu().numpy()

@@ -21,7 +21,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, pose_body
 from primdiffusion.people.payloads import rest_frames
-from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
