@@ -19,7 +19,7 @@ from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.human import Human, pose_body
+from primdiffusion.human import Human, body_of, pose_body
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.from_mesh import from_mesh
