@@ -53,8 +53,22 @@ def stage_one_error(seed: int = 0) -> float:
     )
 
 
+def attention_error(seed: int = 0) -> float:
+    """Largest difference of the self-attention over [motion, appearance] alone, relative to the largest output."""
+    tensors = random_stage_one(template(), seed)
+    x = torch.randn(2, 96, 32, 32, generator=torch.Generator().manual_seed(seed))
+    motion, appearance = x.split((32, 64), dim=1)
+    ours = torch.cat(imported(tensors).attention(motion, appearance), dim=1)
+    found = StageOneTwin(tensors).transformer(x.double())
+    return float((ours - found).abs().max() / found.abs().max())
+
+
 def test_the_imported_encoder_computes_what_the_reference_says():
     assert stage_one_error() < 1e-5
+
+
+def test_its_attention_alone_computes_what_the_reference_says():
+    assert attention_error() < 1e-5
 
 
 def test_the_twin_uses_its_whole_range_so_that_it_can_tell_a_mistake():
