@@ -19,6 +19,10 @@ SOURCES = {
     ),
     "engine": ("The engine in Blender", "benchmarks/engine.py --json docs/results/engine.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
+    "faithful": (
+        "Faithfulness to the released networks and the paper's metrics",
+        "benchmarks/faithful.py --json docs/results/faithful.json",
+    ),
     "captures": ("Captures", "benchmarks/captures.py --assets DIR --json docs/results/captures.json"),
     "encoder": (
         "The encoder",

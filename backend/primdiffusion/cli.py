@@ -44,7 +44,7 @@ COMMANDS = {
     "evaluate": ("commands.evaluate:run", "Evaluate trained models"),
     "import-released": (
         "commands.import_released:run",
-        "Convert the authors' primdiffusion.pt, with your SMPL file, to a checkpoint",
+        "Convert the authors' primdiffusion.pt, with your SMPL file, to a checkpoint and an encoder",
     ),
 }
 """The function of each command, imported when it is used, because several take a second to import; and its summary."""

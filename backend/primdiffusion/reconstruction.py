@@ -22,4 +22,5 @@ def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
         "full_density": model.config.full_density,
         "version": __version__,
     }
-    return Human(payload, betas_of_frames(model.config, person.betas), provenance).to("cpu").validate()
+    betas = betas_of_frames(model.config, person.betas)
+    return Human(payload, betas, provenance, model.body_setup).to("cpu").validate()

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 from pathlib import Path
 
 import numpy as np
 import scipy.sparse
 import torch
+from PIL import Image
+from primdiffusion.body.smpl_files import load_body
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.formats.capture_layout import picture_path
+from primdiffusion.geometry.camera import look_at
+from primdiffusion.raster.z_buffer import nearest_triangles
 from torch import Tensor
 
 T = 1000
@@ -49,8 +55,8 @@ def convolution(name: str, weight: tuple[int, ...], bias: tuple[int, ...]) -> di
 
 
 def blank(*shape: int) -> Tensor:
-    """Zeros of any shape that take no memory."""
-    return torch.zeros(()).expand(shape)
+    """Ones of any shape that take no memory."""
+    return torch.ones(()).expand(shape)
 
 
 def stage_one(template: Tensor) -> dict[str, Tensor]:
@@ -75,6 +81,28 @@ def stage_one(template: Tensor) -> dict[str, Tensor]:
     for n in range(4):
         found |= convolution(f"decoder_geom.{n}", (5, 5, 3, 3), (5, 7, 7))
     return found | {f"transformer.{name}": blank(*shape) for name, shape in attention().items()}
+
+
+def random_stage_one(template: Tensor, seed: int = 0) -> dict[str, Tensor]:
+    """`stage_one` with weights that keep the size of the signal, so that colours and densities are within range."""
+    generator = torch.Generator().manual_seed(seed)
+    found = stage_one(template)
+    for name, value in found.items():
+        group, kind = name.partition(".")[0], name.rpartition(".")[2]
+        if group in ("lbs_fn", "geo_fn", "decoder_geom"):
+            continue
+        draw = torch.randn(value.shape, generator=generator)
+        if kind == "g":
+            up = group in ("decoder_rgb", "decoder_alpha") or ".up." in name
+            draw = (2 if up else 1) * value.numel() ** 0.5 * (1 + 0.2 * draw)
+        elif group != "transformer":
+            draw = draw if kind == "weight" else 0.3 * draw
+        elif value.ndim == 1:
+            draw = 0.1 * draw + float(kind == "weight")
+        else:
+            draw = draw / value[0].numel() ** 0.5
+        found[name] = draw
+    return found
 
 
 def attention() -> dict[str, tuple[int, ...]]:
@@ -102,11 +130,12 @@ def random_network(config: UNetConfig, seed: int = 0) -> SlabUNet:
     return network.eval()
 
 
-def state(denoiser: dict[str, Tensor], template: Tensor) -> dict[str, Tensor]:
-    """What the authors' file has under "model_state_dict"."""
+def state(denoiser: dict[str, Tensor], template: Tensor, stage: dict[str, Tensor] | None = None) -> dict[str, Tensor]:
+    """What the authors' file has under "model_state_dict"; `stage` is `stage_one` if None."""
+    stage = stage_one(template) if stage is None else stage
     return (
         schedule_buffers()
-        | {f"bodydecoder.{name}": value for name, value in stage_one(template).items()}
+        | {f"bodydecoder.{name}": value for name, value in stage.items()}
         | {f"diffusion.{name}": value for name, value in denoiser.items()}
     )
 
@@ -187,3 +216,36 @@ def save_body(folder: Path) -> tuple[Path, Path]:
 
 def template() -> Tensor:
     return torch.from_numpy(np.asarray(body_arrays()["v_template"])).float()
+
+
+def save_capture(root: Path, name: str = "someone", size: int = 48, cameras: int = 4) -> Path:
+    """A dataset of the drum in the released layout, grey by its normals, in two frames; returns its subject."""
+    body, folder = load_body(root / "SMPL_NEUTRAL.pkl"), root / "captures" / name
+    (folder / "outputs_re_fitting").mkdir(parents=True)
+    (folder.parent / "release_human_list.txt").write_text(f"{name}\n")
+    corners = body.template[body.faces].double().numpy()
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    grey = np.clip(128 + 100 * normals @ [0.6, 0.0, 0.8] / np.linalg.norm(normals, axis=1), 0, 255).astype(np.uint8)
+    rig = {}
+    for number in range(cameras):
+        yaw = 2 * np.pi * number / cameras
+        position = torch.tensor([3 * np.sin(yaw), 0.2, 3 * np.cos(yaw)]).float()
+        camera = look_at(position, torch.zeros(3), vertical_fov=0.8, width=size, height=size)
+        world = camera.world_to_camera.double().numpy()
+        rig[f"camera{number:04d}"] = {
+            "K": camera.intrinsics.double().tolist(), "R": world[:, :3].tolist(), "T": world[:, 3].tolist()
+        }  # fmt: skip
+        found = nearest_triangles(corners, camera).triangle
+        mask = np.where(found >= 0, 255, 0).astype(np.uint8)
+        for kind, pixels in (("img", np.where(found >= 0, grey[found], 0)[..., None].repeat(3, -1)), ("mask", mask)):
+            for frame in range(2):
+                path = picture_path(folder, kind, number, frame)
+                path.parent.mkdir(parents=True, exist_ok=True)
+                Image.fromarray(pixels.astype(np.uint8)).save(path)
+    (folder / "cameras.json").write_text(json.dumps(rig))
+    parameters = {
+        "global_orient": np.zeros((2, 3)), "body_pose": np.zeros((2, 69)), "betas": np.zeros((1, 10)),
+        "transl": np.zeros((2, 3)),
+    }  # fmt: skip
+    np.savez(folder / "outputs_re_fitting" / "refit_smpl_2nd.npz", smpl=np.array(parameters, dtype=object))
+    return folder

@@ -42,7 +42,7 @@ def asked(people, checkpoint, tmp_path) -> dict:
 EDITS = {
     "vary": {"amount": 0.4, "seed": 7},
     "interpolate": {"other": "bob", "fraction": 0.25},
-    "inpaint": {"region": ["top"], "seed": 7, "attributes": {"outfit": "suit"}, "guidance": 2.0},
+    "inpaint": {"region": ["top"], "seed": 7, "attributes": {"outfit": "suit"}, "guidance": 2.0, "masking": "released"},
     "transfer": {"source": "bob", "region": ["top", "left_foot"], "harmonise": 0.4, "seed": 7},
 }
 

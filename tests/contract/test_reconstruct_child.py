@@ -47,7 +47,7 @@ def test_reconstruct_reports_its_stages_and_leaves_whole_files(child, asked):
     stages = []
     while "method" in (message := child.until(lambda m: m.get("method") == "progress" or m.get("id") == 1)):
         stages.append((message["params"]["stage"], message["params"]["step"], message["params"]["total"]))
-    assert stages == [("read", 0, 4), ("load", 1, 4), ("encode", 2, 4), ("write", 3, 4), ("write", 4, 4)]
+    assert stages == [("load", 0, 4), ("read", 1, 4), ("encode", 2, 4), ("write", 3, 4), ("write", 4, 4)]
     result = message["result"]
     assert (result["subject"], result["frame"], len(result["views"])) == (FIRST, 1, 2)
     assert result["seconds"] >= result["seconds_encoding"] > 0

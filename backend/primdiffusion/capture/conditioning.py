@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.body.model import default_body
+from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.capture.people_files import LARGEST_BETA
 from primdiffusion.capture.reader import (
@@ -25,7 +25,7 @@ from primdiffusion.capture.reader import (
     resample,
     windowed_view,
 )
-from primdiffusion.capture.sheet import default_joints, joints_of
+from primdiffusion.capture.sheet import body_joints, joints_of
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 
@@ -55,13 +55,17 @@ class CapturedPerson:
     views: Views
     """Unbatched, [v]."""
     betas: Float[Tensor, "10"]
-    """Betas of the default body."""
+    """Betas of the encoder's body."""
     warnings: tuple[str, ...]
     """Messages for the user about problems of the captures."""
 
 
-def captured_person(path: str | Path, subject: str | None = None, frame: int = 0, views: int = 8) -> CapturedPerson:
+def captured_person(
+    path: str | Path, subject: str | None = None, frame: int = 0, views: int = 8, body: BodyModel | None = None
+) -> CapturedPerson:
     """A subject of a dataset, or of its own folder, in one frame; `views` spread cameras, or all if there are fewer.
+
+    `body` is the encoder's; None is the default body.
 
     Raises:
         FileNotFoundError: the folder or a file of the subject does not exist.
@@ -70,12 +74,13 @@ def captured_person(path: str | Path, subject: str | None = None, frame: int = 0
     """
     captures, name = choose_subject(path, subject)
     person = captures.subject(name)
-    betas = default_betas(person)
+    body = default_body() if body is None else body
+    betas = body_betas(person, body)
     _check_frame(person, frame)
-    cameras = spread_cameras(person, frame, views)
+    cameras = spread_cameras(person, frame, views, body)
     chosen = conditioning_views(captures, name, frame, cameras)
     warnings = [] if len(cameras) > 1 else ["only one view: the sides that it does not show are guessed"]
-    covered = _covered_share(person, frame, cameras, chosen)
+    covered = _covered_share(person, frame, cameras, chosen, body)
     if covered < LEAST_COVERED:
         warnings.append(
             f"only {100 * covered:.0f} % of the body of {name} is inside the masks: the betas or poses may belong to "
@@ -148,7 +153,7 @@ def conditioning_views(
     return views
 
 
-def spread_cameras(subject: Subject, frame: int, count: int) -> tuple[int, ...]:
+def spread_cameras(subject: Subject, frame: int, count: int, body: BodyModel | None = None) -> tuple[int, ...]:
     """Indices of `count` cameras around a subject, sorted; all if there are fewer.
 
     The first faces the subject most directly; each next is the farthest in angle from those chosen.
@@ -159,7 +164,7 @@ def spread_cameras(subject: Subject, frame: int, count: int) -> tuple[int, ...]:
     if count >= len(subject.views):
         return tuple(range(len(subject.views)))
     pose = subject.smpl.pose(frame)
-    pelvis = joints_of(subject)[frame, 0]
+    pelvis = joints_of(subject, body)[frame, 0]
     offset = np.stack([view.position for view in subject.views]) - pelvis
     direction = offset / np.maximum(np.linalg.norm(offset, axis=1, keepdims=True), 1e-9)
     forward = pose.joint_rotation[0, :, 2].double().numpy()
@@ -172,23 +177,33 @@ def spread_cameras(subject: Subject, frame: int, count: int) -> tuple[int, ...]:
 
 
 def default_betas(subject: Subject) -> Float[Tensor, "10"]:
-    """Betas of the subject on the default body, padded with zeros to ten.
+    """Betas of the subject on the default body, padded with zeros to ten. Raises as `body_betas`."""
+    return body_betas(subject, default_body())
+
+
+def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
+    """Betas of the subject on a body, padded with zeros to the number of its shape components.
 
     Raises:
-        ConditioningError: there are more than ten, they are out of range, or stored joints are not the default body's.
+        ConditioningError: there are too many, they are out of range, or stored joints are not the body's.
         ArrayFileError: joints.npz is damaged.
     """
-    betas, components = torch.from_numpy(subject.smpl.betas), default_body().shape_basis.shape[-1]
-    remedy = "render the human again on the default body (primdiffusion captures, or Blender's without a body file)"
+    betas, components = torch.from_numpy(subject.smpl.betas), body.shape_basis.shape[-1]
+    name, remedy = (
+        "default body",
+        ("render the human again on the default body (primdiffusion captures, or Blender's without a body file)"),
+    )
+    if body is not default_body():
+        name, remedy = "encoder's body", "use captures that are fitted to the SMPL file that the encoder refers to"
     if len(betas) > components or not (betas.abs() <= LARGEST_BETA).all():
         raise ConditioningError(
             f"{subject.folder} has {len(betas)} betas of up to {float(betas.abs().max()):.3g}; there may be at most "
-            f"{components} of the default body, within {LARGEST_BETA:g}: {remedy}"
+            f"{components} of the {name}, within {LARGEST_BETA:g}: {remedy}"
         )
-    distance = float(np.linalg.norm(joints_of(subject) - default_joints(subject), axis=-1).max())
+    distance = float(np.linalg.norm(joints_of(subject, body) - body_joints(subject, body), axis=-1).max())
     if not distance <= SAME_BODY_M:
         raise ConditioningError(
-            f"the joints of {subject.folder} are up to {100 * distance:.0f} cm from the default body's, so its betas "
+            f"the joints of {subject.folder} are up to {100 * distance:.0f} cm from the {name}'s, so its betas "
             f"belong to another body model; {remedy}"
         )
     return torch.nn.functional.pad(betas, (0, components - len(betas)))
@@ -199,13 +214,13 @@ def _check_frame(subject: Subject, frame: int) -> None:
         raise ConditioningError(f"{subject.name} has frames 0 to {subject.frames - 1}, not {frame}: choose one of them")
 
 
-def _covered_share(subject: Subject, frame: int, cameras: Sequence[int], views: Views) -> float:
+def _covered_share(subject: Subject, frame: int, cameras: Sequence[int], views: Views, body: BodyModel) -> float:
     """Fraction of the body's projected points that are inside the masks.
 
     Raises ConditioningError if it is 0.
     """
-    body = default_body().shape(torch.from_numpy(subject.smpl.betas)).pose(subject.smpl.pose(frame))
-    points, size = body.vertices[::_EACH].double().numpy(), views.rgba.shape[-2]
+    posed = body.shape(torch.from_numpy(subject.smpl.betas)).pose(subject.smpl.pose(frame))
+    points, size = posed.vertices[::_EACH].double().numpy(), views.rgba.shape[-2]
     inside = [
         mask[pixels[:, 1], pixels[:, 0]] > 0
         for camera, mask in zip(cameras, views.mask.numpy(), strict=True)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 
-from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.body.model import BodyModel, BodyPose, default_body
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import View
@@ -50,8 +50,8 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
     return max(reprojection_error(captures.subject(name)) for name in {name for name, _ in chosen})
 
 
-def joints_of(subject: Subject) -> Float[np.ndarray, "F J 3"]:
-    """World positions of the joints from joints.npz; without it (released layout), those of the default body.
+def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarray, "F J 3"]:
+    """World positions of the joints from joints.npz; without it (released layout), those of the body (None: default).
 
     Raises:
         ArrayFileError: joints.npz is damaged.
@@ -59,14 +59,19 @@ def joints_of(subject: Subject) -> Float[np.ndarray, "F J 3"]:
     try:
         return read_numbers(subject.folder / "joints.npz", ("world",))["world"]
     except FileNotFoundError:
-        return default_joints(subject)
+        return body_joints(subject, default_body() if body is None else body)
 
 
 def default_joints(subject: Subject) -> Float[np.ndarray, "F J 3"]:
     """World positions of the default body's joints in the subject's shape and poses."""
+    return body_joints(subject, default_body())
+
+
+def body_joints(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]:
+    """World positions of a body's joints in the subject's shape and poses."""
     smpl = subject.smpl
     pose = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
-    return default_body().shape(torch.from_numpy(smpl.betas)).pose(pose).joints[..., :3, 3].double().numpy()
+    return body.shape(torch.from_numpy(smpl.betas)).pose(pose).joints[..., :3, 3].double().numpy()
 
 
 def reprojection_error(subject: Subject) -> float:

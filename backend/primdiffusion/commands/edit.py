@@ -235,6 +235,9 @@ class InpaintRequest(EditRequest):
     """Attributes of the region, NAME=VALUE as in outfit=suit; `info` lists those that a checkpoint knows."""
     guidance: float = requests.GUIDANCE
     """How closely attributes are followed; 1 is plain conditioning, more costs variety."""
+    masking: requests.Masking = requests.MASKINGS[0]
+    """repaint: the rest is noised to each step's own level, and each step is sampled twice; released: as in the
+    authors' code, the rest is pasted one level too noisy, and each step is sampled once."""
 
     def check(self) -> None:
         """See `RequestRecord`."""
@@ -250,7 +253,9 @@ class InpaintRequest(EditRequest):
         region = self.region.primitives(human)
         model = session.model(self.checkpoint)
         with sampling(lambda x0: _decode_inside(model, human, region, x0)) as on_step:
-            return inpaint(model, human, region, self.seed, self.steps, self.attributes, self.guidance, on_step)
+            return inpaint(
+                model, human, region, self.seed, self.steps, self.attributes, self.guidance, on_step, self.masking
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

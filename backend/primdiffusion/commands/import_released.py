@@ -1,4 +1,4 @@
-"""Convert the authors' checkpoint and the user's SMPL file to a checkpoint: `primdiffusion import-released`."""
+"""Convert the authors' checkpoint and the user's SMPL file to our files: `primdiffusion import-released`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.primitives.anchors import grid_points_outside
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K
-from primdiffusion.released.imported import Reference, write_imported
+from primdiffusion.released.imported import Reference, write_encoder, write_imported
 from primdiffusion.released.inventory import PREFIX, Inventory, take_inventory
-from primdiffusion.released.reading import ReleasedFileError, read_weights
+from primdiffusion.released.reading import read_weights
 from primdiffusion.released.stage_one import PREFIX as STAGE_ONE
+from primdiffusion.released.stage_one import encoder_tensors
 
 SMPL_CELLS_OUTSIDE = 214
 """Of 1024 grid points outside every chart with SMPL's own UV (SPEC 1.2)."""
@@ -33,10 +34,11 @@ SAME_BODY = 1e-4
 
 @dataclasses.dataclass(frozen=True)
 class ImportReleased:
-    """Convert the authors' primdiffusion.pt to a checkpoint for generate, render, the extension and everything else.
+    """Convert the authors' primdiffusion.pt to a checkpoint for generate, render, the extension and everything else,
+    and an encoder for reconstruct and payloads encode.
 
-    Only the denoiser (stage 2) is imported. The new file contains nothing of SMPL: it stores the path and checksum of
-    your SMPL file, which it needs wherever it is used.
+    The new files contain nothing of SMPL: they store the path and checksum of your SMPL file, which they need wherever
+    they are used. A stage-1 file gives the encoder only.
     """
 
     checkpoint: tyro.conf.Positional[Path]
@@ -46,7 +48,9 @@ class ImportReleased:
     uv: tuple[Path, ...]
     """The UV layout it was trained with: SMPL's UV .obj, an .npz with vt and ft, or the pair vt.npy ft.npy."""
     out: Path
-    """Output .safetensors."""
+    """Output .safetensors: the denoiser, or the encoder of a stage-1 file."""
+    encoder: Path | None = None
+    """Output .safetensors of the encoder; the default is beside `out`, NAME.encoder.safetensors."""
     reference: Path | None = None
     """Folder of the dataset's subject seq_000016-rp_alison_rigged_002, whose first frame determined the box sizes; the
     default is the mean body in the T pose, which differs by millimetres."""
@@ -60,23 +64,27 @@ class ImportReleased:
         weights = read_weights(self.checkpoint)
         inventory = take_inventory(weights)
         print(inventory.account.table())
-        if inventory.unet is None:
-            raise ReleasedFileError(
-                f"{self.checkpoint} is a whole checkpoint of stage 1, the encoder, which is not imported; nothing was "
-                "written: give the authors' primdiffusion.pt, which holds the denoiser"
-            )
         if not 1 <= len(self.uv) <= 2:
             raise ValueError(f"uv names {len(self.uv)} files: give one .obj or .npz, or the pair vt.npy ft.npy")
         body_setup = body_setup_from_files(self.smpl, self.uv)
-        notes = [*_about_body(weights, body_setup.body), _about_layout(body_setup)]
-        denoiser = under(weights, PREFIX)
-        card = _card(self.checkpoint, inventory, denoiser, self.reference)
-        write_imported(self.out, denoiser, inventory.unet, body_setup, _reference(self.reference), self.chain, card)
+        stage_one = under(weights, STAGE_ONE) or weights
+        notes = [*_about_body(stage_one, body_setup.body), _about_layout(body_setup)]
+        encoder, reference = encoder_tensors(stage_one), _reference(self.reference)
+        encoder_card = card = _card(self.checkpoint, inventory, encoder, self.reference, "encoder")
+        encoder_out, files = self.encoder or self.out, [self.encoder or self.out]
+        if inventory.unet is not None:
+            encoder_out = self.encoder or self.out.with_name(f"{self.out.stem}.encoder.safetensors")
+            if encoder_out.absolute() == self.out.absolute():
+                raise ValueError(f"{self.out} is the output of both stages: give --encoder another name")
+            denoiser, files = under(weights, PREFIX), [self.out, encoder_out]
+            card = _card(self.checkpoint, inventory, denoiser, self.reference, "denoiser")
+            write_imported(self.out, denoiser, inventory.unet, body_setup, reference, self.chain, card)
+        write_encoder(encoder_out, encoder, body_setup, reference, encoder_card)
         for note in notes:
             print(note)
         if self.report is not None:
             _write_report(self.report, inventory, card, notes, body_setup)
-        print(self.out)
+        print(*files, sep="\n")
 
 
 def _reference(folder: Path | None) -> Reference:
@@ -88,12 +96,12 @@ def _reference(folder: Path | None) -> Reference:
     return Reference(betas, parameters.pose(0))
 
 
-def _about_body(weights: Mapping[str, Tensor], body: BodyModel) -> list[str]:
-    """Compare the given SMPL body with the copy in the checkpoint."""
+def _about_body(stage_one: Mapping[str, Tensor], body: BodyModel) -> list[str]:
+    """Compare the given SMPL body with the copy among the tensors of stage 1 (names without prefix)."""
     held = [
         value.reshape(body.template.shape)
-        for key, value in weights.items()
-        if key.startswith(f"{STAGE_ONE}lbs_fn.")
+        for key, value in stage_one.items()
+        if key.startswith("lbs_fn.")
         and value.is_floating_point()
         and tuple(value.shape)[-2:] == body.template.shape
         and value.numel() == body.template.numel()
@@ -111,16 +119,22 @@ def _about_layout(body_setup: BodySetup) -> str:
     return f"{outside} of {K} primitives lie outside of the UV charts; with SMPL's own UV {SMPL_CELLS_OUTSIDE} do"
 
 
-def _card(path: Path, inventory: Inventory, denoiser: Mapping[str, Tensor], reference: Path | None) -> dict[str, Any]:
+def _card(
+    path: Path,
+    inventory: Inventory,
+    network: Mapping[str, Tensor],
+    reference: Path | None,
+    stage: Literal["denoiser", "encoder"],
+) -> dict[str, Any]:
     return {
-        "name": f"released {path.stem}",
+        "name": f"released {path.stem}" + (" encoder" if stage == "encoder" else ""),
         "source": path.name,
         "source_sha256": file_hash(path),
         "source_tensors": len(inventory.account.entries),
-        "parameters": sum(value.numel() for value in denoiser.values()),
+        "parameters": sum(value.numel() for value in network.values()),
         "sizes_from": "template" if reference is None else reference.name,
         "licence": "that of the authors' weights, and of SMPL for what is made on its body",
-        "limits": ["needs the SMPL file it was imported with", "encoder (stage 1) not imported"],
+        "limits": ["needs the SMPL file it was imported with"],
     }
 
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from primdiffusion.training.refine import RefineStep
 
 STEPS = 4
-"""Read, load, encode, write."""
+"""Load, read, encode, write."""
 ENCODER, BODY = "encoder", "body"
 """Values of `start`."""
 ENCODER_VIEWS = 8
@@ -77,10 +77,10 @@ class ReconstructRequest:
 
         began = time.perf_counter()
         with staged(self.out_dir) as folder:
-            report("read", 0, STEPS, None)
-            person = captured_person(self.capture, self.subject, self.frame, self.views)
-            report("load", 1, STEPS, None)
+            report("load", 0, STEPS, None)
             model = session.encoder(self.checkpoint)
+            report("read", 1, STEPS, None)
+            person = captured_person(self.capture, self.subject, self.frame, self.views, model.body)
             report("encode", 2, STEPS, None)
             loaded = time.perf_counter()
             human = reconstruct(model, person)

@@ -28,7 +28,8 @@ from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.json_files import JsonError, parse_json
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.primitives.body_setup import BodyFiles, BodySetupError, find_body_setup
+from primdiffusion.primitives.anchors import Anchors
+from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
 from primdiffusion.tensor_file import save
 
 FORMAT = "primdiffusion-checkpoint"
@@ -198,13 +199,7 @@ def _released_model(
         network = SlabUNet(_unet_config(architecture["config"]))
     network.load_state_dict(under(tensors, "denoiser."), assign=True)
     network.eval().requires_grad_(False)
-    body_setup = find_body_setup(BodyFiles.from_json(architecture["body"]), tensors["stand.rest_half_extent"], [folder])
-    anchors = body_setup.anchors
-    if not (
-        torch.equal(anchors.face, tensors["stand.face"].long())
-        and torch.allclose(anchors.barycentric, tensors["stand.barycentric"], atol=1e-5)
-    ):
-        raise BodySetupError("the anchors differ from those that the checkpoint was imported with: import it again")
+    body_setup = stored_body_setup(tensors, architecture["body"], folder)
     fixed_betas = (
         torch.zeros(BETAS, 0),
         tensors["stand.betas"],
@@ -221,6 +216,30 @@ def _released_model(
         chain=CHAINS[architecture["chain"]],
         body_setup=body_setup,
     )
+
+
+def anchor_tensors(anchors: Anchors) -> dict[str, Tensor]:
+    """The tensors by which a file stores the anchors on a user's body."""
+    return {
+        "stand.face": anchors.face,
+        "stand.barycentric": anchors.barycentric,
+        "stand.rest_half_extent": anchors.rest_half_extent,
+    }
+
+
+def stored_body_setup(tensors: Mapping[str, Tensor], body: str, folder: Path) -> BodySetup:
+    """Load the body of a file in `folder` with its `anchor_tensors`; `body` is the JSON of `BodyFiles`.
+
+    Raises BodySetupError if a body file is missing or changed, or does not give these anchors; KeyError, ValueError.
+    """
+    body_setup = find_body_setup(BodyFiles.from_json(body), tensors["stand.rest_half_extent"], [folder])
+    anchors = body_setup.anchors
+    if not (
+        torch.equal(anchors.face, tensors["stand.face"].long())
+        and torch.allclose(anchors.barycentric, tensors["stand.barycentric"], atol=1e-5)
+    ):
+        raise BodySetupError("the anchors differ from those that the checkpoint was imported with: import it again")
+    return body_setup
 
 
 def _unet_config(tree: Mapping[str, Any]) -> UNetConfig:

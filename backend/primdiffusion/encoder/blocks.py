@@ -2,26 +2,49 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils import parametrize
 from torch.nn.utils.parametrizations import weight_norm
 
 SLOPE = 0.2
 """Negative slope of the leaky ReLU."""
 
 
+class TensorNorm(nn.Module):
+    """Weight normalisation over the whole tensor with a gain per output channel: w = g[channel] v / ||v|| (SPEC 2)."""
+
+    def __init__(self, channel_axis: int) -> None:
+        super().__init__()
+        self.channel_axis = channel_axis
+
+    def forward(self, gain: Tensor, direction: Tensor) -> Tensor:
+        """Weight of a gain (size 1 on all axes but the channels') and a direction of the weight's shape."""
+        return direction * (gain / direction.norm())
+
+    def right_inverse(self, weight: Tensor) -> tuple[Tensor, Tensor]:
+        """Gain and direction of a weight."""
+        shape = [1] * weight.ndim
+        shape[self.channel_axis] = weight.shape[self.channel_axis]
+        return weight.norm().expand(shape).clone(), weight
+
+
 class UntiedConv(nn.Module):
     """A weight-normalised convolution with a bias [C, H, W], because each UV position is a fixed part of the body.
 
-    `resize` is "same" (3 x 3 or 1 x 1), "down" or "up" (4 x 4, factor 2); `side` is the output's height and width.
+    `resize` is "same" (3 x 3 or 1 x 1), "down" or "up" (4 x 4, factor 2); `side` is the output's height and width, or
+    1 for a bias per channel. The norm is that of each output channel's weights, or with `whole_norm` of all weights.
     """
 
-    def __init__(self, inputs: int, outputs: int, side: int, resize: str = "same", kernel: int = 3) -> None:
+    def __init__(
+        self, inputs: int, outputs: int, side: int, resize: str = "same", kernel: int = 3, whole_norm: bool = False
+    ) -> None:
         super().__init__()
         if resize == "same":
             convolution: nn.Module = nn.Conv2d(inputs, outputs, kernel, padding=kernel // 2, bias=False)
@@ -29,7 +52,12 @@ class UntiedConv(nn.Module):
             convolution = nn.Conv2d(inputs, outputs, 4, stride=2, padding=1, bias=False)
         else:
             convolution = nn.ConvTranspose2d(inputs, outputs, 4, stride=2, padding=1, bias=False)
-        self.convolution = weight_norm(convolution, dim=1 if resize == "up" else 0)
+        channel_axis = 1 if resize == "up" else 0
+        if whole_norm:
+            parametrize.register_parametrization(convolution, "weight", TensorNorm(channel_axis))
+            self.convolution = convolution
+        else:
+            self.convolution = weight_norm(convolution, dim=channel_axis)
         self.bias = nn.Parameter(torch.zeros(outputs, side, side))
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
@@ -41,6 +69,11 @@ class UntiedConv(nn.Module):
         with torch.no_grad():
             self.convolution.get_parameter("parametrizations.weight.original0").mul_(0.1)
         return self
+
+
+Conv = Callable[..., UntiedConv]
+WholeNormConv: Conv = functools.partial(UntiedConv, whole_norm=True)
+"""The released code's convolution."""
 
 
 def rectified(x: Tensor) -> Tensor:
@@ -60,6 +93,20 @@ class ResidualConv(nn.Module):
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """Output of the same size, after the activation."""
         return rectified(self.second(rectified(self.first(x))) + self.shortcut(x))
+
+
+class ReleasedResidualConv(nn.Module):
+    """The residual block of the released code (SPEC 2): rectified before the sum, a shortcut with a tied bias."""
+
+    def __init__(self, inputs: int, outputs: int, side: int, kernel: int) -> None:
+        super().__init__()
+        self.first = WholeNormConv(inputs, inputs, side, kernel=kernel)
+        self.second = WholeNormConv(inputs, outputs, side, kernel=kernel)
+        self.shortcut = WholeNormConv(inputs, outputs, 1, kernel=1)
+
+    def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
+        """Output of the same size."""
+        return rectified(self.second(rectified(self.first(x)))) + self.shortcut(x)
 
 
 class GridNetwork(nn.Module):
@@ -88,17 +135,22 @@ class GridNetwork(nn.Module):
 
 
 class HalvingGridNetwork(nn.Module):
-    """The U-Net of SPEC 2: downsamples first, with additive skips below, and concatenates the input at the end."""
+    """The U-Net of SPEC 2: downsamples first, with additive skips below, and concatenates the input at the end.
 
-    def __init__(self, inputs: int, channels: Sequence[int], side: int) -> None:
+    `channels` are those at `side`, side / 2, ...; `outputs` those of the last layer.
+    """
+
+    def __init__(
+        self, inputs: int, channels: Sequence[int], side: int, outputs: int | None = None, conv: Conv = UntiedConv
+    ) -> None:
         super().__init__()
         sides = [side >> level for level in range(len(channels))]
         inward = list(itertools.pairwise((inputs, *channels[1:])))
         outward = list(itertools.pairwise(reversed(channels)))
-        self.down = nn.ModuleList(UntiedConv(a, b, s, "down") for (a, b), s in zip(inward, sides[1:], strict=True))
-        self.up = nn.ModuleList(UntiedConv(a, b, s, "up") for (a, b), s in zip(outward, sides[-2::-1], strict=True))
+        self.down = nn.ModuleList(conv(a, b, s, "down") for (a, b), s in zip(inward, sides[1:], strict=True))
+        self.up = nn.ModuleList(conv(a, b, s, "up") for (a, b), s in zip(outward, sides[-2::-1], strict=True))
         top = channels[0] if self.up else 0
-        self.leave = UntiedConv(top + inputs, channels[0], side, kernel=1)
+        self.leave = conv(top + inputs, outputs or channels[0], side, kernel=1)
 
     def forward(self, x: Float[Tensor, "b i h w"]) -> Float[Tensor, "b o h w"]:
         """Features of the grid, not rectified."""
@@ -196,13 +248,18 @@ class CrossModalAttention(nn.Module):
 
 
 class ConcatenatedAttention(nn.Module):
-    """Self-attention over the concatenated channels of both branches, as in the released code (SPEC 2)."""
+    """Self-attention over the concatenated channels of both branches, as in the released code (SPEC 2).
 
-    def __init__(self, appearance: int, motion: int, width: int, heads: int, blocks: int) -> None:
+    `epsilon` is that of the group norm. The released code's first branch is the motion.
+    """
+
+    def __init__(
+        self, appearance: int, motion: int, width: int, heads: int, blocks: int, epsilon: float = 1e-5
+    ) -> None:
         super().__init__()
         channels = appearance + motion
         self.sizes = (appearance, motion)
-        self.norm = nn.GroupNorm(32, channels)
+        self.norm = nn.GroupNorm(32, channels, epsilon)
         self.enter = nn.Conv2d(channels, width, 1)
         self.norms = nn.ModuleList(nn.LayerNorm(width) for _ in range(3 * blocks))
         self.attentions = nn.ModuleList(Attention(width, width, heads, width) for _ in range(2 * blocks))

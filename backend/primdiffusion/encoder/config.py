@@ -13,8 +13,11 @@ from primdiffusion.primitives.primitives import GRID, S
 class EncoderConfig:
     """Architecture of the encoder (paper sec. 3.2; SPEC 2)."""
 
-    appearance: Literal["voxels", "texels"] = "voxels"
-    """Where images are sampled: on the body surface at each texel (paper), or at each voxel of the boxes."""
+    appearance: Literal["voxels", "texels", "texture"] = "voxels"
+    """Where images are sampled: on the body surface at each texel (paper), at each voxel of the boxes, or as a texture
+    of 512 x 512 texels, resized to 256 x 256 (SPEC 2)."""
+    masks: Literal["whole", "eroded"] = "whole"
+    """eroded: images and masks lose the pixels within one of the mask's outline, as in the released code's training."""
     unseen: Literal["filled", "black"] = "filled"
     """filled: points that no view sees are inpainted from their surroundings, and extra channels hold visibility and
     mask coverage; black: such points are black, and the network's input is colours only (SPEC 2)."""
@@ -30,6 +33,9 @@ class EncoderConfig:
     """What the networks' output is added to: the value sampled at each voxel, or a constant (paper)."""
     detail: Literal["skips", "bottleneck"] = "skips"
     """skips: mapping networks also get the image encoder's finer levels; bottleneck: the 32 x 32 features (paper)."""
+    compat: Literal["none", "released"] = "none"
+    """released: layers and boxes of the authors' checkpoints: weights normalised over the whole tensor, residual blocks
+    and order of branches of SPEC 2, boxes with B = T x N whose sizes are divided by the scale (SPEC 1.1, 1.8)."""
     stem: tuple[int, int, int] = (24, 48, 64)
     """Channels of the image encoder at 128, 64 and 32 squared."""
     grid: tuple[int, ...] = (64, 96, 96, 96)
@@ -37,6 +43,8 @@ class EncoderConfig:
     grid_entry: Literal["residual", "halving"] = "residual"
     """residual: starts with a residual block at 32 squared; halving: starts with the downsampling to 16 squared, and
     concatenates the input at the end (SPEC 2)."""
+    grid_outputs: int = 0
+    """Output channels of the U-Net; 0: as many as at 32 squared."""
     grid_gain: float = 1.0
     """Factor on the U-Net's output."""
     motion: int = 32
@@ -80,6 +88,11 @@ class EncoderConfig:
         return colours + self.layers * (2 if self.appearance == "voxels" else 1)
 
     @property
+    def appearance_channels(self) -> int:
+        """Output channels of the image encoder's U-Net."""
+        return self.grid_outputs or self.grid[0]
+
+    @property
     def layers(self) -> int:
         """Sampled points per texel."""
         return S if self.appearance == "voxels" else 1
@@ -95,6 +108,11 @@ class EncoderConfig:
         if self.attention_width % self.attention_heads:
             raise ValueError(
                 f"attention_width {self.attention_width} is not a multiple of attention_heads {self.attention_heads}"
+            )
+        if self.compat == "released" and (self.detail, self.grid_entry) != ("bottleneck", "halving"):
+            raise ValueError(
+                f"compat 'released' has no layers for detail {self.detail!r} with grid_entry {self.grid_entry!r}: "
+                "choose 'bottleneck' and 'halving'"
             )
         if self.scale_outputs < 3:
             raise ValueError(f"scale_outputs is {self.scale_outputs}: delta scales are 3 numbers")
@@ -122,16 +140,31 @@ PAPER = EncoderConfig(
     density_gain=25 / 255,
     full_density=25.5,
 )
-"""The architecture of the paper, with the sizes of SPEC 2 where the paper gives none."""
+"""The architecture of the paper, with most sizes of SPEC 2 where the paper gives none."""
+RELEASED = dataclasses.replace(
+    PAPER,
+    appearance="texture",
+    masks="eroded",
+    attention="concatenated",
+    compat="released",
+    grid=(8, 8, 16, 32, 64, 128),
+    grid_outputs=64,
+    scale_outputs=9,
+)
+"""The authors' stage 1 (SPEC 2)."""
 PRESETS: Mapping[str, EncoderConfig] = {
     "default": DEFAULT,
     "shared_scale": dataclasses.replace(DEFAULT, delta_scale="shared"),
     "template_rt": dataclasses.replace(DEFAULT, frames="template"),
     "no_attention": dataclasses.replace(DEFAULT, attention="none"),
     "paper": PAPER,
-    "released": dataclasses.replace(PAPER, attention="concatenated", scale_outputs=9),
+    "released": RELEASED,
 }
 """Encoders by name: ours, its three ablations (paper Table 3), and the architectures of the paper and its code."""
+
+
+_ADDED: Mapping[str, Any] = {"masks": "whole", "compat": "none", "grid_outputs": 0}
+"""Settings that older files lack, with the values that these files imply."""
 
 
 def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
@@ -140,7 +173,7 @@ def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
     Raises:
         ValueError: settings are unknown to this version, missing or invalid.
     """
-    names = {field.name for field in dataclasses.fields(EncoderConfig)}
+    tree, names = {**_ADDED, **tree}, {field.name for field in dataclasses.fields(EncoderConfig)}
     if set(tree) != names:
         differing = ", ".join(sorted(set(tree) ^ names))
         raise ValueError(f"the encoder's configuration differs in {differing}: use the release that trained it")

@@ -13,15 +13,25 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.body.model import BodyModel, BodyPose, default_body
 from primdiffusion.capture.dataset import Views, stack
-from primdiffusion.diffusion.checkpoint import ENCODER_FORMAT, check_finite, mismatches_named, read_tensors
+from primdiffusion.diffusion.checkpoint import (
+    ENCODER_FORMAT,
+    anchor_tensors,
+    check_finite,
+    mismatches_named,
+    read_tensors,
+    stored_body_setup,
+    under,
+)
 from primdiffusion.encoder.config import EncoderConfig, config_from_json
 from primdiffusion.encoder.network import Encoder, motion_of
+from primdiffusion.encoder.texture import eroded, unproject_texture
 from primdiffusion.encoder.unproject import Unprojected, unproject_texels, unproject_voxels
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.tensor_file import save
 
@@ -35,24 +45,31 @@ class EncoderModel:
     encoder: Encoder
     card: Mapping[str, Any]
     """Model card: description and training settings; JSON values."""
+    body_setup: BodySetup | None = None
+    """Body and anchors of the humans it encodes; None is the default body."""
 
     @property
     def config(self) -> EncoderConfig:
         """Settings of the encoder."""
         return self.encoder.config
 
+    @property
+    def body(self) -> BodyModel:
+        """The body to which captures must be fitted."""
+        return default_body() if self.body_setup is None else self.body_setup.body
+
     def encode(self, views: Views, betas: Float[Tensor, "n"]) -> Payload:
         """The payload of the human in `views` (unbatched, one pose); see `encode`."""
-        return encode(self.encoder, views, betas)
+        return encode(self.encoder, views, betas, self.body_setup)
 
     def place(self, payload: Payload, betas: Float[Tensor, "n"], pose: BodyPose) -> Primitives:
         """Place the payload on the body that carries this encoder's boxes; on the payload's device."""
-        frames = frames_of(self.config, betas.cpu(), pose.to("cpu"))[1]
+        frames = frames_of(self.config, betas.cpu(), pose.to("cpu"), self.body_setup)[1]
         return Primitives.place(frames.to(payload.density.device), payload)
 
 
 @torch.no_grad()
-def encode(encoder: Encoder, views: Views, betas: Float[Tensor, "n"]) -> Payload:
+def encode(encoder: Encoder, views: Views, betas: Float[Tensor, "n"], body_setup: BodySetup | None = None) -> Payload:
     """The payload of one human: unprojection and one forward pass, without gradients; on the encoder's device.
 
     Raises:
@@ -60,32 +77,41 @@ def encode(encoder: Encoder, views: Views, betas: Float[Tensor, "n"]) -> Payload
     """
     device = encoder.scale_out.bias.device
     views, betas = views.to("cpu"), betas.cpu()
-    found = look_up(encoder.config, views, betas)
+    found = look_up(encoder.config, views, betas, body_setup)
     axis_angle = motion_of(views.pose.joint_rotation)[None].to(device)
     payload = encoder(stack([found]).to(device), axis_angle)
     return payload.map(lambda tensor: tensor[0].float())
 
 
-def look_up(config: EncoderConfig, views: Views, betas: Float[Tensor, "n"]) -> Unprojected:
+def look_up(
+    config: EncoderConfig, views: Views, betas: Float[Tensor, "n"], body_setup: BodySetup | None = None
+) -> Unprojected:
     """Unproject the images of one human in one pose to the input of an encoder with this configuration; on the CPU."""
-    if not torch.isfinite(betas).all() or betas.shape != default_body().shape_basis.shape[-1:]:
-        expected = default_body().shape_basis.shape[-1]
+    body = default_body() if body_setup is None else body_setup.body
+    if not torch.isfinite(betas).all() or betas.shape != body.shape_basis.shape[-1:]:
+        expected, name = body.shape_basis.shape[-1], "default body" if body_setup is None else "encoder's body"
         raise ValueError(
-            f"betas have the shape {tuple(betas.shape)}; the default body needs {expected} finite numbers: captures of "
-            "another body model must be fitted to the default body first"
+            f"betas have the shape {tuple(betas.shape)}; the {name} needs {expected} finite numbers: captures of "
+            "another body model must be fitted to this body first"
         )
-    vertices, frames = frames_of(config, betas, views.pose)
-    frames = dataclasses.replace(frames, half_extent=frames.half_extent * vertices.new_tensor(config.extent))
+    vertices, frames = frames_of(config, betas, views.pose, body_setup)
+    if config.masks == "eroded":
+        views = eroded(views)
+    if config.appearance == "texture":
+        return unproject_texture(views, vertices, body)
     if config.appearance == "texels":
-        return unproject_texels(views, vertices, config.facing)
-    return unproject_voxels(views, vertices, frames, config.facing)
+        return unproject_texels(views, vertices, config.facing, body)
+    frames = dataclasses.replace(frames, half_extent=frames.half_extent * vertices.new_tensor(config.extent))
+    return unproject_voxels(views, vertices, frames, config.facing, body)
 
 
-def frames_of(config: EncoderConfig, betas: Float[Tensor, "n"], pose: BodyPose) -> tuple[Tensor, Frames]:
+def frames_of(
+    config: EncoderConfig, betas: Float[Tensor, "n"], pose: BodyPose, body_setup: BodySetup | None = None
+) -> tuple[Tensor, Frames]:
     """Vertices [V, 3] of the posed body and the boxes' frames on it; of mean shape if `frames` is "template"."""
-    body = default_body()
+    body, anchors = (default_body(), default_anchors()) if body_setup is None else (body_setup.body, body_setup.anchors)
     vertices = body.shape(betas_of_frames(config, betas)).pose(pose).vertices
-    return vertices, attach(default_anchors(), vertices, body.faces)
+    return vertices, attach(anchors, vertices, body.faces)
 
 
 def betas_of_frames(config: EncoderConfig, betas: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
@@ -98,17 +124,25 @@ def default_encoder() -> Path:
     return Path(str(resources.files("primdiffusion.weights") / "encoder.safetensors"))
 
 
-def save_encoder(path: Path, model: EncoderModel) -> None:
-    """Write an encoder, whole or not at all. Raises CheckpointError for weights that are not finite, OSError."""
+def save_encoder(path: Path, model: EncoderModel, dtype: torch.dtype = torch.float16) -> None:
+    """Write an encoder, whole or not at all; of its body only path and checksum of the files, and the anchors.
+
+    Raises CheckpointError for weights that are not finite, OSError.
+    """
     tensors = {
-        name: value.detach().cpu().half().contiguous().clone() for name, value in model.encoder.state_dict().items()
+        name: value.detach().cpu().to(dtype).contiguous().clone() for name, value in model.encoder.state_dict().items()
     }
     check_finite(path, tensors)
+    body = {}
+    if model.body_setup is not None:
+        tensors |= anchor_tensors(model.body_setup.anchors)
+        body["body"] = model.body_setup.files.to_json()
     metadata = {
         "format": ENCODER_FORMAT,
         "format_version": str(FORMAT_VERSION),
         "config": json.dumps(dataclasses.asdict(model.config)),
         "card": json.dumps(dict(model.card)),
+        **body,
     }
     write_atomically(path, save(tensors, metadata=metadata))
 
@@ -117,7 +151,8 @@ def load_encoder(path: Path | str | None = None, device: torch.device | str = "c
     """Load an encoder in float32 (without a path: the one in the package).
 
     Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
-    format or version, does not match its own configuration or holds values that are not finite.
+    format or version, does not match its own configuration or holds values that are not finite. An imported one raises
+    BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
     """
     path = default_encoder() if path is None else Path(path)
     if not path.is_file():
@@ -125,6 +160,11 @@ def load_encoder(path: Path | str | None = None, device: torch.device | str = "c
     tensors, metadata = read_tensors(path, (ENCODER_FORMAT,))
     with mismatches_named(path, ValueError):
         encoder = Encoder(config_from_json(parse_json(metadata["config"])))
-        encoder.load_state_dict(tensors)
+        anchors = {f"stand.{name}": value for name, value in under(tensors, "stand.").items()}
+        encoder.load_state_dict({name: value for name, value in tensors.items() if name not in anchors})
         card = parse_json(metadata["card"])
-    return EncoderModel(encoder.eval().requires_grad_(False).to(device), card)
+    body_setup = None
+    if "body" in metadata:
+        with mismatches_named(path):
+            body_setup = stored_body_setup(anchors, metadata["body"], path.parent)
+    return EncoderModel(encoder.eval().requires_grad_(False).to(device), card, body_setup)

@@ -12,11 +12,14 @@ from torch.nn import functional
 from primdiffusion.body.model import J
 from primdiffusion.encoder.blocks import (
     ConcatenatedAttention,
+    Conv,
     CrossModalAttention,
     GridNetwork,
     HalvingGridNetwork,
+    ReleasedResidualConv,
     ResidualConv,
     UntiedConv,
+    WholeNormConv,
     rectified,
 )
 from primdiffusion.encoder.config import EncoderConfig
@@ -29,6 +32,10 @@ MOTION = 3 * (J - 1)
 """Inputs of the motion branch: axis-angles of all joints except the pelvis, which only rotates the whole body."""
 CONSTANT_BASE = 100 / 255
 """Base value of the paper's networks (SPEC 2: relu(25 x + 100))."""
+RELEASED_EPSILON = 1e-6
+"""Of the released code's group norm (SPEC 2)."""
+B_AXIS = -2
+"""The voxels' axes D, H, W run along N, B, T."""
 HULL_BASE = (0.8, -0.5)
 """Initial relative density of a voxel with mask coverage c: clamp(0.8 c - 0.5). Interpolation extends an inner voxel
 half way to its outer neighbour, so a larger value would enlarge silhouettes."""
@@ -40,30 +47,43 @@ class Encoder(nn.Module):
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
         self.config = config
+        released = config.compat == "released"
+        conv: Conv = WholeNormConv if released else UntiedConv
         first, second, third = config.stem
         self.stem = nn.ModuleList(
             [
-                UntiedConv(config.channels, first, SIDE // 2, "down"),
-                UntiedConv(first, second, SIDE // 4, "down"),
-                UntiedConv(second, third, SIDE // 8, "down"),
+                conv(config.channels, first, SIDE // 2, "down"),
+                conv(first, second, SIDE // 4, "down"),
+                conv(second, third, SIDE // 8, "down"),
             ]
         )
-        grid = {"residual": GridNetwork, "halving": HalvingGridNetwork}[config.grid_entry]
-        self.appearance = grid(third, config.grid, GRID)
-        self.motion = ResidualConv(MOTION, config.motion, GRID)
-        channels = config.grid[0], config.motion
-        attention = {"cross": CrossModalAttention, "concatenated": ConcatenatedAttention, "none": None}[
-            config.attention
-        ]
-        self.attention = None if attention is None else attention(
-            *channels, config.attention_width, config.attention_heads, config.attention_blocks
-        )  # fmt: skip
-        self.fuse = ResidualConv(sum(channels), config.fused, GRID)
-        self.colour = MappingNetwork(config, config.colour, 3 * S)
-        self.density = MappingNetwork(config, config.density, S)
+        if config.grid_entry == "halving":
+            self.appearance: nn.Module = HalvingGridNetwork(third, config.grid, GRID, config.appearance_channels, conv)
+        else:
+            self.appearance = GridNetwork(third, config.grid, GRID)
+        branches = config.appearance_channels, config.motion
+        self.motion: nn.Module = (
+            ReleasedResidualConv(MOTION, config.motion, GRID, kernel=1)
+            if released
+            else ResidualConv(MOTION, config.motion, GRID)
+        )
+        sizes = *(branches[::-1] if released else branches), config.attention_width, config.attention_heads
+        self.attention: nn.Module | None = None
+        if config.attention == "cross":
+            self.attention = CrossModalAttention(*sizes, config.attention_blocks)
+        elif config.attention == "concatenated":
+            epsilon = RELEASED_EPSILON if released else 1e-5
+            self.attention = ConcatenatedAttention(*sizes, config.attention_blocks, epsilon)
+        self.fuse: nn.Module = (
+            ReleasedResidualConv(sum(branches), config.fused, GRID, kernel=3)
+            if released
+            else ResidualConv(sum(branches), config.fused, GRID)
+        )
+        self.colour = MappingNetwork(config, config.colour, 3 * S, conv)
+        self.density = MappingNetwork(config, config.density, S, conv)
         scale = (config.fused, *config.scale)
-        self.scale = nn.ModuleList(UntiedConv(a, b, GRID) for a, b in itertools.pairwise(scale))
-        self.scale_out = UntiedConv(scale[-1], config.scale_outputs, GRID).quiet()
+        self.scale = nn.ModuleList(conv(a, b, GRID) for a, b in itertools.pairwise(scale))
+        self.scale_out = conv(scale[-1], config.scale_outputs, GRID).quiet()
 
     def forward(self, found: Unprojected, axis_angle: Float[Tensor, "b 24 3"]) -> Payload:
         """Payloads [b] from unprojected images [b, d, ...] and the poses of the subjects.
@@ -82,9 +102,10 @@ class Encoder(nn.Module):
             appearance = config.grid_gain * appearance
         motion = axis_angle[:, 1:].to(x).flatten(1)[:, :, None, None].expand(-1, -1, GRID, GRID)
         motion = self.motion(motion)
+        branches = (motion, appearance) if config.compat == "released" else (appearance, motion)
         if self.attention is not None:
-            appearance, motion = self.attention(appearance, motion)
-        fused = self.fuse(torch.cat([appearance, motion], dim=1))
+            branches = self.attention(*branches)
+        fused = self.fuse(torch.cat(branches, dim=1))
         colour = clamp(base[:, : 3 * S] + config.colour_gain * self.colour(fused, fine))
         density = clamp(base[:, 3 * S :] + config.density_gain * self.density(fused, fine))
         value = fused
@@ -93,11 +114,10 @@ class Encoder(nn.Module):
         logarithm = config.scale_gain * self.scale_out(value)[:, -3:]
         if config.delta_scale == "shared":
             logarithm = logarithm.mean((-1, -2), keepdim=True).expand_as(logarithm)
-        return Payload(
-            rgb=decode_srgb(voxels(colour, 3)),
-            density=config.full_density * voxels(density, 1)[:, :, 0],
-            delta_scale=logarithm.exp().flatten(2).mT * logarithm.new_tensor(config.extent),
-        )
+        rgb, filled = decode_srgb(voxels(colour, 3)), config.full_density * voxels(density, 1)[:, :, 0]
+        if config.compat == "released":
+            rgb, filled, logarithm = rgb.flip(B_AXIS), filled.flip(B_AXIS), -logarithm
+        return Payload(rgb, filled, logarithm.exp().flatten(2).mT * logarithm.new_tensor(config.extent))
 
     def read(self, found: Unprojected) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 32 h w"]]:
         """Input of the image encoder, and base values of colours (d, c) and densities (d); sRGB-encoded, 0 ... 1.
@@ -140,7 +160,7 @@ class Encoder(nn.Module):
 class MappingNetwork(nn.Module):
     """Upsample 32 x 32 features to voxel values at 256 x 256: `layers` channels, depth slowest."""
 
-    def __init__(self, config: EncoderConfig, channels: tuple[int, int], layers: int) -> None:
+    def __init__(self, config: EncoderConfig, channels: tuple[int, int], layers: int, conv: Conv) -> None:
         super().__init__()
         middle, fine = channels
         self.skips = None
@@ -155,9 +175,9 @@ class MappingNetwork(nn.Module):
         finest = config.finest if self.skips is not None else layers
         self.up = nn.ModuleList(
             [
-                UntiedConv(config.fused, middle, SIDE // 4, "up"),
-                UntiedConv(middle, fine, SIDE // 2, "up"),
-                UntiedConv(fine, finest, SIDE, "up"),
+                conv(config.fused, middle, SIDE // 4, "up"),
+                conv(middle, fine, SIDE // 2, "up"),
+                conv(fine, finest, SIDE, "up"),
             ]
         )
         self.out = UntiedConv(finest, layers, SIDE).quiet() if self.skips is not None else None

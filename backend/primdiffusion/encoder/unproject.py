@@ -41,8 +41,8 @@ COVERED = 128
 class Unprojected(TensorRecord):
     """Image samples at points arranged as an image of SIDE x SIDE with `d` layers."""
 
-    rgb: UInt8[Tensor, "*b d 3 h w"]
-    """sRGB-encoded mean over the views; 0 if no view sees the point."""
+    rgb: UInt8[Tensor, "*b d 3 h w"] | Float32[Tensor, "*b d 3 h w"]
+    """sRGB-encoded mean over the views, 0 ... 255; 0 if no view sees the point. A texture's are not rounded."""
     seen: UInt8[Tensor, "*b d h w"]
     """255 times the fraction of the views' weight that sees the point."""
     covered: UInt8[Tensor, "*b d h w"]

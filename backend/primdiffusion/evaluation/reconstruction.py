@@ -14,8 +14,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from primdiffusion.body.model import BodyPose
-from primdiffusion.capture.conditioning import conditioning_views, default_betas, spread_cameras
+from primdiffusion.body.model import BodyModel, BodyPose
+from primdiffusion.capture.conditioning import body_betas, conditioning_views, spread_cameras
 from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.reader import Captures
 from primdiffusion.evaluation.image_metrics import Lpips, bounding_box, overlap, psnr, ssim
@@ -26,6 +26,11 @@ from primdiffusion.render.march import MarchSettings, Rendering, march
 
 class Reconstructor(Protocol):
     """The interface of an evaluated encoder, such as `primdiffusion.encoder.model.EncoderModel`."""
+
+    @property
+    def body(self) -> BodyModel:
+        """The body to which captures must be fitted."""
+        ...
 
     def encode(self, views: Views, betas: Float[Tensor, "n"]) -> Payload:
         """Encode the subject in the views (unbatched, of one pose)."""
@@ -133,8 +138,8 @@ def evaluate(
     settings = settings or EvaluationSettings()
     for name in settings.subjects or captures.subjects:
         subject = captures.subject(name)
-        betas = default_betas(subject)
-        given = spread_cameras(subject, settings.given_frame, settings.given_views)
+        betas = body_betas(subject, model.body)
+        given = spread_cameras(subject, settings.given_frame, settings.given_views, model.body)
         views = conditioning_views(captures, name, settings.given_frame, given, settings.size)
         payload = model.encode(views, betas)
         device = payload.density.device

@@ -11,6 +11,10 @@ Transfer = Literal["texture", "garment"]
 """What is copied from another human: colours, or shape too."""
 TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
 """The first is the default."""
+Masking = Literal["repaint", "released"]
+"""How inpainting conditions on the part that stays: noised to each step's own level and resampled, or as released."""
+MASKINGS: tuple[Masking, ...] = get_args(Masking)
+"""The first is the default."""
 View = Literal["colour", "depth", "alpha", "boxes"]
 """Colours, depth in false colours, alpha in grey, or the primitives as boxes."""
 VIEWS: tuple[View, ...] = get_args(View)

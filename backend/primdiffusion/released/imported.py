@@ -1,7 +1,7 @@
-"""Write checkpoints in this package's format from the authors' checkpoint and the user's body files.
+"""Write checkpoints and encoders in this package's format from the authors' checkpoint and the user's body files.
 
-The file contains the denoiser's tensors, and anchors and box sizes of the body (SPEC 1, 2, 3). The body files are
-referenced by path and checksum, and must exist unchanged to load the checkpoint.
+A file contains the tensors of the denoiser or the encoder, and anchors and box sizes of the body (SPEC 1, 2, 3). The
+body files are referenced by path and checksum, and must exist unchanged to load it.
 """
 
 from __future__ import annotations
@@ -18,9 +18,12 @@ from torch import Tensor
 
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyPose
-from primdiffusion.diffusion.checkpoint import FORMAT, FORMAT_VERSION, RELEASED
+from primdiffusion.diffusion.checkpoint import FORMAT, FORMAT_VERSION, RELEASED, anchor_tensors
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.diffusion.unet import UNetConfig
+from primdiffusion.encoder.config import RELEASED as RELEASED_ENCODER
+from primdiffusion.encoder.model import EncoderModel, save_encoder
+from primdiffusion.encoder.network import Encoder
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import released_half_extent
@@ -64,6 +67,12 @@ def reference_extents(body_setup: BodySetup, reference: Reference) -> Float[Tens
     return rest_half_extent(surface_points(vertices, body_setup.body.faces, anchors.face, anchors.barycentric))
 
 
+def sized(body_setup: BodySetup, reference: Reference) -> BodySetup:
+    """The body setup with the rest half extents of `reference_extents`."""
+    extents = reference_extents(body_setup, reference)
+    return dataclasses.replace(body_setup, anchors=dataclasses.replace(body_setup.anchors, rest_half_extent=extents))
+
+
 def write_imported(
     out: Path,
     denoiser: Mapping[str, Tensor],
@@ -75,12 +84,8 @@ def write_imported(
 ) -> None:
     """Write the file, atomically; `denoiser` uses the names of `SlabUNet`. Raises OSError."""
     tensors = {f"denoiser.{name}": value.float().contiguous() for name, value in denoiser.items()}
-    tensors |= {
-        "stand.face": body_setup.anchors.face,
-        "stand.barycentric": body_setup.anchors.barycentric,
-        "stand.rest_half_extent": reference_extents(body_setup, reference),
-        "stand.betas": reference.betas.clamp(-LARGEST_BETA, LARGEST_BETA),
-    }
+    tensors |= anchor_tensors(sized(body_setup, reference).anchors)
+    tensors["stand.betas"] = reference.betas.clamp(-LARGEST_BETA, LARGEST_BETA)
     architecture = {
         "kind": RELEASED,
         "schedule": SCHEDULE,
@@ -96,3 +101,16 @@ def write_imported(
         "card": json.dumps(dict(card)),
     }
     write_atomically(out, save(tensors, metadata))
+
+
+def write_encoder(
+    out: Path, parameters: Mapping[str, Tensor], body_setup: BodySetup, reference: Reference, card: Mapping[str, Any]
+) -> None:
+    """Write stage 1 as an encoder, atomically, in float32; `parameters` are those of `encoder_tensors`.
+
+    Raises OSError.
+    """
+    with torch.device("meta"):
+        encoder = Encoder(RELEASED_ENCODER)
+    encoder.load_state_dict(dict(parameters), assign=True)
+    save_encoder(out, EncoderModel(encoder, card, sized(body_setup, reference)), torch.float32)

@@ -1,7 +1,7 @@
 """Validate a whole checkpoint of the authors: every tensor is known, none is missing (SPEC 1.4, 3, 6).
 
-The twelve DDPM buffers follow from the noise schedule, stage 1 is checked by `stage_one`, and the denoiser's tensors,
-from which the configuration of the U-Net is inferred, load unchanged.
+The twelve DDPM buffers follow from the noise schedule, stage 1 is for `stage_one`, and the denoiser's tensors, from
+which the configuration of the U-Net is inferred, load unchanged.
 """
 
 from __future__ import annotations
@@ -191,6 +191,8 @@ def take_inventory(weights: Mapping[str, Tensor]) -> Inventory:
                 "authors' primdiffusion.pt"
             )
         return Inventory(Account(tuple(stage_one.account_stage_one(weights, prefix=""))), None)
+    if all(key.startswith(stage_one.PREFIX) for key in weights):
+        return Inventory(Account(tuple(stage_one.account_stage_one(under(weights, stage_one.PREFIX)))), None)
     known = buffers()
     for key, value in weights.items():
         if key not in known and not key.startswith(prefixes):

@@ -1,17 +1,25 @@
-"""Validate the 165 tensors of stage 1 (`bodydecoder.*`); none is imported.
+"""Validate the 165 tensors of stage 1 (`bodydecoder.*`) and convert them to the encoder "released" (SPEC 2, 6).
 
-SPEC 6 gives the groups and their numbers of tensors, SPEC 2 the layers. That is enough to validate a file but not to
-run it: neither states over which axes weights are normalised, and shapes do not determine it.
+SPEC 6 gives the groups and their numbers of tensors, SPEC 2 the layers, but names within the groups are only partly
+known. A convolution is identified by its group and the shapes of its weight and bias; of two with the same shapes, the
+one whose name is first in natural order is the first in the network. The transformer's names are those of the
+denoiser's (latent diffusion).
 """
 
 from __future__ import annotations
 
 import collections
 import dataclasses
-from collections.abc import Mapping, Sequence
+import functools
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
+import torch
 from torch import Tensor
 
+from primdiffusion.encoder.config import RELEASED
+from primdiffusion.encoder.network import Encoder
 from primdiffusion.released.reading import ReleasedFileError, TensorEntry
 
 PREFIX = "bodydecoder."
@@ -33,64 +41,164 @@ NOT_USED = {
     "geo_fn": "the licensed SMPL model's UV: read from your files instead",
     "decoder_geom": "unused by the released code",
 }
-NOT_CARRIED_OVER = "has the layers of the encoder 'released'; stage 1 is not imported"
+IMPORTED = "as the encoder 'released'"
+
+
+class Convolution(NamedTuple):
+    """Names of the three tensors of a weight-normalised convolution."""
+
+    weight: str
+    """[out, in, k, k], or [in, out, k, k] if transposed: the direction v."""
+    gain: str
+    """One value per output channel."""
+    bias: str
+    """[out, side, side], or [out] without positions."""
 
 
 @dataclasses.dataclass(frozen=True)
 class DecoderLayer:
-    """A weight-normalised convolution, mostly with a bias per position: three tensors (SPEC 2)."""
+    """A convolution of the encoder "released"."""
 
-    weight: tuple[int | None, ...]
-    """[out, in, k, k], or [in, out, k, k] if transposed; None where SPEC 2 does not specify it."""
-    bias: tuple[int | None, ...]
-    """[out, side, side], or [out] without positions."""
-
-
-def _same(outputs: int, inputs: int, kernel: int) -> DecoderLayer:
-    return DecoderLayer((outputs, inputs, kernel, kernel), (outputs, 32, 32))
+    name: str
+    """Its module in `Encoder`."""
+    weight: tuple[int, ...]
+    bias: tuple[int, ...]
 
 
-def _residual(inputs: int, outputs: int, kernel: int) -> list[DecoderLayer]:
+def _same(name: str, outputs: int, inputs: int, kernel: int) -> DecoderLayer:
+    return DecoderLayer(name, (outputs, inputs, kernel, kernel), (outputs, 32, 32))
+
+
+def _residual(name: str, inputs: int, outputs: int, kernel: int) -> list[DecoderLayer]:
     """A residual block: two convolutions, and a 1 x 1 one with an ordinary bias beside them."""
-    beside = DecoderLayer((outputs, inputs, 1, 1), (outputs,))
-    return [_same(inputs, inputs, kernel), _same(outputs, inputs, kernel), beside]
+    shortcut = DecoderLayer(f"{name}.shortcut", (outputs, inputs, 1, 1), (outputs,))
+    return [_same(f"{name}.first", inputs, inputs, kernel), _same(f"{name}.second", outputs, inputs, kernel), shortcut]
 
 
-def _up(inputs: int, outputs: int, side: int) -> DecoderLayer:
-    return DecoderLayer((inputs, outputs, 4, 4), (outputs, side, side))
+def _down(name: str, inputs: int, outputs: int, side: int) -> DecoderLayer:
+    return DecoderLayer(name, (outputs, inputs, 4, 4), (outputs, side, side))
 
 
-def _up_thrice(outputs: int) -> list[DecoderLayer]:
-    return [_up(64, 32, 64), _up(32, 16, 128), _up(16, outputs, 256)]
+def _up(name: str, inputs: int, outputs: int, side: int) -> DecoderLayer:
+    return DecoderLayer(name, (inputs, outputs, 4, 4), (outputs, side, side))
 
 
-def _of_u_net(side: int) -> DecoderLayer:
-    return DecoderLayer((None,) * 4, (None, side, side))
+def _up_thrice(name: str, outputs: int) -> list[DecoderLayer]:
+    steps = ((64, 32, 64), (32, 16, 128), (16, outputs, 256))
+    return [_up(f"{name}.up.{n}", i, o, side) for n, (i, o, side) in enumerate(steps)]
 
 
+_STEM = ((3, 4, 128), (4, 8, 64), (8, 16, 32))
+_INWARD = ((16, 8, 16), (8, 16, 8), (16, 32, 4), (32, 64, 2), (64, 128, 1))
+_OUTWARD = ((128, 64, 2), (64, 32, 4), (32, 16, 8), (16, 8, 16), (8, 8, 32))
+_SCALE = ((64, 64), (64, 128), (128, 64), (64, 64))
 LAYERS: dict[str, list[DecoderLayer]] = {
-    "local_pose_conv_block": _residual(69, 32, 1),
-    "joint_conv_block": _residual(96, 64, 3),
+    "local_pose_conv_block": _residual("motion", 69, 32, 1),
+    "joint_conv_block": _residual("fuse", 96, 64, 3),
     "embs_encoder": [
-        *(DecoderLayer((o, i, 4, 4), (o, side, side)) for i, o, side in ((3, 4, 128), (4, 8, 64), (8, 16, 32))),
-        DecoderLayer((64, None, 1, 1), (64, 32, 32)),
-        *(_of_u_net(side) for side in (16, 8, 4, 2, 1, 2, 4, 8, 16, 32)),
+        *(_down(f"stem.{n}", *sizes) for n, sizes in enumerate(_STEM)),
+        *(_down(f"appearance.down.{n}", *sizes) for n, sizes in enumerate(_INWARD)),
+        *(_up(f"appearance.up.{n}", *sizes) for n, sizes in enumerate(_OUTWARD)),
+        _same("appearance.leave", 64, 24, 1),
     ],
-    "decoder_motion": [_same(o, i, 3) for i, o in ((64, 64), (64, 128), (128, 64), (64, 64), (64, 9))],
-    "decoder_rgb": _up_thrice(3 * 8),
-    "decoder_alpha": _up_thrice(8),
+    "decoder_motion": [
+        *(_same(f"scale.{n}", o, i, 3) for n, (i, o) in enumerate(_SCALE)),
+        _same("scale_out", 9, 64, 3),
+    ],
+    "decoder_rgb": _up_thrice("colour", 3 * 8),
+    "decoder_alpha": _up_thrice("density", 8),
 }
-"""Layers of SPEC 2, most specific first; the small U-Net goes from 32 x 32 to 1 x 1 and back, with unknown channels."""
-ATTENTION: list[tuple[int, ...]] = [(256, 96), (96, 256), *[(2048, 256), (256, 1024)] * 2]
-"""Matrices of the transformer in SPEC 2: to 256 channels, back to 96, and two gated feed-forwards."""
+"""Layers of SPEC 2 in the order of the network."""
+
+
+def _attention_names() -> Iterator[tuple[str, tuple[str, ...]]]:
+    """Each parameter of the encoder's attention with the names in the file whose rows it consists of."""
+    for ours, theirs in (("norm", "norm"), ("enter", "proj_in"), ("leave", "proj_out")):
+        yield from ((f"{ours}.{part}", (f"{theirs}.{part}",)) for part in ("weight", "bias"))
+    for number in range(RELEASED.attention_blocks):
+        block = f"transformer_blocks.{number}"
+        for step in range(2):
+            ours, theirs = f"attentions.{2 * number + step}", f"{block}.attn{step + 1}"
+            yield f"{ours}.query.weight", (f"{theirs}.to_q.weight",)
+            yield f"{ours}.key_value.weight", (f"{theirs}.to_k.weight", f"{theirs}.to_v.weight")
+            yield from ((f"{ours}.out.{part}", (f"{theirs}.to_out.0.{part}",)) for part in ("weight", "bias"))
+        for part in ("weight", "bias"):
+            yield f"forwards.{number}.enter.{part}", (f"{block}.ff.net.0.proj.{part}",)
+            yield f"forwards.{number}.leave.{part}", (f"{block}.ff.net.2.{part}",)
+            yield from ((f"norms.{3 * number + n}.{part}", (f"{block}.norm{n + 1}.{part}",)) for n in range(3))
+
+
+ATTENTION = dict(_attention_names())
+"""Names in the group "transformer" of the parameters of the encoder's `attention`."""
+
+
+@functools.lru_cache(maxsize=1)
+def _shapes() -> dict[str, tuple[int, ...]]:
+    """Shapes of the encoder's parameters by name."""
+    with torch.device("meta"):
+        return {name: tuple(value.shape) for name, value in Encoder(RELEASED).state_dict().items()}
 
 
 def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> list[TensorEntry]:
     """Validate the tensors (names without `prefix`, which error messages include).
 
     Groups that are not used may be of any shape, incomplete or missing. Raises ReleasedFileError, naming a tensor that
-    is unknown or has a wrong shape, or an incomplete group.
+    is unknown, of a wrong shape or not finite floating point, an incomplete group, or layers that cannot be told apart.
     """
+    groups = _grouped(tensors, prefix)
+    for group, found in groups.items():
+        if group in NOT_USED:
+            continue
+        if group in LAYERS:
+            _matched(group, found)
+        if len(found) != TENSORS[group]:
+            names = ", ".join(found) or "none"
+            raise ReleasedFileError(
+                f"'{prefix}{group}' has {len(found)} tensors, not {TENSORS[group]}: {names}; download the checkpoint "
+                "again"
+            )
+    _check_attention(groups["transformer"], prefix)
+    for group, found in groups.items():
+        for key, value in found.items():
+            if group not in NOT_USED and not (value.is_floating_point() and torch.isfinite(value).all()):
+                raise ReleasedFileError(
+                    f"{key!r} has NaN or infinite values or is not floating point: download the checkpoint again"
+                )
+    return [
+        TensorEntry(
+            f"{prefix}{name}",
+            group := name.partition(".")[0],
+            tuple(value.shape),
+            "dropped" if group in NOT_USED else "imported",
+            NOT_USED.get(group, IMPORTED),
+        )
+        for name, value in tensors.items()
+    ]
+
+
+def encoder_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Parameters (float32) of the encoder "released" by name, from tensors that `account_stage_one` has validated.
+
+    Raises ReleasedFileError for a convolution whose weights are all zero, which has no direction.
+    """
+    groups, shapes, found = _grouped(tensors, ""), _shapes(), {}
+    for group in LAYERS:
+        for name, keys in _matched(group, groups[group]).items():
+            weight, gain, bias = (tensors[key].float() for key in keys)
+            if not weight.any():
+                raise ReleasedFileError(f"{keys.weight!r} is all zero: download the checkpoint again")
+            norm = f"{name}.convolution.parametrizations.weight"
+            found[f"{norm}.original0"] = gain.reshape(shapes[f"{norm}.original0"])
+            found[f"{norm}.original1"] = weight.contiguous()
+            found[f"{name}.bias"] = bias.reshape(shapes[f"{name}.bias"])
+    for name, parts in ATTENTION.items():
+        value = torch.cat([tensors[f"transformer.{part}"].float() for part in parts])
+        found[f"attention.{name}"] = value.reshape(shapes[f"attention.{name}"])
+    return found
+
+
+def _grouped(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, dict[str, Tensor]]:
+    """The tensors of each group by their names with `prefix`."""
     groups: dict[str, dict[str, Tensor]] = {group: {} for group in TENSORS}
     for name, value in tensors.items():
         group = name.partition(".")[0]
@@ -99,50 +207,47 @@ def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> li
                 f"unknown tensor '{prefix}{name}' {tuple(value.shape)}: give the authors' primdiffusion.pt"
             )
         groups[group][f"{prefix}{name}"] = value
-    for group, found in groups.items():
-        if group in NOT_USED:
-            continue
-        if group in LAYERS:
-            _check_layers(group, found)
-        if len(found) != TENSORS[group]:
-            names = ", ".join(found) or "none"
-            raise ReleasedFileError(
-                f"'{prefix}{group}' has {len(found)} tensors, not {TENSORS[group]}: {names}; download the checkpoint "
-                "again"
-            )
-    _check_attention(groups["transformer"])
-    return [
-        TensorEntry(
-            f"{prefix}{name}",
-            group := name.partition(".")[0],
-            tuple(value.shape),
-            "dropped" if group in NOT_USED else "checked",
-            NOT_USED.get(group, NOT_CARRIED_OVER),
-        )
-        for name, value in tensors.items()
-    ]
+    return groups
 
 
-def _check_layers(group: str, found: Mapping[str, Tensor]) -> None:
-    modules: dict[str, list[str]] = collections.defaultdict(list)
-    for key in found:
-        modules[key.rpartition(".")[0]].append(key)
-    left = list(LAYERS[group])
-    for module, keys in modules.items():
-        weight, bias = _weight_and_bias(module, {key: found[key] for key in keys})
-        shapes = tuple(found[weight].shape), tuple(found[bias].shape)
-        fitting = [layer for layer in left if _fits(shapes[0], layer.weight) and _fits(shapes[1], layer.bias)]
+def _matched(group: str, found: Mapping[str, Tensor]) -> dict[str, Convolution]:
+    """The convolution in the file of each layer of a group, by the layer's module in `Encoder`."""
+    modules: dict[str, dict[str, Tensor]] = collections.defaultdict(dict)
+    for key, value in found.items():
+        modules[key.rpartition(".")[0]][key] = value
+    left, matched = list(LAYERS[group]), {}
+    by_shapes: dict[tuple[tuple[int, ...], ...], str] = {}
+    for module in sorted(modules, key=_natural):
+        keys = _convolution(module, modules[module])
+        shapes = tuple(found[keys.weight].shape), tuple(found[keys.bias].shape)
+        fitting = [layer for layer in left if shapes == (layer.weight, layer.bias)]
         if not fitting:
             rest = "; ".join(f"{_written(layer.weight)} with {_written(layer.bias)}" for layer in left) or "none"
             raise ReleasedFileError(
-                f"{weight!r} {shapes[0]} with {bias!r} {shapes[1]} matches no layer of {group}; unmatched layers: "
-                f"{rest}"
+                f"{keys.weight!r} {shapes[0]} with {keys.bias!r} {shapes[1]} matches no layer of {group}; unmatched "
+                f"layers: {rest}"
             )
+        before = by_shapes.setdefault(shapes, module)
+        if before != module and _NUMBER.sub("", before) != _NUMBER.sub("", module):
+            raise ReleasedFileError(
+                f"{before!r} and {module!r} have the same shapes and no numbers that tell which comes first: the "
+                "checkpoint is of another version of the released code"
+            )
+        matched[fitting[0].name] = keys
         left.remove(fitting[0])
+    return matched
 
 
-def _weight_and_bias(module: str, found: Mapping[str, Tensor]) -> tuple[str, str]:
-    """Names of the weight and bias among a convolution's three tensors; the third is the per-channel gain."""
+_NUMBER = re.compile(r"\d+")
+
+
+def _natural(name: str) -> list[tuple[int, str]]:
+    """Sort key in which numbers within names count as numbers."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+def _convolution(module: str, found: Mapping[str, Tensor]) -> Convolution:
+    """Tell the three tensors of a convolution apart."""
     weights = [key for key, value in found.items() if value.ndim == 4 and value.numel() > max(value.shape)]
     biases = [key for key, value in found.items() if value.ndim == 3]
     if not biases:  # without positions it has the gain's shape, and only its name tells it
@@ -157,20 +262,30 @@ def _weight_and_bias(module: str, found: Mapping[str, Tensor]) -> tuple[str, str
             f"{gains[0]!r} has shape {tuple(found[gains[0]].shape)}, not one value per channel of {biases[0]!r} "
             f"{tuple(found[biases[0]].shape)}"
         )
-    return weights[0], biases[0]
+    return Convolution(weights[0], gains[0], biases[0])
 
 
-def _check_attention(found: Mapping[str, Tensor]) -> None:
-    matrices = [tuple(side for side in value.shape if side != 1) for value in found.values()]
-    for wanted in ATTENTION:
-        if matrices.count(wanted) < ATTENTION.count(wanted):
-            given = ", ".join(f"{key!r} {tuple(value.shape)}" for key, value in found.items() if value.ndim > 1)
-            raise ReleasedFileError(f"the transformer lacks a matrix of shape {wanted}; it has {given}")
+def _check_attention(found: Mapping[str, Tensor], prefix: str) -> None:
+    for ours, parts in ATTENTION.items():
+        rows, *columns = (side for side in _shapes()[f"attention.{ours}"] if side != 1)
+        expected = [rows // len(parts), *columns]
+        for part in parts:
+            key = f"{prefix}transformer.{part}"
+            if key not in found:
+                unknown = ", ".join(sorted(found.keys() - _attention_keys(prefix))) or "none"
+                raise ReleasedFileError(
+                    f"{key!r} is missing; the transformer has unknown tensors instead: {unknown:.120}"
+                )
+            if [side for side in found[key].shape if side != 1] != expected:
+                raise ReleasedFileError(
+                    f"{key!r} has shape {tuple(found[key].shape)}, not {tuple(expected)}: the checkpoint is of another "
+                    "version of the released code, or damaged"
+                )
 
 
-def _fits(shape: Sequence[int], wanted: Sequence[int | None]) -> bool:
-    return len(shape) == len(wanted) and all(w in (None, s) for s, w in zip(shape, wanted, strict=True))
+def _attention_keys(prefix: str) -> set[str]:
+    return {f"{prefix}transformer.{part}" for parts in ATTENTION.values() for part in parts}
 
 
-def _written(shape: Sequence[int | None]) -> str:
-    return " x ".join("?" if side is None else str(side) for side in shape)
+def _written(shape: Sequence[int]) -> str:
+    return " x ".join(map(str, shape))

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.capture.conditioning import conditioning_views, default_betas, spread_cameras
+from primdiffusion.capture.conditioning import body_betas, conditioning_views, spread_cameras
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.reader import Captures
 from primdiffusion.capture.render import SubjectResult
@@ -102,16 +102,16 @@ def looks_of(
         ValueError: the pictures lead to numbers that are not finite.
     """
     subject = captures.subject(name)
-    given = default_betas(subject)
+    given = body_betas(subject, model.body)
     betas, payloads, pictures = betas_of_frames(model.config, given), [], []
     if settings.refine_steps:
         frames = range(subject.frames)
         pictures = [conditioning_views(captures, name, frame, None, settings.refine_size) for frame in frames]
     for frame in frames_of_looks(subject.frames, settings.looks):
-        cameras = spread_cameras(subject, frame, settings.views)
+        cameras = spread_cameras(subject, frame, settings.views, model.body)
         payload = model.encode(conditioning_views(captures, name, frame, cameras), given).validate()
         if pictures:
-            human = Human(payload, betas, {}).to(payload.density.device)
+            human = Human(payload, betas, {}, model.body_setup).to(payload.density.device)
             payload = refine(human, pictures, RefineSettings(settings.refine_steps, seed=settings.seed)).human.payload
         payloads.append(payload.to("cpu"))
     return payloads, betas

@@ -23,6 +23,7 @@ from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.config import PRESETS, EncoderConfig
 from primdiffusion.encoder.model import frames_of, look_up
 from primdiffusion.encoder.network import motion_of
+from primdiffusion.encoder.texture import eroded
 from primdiffusion.encoder.unproject import Unprojected
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Frames
@@ -72,7 +73,7 @@ class FitDataset(SampleSet[FitSample]):
             found=look_up(self.encoder, given, betas),
             axis_angle=motion_of(given.pose.joint_rotation),
             frames=frames_of(self.encoder, betas, target.pose)[1],
-            target=target,
+            target=eroded(target) if self.encoder.masks == "eroded" else target,
             subject=sample.subject,
             frame=sample.frame,
         )

@@ -19,9 +19,9 @@ from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.human import Human, pose_body
+from primdiffusion.human import Human, body_of, pose_body
 from primdiffusion.people.payloads import rest_frames
-from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
@@ -47,20 +47,21 @@ class PosedView(NamedTuple):
 def scenes_of(human: Human, views: Sequence[Views]) -> list[PosedView]:
     """Return every image with camera and frames, on the human's device; each pose is computed once.
 
-    Raises ValueError for no views, views that do not match their cameras, and a human on another body.
+    Raises ValueError for no views, views that do not match their cameras, and more betas than the human's body has.
     """
-    components = default_body().shape_basis.shape[-1]
+    body, anchors = body_of(human)
+    components = body.shape_basis.shape[-1]
     if len(human.betas) > components:
         raise ValueError(
-            f"the human has {len(human.betas)} betas, the default body {components}: it was captured on another body"
+            f"the human has {len(human.betas)} betas, its body {components}: it was captured on another body"
         )
     if not views or not any(record.rgba.shape[0] for record in views):
         raise ValueError("there are no views to refine from: give images of at least one view")
     device, scenes = human.payload.density.device, []
     for number, record in enumerate(views):
         _check(number, record)
-        vertices = pose_body(human.betas.cpu().float(), record.pose.to("cpu")).vertices
-        frames = attach(default_anchors(), vertices, default_body().faces).to(device)
+        vertices = pose_body(human.betas.cpu().float(), record.pose.to("cpu"), body).vertices
+        frames = attach(anchors, vertices, body.faces).to(device)
         record = record.to(device)
         for camera, rgba in enumerate(record.rgba):
             one = record.camera.map(lambda values, camera=camera: values[camera])

@@ -208,7 +208,7 @@ def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypa
     request = ReconstructRequest(capture=folder, out_dir=tmp_path / "out", checkpoint=checkpoint, size=32)
     session, reports = Session(), []
     result = request.run(session, lambda *report: reports.append(report))
-    stages = [("read", 0), ("load", 1), ("encode", 2), ("write", 3), ("write", 4)]
+    stages = [("load", 0), ("read", 1), ("encode", 2), ("write", 3), ("write", 4)]
     assert [report[:2] for report in reports] == stages
     assert result["subject"] == FIRST
     assert result["views"] == [0, 1, 2, 3]

@@ -128,9 +128,12 @@ def test_attention_carries_each_branch_into_the_other(kind):
     assert (of_a[1] - before[1])[..., -1, -1].abs().max() > 1e-5
 
 
-@pytest.mark.parametrize(("preset", "reaches"), [("default", True), ("released", True), ("no_attention", False)])
-def test_a_change_at_one_place_reaches_far_ones_only_through_attention(preset, reaches):
-    config = small(preset, grid=(32,), grid_entry="residual")
+@pytest.mark.parametrize(
+    ("preset", "entry", "reaches"),
+    [("default", "residual", True), ("released", "halving", True), ("no_attention", "residual", False)],
+)
+def test_a_change_at_one_place_reaches_far_ones_only_through_attention(preset, entry, reaches):
+    config = small(preset, grid=(32,), grid_entry=entry)
     encoder, found = encoder_of(config).double(), seen_from(config)
     changed = found.map(lambda tensor: tensor.clone())
     changed.rgb[..., :S, :S] = 255 - changed.rgb[..., :S, :S]
@@ -255,10 +258,15 @@ def test_the_papers_layers_have_the_sizes_of_the_reference():
     assert [tuple(layer.bias.shape) for layer in encoder.stem] == [(4, 128, 128), (8, 64, 64), (16, 32, 32)]
     assert [layer.bias.shape[-1] for layer in encoder.appearance.down] == [16, 8, 4, 2, 1]
     assert [layer.bias.shape[-1] for layer in encoder.appearance.up] == [2, 4, 8, 16, 32]
-    assert encoder.appearance.leave.convolution.weight.shape == (64, 64 + 16, 1, 1)
-    assert encoder.motion.first.convolution.weight.shape == (32, 69, 3, 3)
+    assert channels(encoder.appearance.down) == [8, 16, 32, 64, 128]
+    assert channels(encoder.appearance.up) == [64, 32, 16, 8, 8]
+    assert encoder.appearance.leave.convolution.weight.shape == (64, 8 + 16, 1, 1)
+    assert encoder.motion.first.convolution.weight.shape == (69, 69, 1, 1)
+    assert encoder.motion.second.convolution.weight.shape == (32, 69, 1, 1)
     assert encoder.attention.enter.weight.shape == (256, 96, 1, 1)
-    assert encoder.fuse.first.convolution.weight.shape == (64, 96, 3, 3)
+    assert encoder.attention.norm.eps == 1e-6
+    assert encoder.fuse.first.convolution.weight.shape == (96, 96, 3, 3)
+    assert encoder.fuse.second.convolution.weight.shape == (64, 96, 3, 3)
     assert channels([*encoder.scale, encoder.scale_out]) == [64, 128, 64, 64, 9]
     for network, last in ((encoder.colour, 24), (encoder.density, 8)):
         assert [tuple(layer.bias.shape) for layer in network.up] == [(32, 64, 64), (16, 128, 128), (last, 256, 256)]
@@ -266,7 +274,7 @@ def test_the_papers_layers_have_the_sizes_of_the_reference():
 
 @pytest.mark.parametrize(
     ("preset", "parameters"),
-    [("default", 11_507_515), ("no_attention", 10_954_523), ("paper", 9_115_359), ("released", 7_546_213)],
+    [("default", 11_507_515), ("no_attention", 10_954_523), ("paper", 9_115_359), ("released", 7_190_747)],
 )
 def test_presets_have_the_size_that_the_documents_state(preset, parameters):
     with torch.device("meta"):

@@ -7,6 +7,7 @@ it: pip install --no-deps --target FOLDER torch-fidelity; PYTHONPATH=FOLDER pyth
 import importlib
 import sys
 import types
+from pathlib import Path
 
 import pytest
 import torch
@@ -41,6 +42,10 @@ def torch_fidelity():
 
 @pytest.fixture(scope="module")
 def weights_file(tmp_path_factory):
+    return save_random_inception(tmp_path_factory.mktemp("weights") / "inception.pth")
+
+
+def save_random_inception(path: Path) -> Path:
     """Random weights that keep the size of the signal, in torch-fidelity's layout."""
     generator = torch.Generator().manual_seed(0)
     weights = Inception().state_dict()
@@ -51,13 +56,17 @@ def weights_file(tmp_path_factory):
             value.uniform_(0.5, 1.5, generator=generator)
         elif value.is_floating_point():
             value.normal_(0, 0.1, generator=generator)
-    path = tmp_path_factory.mktemp("weights") / "inception.pth"
     torch.save({**weights, "fc.weight": torch.zeros(1008, 2048), "fc.bias": torch.zeros(1008)}, path)
     return path
 
 
 @pytest.fixture(scope="module")
 def pictures():
+    return random_pictures()
+
+
+def random_pictures() -> list[torch.Tensor]:
+    """Two sets, uint8 [n, 64, 64, 3]."""
     generator = torch.Generator().manual_seed(1)
     return [
         torch.randint(0, most, (count, 64, 64, 3), generator=generator, dtype=torch.uint8)
@@ -67,8 +76,17 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def features(weights_file, pictures):
+    return features_of(weights_file, pictures)
+
+
+def features_of(weights_file: Path, pictures: list[torch.Tensor]) -> list[torch.Tensor]:
     network = load_inception(weights_file)
     return [network(part.float() / 255) for part in pictures]
+
+
+def fid_error(weights_file: Path) -> float:
+    """Relative difference of our FID of `random_pictures` from torch-fidelity's."""
+    return abs(frechet_distance(*features_of(weights_file, random_pictures())) / GIVEN_FID - 1)
 
 
 def test_figures_are_those_that_torch_fidelity_gave(features):

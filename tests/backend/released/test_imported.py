@@ -24,7 +24,7 @@ from primdiffusion.human_file import HumanFileError, load_human, save_human
 from primdiffusion.primitives.anchors import build_anchors
 from primdiffusion.primitives.body_setup import BodySetupError, body_setup_from_files
 from primdiffusion.primitives.primitives import K, Payload
-from released_files import TINY, body_arrays, random_network, save_body, save_released, stage_one, state, template
+from released_files import TINY, body_arrays, random_network, save_body, save_released, state, template
 
 
 def line(folder: Path, *more: str) -> list[str]:
@@ -158,7 +158,7 @@ def test_the_table_is_printed(tmp_path, capsys):
     out = capsys.readouterr().out.splitlines()
     assert out[0].split() == ["group", "fate", "tensors", "values", "note"]
     assert any(row.startswith("decoder_geom") and "dropped" in row for row in out)
-    assert out[-1] == str(tmp_path / "imported.safetensors")
+    assert out[-2:] == [str(tmp_path / "imported.safetensors"), str(tmp_path / "imported.encoder.safetensors")]
 
 
 def test_a_body_that_is_gone_changed_or_moved(copied):
@@ -218,7 +218,6 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
     ("change", "message"),
     [
         ("truncated", "truncated"),
-        ("stage 1", "stage 1, the encoder, which is not imported"),
         ("no smpl", "SMPL_NEUTRAL.pkl: no such file"),
         ("another smpl", "SMPL_NEUTRAL.pkl"),
         ("another uv", "smpl_uv.obj"),
@@ -231,8 +230,6 @@ def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(t
     weights, smpl, uv = (tmp_path / name for name in ("primdiffusion.pt", "SMPL_NEUTRAL.pkl", "smpl_uv.obj"))
     if change == "truncated":
         weights.write_bytes(weights.read_bytes()[:-500])
-    elif change == "stage 1":
-        save_released(weights, stage_one(template()))
     elif change == "unknown tensor":
         tensors = torch.load(weights, weights_only=True)["model_state_dict"]
         save_released(weights, {**tensors, "diffusion.label_emb.weight": torch.zeros(3, 4)})

@@ -1,0 +1,253 @@
+"""The encoder imported from a released file of 475 tensors: what it is made of, and its use on captures."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import safetensors.torch
+import torch
+from primdiffusion import cli
+from primdiffusion.body.smpl_files import load_body
+from primdiffusion.capture.conditioning import ConditioningError, captured_person
+from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.encoder.config import RELEASED
+from primdiffusion.encoder.model import load_encoder, look_up
+from primdiffusion.human import place
+from primdiffusion.human_file import load_human
+from primdiffusion.primitives.body_setup import BodySetupError
+from primdiffusion.primitives.primitives import K, S
+from primdiffusion.released.imported import Reference, reference_extents
+from primdiffusion.released.reading import ReleasedFileError
+from primdiffusion.released.stage_one import account_stage_one, encoder_tensors
+from primdiffusion.training.stored_people import read_person
+from released_files import (
+    SMALL,
+    body_arrays,
+    random_network,
+    random_stage_one,
+    save_body,
+    save_capture,
+    save_released,
+    state,
+    template,
+)
+from stage_one_twin import StageOneTwin
+
+
+def line(folder: Path, out: str = "imported.safetensors", *more: str) -> list[str]:
+    return [
+        "import-released", str(folder / "primdiffusion.pt"), "--smpl", str(folder / "SMPL_NEUTRAL.pkl"),
+        "--uv", str(folder / "smpl_uv.obj"), "--out", str(folder / out), *more,
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def stage() -> dict[str, torch.Tensor]:
+    return random_stage_one(template())
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, stage) -> Path:
+    """SMPL, the authors' file and what it is imported to, and captures on that body."""
+    folder = tmp_path_factory.mktemp("stage_one")
+    save_body(folder)
+    save_released(folder / "primdiffusion.pt", state(random_network(SMALL).state_dict(), template(), stage))
+    save_capture(folder)
+    cli.run(line(folder, "imported.safetensors", "--report", str(folder / "report.json")))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def encoder_file(folder) -> Path:
+    return folder / "imported.encoder.safetensors"
+
+
+def test_all_475_tensors_are_imported_checked_or_dropped_with_a_reason(folder):
+    report = json.loads((folder / "report.json").read_text())
+    keys = list(torch.load(folder / "primdiffusion.pt", weights_only=True)["model_state_dict"])
+    assert [tensor["key"] for tensor in report["tensors"]] == keys
+    fates = {fate: [t for t in report["tensors"] if t["fate"] == fate] for fate in ("imported", "checked", "dropped")}
+    assert {fate: len(found) for fate, found in fates.items()} == {"imported": 437, "checked": 12, "dropped": 26}
+    assert {tensor["group"] for tensor in fates["dropped"]} == {"lbs_fn", "geo_fn", "decoder_geom"}
+    assert all(tensor["note"] for tensor in report["tensors"])
+
+
+def test_the_file_holds_the_weights_as_they_were_and_nothing_of_smpl(folder, encoder_file, stage):
+    model = load_encoder(encoder_file)
+    assert model.config == RELEASED
+    for name, value in encoder_tensors(stage).items():
+        torch.testing.assert_close(model.encoder.state_dict()[name], value, rtol=0, atol=0, msg=name)
+    assert model.card["parameters"] == 7_190_747
+    body = load_body(folder / "SMPL_NEUTRAL.pkl", uv=folder / "smpl_uv.obj")
+    torch.testing.assert_close(model.body.template, body.template)
+    denoiser = load_checkpoint(folder / "imported.safetensors")
+    extents = model.body_setup.anchors.rest_half_extent
+    torch.testing.assert_close(extents, denoiser.body_setup.anchors.rest_half_extent)
+    torch.testing.assert_close(extents, reference_extents(model.body_setup, Reference.template()))
+    with safetensors.safe_open(encoder_file, framework="pt") as file:
+        shapes = {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}  # noqa: SIM118
+        metadata = json.dumps(file.metadata())
+    vertices, faces = len(body_arrays()["v_template"]), len(body_arrays()["f"])
+    assert not any(vertices in shape or faces in shape for shape in shapes.values())
+    assert "v_template" not in metadata
+
+
+def test_reconstruct_makes_the_human_that_the_twin_makes_of_the_texture(folder, encoder_file, stage):
+    out = folder / "person"
+    cli.run(["reconstruct", "--checkpoint", str(encoder_file), "--capture", str(folder / "captures"),
+             "--out", str(out), "--size", "32"])  # fmt: skip
+    human = load_human(out / "person.human.safetensors")
+    model = load_encoder(encoder_file)
+    person = captured_person(folder / "captures", body=model.body)
+    assert person.warnings == ()
+    texture = look_up(model.config, person.views, person.betas, model.body_setup).rgb[0]
+    assert texture.max() > 100
+    slabs = StageOneTwin(stage)(texture, torch.zeros(72))
+    torch.testing.assert_close(human.payload.delta_scale.double(), 1 / slabs.delta_s, rtol=1e-4, atol=0)
+    torch.testing.assert_close(
+        human.payload.density.double(), slabs.density.flip(-2) * 0.1, rtol=0, atol=0.11
+    )  # files hold densities in 255 levels
+    torch.testing.assert_close(
+        place(human).half_extent, model.place(human.payload, human.betas, person.views.pose).half_extent
+    )
+    assert human.body_setup.files == model.body_setup.files
+    with np.load(out / "human.npz") as arrays:
+        np.testing.assert_allclose(arrays["vertices"], body_arrays()["v_template"], atol=1e-6)
+
+
+def test_payloads_are_encoded_with_it(folder, encoder_file):
+    out = folder / "payloads"
+    cli.run(["payloads", "encode", "--captures", str(folder / "captures"), "--encoder", str(encoder_file),
+             "--out", str(out), "--views", "2", "--looks", "2"])  # fmt: skip
+    stored = read_person(out / "someone.npz")
+    assert stored.voxels.shape == (2, K, S, S, S, 4)
+    model = load_encoder(encoder_file)
+    person = captured_person(folder / "captures", views=2, body=model.body)
+    wanted = model.encode(person.views, person.betas)
+    torch.testing.assert_close(stored.payload(0).delta_scale, wanted.delta_scale, rtol=1e-3, atol=0)
+
+
+def test_captures_on_the_default_body_are_rejected(folder, encoder_file, tmp_path):
+    model = load_encoder(encoder_file)
+    subject = folder / "captures" / "someone"
+    other = tmp_path / "someone"
+    other.mkdir()
+    for part in subject.iterdir():
+        (other / part.name).symlink_to(part)
+    joints = np.zeros((2, 24, 3))
+    joints[:, :, 1] = 1
+    np.savez(other / "joints.npz", world=joints)
+    with pytest.raises(ConditioningError, match=r"encoder's body.*fitted to the SMPL file"):
+        captured_person(other, body=model.body)
+
+
+def test_a_body_file_that_has_changed_is_named(folder, encoder_file, tmp_path):
+    copy = tmp_path / encoder_file.name
+    with safetensors.safe_open(encoder_file, framework="pt") as file:
+        metadata = file.metadata()
+    body = json.loads(metadata["body"])
+    body["smpl"]["path"] = str(tmp_path / "none.pkl")
+    tensors = safetensors.torch.load_file(encoder_file)
+    safetensors.torch.save_file(tensors, copy, {**metadata, "body": json.dumps(body)})
+    with pytest.raises(BodySetupError, match=r"none\.pkl is missing"):
+        load_encoder(copy)
+    del tensors["stand.rest_half_extent"]
+    safetensors.torch.save_file(tensors, copy, metadata)
+    with pytest.raises(ValueError, match="rest_half_extent"):
+        load_encoder(copy)
+
+
+@pytest.mark.parametrize("prefix", ["", "bodydecoder."])
+def test_a_stage_1_file_gives_the_encoder_alone(folder, encoder_file, tmp_path, prefix, stage):
+    save_body(tmp_path)
+    save_released(tmp_path / "primdiffusion.pt", {f"{prefix}{name}": value for name, value in stage.items()})
+    cli.run(line(tmp_path, "stage.safetensors"))
+    assert sorted(path.name for path in tmp_path.glob("*.safetensors")) == ["stage.safetensors"]
+    found, wanted = (safetensors.torch.load_file(path) for path in (tmp_path / "stage.safetensors", encoder_file))
+    assert found.keys() == wanted.keys()
+    assert all(torch.equal(found[name], wanted[name]) for name in wanted)
+
+
+# Names within the groups are only partly known.
+
+
+def renamed(tensors: dict[str, torch.Tensor], names: dict[str, str]) -> dict[str, torch.Tensor]:
+    def new(key: str) -> str:
+        module, _, kind = key.rpartition(".")
+        return f"{names.get(module, module)}.{kind}"
+
+    return {new(key): value for key, value in tensors.items()}
+
+
+def same(a: dict[str, torch.Tensor], b: dict[str, torch.Tensor]) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_layers_are_recognised_by_shape_and_natural_order_whatever_their_names_and_order(stage):
+    other = renamed(stage, {
+        "decoder_motion.0": "decoder_motion.net.2", "decoder_motion.3": "decoder_motion.net.10",
+        "decoder_rgb.0": "decoder_rgb.z", "embs_encoder.out": "embs_encoder.a.b.c",
+    })  # fmt: skip
+    shuffled = {name: other[name] for name in sorted(other, reverse=True)}
+    assert len(account_stage_one(shuffled, "")) == 165
+    assert same(encoder_tensors(shuffled), encoder_tensors(stage))
+
+
+def test_layers_that_nothing_tells_apart_are_refused(stage):
+    other = renamed(stage, {"decoder_motion.0": "decoder_motion.enter", "decoder_motion.3": "decoder_motion.leave"})
+    with pytest.raises(ReleasedFileError, match=r"'decoder_motion\.enter' and 'decoder_motion\.leave' have the same"):
+        account_stage_one(other, "")
+
+
+def damaged(tensors: dict[str, torch.Tensor], kind: str) -> dict[str, torch.Tensor]:
+    tensors = dict(tensors)
+    if kind == "nan":
+        tensors["decoder_rgb.1.weight"] = torch.full_like(tensors["decoder_rgb.1.weight"], torch.nan)
+    elif kind == "integers":
+        tensors["transformer.norm.bias"] = tensors["transformer.norm.bias"].int()
+    elif kind == "zero":
+        tensors["embs_encoder.down.3.weight"] = torch.zeros_like(tensors["embs_encoder.down.3.weight"])
+    elif kind == "no gain":
+        del tensors["joint_conv_block.conv1.g"]
+    elif kind == "two gains":
+        tensors["joint_conv_block.conv1.extra"] = tensors["joint_conv_block.conv1.g"]
+    elif kind == "query":
+        tensors = renamed(tensors, {"transformer.transformer_blocks.0.attn1.to_q": "transformer.one"})
+    elif kind == "channels":
+        tensors["decoder_alpha.2.bias"] = torch.zeros(9, 256, 256)
+    return tensors
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("nan", r"'bodydecoder\.decoder_rgb\.1\.weight' has NaN"),
+        ("integers", r"'bodydecoder\.transformer\.norm\.bias' has NaN or .* not floating"),
+        ("zero", r"'embs_encoder\.down\.3\.weight' is all zero"),
+        ("no gain", r"joint_conv_block\.conv1' is not a convolution"),
+        ("two gains", r"joint_conv_block\.conv1' is not a convolution"),
+        ("query", r"attn1\.to_q\.weight' is missing.*bodydecoder\.transformer\.one\.weight"),
+        ("channels", r"not one value per channel"),
+    ],
+)
+def test_a_damaged_stage_1_is_rejected_in_a_sentence_and_nothing_written(tmp_path, capsys, stage, kind, message):
+    save_body(tmp_path)
+    tensors = state({}, template(), damaged(stage, kind))
+    save_released(tmp_path / "primdiffusion.pt", tensors | {
+        f"diffusion.{name}": value for name, value in random_network(SMALL).state_dict().items()
+    })  # fmt: skip
+    with pytest.raises(SystemExit) as end:
+        cli.main(line(tmp_path))
+    error = capsys.readouterr().err.strip()
+    assert end.value.code == 1
+    assert "\n" not in error
+    assert not list(tmp_path.glob("*.safetensors"))
+    with pytest.raises(ReleasedFileError, match=message):
+        raise ReleasedFileError(error)
+
+
+def test_both_stages_cannot_be_written_to_one_file(folder, capsys):
+    with pytest.raises(ValueError, match="give --encoder another name"):
+        cli.run(line(folder, "both.safetensors", "--encoder", str(folder / "both.safetensors")))
+    assert not (folder / "both.safetensors").exists()
