@@ -39,6 +39,7 @@ class Grey:
 
     def __init__(self, level=0.2):
         self.card = {"name": "grey", "steps": 0}
+        self.body = default_body()
         self.level = level
         self.given = []
         self.placed = []
