@@ -10,6 +10,7 @@ import pytest
 
 import build_addon
 
+pytestmark = pytest.mark.any_blender
 PROGRAM = Path(__file__).parent / "installed_both.py"
 
 

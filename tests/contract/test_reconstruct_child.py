@@ -133,6 +133,7 @@ def test_an_error_of_the_backend_becomes_the_requests_error(start):
     assert str(request.error).startswith("There is no subject 'nobody'")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
 def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_works(start, tmp_path):
     request = start()

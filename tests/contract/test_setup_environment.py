@@ -72,6 +72,7 @@ def test_an_environment_is_made_of_a_folder_of_wheels_tested_and_marked_ready(pl
     assert next(candidates(None, place.folder.environment))[1] == place.folder.python
 
 
+@pytest.mark.slow
 def test_an_environment_may_have_a_pip_of_its_own(place, monkeypatch):
     monkeypatch.setattr(setup, "_VENV", setup._VENV[:-1])
     monkeypatch.setattr(setup, "_pip", lambda python: [str(python), "-I", "-m", "pip"])

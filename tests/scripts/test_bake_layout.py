@@ -170,6 +170,7 @@ def test_a_lopsided_body_is_rejected():
         mirror_vertices(np.array([[0.1, 0, 0], [-0.2, 0, 0]]))
 
 
+@pytest.mark.slow
 def test_the_shipped_layout_is_what_the_script_makes():
     """Positions within half a millimetre: SLIM's last digits depend on the linear algebra library."""
     body = runpy.run_path(str(SCRIPT / "__main__.py"))["read_body"]()

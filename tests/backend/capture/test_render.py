@@ -125,6 +125,7 @@ def test_two_workers_make_the_same_files_as_one(tmp_path):
     assert everything(one) == everything(two.out)
 
 
+@pytest.mark.slow
 def test_few_people_are_shared_out_to_many_workers(tmp_path):
     one, many = captured(tmp_path / "one", people=1), small_job(tmp_path / "many", people=1)
     assert [(outcome.status, outcome.views) for outcome in render(many, workers=2)] == [("done", 12)]

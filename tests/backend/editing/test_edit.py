@@ -262,6 +262,7 @@ def test_an_interpolation_leaves_its_ends_without_a_jump(human, other):
         assert distance(edited, end) < 0.01 * distance(human, other)
 
 
+@pytest.mark.slow
 def test_an_interpolation_of_slabs_is_as_near_to_each_end_as_was_asked(human, other):
     """The whole payload is diffused, so nothing is left out."""
     edited = interpolate(slab_model(), human, other, 0.01, steps=2)

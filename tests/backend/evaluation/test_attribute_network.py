@@ -46,8 +46,8 @@ def test_outlines_are_not_detail():
 
 
 def test_blurred_figures_are_far_from_sharp_ones_in_feature_space():
-    sharp, others = noisy_figures(48), noisy_figures(48, seed=1)
-    attributes = [{"sex": "female" if number % 2 else "male"} for number in range(48)]
+    sharp, others = noisy_figures(24), noisy_figures(24, seed=1)
+    attributes = [{"sex": "female" if number % 2 else "male"} for number in range(24)]
     network = fit_attribute_network(sharp, attributes, epochs=1)
     real, same, soft = (features_of(network, pictures) for pictures in (sharp, others, blurred(others)))
     assert frechet_distance(soft, real) > 5 * frechet_distance(same, real)

@@ -37,7 +37,7 @@ def marched(primitives, camera):
     return straight * alpha[..., None] + (1 - alpha[..., None]) * 0.5, alpha
 
 
-@pytest.mark.parametrize("bent", [0.0, 0.8])
+@pytest.mark.parametrize("bent", [pytest.param(0.0, marks=pytest.mark.slow), 0.8])
 def test_splatted_they_look_like_the_marched_person(tmp_path, bent):
     theta = torch.zeros(24, 3)
     theta[1, 0] = -bent

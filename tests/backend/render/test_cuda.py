@@ -96,7 +96,9 @@ def resources(compiled, folder: Path) -> dict[str, int]:
 
 
 @with_triton
-@pytest.mark.parametrize(("sets", "gap"), [(1, 4), (1, 1), (2, 2), (4, 1)])
+@pytest.mark.parametrize(
+    ("sets", "gap"), [(2, 2), *(pytest.param(*others, marks=pytest.mark.slow) for others in ((1, 4), (1, 1), (4, 1)))]
+)
 def test_the_forward_kernel_fits_into_registers(sets, gap, tmp_path):
     from primdiffusion.render import triton_march
 
@@ -129,6 +131,7 @@ def test_the_backward_kernel_fits_into_registers_and_uses_tensor_cores(tmp_path)
     assert "ld.global.v4" in compiled.asm["ptx"]
 
 
+@pytest.mark.slow
 @with_triton
 def test_the_small_kernels_compile_without_spilling(tmp_path):
     """Also where an argument is 1 or absent: Triton compiles such kernels anew."""

@@ -276,7 +276,15 @@ def test_gradients_of_boxes_and_camera_agree_with_finite_differences(density, sa
     assert torch.autograd.gradcheck(picture, inputs, eps=1e-7, atol=1e-5, rtol=1e-4)
 
 
-@pytest.mark.parametrize("case", ["inside a box", "grazing", "overlapping and saturating", "index order"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        "inside a box",
+        "grazing",
+        pytest.param("overlapping and saturating", marks=pytest.mark.slow),
+        pytest.param("index order", marks=pytest.mark.slow),
+    ],
+)
 def test_gradients_agree_with_finite_differences_where_marchers_break(case):
     boxes = random_boxes(3, 22, density=30.0, size=3, spread=0.02, smallest=0.04)
     camera = camera_at((0.05, 0.02, 0.3), fov=0.2, width=3, height=2)
