@@ -6,6 +6,7 @@ Every scene gets the name of the extension's module and the backend's Python, an
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
