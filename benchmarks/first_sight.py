@@ -1,19 +1,30 @@
 """What a user meets first: how soon a generated human of 1024 volumes stands, and what it then costs Blender.
 
-    python benchmarks/first_sight.py --json docs/results/first_sight.json
+    python scripts/window/look.py --blender blender --scenes stalls redraw --out one    # and two, three
+    python benchmarks/viewport.py --blender blender --json viewport.json
+    python benchmarks/first_sight.py --json docs/results/first_sight.json \\
+        --window one/figures.json two/figures.json three/figures.json viewport.json
 
 Measured without a window, which adds its redraws: the seconds from the child's answer until the human stands
 (stand_seconds) and the longest step of these without a pause; the seconds in which its volumes are written afterwards;
 memory with undo, milliseconds of a frame change, and rows of the Outliner as Blender opens them (collections open,
 objects closed). second_* are the same with another human in the scene. panels_open and sidebar_px are of `sidebar.py`.
 proxy_cpu_seconds is the processor time of `primdiffusion export` of a textured mesh, of the default checkpoint's human
-with seed 7. WINDOW lists figures of a real window or GPU; those that the file has already are kept.
+with seed 7.
+
+Figures of a real window are of `--window`: the median of its files, or the longest stall of all.
+in_view_seconds_window is from the child's answer until a view shows the human; longest_stall_s the longest that
+Blender's main loop was blocked, its own redraws included, from the answer until the volumes are written and the views
+at rest; longest_stall_entering_s the same until the human is in view, longest_stall_extension_s within the extension's
+own functions; redraw_ratio a redraw in Solid with a hidden human against an empty scene's and the extension's drawing;
+window_load the machine's load before. Without `--window`, those that the JSON file has already are kept.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import statistics
 import subprocess
 import sys
 import tempfile
@@ -40,18 +51,48 @@ from blender_primdiffusion.scene.human_npz import Destination, WrittenHuman, wri
 from blender_primdiffusion.scene.unwritten import unwritten, write_unwritten
 
 FRAMES = 60
-WINDOW = ("stand_seconds_window", "longest_stall_s", "viewport_error_999", "viewport_ms_1080p_gpu")
-"""Figures that this benchmark does not measure."""
+_ENTERING = (
+    "stand_seconds_window",
+    "in_view_seconds_window",
+    "longest_stall_entering_s",
+    "longest_stall_s",
+    "longest_stall_extension_s",
+    "window_load",
+)
+WINDOW = (
+    "window_blender",
+    "window_gpu",
+    *_ENTERING,
+    *(f"second_{name}" for name in _ENTERING),
+    *(f"redraw_{name}" for name in ("empty_ms", "armature_ms", "person_ms", "drawing_ms", "ratio")),
+    "viewport_error_999",
+    "viewport_ms_1080p_gpu",
+)
+"""Figures that other programs measure."""
 
 
 def main() -> None:
     parser = command_line(__doc__)
+    parser.add_argument("--window", type=Path, nargs="+", help="figures of scripts/window/look.py and of viewport.py")
     arguments = parser.parse_args()
     before = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else {}
     with tempfile.TemporaryDirectory(prefix="primdiffusion_first_sight_") as folder:
         figures = measured(Path(folder)) | sidebar.measured()
         figures["proxy_cpu_seconds"] = proxy_cpu_seconds(Path(folder))
-    report({**{name: before.get(name) for name in WINDOW}, **figures}, arguments.json)
+    window = in_window([json.loads(path.read_text()) for path in arguments.window]) if arguments.window else before
+    report({**{name: window.get(name) for name in WINDOW}, **figures}, arguments.json)
+
+
+def in_window(records: list[dict]) -> dict[str, float | str | None]:
+    """One value for each figure of WINDOW that any of these records has."""
+    found: dict[str, float | str | None] = {}
+    for name in WINDOW:
+        values = [record[name] for record in records if record.get(name) is not None]
+        if values and isinstance(values[0], str):
+            found[name] = values[0]
+        elif values:
+            found[name] = max(values) if "longest" in name else statistics.median(values)
+    return found
 
 
 def measured(folder: Path) -> dict[str, float]:

@@ -15,7 +15,7 @@ SOURCES = {
     "extension": ("The extension on Blender 5.0 and 4.5", "benchmarks/extension.py --json docs/results/extension.json"),
     "first_sight": (
         "From the backend's answer to a human in Blender",
-        "benchmarks/first_sight.py --json docs/results/first_sight.json",
+        "benchmarks/first_sight.py --json docs/results/first_sight.json --window FIGURES ... viewport.json",
     ),
     "engine": ("The engine in Blender", "benchmarks/engine.py --json docs/results/engine.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),

@@ -91,6 +91,8 @@ class Overlay:
         self._readings: dict[object, SceneReading] = {}
         """By view layer and local view, since the scene has changed."""
         self._placed: dict[object, tuple[GpuPayload, Boxes]] = {}
+        self.undrawn = False
+        """There are pictures that the windows have not drawn."""
         self._fault = ""
         """Why the GPU cannot march."""
         self.error = ""
@@ -178,7 +180,8 @@ class Overlay:
     def resting(self) -> bool:
         """Whether every region shows its finest picture."""
         complete = all(reading.complete for reading in self._readings.values())
-        return self._start is None and complete and all(picture.resting for picture in self._regions.values())
+        at_rest = complete and all(picture.resting for picture in self._regions.values())
+        return at_rest and self._start is None and not self.undrawn
 
     def _starting(self, marcher: GpuMarcher) -> Iterator[None]:
         payload = GpuPayload(np.zeros((1, 3, 8, 8, 8)), np.ones((1, 8, 8, 8)))
@@ -281,7 +284,9 @@ def draw_above_overlays(context: bpy.types.Context, picture: PictureTextures) ->
 
 def follow() -> None:
     """March finer pictures until every region shows its finest."""
+    global _steps
     if not bpy.app.timers.is_registered(_tick):
+        _steps = _march_and_draw()
         bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
 
 
@@ -289,15 +294,29 @@ def stop() -> None:
     """Stop marching finer pictures."""
     if bpy.app.timers.is_registered(_tick):
         bpy.app.timers.unregister(_tick)
+    overlay.undrawn = False
+
+
+_steps: Iterator[float] = iter(())
 
 
 def _tick() -> float | None:
-    if overlay.advance():
-        for window in bpy.context.window_manager.windows:
-            for area in window.screen.areas:
-                if area.type == "VIEW_3D":
-                    area.tag_redraw()
-    return None if overlay.resting else TICK_S
+    return next(_steps, None)
+
+
+def _march_and_draw() -> Iterator[float]:
+    """Yields seconds to wait: marching and drawing both block the windows, and between them Blender handles input."""
+    while not overlay.resting:
+        if overlay.advance():
+            overlay.undrawn = True
+            yield 0.0
+            overlay.undrawn = False
+            for window in bpy.context.window_manager.windows:
+                for area in window.screen.areas:
+                    if area.type == "VIEW_3D":
+                        area.tag_redraw()
+            yield 0.0
+        yield TICK_S
 
 
 def draw_error(context: bpy.types.Context) -> None:

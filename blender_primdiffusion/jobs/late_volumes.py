@@ -75,8 +75,10 @@ class LateVolumes:
         self.error = ""
 
     def tick(self) -> float | None:
-        """The timer: a slice of writing, until all is written."""
-        if in_the_way():
+        """The timer: a slice of writing, until all is written. Views that humans are drawn in come first."""
+        from ..engine.overlay import overlay  # needs numpy
+
+        if in_the_way() or not overlay.resting:
             return BLOCKED_S
         drawing = time.monotonic() - self._ended - PAUSE_S
         more = self.work(min(max(drawing, SHORTEST_S), LONGEST_S))

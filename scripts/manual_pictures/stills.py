@@ -58,7 +58,7 @@ def group(folder: Path) -> list[Path]:
 
 
 def redressed(folder: Path) -> list[Path]:
-    """One person, then with a tee instead of the jacket, then with shorts too."""
+    """One person, then in a suit, then in a tee and shorts."""
     scene = _stage(folder, 0, "Contrapposto")
     pictures = [render(scene, folder / "before.png", SIZE)]
     for number, (parts, outfit) in enumerate((({"clothes"}, "suit"), ({"clothes"}, "tee and shorts"))):

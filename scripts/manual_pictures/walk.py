@@ -46,7 +46,7 @@ def walk(scratch: Path, out: Path) -> None:
         for floor, stride in floors:
             floor.location.y = stride * frame / FRAMES
         pictures.append(render(scene, scratch / f"{frame:04d}.png", SIZE))
-    save_gif(pictures, out, 1000 // FPS)
+    save_gif(pictures, out, 1000 // FPS, colours=176)
 
 
 def _floor(scene: bpy.types.Scene, lane: float, stride: float) -> tuple[bpy.types.Object, float]:

@@ -6,6 +6,7 @@ Every scene gets the name of the extension's module and the backend's Python, an
 from __future__ import annotations
 
 import tempfile
+import time
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -75,7 +76,8 @@ def generate(module: str, python: str) -> Steps:
     settings = bpy.context.scene.primdiffusion
     settings.count = 3
     press("primdiffusion.generate")
-    yield 4.0
+    so_far = import_module(f"{module}.jobs.pictures").so_far
+    yield from wait(lambda: bool(so_far.icon), 120)
     yield "generate_in_line"
     yield from cancel_all(module)
     settings.count = 1
@@ -201,6 +203,9 @@ def render(module: str, python: str) -> Steps:
     """Engine and Cycles, attachment, merging, gain, memory."""
     yield from with_people(module, python, FIRST_SEED)
     names = ("render", "attachment", "merge", "cycles_look", "memory")
+    import_module(f"{module}.jobs.cycles_check").volumes_are_empty = lambda: False  # Debian's builds have this fault
+    writing = import_module(f"{module}.jobs.late_volumes")._tick
+    yield from wait(lambda: not bpy.app.timers.is_registered(writing), 120)
     yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
     press("primdiffusion.set_up_cycles")
     yield "render_cycles"

@@ -22,7 +22,7 @@ _OURS = (
     ("engine.overlay", "Overlay", "draw"),
 )
 """Module, class and function of what the extension does in the main loop and in draw handlers while a human enters."""
-_ours_s = [0.0]
+_ours_s = dict.fromkeys((f"{owner or module}.{function}" for module, owner, function in _OURS), 0.0)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +35,8 @@ class Gap:
     """Processor time of the main thread."""
     ours: float
     """Within the functions of `_OURS`; the rest is Blender's events, evaluation and drawing."""
+    mostly: str
+    """The function of those that took longest."""
 
 
 def measure_extension(module: str) -> None:
@@ -42,17 +44,17 @@ def measure_extension(module: str) -> None:
     for name, owner, function in _OURS:
         found = import_module(f"{module}.{name}")
         found = getattr(found, owner) if owner else found
-        setattr(found, function, _counted(getattr(found, function)))
+        setattr(found, function, _counted(getattr(found, function), f"{owner or name}.{function}"))
 
 
-def _counted(function: Callable) -> Callable:
+def _counted(function: Callable, name: str) -> Callable:
     @functools.wraps(function)
     def call(*given: object, **named: object) -> object:
         began = time.perf_counter()
         try:
             return function(*given, **named)
         finally:
-            _ours_s[0] += time.perf_counter() - began
+            _ours_s[name] += time.perf_counter() - began
 
     return call
 
@@ -72,7 +74,7 @@ class Stalls:
 
     def end(self) -> str:
         """A summary: the longest gaps in ms, and in each the processor time of the main thread and, if it is measured,
-        the time within the extension.
+        the time within the extension and the function that took most of it.
 
         Gap and processor time differ on a busy machine, where the thread waits for a core, and while software OpenGL
         draws in its own threads.
@@ -80,7 +82,7 @@ class Stalls:
         self._tick()
         bpy.app.timers.unregister(self._timer)
         longest = sorted(self.gaps, key=lambda gap: -gap.wall)[:_SHOWN]
-        gaps = ", ".join(f"{_ms(gap.wall)} ({_ms(gap.worked)}; {_ms(gap.ours)})" for gap in longest)
+        gaps = ", ".join(f"{_ms(gap.wall)} ({_ms(gap.worked)}; {_ms(gap.ours)} {gap.mostly})" for gap in longest)
         noticed = sum(gap.wall for gap in self.gaps if gap.wall > _NOTICED_S)
         whole = sum(gap.wall for gap in self.gaps)
         return f"longest {gaps} ms; {noticed:.1f} s of {whole:.1f} s in gaps above 0.1 s"
@@ -90,15 +92,17 @@ class Stalls:
         return [gap for gap in self.gaps if self.met[first] < gap.end <= self.met[last]]
 
     @staticmethod
-    def _now() -> tuple[float, float, float]:
-        return time.perf_counter(), time.thread_time(), _ours_s[0]
+    def _now() -> tuple[float, float, dict[str, float]]:
+        return time.perf_counter(), time.thread_time(), dict(_ours_s)
 
     def _tick(self) -> float:
-        now = self._now()
-        self.gaps.append(Gap(now[0], *(after - before for after, before in zip(now, self._last, strict=True))))
-        self._last = now
+        (then, then_worked, before), (now, worked, after) = self._last, self._now()
+        ours = {name: after[name] - before[name] for name in after}
+        longest = max(ours, key=ours.__getitem__)
+        self.gaps.append(Gap(now, now - then, worked - then_worked, sum(ours.values()), longest))
+        self._last = now, worked, after
         for name in [name for name, met in self._events.items() if met()]:
-            self.met[name] = now[0]
+            self.met[name] = now
             del self._events[name]
         return _EVERY_S
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -18,6 +19,8 @@ from start import FIRST_SEED, SECOND_SEED, armatures, begin, queue_of, select, w
 
 REDRAW_ROUNDS, REDRAWS = 5, 6
 """Rounds of all states, and redraws in each."""
+AFTERWARDS_S = 3.0
+"""After a human's volumes are written: views refine their pictures."""
 
 
 def shadings(module: str, python: str) -> Steps:
@@ -157,6 +160,7 @@ def stalls(module: str, python: str) -> Steps:
     yield from show("PRIMDIFFUSION_PT_generate")
     queue = queue_of(module)
     measure_extension(module)
+    yield {"figures": {"window_blender": bpy.app.version_string, "window_gpu": gpu.platform.renderer_get()}}
     yield from entering(module, FIRST_SEED, "")
     yield from entering(module, SECOND_SEED, "second_")
     yield "stalls_person"
@@ -176,29 +180,39 @@ def stalls(module: str, python: str) -> Steps:
 
 
 def entering(module: str, seed: int, prefix: str) -> Steps:
-    """Generate a person and measure from the child's answer until a view shows them."""
+    """Generate a person and measure from the child's answer until a view shows them and their volumes are written."""
     queue, overlay = queue_of(module), import_module(f"{module}.engine.overlay").overlay
+    writing = import_module(f"{module}.jobs.late_volumes")._tick
     humans = len(armatures()) + 1
 
-    def in_view() -> bool:
-        shown = [picture.shown for picture in overlay._regions.values() if picture.shown is not None]
-        return any(len(march.request.key[0]) == humans for march in shown)  # a picture's key begins with its humans
+    def shown() -> set[tuple]:
+        pictures = [picture.shown for picture in overlay._regions.values() if picture.shown is not None]
+        return {march.request.key[0] for march in pictures}  # a picture's key begins with its humans
 
-    events = {"answered": lambda: queue.ready, "standing": lambda: not queue.busy, "in view": in_view}
+    def in_view() -> bool:
+        return any(len(key) == humans for key in shown() - before)
+
+    def written() -> bool:
+        return not queue.busy and not bpy.app.timers.is_registered(writing)
+
+    before, load = shown(), os.getloadavg()[0]
     press("primdiffusion.generate", seed=seed)
-    measured = Stalls(events)
+    measured = Stalls({"answered": lambda: queue.ready, "standing": lambda: not queue.busy, "in view": in_view})
     yield from wait(lambda: "in view" in measured.met, 240)
-    yield 8.0
+    yield from wait(written, 240)
+    yield AFTERWARDS_S
     print(f"adding a person: {measured.end()}", flush=True)
     answered = measured.met["answered"]
-    gaps = measured.between("answered", "in view")
+    gaps = [gap for gap in measured.gaps if gap.end > answered]
     figures = {
         "stand_seconds_window": measured.met["standing"] - answered,
         "in_view_seconds_window": measured.met["in view"] - answered,
+        "longest_stall_entering_s": max(gap.wall for gap in measured.between("answered", "in view")),
         "longest_stall_s": max(gap.wall for gap in gaps),
-        "longest_stall_extension_s": max(gap.ours for gap in measured.gaps if gap.end > answered),
+        "longest_stall_extension_s": max(gap.ours for gap in gaps),
+        "window_load": load,
     }
-    yield {"figures": {prefix + name: value for name, value in figures.items()}}
+    yield {"figures": {prefix + name: round(value, 3) for name, value in figures.items()}}
 
 
 def redraw(module: str, python: str) -> Steps:

@@ -96,7 +96,7 @@ def read_numbers(path: str | Path, required: Sequence[str] = (), optional: Seque
 
 def all_finite(values: NDArray) -> bool:
     """Whether no number is NaN, infinite, or too large for products in float32."""
-    return bool(np.isfinite(values).all() and (values.size == 0 or np.abs(values).max() <= LARGEST_NUMBER))
+    return bool(np.isfinite(values).all() and (values.size == 0 or float(np.abs(values).max()) <= LARGEST_NUMBER))
 
 
 def check_shapes(

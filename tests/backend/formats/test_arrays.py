@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import struct
 import tracemalloc
+import warnings
 import zipfile
 
 import numpy as np
 import pytest
 from primdiffusion.formats.arrays import (
     ArrayFileError,
+    all_finite,
     array_names,
     array_shape,
     map_npy,
@@ -160,3 +162,11 @@ def test_a_mapped_array_may_be_larger_than_what_is_read_at_once(tmp_path, monkey
     np.save(tmp_path / "a.npy", np.arange(12, dtype=np.uint8).reshape(3, 4))
     monkeypatch.setattr("primdiffusion.formats.arrays.LARGEST_BYTES", 10)
     assert np.array_equal(map_npy(tmp_path / "a.npy"), np.arange(12).reshape(3, 4))
+
+
+def test_numbers_of_half_precision_are_checked_without_a_warning():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert all_finite(np.float16([-65504, 1]))
+        assert not all_finite(np.float16([1, np.inf]))
+        assert not all_finite(np.float32([1e31]))

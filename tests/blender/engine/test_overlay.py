@@ -170,6 +170,25 @@ def test_shaders_are_compiled_in_steps_before_a_human_stands(addon, monkeypatch)
     assert own.resting
 
 
+def test_marching_and_drawing_are_steps_of_their_own(monkeypatch):
+    own, news = Overlay(), [False, True, False]
+    pictures = SimpleNamespace(resting=False, advance=lambda: news.pop(0))
+    own._regions[0] = pictures
+    monkeypatch.setattr(module, "overlay", own)
+    steps, seen = module._march_and_draw(), []
+    for seconds in steps:
+        pictures.resting = not news
+        seen.append((seconds, own.undrawn, own.resting))
+    march, at_once = module.TICK_S, 0.0
+    assert seen == [
+        (march, False, False),
+        (at_once, True, False),
+        (at_once, False, False),
+        (march, False, False),
+        (march, False, True),
+    ]
+
+
 def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
     reading = read(people.overlay)
     assert people.overlay.reading(context()) is reading

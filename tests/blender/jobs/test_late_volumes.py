@@ -9,6 +9,7 @@ import pytest
 from late_volumes_stage import COUNT, advance, check_complete, generated, on_disk, paths_of
 
 import blender_primdiffusion
+from blender_primdiffusion.engine.overlay import overlay
 from blender_primdiffusion.jobs import late_volumes as module
 from blender_primdiffusion.jobs.late_volumes import late_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
@@ -67,6 +68,12 @@ def test_a_slice_is_as_long_as_the_drawing_before_it_within_limits(person, monke
         now[0] += module.PAUSE_S + drawing
         assert late_volumes.tick() == module.PAUSE_S
     assert given == [module.SHORTEST_S, 0.07, module.LONGEST_S]
+
+
+def test_views_that_show_the_human_come_before_its_volumes(person, monkeypatch):
+    monkeypatch.setattr(overlay, "undrawn", True)
+    assert late_volumes.tick() == module.BLOCKED_S
+    assert not on_disk()
 
 
 def test_the_timer_waits_for_what_the_user_holds_and_ends_with_the_work(person, monkeypatch):
