@@ -67,13 +67,14 @@ class Encoder(nn.Module):
             if released
             else ResidualConv(MOTION, config.motion, GRID)
         )
-        sizes = *(branches[::-1] if released else branches), config.attention_width, config.attention_heads
+        first, second = branches[::-1] if released else branches
+        heads = config.attention_width, config.attention_heads
         self.attention: nn.Module | None = None
         if config.attention == "cross":
-            self.attention = CrossModalAttention(*sizes, config.attention_blocks)
+            self.attention = CrossModalAttention(first, second, *heads, config.attention_blocks)
         elif config.attention == "concatenated":
             epsilon = RELEASED_EPSILON if released else 1e-5
-            self.attention = ConcatenatedAttention(*sizes, config.attention_blocks, epsilon)
+            self.attention = ConcatenatedAttention(first, second, *heads, config.attention_blocks, epsilon)
         self.fuse: nn.Module = (
             ReleasedResidualConv(sum(branches), config.fused, GRID, kernel=3)
             if released
