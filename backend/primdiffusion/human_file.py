@@ -65,7 +65,7 @@ def save_human(path: str | Path, human: Human, *, compact: bool = False) -> None
 
     Raises ValueError for NaN, betas out of range and a provenance that is not JSON; OSError.
     """
-    _check_betas(human.validate())
+    _check_values(human.validate())
     _check_provenance(human.provenance)
     payload = human.payload
     tensors = {"rgb": payload.rgb, "density": payload.density, "delta_scale": payload.delta_scale, "betas": human.betas}
@@ -113,7 +113,7 @@ def load_human(path: str | Path) -> Human:
     try:
         body_setup = _body_setup(path, metadata, tensors) if "body" in metadata else None
         human = Human(payload, tensors["betas"], _provenance(metadata), body_setup).validate()
-        _check_betas(human)
+        _check_values(human)
     except BodySetupError as e:
         raise HumanFileError(f"{path}: {e}") from e
     except ValueError as e:
@@ -164,7 +164,10 @@ def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
             )
 
 
-def _check_betas(human: Human) -> None:
+def _check_values(human: Human) -> None:
+    for name, values in vars(human.payload).items():
+        if float(values.abs().max()) > compact_human.LARGEST_VALUE or (name == "density" and float(values.min()) < 0):
+            raise ValueError(f"{name!r} holds impossible values: generate the human again")
     largest = float(human.betas.abs().max())
     if largest > LARGEST_BETA:
         raise ValueError(

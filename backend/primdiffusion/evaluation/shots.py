@@ -135,7 +135,10 @@ def folder_shots(folder: Path) -> Iterator[Shot]:
     Raises ValueError for an empty folder, pictures that are not square or unreadable, and truth that does not fit.
     """
     paths = folder_pictures(folder)
-    truth = read_json(folder / JOINTS_FILE) if (folder / JOINTS_FILE).is_file() else {}
+    try:
+        truth = read_json(folder / JOINTS_FILE) if (folder / JOINTS_FILE).is_file() else {}
+    except ValueError as error:
+        raise ValueError(f"{folder / JOINTS_FILE} is damaged ({error}): write it again") from error
     if not isinstance(truth, dict):
         raise ValueError(f"{folder / JOINTS_FILE} is not an object of picture names: see docs/design/evaluation.md")
     for path in paths:
