@@ -106,7 +106,9 @@ def load_human(path: str | Path) -> Human:
             _check_format(path, metadata)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  safe_open is no mapping
     except (safetensors.SafetensorError, OSError, RuntimeError) as e:
-        raise HumanFileError(f"{path} is truncated or not a safetensors file ({e}): generate the human again") from e
+        raise HumanFileError(
+            f"{path} is truncated or not a safetensors file ({e!s:.100}): generate the human again"
+        ) from e
     tensors = _expanded(path, tensors, metadata)
     _check_shapes(path, tensors)
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
@@ -149,7 +151,7 @@ def _expanded(path: Path, tensors: dict[str, torch.Tensor], metadata: Mapping[st
     try:
         expanded = compact_human.expand(stored, metadata[compact_human.METADATA])
     except (ValueError, KeyError) as e:
-        raise HumanFileError(f"{path} does not contain a valid human ({e}): generate it again") from e
+        raise HumanFileError(f"{path} does not contain a valid human ({e!s:.100}): generate it again") from e
     return {**tensors, **{name: torch.from_numpy(values) for name, values in expanded.items()}}
 
 
@@ -180,7 +182,7 @@ def _provenance(metadata: Mapping[str, str]) -> dict[str, Any]:
     try:
         provenance = parse_message(metadata.get("provenance", ""))
     except ValueError as e:
-        raise ValueError(f"its provenance is not JSON ({e}): generate the human again") from e
+        raise ValueError(f"its provenance is not JSON ({e!s:.100}): generate the human again") from e
     _check_provenance(provenance)
     return provenance
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fuzz.run import FINDINGS, run  # noqa: E402
+from fuzz.run import FINDINGS, run
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from fuzz import mutations
 from fuzz.data_targets import NPY, as_json, as_npy
-from fuzz.target import Garbage, Target, finite, finite_members
+from fuzz.target import Target, finite, finite_members
 
 
 def make_human(folder: Path, motion: bool = False, compact: bool = False) -> Path:
@@ -115,6 +115,7 @@ def read_cameras(path: Path) -> None:
 
 def make_body(folder: Path) -> Path:
     from blender_primdiffusion.formats.arrays import read_arrays
+
     from blender_primdiffusion.places import body_data
 
     names = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "f", "kintree_table")

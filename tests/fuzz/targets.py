@@ -94,10 +94,9 @@ def make_released(folder: Path) -> Path:
 
 
 def read_released(path: Path) -> None:
-    from primdiffusion.released.inventory import take_inventory
-    from primdiffusion.released.reading import read_weights
+    from primdiffusion.commands.import_released import read_released
 
-    take_inventory(read_weights(path))
+    read_released(path)
 
 
 # --- bodies, poses, motions
@@ -386,4 +385,3 @@ TARGETS = (
     *extension_targets.TARGETS,
     *served.TARGETS,
 )
-

@@ -270,7 +270,7 @@ def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
             metadata = file.metadata() or {}
     except (SafetensorError, OSError) as error:
         raise CheckpointError(
-            f"{path} is truncated or not a safetensors file ({error}): download or train it again"
+            f"{path} is truncated or not a safetensors file ({error!s:.100}): download or train it again"
         ) from error
     if metadata.get("format") not in formats:
         raise CheckpointError(

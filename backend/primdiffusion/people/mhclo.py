@@ -169,7 +169,9 @@ def parse_mhclo(text: str) -> Proxy:
     if not reference:
         raise ProxyFileError(f"{name or 'the .mhclo'} has no vertices after its line 'verts': the file is damaged")
     if any(not abs(value) <= LARGEST_NUMBER for row in (*weight, *offset) for value in row):
-        raise ProxyFileError(f"the .mhclo holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again")
+        raise ProxyFileError(
+            f"the .mhclo holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again"
+        )
     return Proxy(
         name=name,
         reference=np.array(reference, np.int64),
@@ -211,7 +213,9 @@ def read_pair(mhclo: Path, obj: Path) -> tuple[Proxy, ObjMesh]:
     except ProxyFileError as error:
         raise ProxyFileError(f"{mhclo}: {error}") from error
     except (ValueError, IndexError, OverflowError) as error:
-        raise ProxyFileError(f"{mhclo.name} or {obj} has an unreadable line ({error!s:.60}): fetch both again") from error
+        raise ProxyFileError(
+            f"{mhclo.name} or {obj} has an unreadable line ({error!s:.60}): fetch both again"
+        ) from error
     if len(proxy.reference) != len(mesh.vertices):
         raise ProxyFileError(
             f"{mhclo} binds {len(proxy.reference)} vertices but {obj} has {len(mesh.vertices)}: fetch both again"
