@@ -123,7 +123,7 @@ def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         if isinstance(error, CameraError):
             raise
-        raise CameraError(f"{path} holds no cameras as cameras.json has them ({error!r})") from error
+        raise CameraError(f"{path} holds no cameras as cameras.json has them ({error!r:.100})") from error
     if not views:
         raise CameraError(f"{path} holds no camera")
     return tuple(views)

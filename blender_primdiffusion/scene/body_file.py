@@ -105,7 +105,9 @@ def read_body_file(path: Path) -> ShapeModel:
         model = ShapeModel.from_arrays(arrays)
         fault = faulty_field(model)
     except (OSError, ValueError, IndexError) as error:
-        raise ValueError(f"the body's file {str(path)!r} is damaged ({error}); generate the human again") from error
+        raise ValueError(
+            f"the body's file {str(path)!r} is damaged ({error!s:.160}); generate the human again"
+        ) from error
     if fault is not None:
         raise ValueError(f"the field {fault!r} of {str(path)!r} holds impossible values; generate the human again")
     return model
@@ -121,6 +123,6 @@ def _write(path: Path, model: ShapeModel) -> None:
             np.savez(file, **arrays)  # compressing takes half a second, and Blender waits
     except OSError as error:
         raise VolumeWriteError(
-            f"the body's file could not be written to {str(path.parent)!r} ({error}); save the .blend in a folder with "
+            f"the body's file could not be written to {str(path.parent)!r} ({error!s:.160}); save the .blend in a folder with "
             "write permission and free space"
         ) from error

@@ -172,7 +172,7 @@ def compacted(human: HumanTensors) -> HumanTensors:
     try:
         rgb, density, scales = compact_human.compact(*(_loaded(*human.arrays[name]) for name in _EIGHT_BIT))
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"the human's file is damaged ({error}); {_REMEDY}") from error
+        raise ValueError(f"the human's file is damaged ({error!s:.160}); {_REMEDY}") from error
     arrays = {
         name: ("U8", array.shape, array.tobytes()) for name, array in zip(_EIGHT_BIT, (rgb, density), strict=True)
     }

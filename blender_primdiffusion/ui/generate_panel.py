@@ -11,7 +11,7 @@ import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
-from ..backend.requests import sentence
+from ..backend.requests import in_words, sentence
 from ..formats import requests
 from ..jobs.follow import Reporting, submit
 from ..jobs.memory import device_line
@@ -223,7 +223,7 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
                 before.append((holder, names[-1], getattr(holder, names[-1])))
                 setattr(holder, names[-1], value)
         except OSError as error:
-            self.report({"ERROR"}, f"The preset cannot be read: {error}. Choose another one")
+            self.report({"ERROR"}, f"The preset cannot be read: {in_words(error)}. Choose another one")
             return {"CANCELLED"}
         except (TypeError, AttributeError, ValueError, OverflowError) as error:
             for holder, setting, value in reversed(before):

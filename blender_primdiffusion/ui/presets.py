@@ -19,7 +19,10 @@ def read_preset(path: Path) -> list[tuple[tuple[str, ...], bool | int | float | 
     """
     try:
         tree = ast.parse(read_regular(path, _LARGEST).decode("utf-8"))
-        return list(_assignments(tree))
+        found = list(_assignments(tree))
+        if not found:
+            raise ValueError("it sets nothing")
+        return found
     except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
         raise ValueError(f"{path.name!r} is no preset ({error!s:.80}): remove it, and add it again") from error
 

@@ -204,4 +204,6 @@ def _load_solids(file: Stamp) -> Solids:
             np.ascontiguousarray(arrays["holdout"], np.bool_),
         )
     except ValueError as e:
-        raise ValueError(f"{path} holds no solids ({e}): it needs corners [F, 3, 3], colour [F, 3], holdout [F]") from e
+        raise ValueError(
+            f"{path} holds no solids ({e!s:.160}): it needs corners [F, 3, 3], colour [F, 3], holdout [F]"
+        ) from e

@@ -151,7 +151,7 @@ def read_attributes(path: Path) -> list[dict[str, Any]]:
     try:
         stored = parse_json(str(arrays["attributes"]))
     except ValueError as error:
-        raise ValueError(f"{path}: its attributes are not JSON ({error}): make it again") from error
+        raise ValueError(f"{path}: its attributes are not JSON ({error!s:.160}): make it again") from error
     return list(stored.get("variants", [stored] * len(arrays["voxels"])))
 
 
