@@ -123,6 +123,6 @@ def _write(path: Path, model: ShapeModel) -> None:
             np.savez(file, **arrays)  # compressing takes half a second, and Blender waits
     except OSError as error:
         raise VolumeWriteError(
-            f"the body's file could not be written to {str(path.parent)!r} ({error!s:.160}); save the .blend in a folder with "
+            f"the body's file could not be written to {str(path.parent)!r} ({error}); save the .blend in a folder with "
             "write permission and free space"
         ) from error

@@ -100,7 +100,7 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
         collect_temporary_volumes(blend_path)
     except OSError as error:
         print(
-            f"PrimDiffusion: volumes stay in {humans_folder('')}: they could not be copied beside the .blend ({error!s:.160})"
+            f"PrimDiffusion: volumes stay in {humans_folder('')}: they could not be copied beside the .blend ({error})"
         )
     store_folders()
 
@@ -163,7 +163,7 @@ def _collect(blend_path: str, away: Iterable[bpy.types.Volume]) -> Collected:
         for path in made:
             remove_file(path, path.parent)
         raise VolumeWriteError(
-            f"the files of humans could not be copied to {str(target)!r} ({error!s:.160}); save the .blend in a folder with "
+            f"the files of humans could not be copied to {str(target)!r} ({error}); save the .blend in a folder with "
             "write permission and free space"
         ) from error
     for volume, path in moved.items():

@@ -164,6 +164,6 @@ def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequen
 
 def _write_error(folder: Path, error: BaseException) -> VolumeWriteError:
     return VolumeWriteError(
-        f"the merged volume could not be written to {str(folder)!r} ({error!s:.160}); save the .blend in a folder with write "
+        f"the merged volume could not be written to {str(folder)!r} ({error}); save the .blend in a folder with write "
         "permission and free space"
     )

@@ -15,9 +15,11 @@ from chaos.forks import Death, Ended, Forks
 from diffusion_people import small_model, write_people
 from primdiffusion.capture.render import render
 from primdiffusion.diffusion.checkpoint import save_checkpoint
+from primdiffusion.human import generate
+from primdiffusion.human_file import save_human
 from released_files import TINY, random_network, save_body, save_released, state, template
 from tiny_encoder import save_tiny_encoder
-from tiny_model import save_tiny_checkpoint
+from tiny_model import save_tiny_checkpoint, tiny_model
 
 Words = Sequence[str | Path]
 ASSETS = "PRIMDIFFUSION_ASSETS"
@@ -61,8 +63,8 @@ def makehuman() -> Path | None:
 class Inputs:
     """Inputs of the commands; each is made when it is first needed."""
 
-    def __init__(self, folder: Path, forks: Forks) -> None:
-        self.folder, self._forks = folder, forks
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     @functools.cached_property
     def checkpoint(self) -> Path:
@@ -113,8 +115,8 @@ class Inputs:
         """A generated human."""
         path = self.folder / f"human{seed}" / "person.human.safetensors"
         if not path.exists():
-            made = self._forks.run(["generate", "--seed", str(seed), *self.sampled, "--out", path.parent])
-            assert made.exit_code == 0, made.log
+            path.parent.mkdir()
+            save_human(path, generate(tiny_model(), seed, 2))
         return path
 
     @property

@@ -115,7 +115,7 @@ def mismatches_named(path: Path, *also: type[Exception]) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, JsonError, RuntimeError, *also) as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
         raise CheckpointError(
             f"{path} does not match its own description ({reason}): download or train it again"
         ) from error

@@ -191,7 +191,10 @@ def _joints(given: Any, size: int, source: Path, name: str) -> tuple[Tensor | No
 def _depth(path: Path, size: int) -> Float[Tensor, "s s"] | None:
     if not path.is_file():
         return None
-    depth = torch.from_numpy(np.asarray(read_npy(path), np.float32))
+    try:
+        depth = torch.from_numpy(np.asarray(read_npy(path), np.float32))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} holds no depth ({error!s:.160}): write it again") from error
     if depth.shape != (size, size):
         raise ValueError(f"{path} has shape {tuple(depth.shape)}, its picture {size} x {size} pixels: give one size")
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.inf)
