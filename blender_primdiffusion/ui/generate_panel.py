@@ -230,7 +230,7 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
                 setattr(holder, setting, value)
             reason = sentence(f"{error!s:.120}")
             self.report(
-                {"ERROR"}, f"The preset {name!r} does not match this checkpoint or version: {reason}. Remove it"
+                {"ERROR"}, f"The preset {name!r} does not match this checkpoint or version: {reason} Remove it"
             )
             return {"CANCELLED"}
         PRIMDIFFUSION_PT_generate_presets.bl_label = name

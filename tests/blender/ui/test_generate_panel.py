@@ -158,7 +158,7 @@ def test_a_preset_holds_everything_but_the_seed(panel_settings, presets_folder):
     ("text", "sentence"),
     [
         ("settings.steps = 7\nsettings.sampler = 'magic'\n", "'Old One'.*magic"),
-        ("settings.steps = 7\nsettings.seed = 5\n", "'Old One'.*it sets seed"),
+        ("settings.steps = 7\nsettings.seed = 5\n", "'Old One'.*It sets seed"),
         ("settings.steps = 7\nsettings.steps = 1" + 400 * "0", "'Old One'"),
         ("settings.steps = 7\nbpy.app.tempdir", "'Old One'.*line 2 sets nothing"),
         ("settings.steps = print(7)", "'Old One'"),
