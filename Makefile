@@ -74,7 +74,7 @@ test-all: $(READY_TO_TEST)
 
 ## fuzz: feed damaged files and messages to every reader for MINUTES=30; see tests/fuzz
 fuzz: $(READY_TO_TEST)
-	cd tests && $(ONE_THREAD) ../$(BIN)/python -m fuzz --minutes $(MINUTES)
+	$(ONE_THREAD) $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 
 ## chaos: kill programs, fill disks, break environments for MINUTES=30; see tests/chaos
 MINUTES ?= 30

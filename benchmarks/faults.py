@@ -5,6 +5,8 @@
 Runs `python -m tests.fuzz` and `python -m tests.chaos` (about an hour in all), whose figures are described there. Then
 one seed is generated on 1, 2 and 4 threads, alone and in a batch of 8: the largest difference of any number of the
 human, relative to the range of its kind. Two processes write the same seed: their files must have the same bytes.
+
+With --parts some of the three are measured anew, and the file's other figures are kept.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -28,6 +31,8 @@ SEED = 7
 THREADS = (1, 2, 4)
 BATCHES = (1, 8)
 PERSON = "person.human.safetensors"
+PARTS = ("seed", "fuzz", "chaos")
+Figure = float | int | bool | str | None
 
 
 def main() -> None:
@@ -36,14 +41,29 @@ def main() -> None:
     parser.add_argument("--chaos-minutes", type=float, default=30.0)
     parser.add_argument("--deaths", type=int, default=1000, help="of the child")
     parser.add_argument("--steps", type=int, default=30, help="of the sampler")
+    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="measure only these anew")
     arguments = parser.parse_args()
-    figures: dict[str, float | int | bool | str | None] = {
-        "threads_person_error_max": person_error(arguments.steps),
-        "same_seed_bytes_equal": same_bytes(arguments.steps),
-        **tool("tests.fuzz", "--inputs", str(arguments.fuzz_inputs)),
-        **chaos(arguments.chaos_minutes, arguments.deaths),
-    }
+    figures = {} if set(arguments.parts) == set(PARTS) else kept(arguments.json)
+    if "seed" in arguments.parts:
+        figures["threads_person_error_max"] = person_error(arguments.steps)
+        figures["same_seed_bytes_equal"] = same_bytes(arguments.steps)
+    if "fuzz" in arguments.parts:
+        began = time.monotonic()
+        figures |= tool("tests.fuzz", "--inputs", str(arguments.fuzz_inputs))
+        figures["fuzz_seconds"] = round(time.monotonic() - began, 1)
+    if "chaos" in arguments.parts:
+        began = time.monotonic()
+        figures |= chaos(arguments.chaos_minutes, arguments.deaths)
+        figures["chaos_seconds"] = round(time.monotonic() - began, 1)
     record.report(figures, arguments.json)
+
+
+def kept(path: Path | None) -> dict[str, Figure]:
+    """The figures of an earlier run; none without a file."""
+    if path is None or not path.is_file():
+        return {}
+    about = record.surroundings()
+    return {name: value for name, value in json.loads(path.read_text(encoding="utf-8")).items() if name not in about}
 
 
 def person_error(steps: int) -> float:

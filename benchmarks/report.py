@@ -42,6 +42,7 @@ SOURCES = {
         "Line coverage of the tests by room",
         "benchmarks/coverage_by_room.py before.json after.json --json docs/results/coverage_rooms.json",
     ),
+    "faults": ("Faults: hostile files, kills, full disks", "benchmarks/faults.py --json docs/results/faults.json"),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
 }  # fmt: skip
 ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")

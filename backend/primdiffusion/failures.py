@@ -51,6 +51,8 @@ def optional_package(module: str, extra: str) -> ModuleType:
         ) from error
 
 
+_LONGEST_NAME = 200
+"""Characters of a path in a sentence."""
 PICTURE_REMEDY = "choose a smaller resolution, or close other programs, then try again"
 MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture, then try again"
 
@@ -97,5 +99,7 @@ def out_of_memory(error: BaseException) -> bool:
 def _of_file(error: OSError) -> str:
     """Rewrite Python's "[Errno 13] Permission denied: 'x'"; messages of this package are sentences already."""
     if error.strerror and error.filename:
-        return f"{error.filename}: {error.strerror[0].lower()}{error.strerror[1:]}"
+        name = str(error.filename)
+        name = name if len(name) <= _LONGEST_NAME else f"{name[:60]}...{name[60 - _LONGEST_NAME :]}"
+        return f"{name}: {error.strerror[0].lower()}{error.strerror[1:]}"
     return " ".join(str(error).split()) or type(error).__name__

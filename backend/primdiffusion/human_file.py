@@ -65,7 +65,7 @@ def save_human(path: str | Path, human: Human, *, compact: bool = False) -> None
 
     Raises ValueError for NaN, betas out of range and a provenance that is not JSON; OSError.
     """
-    _check_betas(human.validate())
+    _check_values(human.validate())
     _check_provenance(human.provenance)
     payload = human.payload
     tensors = {"rgb": payload.rgb, "density": payload.density, "delta_scale": payload.delta_scale, "betas": human.betas}
@@ -106,14 +106,16 @@ def load_human(path: str | Path) -> Human:
             _check_format(path, metadata)
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  safe_open is no mapping
     except (safetensors.SafetensorError, OSError, RuntimeError) as e:
-        raise HumanFileError(f"{path} is truncated or not a safetensors file ({e}): generate the human again") from e
+        raise HumanFileError(
+            f"{path} is truncated or not a safetensors file ({e!s:.100}): generate the human again"
+        ) from e
     tensors = _expanded(path, tensors, metadata)
     _check_shapes(path, tensors)
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
     try:
         body_setup = _body_setup(path, metadata, tensors) if "body" in metadata else None
         human = Human(payload, tensors["betas"], _provenance(metadata), body_setup).validate()
-        _check_betas(human)
+        _check_values(human)
     except BodySetupError as e:
         raise HumanFileError(f"{path}: {e}") from e
     except ValueError as e:
@@ -149,7 +151,7 @@ def _expanded(path: Path, tensors: dict[str, torch.Tensor], metadata: Mapping[st
     try:
         expanded = compact_human.expand(stored, metadata[compact_human.METADATA])
     except (ValueError, KeyError) as e:
-        raise HumanFileError(f"{path} does not contain a valid human ({e}): generate it again") from e
+        raise HumanFileError(f"{path} does not contain a valid human ({e!s:.100}): generate it again") from e
     return {**tensors, **{name: torch.from_numpy(values) for name, values in expanded.items()}}
 
 
@@ -164,7 +166,10 @@ def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
             )
 
 
-def _check_betas(human: Human) -> None:
+def _check_values(human: Human) -> None:
+    for name, values in vars(human.payload).items():
+        if float(values.abs().max()) > compact_human.LARGEST_VALUE or (name == "density" and float(values.min()) < 0):
+            raise ValueError(f"{name!r} holds impossible values: generate the human again")
     largest = float(human.betas.abs().max())
     if largest > LARGEST_BETA:
         raise ValueError(
@@ -177,7 +182,7 @@ def _provenance(metadata: Mapping[str, str]) -> dict[str, Any]:
     try:
         provenance = parse_message(metadata.get("provenance", ""))
     except ValueError as e:
-        raise ValueError(f"its provenance is not JSON ({e}): generate the human again") from e
+        raise ValueError(f"its provenance is not JSON ({e!s:.100}): generate the human again") from e
     _check_provenance(provenance)
     return provenance
 

@@ -12,10 +12,22 @@ from typing import Any, Literal, TypeVar
 from ..formats.whole_files import remove_of_process
 from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
 
+_LONGEST_NAME = 120
+"""Characters of a path in a sentence."""
+
+
+def in_words(error: BaseException | str) -> str:
+    """What an error says: the system's with the file first, whose name is cut if it is very long."""
+    if isinstance(error, OSError) and error.strerror and error.filename:
+        name = str(error.filename)
+        name = name if len(name) <= _LONGEST_NAME else f"{name[:40]}...{name[40 - _LONGEST_NAME :]}"
+        return f"{name}: {error.strerror[:1].lower()}{error.strerror[1:]}"
+    return str(error).strip()
+
 
 def sentence(text: BaseException | str) -> str:
     """`text` with a capital and a full stop; the kind of an error that says nothing."""
-    said = str(text).strip() or type(text).__name__
+    said = in_words(text) or type(text).__name__
     said = said[:1].upper() + said[1:]
     return said if said.endswith((".", "!", "?")) else f"{said}."
 

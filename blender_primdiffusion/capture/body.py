@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, read_arrays
+from ..formats.arrays import ArrayFileError, all_finite, read_arrays
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..motion.skeleton import chain, joint_positions
 from ..places import body_data
@@ -133,7 +133,7 @@ def _check(source: Path, arrays: dict[str, NDArray]) -> None:
     for key, shape in shapes.items():
         array = arrays[key]
         fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
-        if not fits or array.dtype.kind not in "iuf" or not np.isfinite(array).all():
+        if not fits or array.dtype.kind not in "iuf" or not (key == "kintree_table" or all_finite(array)):
             raise BodyError(f"{source}: {key!r} has shape {array.shape} of {array.dtype}, not SMPL's finite numbers")
     if tuple(arrays["kintree_table"][0][1:].tolist()) != PARENTS[1:]:
         raise BodyError(f"{source}: its joints are not SMPL's 24; SMPL-H and SMPL-X bodies do not serve here")

@@ -120,10 +120,10 @@ def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
             if not np.allclose(r @ r.T, np.eye(3), atol=1e-5) or np.linalg.det(r) < 0:
                 raise CameraError(f"{path}: R of {name} is no rotation")
             views.append(View(k, r, t.ravel(), width, height))
-    except (ValueError, TypeError, KeyError, AttributeError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
         if isinstance(error, CameraError):
             raise
-        raise CameraError(f"{path} holds no cameras as cameras.json has them ({error!r})") from error
+        raise CameraError(f"{path} holds no cameras as cameras.json has them ({error!r:.100})") from error
     if not views:
         raise CameraError(f"{path} holds no camera")
     return tuple(views)

@@ -42,7 +42,7 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
     try:
         return _read(data)
     except (struct.error, IndexError, ValueError, KeyError) as error:
-        raise ExrError(f"{path} is no whole, uncompressed OpenEXR picture ({error}): render it again") from error
+        raise ExrError(f"{path} is no whole, uncompressed OpenEXR picture ({error!s:.160}): render it again") from error
 
 
 def _read(data: bytes) -> dict[str, NDArray[np.float32]]:
@@ -207,7 +207,7 @@ def _write_jpeg(path: Path, pixels: NDArray[np.uint8]) -> None:
             if not is_whole_picture(partial):  # on a full disk Blender saves what fits, and says nothing
                 raise OSError(errno.ENOSPC, "there is no room to write", str(path))
     except RuntimeError as error:
-        raise OSError(f"{path} cannot be written ({error}): is the disk full?") from error
+        raise OSError(f"{path} cannot be written ({error!s:.160}): is the disk full?") from error
     finally:
         bpy.data.images.remove(sheet)
 

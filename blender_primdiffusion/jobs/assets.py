@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.json_files import parse_json
+from ..formats.regular_files import check_regular
 from ..formats.removing import remove_file
 from ..motion.pose_library import builtin_poses, current_pose
 from ..motion.poses import grounding
@@ -224,6 +225,7 @@ def show(asset: bpy.types.ID, picture: NDArray) -> None:
 
 def picture_of_file(path: Path) -> NDArray[np.float32]:
     """An image file as a picture for `show`: padded to a square, then scaled. Raises OSError for no image."""
+    check_regular(path)  # Blender would wait for a pipe
     try:
         image = bpy.data.images.load(str(path))
     except RuntimeError as error:

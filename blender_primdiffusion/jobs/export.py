@@ -304,7 +304,7 @@ class ImportHumanJob(Job):
         return opened(Path(self.path), folder)
 
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        motion = motion_in(read_tensors(Path(self.path)))
+        motion = motion_in(read_tensors(Path(self.path)), Path(self.path).name)
         person, notice = build_person(context, result, "Imported", name_of(self.path))
         armature = armature_of(person)
         if motion is not None:

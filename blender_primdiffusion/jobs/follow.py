@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
-from ..backend.requests import sentence
+from ..backend.requests import in_words, sentence
 from ..places import missing_packages
 from .late_volumes import keep_writing
 from .memory import release_when_idle
@@ -168,7 +168,7 @@ class Reporting:
         try:
             return self.act(context)
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, in_words(error))
         except ModuleNotFoundError:
             if not (lacking := missing_packages()):
                 raise

@@ -268,4 +268,4 @@ def _given(arrays: Mapping[str, NDArray], keys: Iterable[str]) -> NDArray[Any]:
 
 
 def _listed(names: list[str]) -> str:
-    return ", ".join(repr(name) for name in names[:8]) or "nothing"
+    return ", ".join(f"{name[:16]!r}" for name in names[:8]) or "nothing"

@@ -83,7 +83,9 @@ def load_pose(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         pose = np.asarray(content["pose"], np.float64)
         translation = np.asarray(content["transl"], np.float64)
     except (OSError, ValueError, KeyError, TypeError) as error:
-        raise PoseFileError(f"the pose file {str(path)!r} cannot be read ({error}): save the pose again") from error
+        raise PoseFileError(
+            f"the pose file {str(path)!r} cannot be read ({error!s:.160}): save the pose again"
+        ) from error
     finite = all((np.abs(values) < _LARGEST_NUMBER).all() for values in (pose, translation))  # false for NaN
     if pose.shape != (24, 3) or translation.shape != (3,) or not finite:
         raise PoseFileError(f"the pose file {str(path)!r} holds no pose of 24 joints: save the pose again")

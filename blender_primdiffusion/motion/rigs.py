@@ -120,8 +120,8 @@ def map_bones(names: Iterable[str]) -> BoneMap:
     missing = _missing_joints(best.joints)
     if missing:
         raise UnknownBonesError(
-            f"no bone is known to be {_listed(missing)} (nearest rig: {best.rig}); the bones are "
-            f"{_listed(bones):.200}: "
+            f"no bone is known to be {_listed(missing):.60} (nearest rig: {best.rig}); the bones are "
+            f"{_listed(bones):.80}: "
             "name them as in SMPL, Mixamo, Unreal, Rigify or RenderPeople"
         )
     return best

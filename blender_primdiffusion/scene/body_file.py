@@ -105,7 +105,9 @@ def read_body_file(path: Path) -> ShapeModel:
         model = ShapeModel.from_arrays(arrays)
         fault = faulty_field(model)
     except (OSError, ValueError, IndexError) as error:
-        raise ValueError(f"the body's file {str(path)!r} is damaged ({error}); generate the human again") from error
+        raise ValueError(
+            f"the body's file {str(path)!r} is damaged ({error!s:.160}); generate the human again"
+        ) from error
     if fault is not None:
         raise ValueError(f"the field {fault!r} of {str(path)!r} holds impossible values; generate the human again")
     return model

@@ -134,6 +134,10 @@ def payload_in(human: HumanTensors, name: str) -> HumanPayload:
         check_shapes(name, arrays, shapes, {})
         if wrong := [field for field, values in arrays.items() if not np.isfinite(values).all()]:
             raise ValueError(f"{wrong[0]!r} holds NaN or infinite numbers")
+        if wrong := [field for field, values in arrays.items() if np.abs(values).max() > compact_human.LARGEST_VALUE]:
+            raise ValueError(f"{wrong[0]!r} holds impossible values")
+        if arrays["density"].min(initial=0) < 0:
+            raise ValueError("'density' holds impossible values")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name!r} is damaged ({error!s:.120}); {_REMEDY}") from error
     return HumanPayload(**{"rest_half_extent": None, **arrays})
@@ -168,7 +172,7 @@ def compacted(human: HumanTensors) -> HumanTensors:
     try:
         rgb, density, scales = compact_human.compact(*(_loaded(*human.arrays[name]) for name in _EIGHT_BIT))
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"the human's file is damaged ({error}); {_REMEDY}") from error
+        raise ValueError(f"the human's file is damaged ({error!s:.160}); {_REMEDY}") from error
     arrays = {
         name: ("U8", array.shape, array.tobytes()) for name, array in zip(_EIGHT_BIT, (rgb, density), strict=True)
     }
@@ -199,21 +203,21 @@ def with_motion(human: HumanTensors, motion: HumanMotion | None) -> HumanTensors
     return HumanTensors(metadata, arrays)
 
 
-def motion_in(human: HumanTensors) -> HumanMotion | None:
-    """The motion in a file, if any. Raises ValueError where it is damaged."""
+def motion_in(human: HumanTensors, name: str) -> HumanMotion | None:
+    """The motion in a file of this name, if any. Raises ValueError where it is damaged."""
     if "motion" not in human.metadata:
         return None
     try:
         fps = float(parse_json(human.metadata["motion"])["fps"])
         arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ValueError(f"the motion in the .human file is damaged ({error}); {_REMEDY}") from error
+        raise ValueError(f"the motion in {name!r} is damaged ({error!s:.80}); {_REMEDY}") from error
     frames = len(arrays[0])
     for array, shape in zip(arrays, _MOTION.values(), strict=True):
         if array.shape != tuple(frames if s == "F" else s for s in shape) or not np.isfinite(array).all():
-            raise ValueError(f"the motion in the .human file is damaged; {_REMEDY}")
+            raise ValueError(f"the motion in {name!r} is damaged; {_REMEDY}")
     if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
-        raise ValueError(f"the motion in the .human file has frames out of order; {_REMEDY}")
+        raise ValueError(f"the motion in {name!r} has frames out of order; {_REMEDY}")
     return HumanMotion(*arrays, fps)
 
 

@@ -108,7 +108,7 @@ def _read(path: Path) -> HumanFile:
     try:
         meta = parse_json(str(_scalar(arrays, "meta", path)))
     except ValueError as error:
-        raise HumanNpzError(f"the field 'meta' of {path.name!r} is not JSON ({error}); {_REMEDY}") from error
+        raise HumanNpzError(f"the field 'meta' of {path.name!r} is not JSON ({error!s:.160}); {_REMEDY}") from error
     density = meta.get("full_density", 1) if isinstance(meta, dict) else None
     if isinstance(density, bool) or not isinstance(density, int | float) or not density > 0:
         raise HumanNpzError(f"the field 'meta' of {path.name!r} holds no provenance, or no full density; {_REMEDY}")

@@ -65,7 +65,7 @@ def read_grid(path: Path) -> MergedGrid:
         if faulty or not stored["voxel"] > 0:
             raise ArrayFileError(f"{(faulty or ['voxel'])[0]!r} holds NaN or impossible numbers")
     except ArrayFileError as error:
-        raise ValueError(f"the merged grid {path.name!r} is damaged ({error}); merge again") from error
+        raise ValueError(f"the merged grid {path.name!r} is damaged ({error!s:.160}); merge again") from error
     return MergedGrid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
 
 

@@ -62,7 +62,7 @@ def read_proxy(path: Path) -> ProxyMesh:
         arrays = read_arrays(path, ("format_version", "joint_names", *_SHAPES))
         check_shapes(path, arrays, _SHAPES, sizes)
     except ArrayFileError as error:
-        raise ValueError(f"the mesh {path.name!r} is damaged ({error}); export again") from error
+        raise ValueError(f"the mesh {path.name!r} is damaged ({error!s:.160}); export again") from error
     names = tuple(str(name) for name in arrays["joint_names"].ravel())
     if str(arrays["format_version"]) != str(_FORMAT_VERSION) or names != JOINT_NAMES:
         raise ValueError(f"the mesh {path.name!r} is of another version: use an add-on and a backend of one release")

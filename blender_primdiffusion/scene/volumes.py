@@ -228,7 +228,7 @@ def openvdb() -> ModuleType:
 def write_error(folder: Path, error: BaseException) -> VolumeWriteError:
     """For errors of the system and of openvdb."""
     return VolumeWriteError(
-        f"the volumes could not be written to {str(folder)!r} ({error}); save the .blend in a folder with "
+        f"the volumes could not be written to {str(folder)!r} ({error!s:.160}); save the .blend in a folder with "
         "write permission and free space"
     )
 

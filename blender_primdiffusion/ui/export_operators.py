@@ -345,7 +345,7 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
         path = Path(bpy.path.abspath(self.filepath))
         if not self.filepath or not path.is_file():
             raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
-        motion_in(read_tensors(path))
+        motion_in(read_tensors(path), path.name)
         at = tuple(self.location) if self.properties.is_property_set("location") else None
         return submit(self, context, ImportHumanJob(str(path), at))
 

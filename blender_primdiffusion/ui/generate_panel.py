@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import random
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
-from ..backend.requests import sentence
+from ..backend.requests import in_words, sentence
 from ..formats import requests
 from ..jobs.follow import Reporting, submit
 from ..jobs.memory import device_line
@@ -20,6 +21,7 @@ from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked,
 from .backend_state import draw_set_up
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
 from .manual import draw_manual_button
+from .presets import read_preset
 from .render_panel import draw_engines
 from .translations import CONTEXT
 
@@ -209,19 +211,29 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
 
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        """A preset may ask for attributes that the checkpoint lacks; the settings before them are applied."""
+    def execute(self, context: bpy.types.Context) -> set[str]:
+        """A preset may ask for attributes that the checkpoint lacks: then nothing is applied."""
         path = Path(self.filepath)
+        name, before = bpy.path.display_name(path.name), []
         try:
-            bpy.utils.execfile(str(path))
+            for names, value in read_preset(path):
+                if f"settings.{'.'.join(names)}" not in PRIMDIFFUSION_OT_add_generate_preset.preset_values:
+                    raise ValueError(f"it sets {'.'.join(names):.40}")
+                holder = functools.reduce(getattr, names[:-1], context.scene.primdiffusion)
+                before.append((holder, names[-1], getattr(holder, names[-1])))
+                setattr(holder, names[-1], value)
         except OSError as error:
-            self.report({"ERROR"}, f"The preset cannot be read: {error}. Choose another one")
+            self.report({"ERROR"}, f"The preset cannot be read: {in_words(error)}. Choose another one")
             return {"CANCELLED"}
-        except (TypeError, AttributeError, SyntaxError) as error:
-            name = bpy.path.display_name(path.name)
-            self.report({"ERROR"}, f"The preset {name!r} does not match this checkpoint or version: {error}. Remove it")
+        except (TypeError, AttributeError, ValueError, OverflowError) as error:
+            for holder, setting, value in reversed(before):
+                setattr(holder, setting, value)
+            reason = sentence(f"{error!s:.120}")
+            self.report(
+                {"ERROR"}, f"The preset {name!r} does not match this checkpoint or version: {reason} Remove it"
+            )
             return {"CANCELLED"}
-        PRIMDIFFUSION_PT_generate_presets.bl_label = bpy.path.display_name(path.name)
+        PRIMDIFFUSION_PT_generate_presets.bl_label = name
         return {"FINISHED"}
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..backend.requests import sentence
+from ..backend.requests import in_words, sentence
 from ..formats.removing import OutsideFolderError, remove_file
 from ..jobs.follow import Reporting, submit
 from ..jobs.late_volumes import late_volumes
@@ -43,7 +43,7 @@ class _Find:
                 bpy.ops.ed.undo_push(message="Find Missing Volumes")
             restored, left = self._restore(context, directory)
         except OSError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, in_words(error))
             return {"CANCELLED"}
         finally:
             look()
@@ -162,7 +162,7 @@ files that share the folder, may need them"""
                 remove_file(path, humans_folder())
                 removed += 1
             except (OSError, OutsideFolderError) as error:
-                self.report({"WARNING"}, f"{str(path)!r} could not be removed ({error})")
+                self.report({"WARNING"}, f"{str(path)!r} could not be removed ({error!s:.160})")
         self.report({"INFO"}, f"Removed {removed} files ({size / 1e6:.1f} MB) from {str(humans_folder())!r}")
         return {"FINISHED"}
 

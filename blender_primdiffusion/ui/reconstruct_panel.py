@@ -91,6 +91,8 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
         subject = self.subject or ("" if self.directory else asked.subject)  # the panel's belongs to its own folder
         if not folder:
             raise ValueError("choose the folder of captures first")
+        if not Path(folder).is_dir():
+            raise FileNotFoundError(f"there is no folder {folder!r:.200}: choose one of captures")
         frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
         return submit(self, context, ReconstructJob(folder, subject, frame, views))
 

@@ -18,6 +18,7 @@ import synthetic
 import synthetic_shape
 from exporting import write_person
 from jobs_driven import drive
+from scene_state import state
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.generate import GenerateJob
@@ -27,27 +28,10 @@ from blender_primdiffusion.scene.human import armature_of, body_of, humans
 
 ELSEWHERE = {"open_manual", "repair_backend", "test_backend", "set_up_backend", "make_pose_assets", "copy_diagnostics"}
 """Open a browser, set up, write a library or a text: whatever is in the scene, it stays as it is."""
-_BLENDER_LISTS = {"window_managers", "workspaces", "screens", "texts", "palettes", "brushes", "libraries", "all_ids"}
-"""Blender's own, or where an operator says something. A linked person's library is one of theirs."""
 
 
 def operators() -> list[str]:
     return dir(bpy.ops.primdiffusion)
-
-
-def everything() -> dict[str, set[str]]:
-    kinds = [prop.identifier for prop in bpy.data.bl_rna.properties if prop.type == "COLLECTION"]
-    return {kind: {obj.name_full for obj in getattr(bpy.data, kind)} for kind in kinds if kind not in _BLENDER_LISTS}
-
-
-def state() -> tuple:
-    """What a rejected operator must leave as it was."""
-    active = bpy.context.view_layer.objects.active
-    selected = sorted(obj.name for obj in bpy.context.view_layer.objects.selected)
-    places = {obj.name: [list(row) for row in obj.matrix_basis] for obj in bpy.data.objects}
-    paths = {volume.name: volume.filepath for volume in bpy.data.volumes}
-    marks = {c.name: {key: str(c[key]) for key in c.keys()} for c in bpy.data.collections}  # noqa: SIM118
-    return everything(), active and (active.name, active.mode), selected, places, paths, marks
 
 
 def fault(name: str) -> str:

@@ -60,7 +60,7 @@ class Attack:
     def __init__(self, folder: Path, forks: Forks, seed: int, names: Collection[str] = ()) -> None:
         """`names` of the programs; all if there are none."""
         self._folder, self._forks, self.rng = folder, forks, random.Random(seed)
-        self.inputs = Inputs(folder, forks)
+        self.inputs = Inputs(folder)
         self.programs = [one for one in all_programs(self.inputs) if not names or one.name in names]
         self._known: dict[str, Undisturbed] = {}
         self.outcome = Outcome()

@@ -1,8 +1,8 @@
 """Command lines of the backend in processes forked from one that has imported it, so that each starts at once.
 
 `python -m chaos.forks` reads one JSON object per line: `arguments` of `primdiffusion`, `small`
-(the test module that makes its settings small), `death` (see `Death`) and `file_limit`. It answers with the process's
-id, and at its end with `Ended`.
+(the test module that makes its settings small), `death` (see `Death`), `file_limit` and `request`. It answers with the
+process's id, and at its end with `Ended`.
 """
 
 from __future__ import annotations
@@ -15,9 +15,10 @@ import random
 import signal
 import subprocess
 import sys
+import threading
 import time
 import traceback
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,8 +71,12 @@ class Forks:
         small: str = "",
         death: Death | None = None,
         file_limit: int | None = None,
+        request: Mapping[str, Any] | None = None,
     ) -> Ended:
-        """Run a command line to its end, or to its death. Writing beyond `file_limit` bytes of a file fails."""
+        """Run a command line to its end, or to its death. Writing beyond `file_limit` bytes of a file fails.
+
+        `request` of JSON-RPC is what `serve` is asked; it ends with the answer, and exit code 1 for an error.
+        """
         death = death or Death()
         began = time.monotonic()
         pid = self._ask(
@@ -79,6 +84,7 @@ class Forks:
             small=small,
             death=dataclasses.asdict(death),
             file_limit=file_limit,
+            request=request,
         )
         if death.seconds is not None:
             time.sleep(death.seconds)
@@ -153,8 +159,8 @@ def _import_all() -> None:
     from primdiffusion.machine import share_processors
 
     share_processors()
-    lazily = ("commands.session", "commands.output", "people.folder", "people.payloads", "people.assets",
-              "encoder.model", "training.captured_people", "training.refine", "export.proxy",
+    lazily = ("commands.session", "commands.output", "commands.frame_drawer", "people.folder", "people.payloads",
+              "people.assets", "encoder.model", "training.captured_people", "training.refine", "export.proxy",
               "export.merged_file", "capture.dataset", "capture.sheet", "render.march")  # fmt: skip
     for module in (*(path.partition(":")[0] for path, _ in COMMANDS.values()), *lazily):
         importlib.import_module(f"primdiffusion.{module}")
@@ -162,13 +168,19 @@ def _import_all() -> None:
         importlib.import_module(module)
 
 
-def _run(output: int, arguments: list[str], small: str, death: dict[str, Any], file_limit: int | None) -> None:
+def _run(
+    output: int,
+    arguments: list[str],
+    small: str,
+    death: dict[str, Any],
+    file_limit: int | None,
+    request: dict[str, Any] | None,
+) -> None:
     """In the forked process: never returns."""
     code = 70
     try:
         for descriptor in (1, 2):
             os.dup2(output, descriptor)
-        os.close(output)
         sys.stdin = open(os.devnull)  # noqa: SIM115
         os.dup2(sys.stdin.fileno(), 0)
         if small:
@@ -176,6 +188,8 @@ def _run(output: int, arguments: list[str], small: str, death: dict[str, Any], f
         operations = _prepare_death(Death(**death))
         if file_limit is not None:
             _limit_files(file_limit)
+        if request is not None:
+            _ask_server(request, output, operations)
         code = _main(arguments)
         sys.stderr.flush()
         print(f"{COUNTED}{len(operations)}")
@@ -185,6 +199,31 @@ def _run(output: int, arguments: list[str], small: str, death: dict[str, Any], f
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(code)
+
+
+def _ask_server(request: dict[str, Any], output: int, operations: list[int]) -> None:
+    """Let `serve` find a client on descriptors 0 and 1, which asks, and ends the process with the answer."""
+    questions, asked = os.pipe()
+    answered, answers = os.pipe()
+    os.dup2(questions, 0)
+    os.dup2(answers, 1)
+    with open(os.devnull, "w") as nothing:  # tracebacks of errors that are sentences for the user
+        os.dup2(nothing.fileno(), 2)
+
+    def converse() -> None:
+        with open(answered, encoding="utf-8") as lines:
+            for message in map(json.loads, lines):
+                if message.get("id") != 1:
+                    continue
+                error = message.get("error")
+                if error is not None:
+                    sentence = ": ".join(filter(None, (error["message"], error.get("data", {}).get("remedy"))))
+                    os.write(output, f"primdiffusion: {sentence}\n".encode())
+                os.write(output, f"{COUNTED}{len(operations)}\n".encode())
+                os._exit(int(error is not None))
+
+    threading.Thread(target=converse, daemon=True).start()
+    os.write(asked, json.dumps({"jsonrpc": "2.0", "id": 1, **request}).encode() + b"\n")
 
 
 def _main(arguments: list[str]) -> int:

@@ -16,7 +16,7 @@ from chaos.results import differences, files_of, half_written, leftovers, size_o
 
 PAGE = 4096
 ROOMY = 1 << 30
-LONGEST_SENTENCE = 500
+LONGEST_SENTENCE = 300
 
 
 class Disk:
@@ -63,7 +63,7 @@ def fill_and_repeat(whole: Undisturbed, forks: Forks, rng: random.Random, folder
         whole.program.prepare(out)
         given = set(files_of(out))
         disk.resize(_used(disk.folder) + int(rng.uniform(0, 1) * (size_of(whole.folder) + PAGE)))
-        ended = forks.run(whole.program.arguments(out), whole.program.small)
+        ended = whole.program.run(forks, out)
         if ended.exit_code == 0:
             return False
         wrong = complaints(ended)
@@ -79,7 +79,7 @@ def limit_and_repeat(whole: Undisturbed, forks: Forks, rng: random.Random, out: 
     whole.program.prepare(out)
     given = set(files_of(out))
     limit = int(rng.uniform(0, 1) * whole.largest)
-    ended = forks.run(whole.program.arguments(out), whole.program.small, file_limit=limit)
+    ended = whole.program.run(forks, out, file_limit=limit)
     if ended.exit_code:
         tally.add(
             1, complaints(ended) + _left_behind(whole, out, given) + _repeat(whole, forks, out), whole.program.name
@@ -108,7 +108,7 @@ def _left_behind(whole: Undisturbed, out: Path, given: set[str]) -> list[str]:
 
 
 def _repeat(whole: Undisturbed, forks: Forks, out: Path) -> list[str]:
-    ended = forks.run(whole.program.arguments(out), whole.program.small)
+    ended = whole.program.run(forks, out)
     if ended.exit_code:
         return [f"with room it fails, too: {ended.log[-300:]}"]
     return differences(out, whole.folder)

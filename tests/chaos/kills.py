@@ -47,7 +47,7 @@ class Undisturbed:
 def undisturbed(program: Program, forks: Forks, folder: Path) -> Undisturbed:
     """Run a program to its end in a new folder. Raises AssertionError if it fails."""
     program.prepare(folder)
-    run = forks.run(program.arguments(folder), program.small)
+    run = program.run(forks, folder)
     assert run.exit_code == 0, f"{program.name}: {run.log}"
     return Undisturbed(program, folder, run)
 
@@ -58,7 +58,7 @@ def kill_and_repeat(whole: Undisturbed, forks: Forks, rng: random.Random, out: P
     program.prepare(out)
     for _ in range(rng.randint(1, MOST_IN_A_ROW)):
         death = random_death(rng, whole.run, whole.largest)
-        ended = forks.run(program.arguments(out), program.small, death)
+        ended = program.run(forks, out, death)
         if ended.exit_code >= 0:
             if ended.exit_code:
                 wrong.append(f"after {len(deaths)} deaths it failed: {ended.log[-300:]}")
@@ -69,7 +69,7 @@ def kill_and_repeat(whole: Undisturbed, forks: Forks, rng: random.Random, out: P
         tally.add(len(deaths), wrong, program.name)
         shutil.rmtree(out)
         return
-    ended = forks.run(program.arguments(out), program.small)
+    ended = program.run(forks, out)
     if ended.exit_code:
         wrong.append(f"it did not go on: {ended.log[-300:]}")
     else:

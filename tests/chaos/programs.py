@@ -6,17 +6,20 @@ import dataclasses
 import functools
 import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from capture_scenes import save_person, small_job
-from chaos.forks import Forks
+from chaos.forks import Death, Ended, Forks
 from diffusion_people import small_model, write_people
 from primdiffusion.capture.render import render
 from primdiffusion.diffusion.checkpoint import save_checkpoint
+from primdiffusion.human import generate
+from primdiffusion.human_file import save_human
 from released_files import TINY, random_network, save_body, save_released, state, template
 from tiny_encoder import save_tiny_encoder
-from tiny_model import save_tiny_checkpoint
+from tiny_model import save_tiny_checkpoint, tiny_model
 
 Words = Sequence[str | Path]
 ASSETS = "PRIMDIFFUSION_ASSETS"
@@ -35,6 +38,13 @@ class Program:
     """Returns a folder that the command works in, copied to the output folder first."""
     resumes: bool = False
     """Keeps what is finished when it fails, and goes on from there; other commands leave all files or none."""
+    request: Callable[[Path], Mapping[str, Any]] | None = None
+    """What `serve` is asked for, of an output folder."""
+
+    def run(self, forks: Forks, out: Path, death: Death | None = None, file_limit: int | None = None) -> Ended:
+        """Run it in an output folder."""
+        request = None if self.request is None else self.request(out)
+        return forks.run(self.arguments(out), self.small, death, file_limit, request)
 
     def prepare(self, out: Path) -> None:
         """Make the output folder."""
@@ -53,8 +63,8 @@ def makehuman() -> Path | None:
 class Inputs:
     """Inputs of the commands; each is made when it is first needed."""
 
-    def __init__(self, folder: Path, forks: Forks) -> None:
-        self.folder, self._forks = folder, forks
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
 
     @functools.cached_property
     def checkpoint(self) -> Path:
@@ -105,8 +115,8 @@ class Inputs:
         """A generated human."""
         path = self.folder / f"human{seed}" / "person.human.safetensors"
         if not path.exists():
-            made = self._forks.run(["generate", "--seed", str(seed), *self.sampled, "--out", path.parent])
-            assert made.exit_code == 0, made.log
+            path.parent.mkdir()
+            save_human(path, generate(tiny_model(), seed, 2))
         return path
 
     @property
@@ -199,7 +209,59 @@ def all_programs(given: Inputs) -> list[Program]:
                          given.released / "SMPL_NEUTRAL.pkl", "--uv", given.released / "smpl_uv.obj", "--out",
                          out / "model.safetensors", "--report", out / "report.json"],
         ),
+        *served(given),
         *_made_of_assets(makehuman()),
+    ]  # fmt: skip
+
+
+def served(given: Inputs) -> list[Program]:
+    """Every request of the child that writes files."""
+
+    def asked(method: str, params: Callable[[Path], Mapping[str, Any]], resumes: bool = False) -> Program:
+        def request(out: Path) -> dict[str, Any]:
+            named = {name: str(value) if isinstance(value, Path) else value for name, value in params(out).items()}
+            return {"method": method, "params": named}
+
+        return Program(f"serve {method}", lambda _out: ["serve"], resumes=resumes, request=request)
+
+    def sampled(method: str, params: Callable[[], Mapping[str, Any]]) -> Program:
+        small = {"steps": 2, "size": 16}
+        return asked(method, lambda out: {**small, "checkpoint": given.checkpoint, "out_dir": out / "new", **params()})
+
+    def posed(*seeds: int) -> list[dict[str, Any]]:
+        still = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]]
+        return [{"human": str(given.human(seed)), "object": still, "joints": [still] * 24} for seed in seeds]
+
+    return [
+        sampled("generate", lambda: {"seed": 1, "picture_px": 8}),
+        sampled("variations", lambda: {"seeds": [1, 2]}),
+        sampled("vary", lambda: {"person": given.human(1), "seed": 3}),
+        sampled("interpolate", lambda: {"person": given.human(1), "other": given.human(2)}),
+        sampled("inpaint", lambda: {"person": given.human(1), "region": ["head"]}),
+        sampled("transfer", lambda: {"person": given.human(1), "source": given.human(2), "region": ["head"]}),
+        asked(
+            "reconstruct",
+            lambda out: {"capture": given.captures, "subject": "person_000000", "views": 2, "size": 16,
+                         "checkpoint": given.encoder, "out_dir": out / "new"},
+        ),
+        asked("human_npz", lambda out: {"person": given.human(1), "out_dir": out / "new", "size": 16}),
+        asked(
+            "render",
+            lambda out: {"human": given.human(1), "out": out / "a.png", "depth": out / "b.png", "width": 32,
+                         "height": 32},
+        ),
+        asked("merge", lambda out: {"people": posed(1, 2), "out": out / "merged.npz", "voxel": 0.05}),
+        asked(
+            "merge_frames",
+            lambda out: {"people": posed(1, 1), "out_dir": out / "new", "voxel": 0.05},
+            resumes=True,
+        ),
+        asked(
+            "proxy",
+            lambda out: {"person": given.human(1), "out_dir": out / "new", "triangles": 500, "texture_px": 64,
+                         "spacing": 0.03},
+        ),
+        asked("gaussians", lambda out: {"person": given.human(1), "out": out / "a.ply", "limit": 100}),
     ]  # fmt: skip
 
 

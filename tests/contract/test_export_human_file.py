@@ -57,12 +57,12 @@ def test_boxes_of_another_body_are_rejected(saved):
 
 def test_a_motion_comes_back_as_it_was_and_can_be_taken_away(saved, tmp_path):
     write_tensors(tmp_path / "b.human", with_motion(read_tensors(saved), walk()))
-    found = motion_in(read_tensors(tmp_path / "b.human"))
+    found = motion_in(read_tensors(tmp_path / "b.human"), "b.human")
     assert found is not None
     assert found.fps == 24.0
     assert np.array_equal(found.translations, walk().translations)
     write_tensors(tmp_path / "c.human", with_motion(read_tensors(tmp_path / "b.human"), None))
-    assert motion_in(read_tensors(tmp_path / "c.human")) is None
+    assert motion_in(read_tensors(tmp_path / "c.human"), "c.human") is None
 
 
 @pytest.mark.parametrize("damage", ["fps", "order", "shape"])
@@ -76,7 +76,7 @@ def test_a_damaged_motion_is_rejected_with_a_sentence(saved, damage):
     if damage == "fps":
         human.metadata["motion"] = '{"fps": "fast"}'
     with pytest.raises(ValueError, match="export the human again"):
-        motion_in(human)
+        motion_in(human, "b.human")
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff" * 40, b"\x02\0\0\0\0\0\0\0[]", b"\x02\0\0\0\0\0\0\0{}"])

@@ -1,8 +1,11 @@
-"""Fuzz every reader: python -m fuzz --minutes 10, with tests in PYTHONPATH (`make fuzz`). Prints the counts as JSON."""
+"""Fuzz every reader: `python -m tests.fuzz --minutes 10` (`make fuzz`). Prints the counts as JSON."""
 
 import argparse
 import json
 import sys
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fuzz.run import FINDINGS, run
 
@@ -15,8 +18,6 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of the name of a kind of input")
     arguments = parser.parse_args()
     report = run(arguments.seed, arguments.inputs, minutes=arguments.minutes, only=arguments.only)
-    for finding in report.findings:
-        print(finding)
     print(json.dumps(report.figures()))
     if report.findings:
         sys.exit(f"{len(report.findings)} findings: their inputs are in {FINDINGS}")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import os
@@ -16,10 +17,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
-LONGEST_SENTENCE = 600
-"""Characters beside the path; most are far shorter."""
-LONGEST_CPU_S, LONGEST_WALL_S = 2.0, 30.0
+LONGEST_SENTENCE = 300
+"""Characters without the folder of the file, which is the user's."""
+LONGEST_TOTAL_CPU_S, LONGEST_WALL_S = 30.0, 180.0
+"""After so much work, or so long a silence, the process is ended: what waits for ever works on nothing."""
 MOST_MEMORY_MB = 500.0
 PROGRAMS = ("os.system", "os.exec", "os.posix_spawn", "os.spawn", "subprocess.Popen", "pty.spawn", "socket.connect")
 """Audit events of code that a file has made run."""
@@ -35,6 +38,11 @@ class Report:
 
     counts: Counter[str] = dataclasses.field(default_factory=Counter)
     findings: list[str] = dataclasses.field(default_factory=list)
+
+    def find(self, what: str) -> None:
+        """Keep a finding, and print it."""
+        self.findings.append(what)
+        print(what, flush=True)
 
     def figures(self) -> dict[str, int]:
         """As benchmarks/faults.py records them."""
@@ -58,31 +66,35 @@ def _run_child(report: Report, seed: int, first: int, last: int, end: float | No
     with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as child:
         assert child.stdout is not None
         os.set_blocking(child.stdout.fileno(), False)
-        heard, rest = time.monotonic() + 60, b""  # loading torch and bpy takes a while
+        heard, worked, rest = time.monotonic(), 0.0, b""
+        loads = True  # torch and bpy, or what is not damaged
         while True:
             text = child.stdout.read() or b""
             *lines, rest = (rest + text).split(b"\n")
             for message in map(json.loads, lines):
-                heard = time.monotonic()
+                heard, worked, loads = time.monotonic(), _cpu_s(child.pid), "loads" in message
                 now = message["number"]
                 if "outcome" in message:
                     now += 1
                     report.counts["inputs"] += 1
                     _note(report, message)
             over = end is not None and time.monotonic() > end
-            if over or child.poll() is not None or time.monotonic() - heard > LONGEST_WALL_S:
+            silent = time.monotonic() - heard > LONGEST_WALL_S * (1 + loads)
+            if over or silent or child.poll() is not None:
+                break
+            if not loads and _cpu_s(child.pid) - worked > LONGEST_TOTAL_CPU_S:
                 break
             time.sleep(0.05)
         ended = child.poll()
         child.kill()
     if over or ended == 0:
         return now
+    if loads and ended is not None:
+        raise RuntimeError(f"input {now}: the process ended ({ended}) before a damaged file was read")
     report.counts["inputs"] += 1
     outcome = "hangs" if ended is None else "tracebacks"
     report.counts[outcome] += 1
-    report.findings.append(
-        f"{outcome}: seed {seed}, input {now}{f' of {only}' if only else ''}: the process ended ({ended})"
-    )
+    report.find(f"{outcome}: seed {seed}, input {now}{f' of {only}' if only else ''}: the process ended ({ended})")
     return now + 1
 
 
@@ -90,7 +102,7 @@ def _note(report: Report, message: dict[str, Any]) -> None:
     for outcome in message["outcome"]:
         report.counts[outcome] += 1
         if outcome not in ("read", "sentences"):
-            report.findings.append(f"{outcome}: {message['what']}")
+            report.find(f"{outcome}: {message['what']}")
 
 
 def damaged(target: Any, content: bytes, seed: int, number: int) -> bytes:
@@ -106,18 +118,20 @@ def damaged(target: Any, content: bytes, seed: int, number: int) -> bytes:
 
 
 def _serve(seed: int, first: int, last: int, only: str) -> None:
-    from fuzz.targets import TARGETS, Garbage, said
+    from fuzz.target import in_turn
+    from fuzz.targets import TARGETS
 
     events: list[str] = []
     sys.addaudithook(lambda event, _: events.append(event) if event in PROGRAMS else None)
-    targets = [target for target in TARGETS if only in target.name]
+    targets = in_turn([target for target in TARGETS if only in target.name])
     with tempfile.TemporaryDirectory() as temporary:
         os.chdir(temporary)
         valid: dict[str, tuple[Path, bytes]] = {}
         for number in range(first, last):
             target = targets[number % len(targets)]
             if target.name not in valid:
-                folder = Path(temporary, str(targets.index(target)))
+                _say(number=number, loads=True)
+                folder = Path(temporary, str(number))
                 folder.mkdir()
                 path = target.make(folder)
                 target.read(path)  # what is not damaged is read
@@ -125,37 +139,15 @@ def _serve(seed: int, first: int, last: int, only: str) -> None:
             path, content = valid[target.name]
             _say(number=number)
             path.write_bytes(damaged(target, content, seed, number))
-            outcome, what = [], f"{target.name}, seed {seed}, input {number}"
+            what = f"{target.name}, seed {seed}, input {number}"
             events.clear()
-            before, memory = time.process_time(), _peak_mb()
-            try:
-                target.read(path)
-                outcome.append("read")
-            except Garbage as error:
-                outcome, what = ["garbage"], f"{what}: {error}"
-            except Exception as error:
-                sentence = said(error)
-                if sentence is None:
-                    where = traceback.extract_tb(error.__traceback__)[-1]
-                    outcome.append("tracebacks")
-                    place = f"{Path(where.filename).name}:{where.lineno}"
-                    what = f"{what}: {type(error).__name__}: {str(error)[:150]} ({place})"
-                elif len(sentence) > LONGEST_SENTENCE + len(str(path)) or "\n" in sentence:
-                    outcome, what = (
-                        ["tracebacks"],
-                        f"{what}: a sentence of {len(sentence)} characters: {sentence[:150]}",
-                    )
-                else:
-                    outcome.append("sentences")
-            if time.process_time() - before > LONGEST_CPU_S:
-                outcome.append("hangs")
-                what += f" ({time.process_time() - before:.1f} s)"
-            if _peak_mb() - memory > MOST_MEMORY_MB:
-                outcome.append("over_500mb")
-                what += f" ({_peak_mb() - memory:.0f} MB)"
+            outcome, about = _outcome(target, path)
+            if set(outcome) & {"hangs", "over_500mb"}:  # once more alone: another program may have slowed it down
+                outcome, about = _outcome(target, path)
             if events or Path("CANARY").exists():
                 outcome.append("executions")
-                what += f" ({events})"
+                about += f" ({events})"
+            what += f": {about}"
             if set(outcome) - {"read", "sentences"}:
                 FINDINGS.mkdir(exist_ok=True)
                 (FINDINGS / f"{target.name.replace(' ', '_')}_{seed}_{number}{path.suffix}").write_bytes(
@@ -165,6 +157,44 @@ def _serve(seed: int, first: int, last: int, only: str) -> None:
             _say(number=number, outcome=outcome, what=what)
 
 
+def _outcome(target: Any, path: Path) -> tuple[list[str], str]:
+    """What came of reading a damaged file, and more about it."""
+    from fuzz.target import Garbage, said
+
+    outcome, about = ["read"], ""
+    before, memory = time.process_time(), _peak_mb()
+    try:
+        target.read(path)
+    except Garbage as error:
+        outcome, about = ["garbage"], str(error)
+    except Exception as error:
+        sentence = said(error)
+        if sentence is None:
+            where = traceback.extract_tb(error.__traceback__)[-1]
+            place = f"{Path(where.filename).name}:{where.lineno}"
+            outcome, about = ["tracebacks"], f"{type(error).__name__}: {str(error)[:150]} ({place})"
+        else:
+            outcome, about = ["sentences"], sentence
+            if fault := _fault_of(sentence, path, target.is_file):
+                outcome, about = ["tracebacks"], f"{fault}: {sentence}"
+    seconds, grown = time.process_time() - before, _peak_mb() - memory
+    if seconds > target.seconds:
+        outcome, about = [*outcome, "hangs"], f"{about} ({seconds:.1f} s)"
+    if grown > MOST_MEMORY_MB:
+        outcome, about = [*outcome, "over_500mb"], f"{about} ({grown:.0f} MB)"
+    return outcome, about
+
+
+def _fault_of(sentence: str, path: Path, is_file: bool) -> str:
+    """What is wrong with the sentence for a damaged file; empty if nothing."""
+    length = len(sentence.replace(f"{path.parent}{os.sep}", ""))
+    if length > LONGEST_SENTENCE or "\n" in sentence:
+        return f"a sentence of {length} characters"
+    if is_file and not any(name in sentence for name in (path.name, str(path.parent))):
+        return "a sentence without the file"
+    return ""
+
+
 def _say(**message: Any) -> None:
     sys.__stdout__.write(json.dumps(message) + "\n")  # pyright: ignore[reportOptionalMemberAccess]
     sys.__stdout__.flush()  # pyright: ignore[reportOptionalMemberAccess]
@@ -172,6 +202,12 @@ def _say(**message: Any) -> None:
 
 def _peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+def _cpu_s(pid: int) -> float:
+    with contextlib.suppress(psutil.Error):
+        return sum(psutil.Process(pid).cpu_times()[:2])
+    return 0.0
 
 
 if __name__ == "__main__":

@@ -2,45 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
-from fuzz import mutations
-from fuzz.mutations import Mutation
-
-Read = Callable[[Path], None]
-
-
-class Garbage(AssertionError):
-    """A value that no reader should let through."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Target:
-    """A kind of input."""
-
-    name: str
-    make: Callable[[Path], Path]
-    """Writes a valid file into a folder and returns its path."""
-    mutations: Sequence[Mutation]
-    read: Read
-    """Reads the damaged file. Raises Garbage for values that should have been refused."""
-
-
-def finite(*values: Any) -> None:
-    """Raises Garbage for an array with NaN, infinities or numbers that no quantity here has."""
-    for value in values:
-        array = np.asarray(value.detach() if isinstance(value, torch.Tensor) else value)
-        if array.dtype.kind in "fc" and array.size and not (np.abs(array) < 1e12).all():
-            raise Garbage(f"{array.dtype} {array.shape} with {array.flat[np.abs(array).argmax()]}")
-
+from fuzz import data_targets, extension_targets, mutations, served
+from fuzz.target import Garbage, Target, finite, finite_members, said
 
 # --- humans and models
 
@@ -89,7 +60,7 @@ def read_npz(path: Path) -> None:
     from blender_primdiffusion.scene.human_npz import read_human as read
 
     found = read(path)
-    finite(*(value for value in vars(found).values() if isinstance(value, np.ndarray)))
+    finite_members(found)
 
 
 def make_checkpoint(folder: Path) -> Path:
@@ -123,10 +94,9 @@ def make_released(folder: Path) -> Path:
 
 
 def read_released(path: Path) -> None:
-    from primdiffusion.released.inventory import take_inventory
-    from primdiffusion.released.reading import read_weights
+    from primdiffusion.commands.import_released import read_released
 
-    take_inventory(read_weights(path))
+    read_released(path)
 
 
 # --- bodies, poses, motions
@@ -196,7 +166,7 @@ def read_pose_file(path: Path) -> None:
     from primdiffusion.pose_file import read_pose
 
     pose = read_pose(path)
-    finite(*(value for value in vars(pose).values() if isinstance(value, torch.Tensor)))
+    finite_members(pose)
 
 
 def read_own_pose(path: Path) -> None:
@@ -269,8 +239,7 @@ def read_glb_person(path: Path) -> None:
     from primdiffusion.capture.people_files import read_person
 
     person = read_person(path)
-    for part in person.mesh.parts:
-        finite(*(value for value in vars(part).values() if isinstance(value, np.ndarray)))
+    finite_members(*person.mesh.parts)
 
 
 _DATASET: dict[str, Path] = {}
@@ -317,7 +286,7 @@ def view_of(root: Path) -> None:
 
     captures = open_captures(root)
     view = captures.view(person_in(root).name, 0, 0)
-    finite(*(value for value in vars(view).values() if isinstance(value, np.ndarray)))
+    finite_members(view)
 
 
 def make_mhclo(folder: Path) -> Path:
@@ -337,7 +306,7 @@ def read_proxy(path: Path) -> None:
     from primdiffusion.people.mhclo import read_pair
 
     proxy, mesh = read_pair(path.with_suffix(".mhclo"), path.with_suffix(".obj"))
-    finite(*(value for one in (proxy, mesh) for value in vars(one).values() if isinstance(value, np.ndarray)))
+    finite_members(proxy, mesh)
 
 
 def make_picture(folder: Path) -> Path:
@@ -348,10 +317,9 @@ def make_picture(folder: Path) -> Path:
 
 
 def read_picture(path: Path) -> None:
-    from primdiffusion.geometry.pictures import opened_picture
+    from primdiffusion.capture.reader import read_picture
 
-    with opened_picture(path) as picture:
-        np.asarray(picture)
+    read_picture(path, "img", 24, 24)
 
 
 def make_grid(folder: Path) -> Path:
@@ -365,54 +333,10 @@ def read_merged(path: Path) -> None:
     from blender_primdiffusion.scene.merged import read_grid
 
     grid = read_grid(path)
-    finite(*(value for value in vars(grid).values() if isinstance(value, np.ndarray)))
+    finite_members(grid)
 
 
 # --- messages
-
-
-def make_request(folder: Path) -> Path:
-    attributes = {"outfit": "suit", "height": 1.7}
-    params = {"seed": 3, "steps": 4, "out_dir": "out", "size": 64, "guidance": 1.5, "attributes": attributes}
-    message = {"jsonrpc": "2.0", "id": 1, "method": "generate", "params": params}
-    (folder / "request.json").write_text(json.dumps(message))
-    return folder / "request.json"
-
-
-def make_draw(folder: Path) -> Path:
-    near = np.eye(4)[:3].tolist()
-    params = {
-        "frame": "a.frame", "width": 64, "height": 64, "intrinsics": [[100.0, 0, 32], [0, 100.0, 32], [0, 0, 1]],
-        "world_to_camera": near, "people": [{"human": "a.human.safetensors", "object": near, "joints": [near] * 24}],
-    }  # fmt: skip
-    (folder / "draw.json").write_text(json.dumps({"jsonrpc": "2.0", "id": 1, "method": "draw", "params": params}))
-    return folder / "draw.json"
-
-
-def other_method(content: bytes, rng: np.random.Generator) -> bytes:
-    """The same parameters for another method, some of them damaged."""
-    from primdiffusion.serve.server import REQUESTS
-
-    message = json.loads(content)
-    message["method"] = mutations.pick(rng, list(REQUESTS))
-    known = [field.name for field in dataclasses.fields(REQUESTS[message["method"]])]
-    for name in known:
-        if rng.random() < 0.7:
-            message["params"][name] = mutations.pick(rng, (*mutations.VALUES, 0.5, 3, "a.human.safetensors", ["face"]))
-    message["params"] = {
-        name: value for name, value in message["params"].items() if name in known or rng.random() < 0.1
-    }
-    return json.dumps(message).encode()
-
-
-def read_message(path: Path) -> None:
-    from primdiffusion.commands.request import read_request
-    from primdiffusion.serve.rpc import parse_request
-    from primdiffusion.serve.server import REQUESTS
-
-    request = parse_request(path.read_bytes())
-    if request.method in REQUESTS:
-        read_request(REQUESTS[request.method], request.params, request.method)
 
 
 def make_answer(folder: Path) -> Path:
@@ -456,18 +380,8 @@ TARGETS = (
     Target("obj", make_obj, mutations.TEXT, read_proxy),
     Target("picture", make_picture, mutations.PLAIN, read_picture),
     Target("merged grid", make_grid, mutations.NPZ, read_merged),
-    Target("request", make_request, (*mutations.JSON, other_method, other_method, other_method), read_message),
-    Target("draw request", make_draw, (*mutations.JSON, other_method), read_message),
-    Target("child's message", make_answer, mutations.JSON, read_answer),
+    Target("child's message", make_answer, mutations.JSON, read_answer, is_file=False),
+    *data_targets.TARGETS,
+    *extension_targets.TARGETS,
+    *served.TARGETS,
 )
-
-
-def said(error: BaseException) -> str | None:
-    """The sentence that a user reads for this error; None for one that is shown with a traceback."""
-    from primdiffusion.failures import describe
-    from primdiffusion.serve.rpc import RpcError
-
-    if isinstance(error, RpcError):
-        return str(error)
-    description = describe(error)
-    return None if description is None else str(description)

@@ -6,17 +6,24 @@ import json
 
 import numpy as np
 import pytest
+from primdiffusion.serve.server import REQUESTS
 
 from fuzz.mutations import JSON, as_json
 from fuzz.run import damaged, run
+from fuzz.served import CALLS
 from fuzz.targets import TARGETS
 
 
 def test_damaged_files_end_in_a_sentence_or_are_read():
-    report = run(seed=1, inputs=10 * len(TARGETS))
+    inputs = len(TARGETS)
+    report = run(seed=1, inputs=inputs)
     assert report.findings == []
-    assert report.counts["inputs"] == 10 * len(TARGETS)
-    assert report.counts["sentences"] > 3 * len(TARGETS)
+    assert report.counts["inputs"] == inputs
+    assert report.counts["sentences"] > inputs / 4
+
+
+def test_every_request_of_the_child_is_damaged():
+    assert set(CALLS) == {*REQUESTS, "hello", "cancel", "shutdown"}
 
 
 def test_a_seed_gives_the_same_damage():

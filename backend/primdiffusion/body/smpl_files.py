@@ -210,11 +210,11 @@ def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.
                 corners = {vertex: coordinate for vertex, coordinate in corner_numbers}
                 corner_of_face[frozenset(corners)] = corners
         coordinate_faces = [[corner_of_face[frozenset(face)][v] for v in face] for face in faces.tolist()]
+        return np.array(coordinates), np.array(coordinate_faces)
     except (ValueError, TypeError, IndexError, OverflowError) as error:
-        raise BodyFileError(f"{path} is not an OBJ with texture coordinates in every face ({error}).") from error
+        raise BodyFileError(f"{path} is not an OBJ with texture coordinates in every face ({error!s:.100}).") from error
     except KeyError as error:
         raise BodyFileError(
             f"{path} lacks a face of the body (vertices {sorted(error.args[0])}, counted from 0); "
             "use the OBJ made for this body."
         ) from error
-    return np.array(coordinates), np.array(coordinate_faces)

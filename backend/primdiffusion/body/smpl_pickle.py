@@ -104,7 +104,7 @@ def _find(module: str, name: str) -> type:
         return _GLOBALS[module, name]
     except KeyError:
         raise UnsafePickleError(
-            f"The pickle asks for the global {f'{module}.{name}':.80}, which a body model does not need, so nothing in "
+            f"it asks for the global {f'{module}.{name}':.80}, which a body model does not need, so nothing in "
             "it was run; take the file from its publisher again, or convert it to .npz where you trust it."
         ) from None
 
@@ -134,8 +134,10 @@ def load_restricted(data: bytes, name: str) -> object:
     """
     try:
         return load_pickle(data, _find)
+    except UnsafePickleError as error:
+        raise UnsafePickleError(f"{name}: {error}") from None
     except PickleError as error:
-        raise BodyFileError(f"{name} is not a whole pickle file ({error}); download it again.") from error
+        raise BodyFileError(f"{name} is not a whole pickle file ({error!s:.100}); download it again.") from error
 
 
 def array_of_objects(value: object) -> list[object]:

@@ -59,7 +59,7 @@ def subjects_of(command: Sequence[str]) -> list[str]:
     try:
         ran = subprocess.run([*command, *LIST], capture_output=True, text=True, check=False)
     except OSError as e:
-        raise FarmError(f"the renderer {command[0]!r} cannot be started ({e}): give its path") from e
+        raise FarmError(f"the renderer {command[0]!r} cannot be started ({e!s:.160}): give its path") from e
     listed = [parse_json(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
     if ran.returncode or not listed:
         raise FarmError(f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it printed nothing'}")
@@ -123,7 +123,9 @@ def _started(farm: Farm) -> Any:
     try:
         ray.init(address=farm.address or "local", include_dashboard=None if farm.address else False, **local)
     except (ConnectionError, RuntimeError, ValueError, OSError) as e:
-        raise FarmError(f"no Ray cluster at {farm.address or 'this machine'} ({e}): start one with `ray start`") from e
+        raise FarmError(
+            f"no Ray cluster at {farm.address or 'this machine'} ({e!s:.160}): start one with `ray start`"
+        ) from e
     return ray
 
 

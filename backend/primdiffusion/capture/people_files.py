@@ -65,7 +65,7 @@ class Glb:
         except GlbError:
             raise
         except (LookupError, TypeError, ValueError, OverflowError) as e:
-            raise GlbError(f"{self.path}: accessor {accessor} is damaged ({e}): export the file again") from e
+            raise GlbError(f"{self.path}: accessor {accessor} is damaged ({e!s:.160}): export the file again") from e
         rows = np.lib.stride_tricks.as_strided(raw, (count, number.itemsize * width), (stride, 1))
         values = np.ascontiguousarray(rows).view(number)
         if about.get("normalized") and number.kind in "iu":
@@ -85,7 +85,9 @@ class Glb:
             with opened_picture(io.BytesIO(data)) as picture:
                 return np.asarray(picture.convert("RGBA"))
         except (LookupError, TypeError, ValueError, OSError, OverflowError) as e:
-            raise GlbError(f"{self.path}: image {image} cannot be read ({e}): pack PNG or JPEG into the file") from e
+            raise GlbError(
+                f"{self.path}: image {image} cannot be read ({e!s:.160}): pack PNG or JPEG into the file"
+            ) from e
 
 
 def read_glb(path: str | Path) -> Glb:
@@ -110,7 +112,7 @@ def read_glb(path: str | Path) -> Glb:
             at += 8 + size
         content = parse_json(chunks[JSON_CHUNK])
     except (struct.error, KeyError, JsonError) as e:
-        raise GlbError(f"{path} is not a complete .glb file ({e}): write it again") from e
+        raise GlbError(f"{path} is not a complete .glb file ({e!s:.160}): write it again") from e
     if not isinstance(content, dict):
         raise GlbError(f"{path} contains no glTF object: write it again")
     return Glb(path, content, chunks.get(BINARY_CHUNK, b""))

@@ -124,7 +124,9 @@ def _read_plain(path: Path) -> dict[str, NDArray]:
             content = {"poses": content}
         return {key: np.asarray(content[key], np.float64) for key in KEYS if key in content}
     except (ValueError, TypeError, OSError, EOFError) as e:
-        raise MotionFileError(f"{path} is not a pose file ({e}): give axis-angle values as .npz, .npy or .json") from e
+        raise MotionFileError(
+            f"{path} is not a pose file ({e!s:.160}): give axis-angle values as .npz, .npy or .json"
+        ) from e
 
 
 def _turns(path: Path, content: Mapping[str, NDArray]) -> NDArray[np.float64]:
@@ -134,7 +136,7 @@ def _turns(path: Path, content: Mapping[str, NDArray]) -> NDArray[np.float64]:
         turns = body_theta(values).reshape(-1, J, 3)
     except (ValueError, TypeError) as e:
         raise MotionFileError(
-            f"{path} contains no poses ({e}): it needs {3 * J} axis-angle values per frame ({J} joints x 3, radians)"
+            f"{path} contains no poses ({e!s:.99}): it needs {3 * J} axis-angle values per frame ({J} x 3, radians)"
         ) from e
     if not len(turns) or not np.isfinite(turns).all():
         raise MotionFileError(f"{path} has no frames, or NaN or infinite values: export it again")

@@ -258,7 +258,7 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
-        raise CaptureFileError(f"{path} is not a complete image ({e}): render it again") from e
+        raise CaptureFileError(f"{path} is not a complete image ({e!s:.160}): render it again") from e
     raise CaptureFileError(f"{path} has {size[0]} x {size[1]} pixels, its camera {width} x {height}: render it again")
 
 
@@ -270,7 +270,7 @@ def _read_views(folder: Path) -> list[View]:
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
-        raise CaptureFileError(f"{path} cannot be read ({e}): render the subject again") from e
+        raise CaptureFileError(f"{path} cannot be read ({e!s:.160}): render the subject again") from e
     views = []
     try:
         for camera in range(len(named)):
@@ -286,7 +286,7 @@ def _read_views(folder: Path) -> list[View]:
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
         if isinstance(e, CaptureFileError):
             raise
-        raise CaptureFileError(f"{path} is not a list of cameras ({e}): render the subject again") from e
+        raise CaptureFileError(f"{path} is not a list of cameras ({e!s:.160}): render the subject again") from e
     if not views:
         raise CaptureFileError(f"{path} contains no camera: render the subject again")
     return views
@@ -301,7 +301,7 @@ def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
                 with opened_picture(path) as picture:
                     return picture.size
             except (OSError, ValueError) as e:
-                raise CaptureFileError(f"{path} is not a complete image ({e}): render it again") from e
+                raise CaptureFileError(f"{path} is not a complete image ({e!s:.160}): render it again") from e
     raise FileNotFoundError(f"{folder} has no images of camera {camera}: render the subject again")
 
 

@@ -61,7 +61,7 @@ def _read_pickled(path: Path) -> dict[str, np.ndarray]:
     except KeyError as e:
         raise ArrayFileError(f"{path} lacks {e}: render the subject again, or download the file again") from e
     except (ValueError, TypeError) as e:
-        raise ArrayFileError(f"{path} contains no dictionary of SMPL parameters ({e}): download it again") from e
+        raise ArrayFileError(f"{path} contains no dictionary of SMPL parameters ({e!s:.160}): download it again") from e
 
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:

@@ -18,7 +18,7 @@ from primdiffusion.commands.request import ReportProgress
 from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
 from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
-from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.formats.arrays import read_numbers
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.human import Human, place_skinned
 from primdiffusion.human_file import load_human
@@ -197,11 +197,13 @@ def _load_solids(file: Stamp) -> Solids:
     """Raise ValueError, naming the file, for an invalid file."""
     path = file[0]
     try:
-        arrays = read_arrays(path, ("corners", "colour", "holdout"))
+        arrays = read_numbers(path, ("corners", "colour", "holdout"))
         return Solids(
             np.ascontiguousarray(arrays["corners"], np.float32),
             np.ascontiguousarray(arrays["colour"], np.float32),
             np.ascontiguousarray(arrays["holdout"], np.bool_),
         )
     except ValueError as e:
-        raise ValueError(f"{path} holds no solids ({e}): it needs corners [F, 3, 3], colour [F, 3], holdout [F]") from e
+        raise ValueError(
+            f"{path} holds no solids ({e!s:.160}): it needs corners [F, 3, 3], colour [F, 3], holdout [F]"
+        ) from e

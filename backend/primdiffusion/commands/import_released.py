@@ -32,6 +32,15 @@ SAME_BODY = 1e-4
 """Largest difference between two files of one body, metres."""
 
 
+def read_released(path: Path) -> tuple[dict[str, Tensor], Inventory]:
+    """Read the tensors of a released checkpoint and what they are. Raises ValueError, naming the file, and OSError."""
+    weights = read_weights(path)
+    try:
+        return weights, take_inventory(weights)
+    except ValueError as error:
+        raise type(error)(f"{path}: {error}") from error
+
+
 @dataclasses.dataclass(frozen=True)
 class ImportReleased:
     """Convert the authors' primdiffusion.pt to a checkpoint for generate, render, the extension and everything else,
@@ -61,8 +70,7 @@ class ImportReleased:
 
     def run(self) -> None:
         """Import, and print a report on every group of tensors."""
-        weights = read_weights(self.checkpoint)
-        inventory = take_inventory(weights)
+        weights, inventory = read_released(self.checkpoint)
         print(inventory.account.table())
         if not 1 <= len(self.uv) <= 2:
             raise ValueError(f"uv names {len(self.uv)} files: give one .obj or .npz, or the pair vt.npy ft.npy")

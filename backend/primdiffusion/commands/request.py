@@ -103,7 +103,7 @@ def _value(kind: Any, value: Any, name: str) -> Any:
         return kind.from_json(value, name)  # type: ignore[attr-defined]
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return read_record(kind, value, name)  # type: ignore[arg-type]
-    if kind is Path and isinstance(value, str) and value:
+    if kind is Path and isinstance(value, str) and value and "\0" not in value:
         return Path(value)
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if not -LARGEST_NUMBER <= value <= LARGEST_NUMBER:

@@ -115,7 +115,7 @@ def mismatches_named(path: Path, *also: type[Exception]) -> Iterator[None]:
     try:
         yield
     except (KeyError, TypeError, JsonError, RuntimeError, *also) as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:300]}"
+        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
         raise CheckpointError(
             f"{path} does not match its own description ({reason}): download or train it again"
         ) from error
@@ -270,7 +270,7 @@ def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
             metadata = file.metadata() or {}
     except (SafetensorError, OSError) as error:
         raise CheckpointError(
-            f"{path} is truncated or not a safetensors file ({error}): download or train it again"
+            f"{path} is truncated or not a safetensors file ({error!s:.100}): download or train it again"
         ) from error
     if metadata.get("format") not in formats:
         raise CheckpointError(

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion.evaluation.portraits import PORTRAITS
+from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.tensor_file import save
@@ -252,7 +253,9 @@ def load_attribute_network(path: Path) -> AttributeNetwork:
         )
         network = AttributeNetwork(space)
         network.load_state_dict(tensors)
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+        if not all(bool((value.abs() < LARGEST_NUMBER).all()) for value in tensors.values()):
+            raise ValueError("weights that are not finite")
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(
             f"{path} is not a feature network of this version ({reason}): delete it to train a new one"

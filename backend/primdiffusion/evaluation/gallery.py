@@ -150,9 +150,9 @@ def read_attributes(path: Path) -> list[dict[str, Any]]:
     arrays = read_arrays(path, ("attributes", "voxels"))
     try:
         stored = parse_json(str(arrays["attributes"]))
-    except ValueError as error:
-        raise ValueError(f"{path}: its attributes are not JSON ({error}): make it again") from error
-    return list(stored.get("variants", [stored] * len(arrays["voxels"])))
+        return list(stored.get("variants", [stored] * len(arrays["voxels"])))
+    except (ValueError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: its attributes are damaged ({error!s:.160}): make it again") from error
 
 
 def read_seed(path: Path) -> int:

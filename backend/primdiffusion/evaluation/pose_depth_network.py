@@ -20,6 +20,7 @@ from torch.nn import functional
 
 from primdiffusion.evaluation.attribute_network import AttributeSpace, detail_energies
 from primdiffusion.evaluation.shots import JOINTS
+from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.tensor_file import save
@@ -169,8 +170,10 @@ def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
             )
         )
         network.load_state_dict(tensors)
+        if not all(bool((value.abs() < LARGEST_NUMBER).all()) for value in tensors.values()):
+            raise ValueError("weights that are not finite")
         network.card = dict(parse_json(metadata["card"]))
-    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as error:
+    except (SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path} is not a network of joints and depth of this version ({reason})") from error
     return network.eval().requires_grad_(False)

@@ -135,7 +135,10 @@ def folder_shots(folder: Path) -> Iterator[Shot]:
     Raises ValueError for an empty folder, pictures that are not square or unreadable, and truth that does not fit.
     """
     paths = folder_pictures(folder)
-    truth = read_json(folder / JOINTS_FILE) if (folder / JOINTS_FILE).is_file() else {}
+    try:
+        truth = read_json(folder / JOINTS_FILE) if (folder / JOINTS_FILE).is_file() else {}
+    except ValueError as error:
+        raise ValueError(f"{folder / JOINTS_FILE} is damaged ({error!s:.160}): write it again") from error
     if not isinstance(truth, dict):
         raise ValueError(f"{folder / JOINTS_FILE} is not an object of picture names: see docs/design/evaluation.md")
     for path in paths:
@@ -158,7 +161,7 @@ def _read_picture(path: Path) -> Float[Tensor, "h w 4"]:
             width, height = picture.size
             array = np.asarray(picture.convert("RGBA"), np.float32)
     except (PictureError, OSError) as error:
-        raise ValueError(f"{path} is not a readable picture ({error}): write it again or remove it") from error
+        raise ValueError(f"{path} is not a readable picture ({error!s:.160}): write it again or remove it") from error
     if width != height:
         raise ValueError(f"{path} has {width} x {height} pixels: pad it with white to a square")
     return torch.from_numpy(array) / 255
@@ -178,7 +181,7 @@ def _joints(given: Any, size: int, source: Path, name: str) -> tuple[Tensor | No
     try:
         pixels = torch.tensor(given, dtype=torch.float32) * (SIDE / size)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{source}: the joints of {name} are not numbers ({error})") from error
+        raise ValueError(f"{source}: the joints of {name} are not numbers ({error!s:.160})") from error
     if pixels.shape != (len(JOINT_NAMES), 2) or not torch.isfinite(pixels).all():
         raise ValueError(f"{source}: the joints of {name} have shape {tuple(pixels.shape)}: give 24 finite rows x, y")
     neck, head = (pixels[JOINT_NAMES.index(joint)] for joint in HEAD)
@@ -188,7 +191,10 @@ def _joints(given: Any, size: int, source: Path, name: str) -> tuple[Tensor | No
 def _depth(path: Path, size: int) -> Float[Tensor, "s s"] | None:
     if not path.is_file():
         return None
-    depth = torch.from_numpy(np.asarray(read_npy(path), np.float32))
+    try:
+        depth = torch.from_numpy(np.asarray(read_npy(path), np.float32))
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path} holds no depth ({error!s:.160}): write it again") from error
     if depth.shape != (size, size):
         raise ValueError(f"{path} has shape {tuple(depth.shape)}, its picture {size} x {size} pixels: give one size")
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.inf)

@@ -23,7 +23,7 @@ LARGEST_BYTES = 512 * 2**20
 MB."""
 MOST_REPEATED, LARGEST_RATIO = 64 * 2**20, 200
 """Bytes from which on an array may not be larger than this many times its compressed size: arrays of zeros are."""
-LARGEST_NUMBER = 1e30
+LARGEST_NUMBER = 1e9
 LARGEST_FILE = 2**31
 _LARGEST_DIRECTORY = 4 * 2**20
 """Of a zip archive's list of names, bytes; also of a single read."""

@@ -111,7 +111,7 @@ def read_about(root: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise CaptureFolderError(f"{root} holds no captures: there is no {DATASET_FILE} in it") from None
     except (OSError, ValueError) as e:
-        raise CaptureFolderError(f"{root / DATASET_FILE} cannot be read ({e}): render the captures again") from e
+        raise CaptureFolderError(f"{root / DATASET_FILE} cannot be read ({e!s:.160}): render the captures again") from e
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise CaptureFolderError(f"{root / DATASET_FILE} is not the {DATASET_FILE} of captures: choose another folder")
     if about.get("version") != VERSION:

@@ -15,6 +15,8 @@ FORMAT_VERSION = 3
 METADATA = "compact"
 """Name of the metadata of compact files: JSON, the linear colour and the density (1/m) that are stored as 255."""
 LEVELS = 255
+LARGEST_VALUE = 65504.0
+"""Of colours, densities and sizes of boxes: larger ones overflow in half precision."""
 _KNEE = 12.92 * 0.0031308
 
 
@@ -39,7 +41,7 @@ def expand(arrays: Mapping[str, NDArray], metadata: str) -> dict[str, NDArray]:
         scales = {name: float(stored[name]) for name in ("rgb", "density")}
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"its metadata {METADATA!r} is {metadata:.60}, not two scales") from error
-    if not all(0 < scale < 1e6 for scale in scales.values()):
+    if not all(0 < scale <= LARGEST_VALUE for scale in scales.values()):
         raise ValueError(f"its metadata {METADATA!r} has scales out of range")
     if wrong := [name for name in scales if arrays[name].dtype != np.uint8]:
         raise ValueError(f"{wrong[0]!r} is not in eight bits")

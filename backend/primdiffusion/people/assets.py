@@ -138,7 +138,7 @@ def _decoded(path: Path, size: int) -> UInt8[np.ndarray, "H W 4"]:
         with opened_picture(path) as file:
             picture = file.convert("RGBA")
     except (OSError, PictureError) as error:
-        raise DamagedPictureError(f"{path} cannot be decoded ({error}): fetch it again") from error
+        raise DamagedPictureError(f"{path} cannot be decoded ({error!s:.160}): fetch it again") from error
     if picture.width > size:
         box = (size, round(picture.height * size / picture.width))
         picture = picture.convert("RGBa").resize(box, Image.Resampling.BOX).convert("RGBA")

@@ -149,9 +149,12 @@ def is_whole(folder: Path, seed: int) -> bool:
 
 
 def unknown_licences(root: Path) -> list[str]:
-    """Assets in a folder's manifest whose licence is unknown."""
-    manifest = read_json(root / MANIFEST)
-    return [asset["path"] for asset in manifest["assets"] if asset["licence"] == UNKNOWN]
+    """Assets in a folder's manifest whose licence is unknown. Raises ValueError for a damaged one, OSError."""
+    try:
+        manifest = read_json(root / MANIFEST)
+        return [str(asset["path"]) for asset in manifest["assets"] if asset["licence"] == UNKNOWN]
+    except (ValueError, TypeError, LookupError) as error:
+        raise ValueError(f"{root / MANIFEST} is damaged ({error!s:.80}): make the humans again") from error
 
 
 def _identity(person: Person, seed: int) -> dict[str, Any]:

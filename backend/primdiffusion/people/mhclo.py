@@ -16,9 +16,17 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from primdiffusion.formats.regular_files import read_regular
+
 
 class ProxyFileError(ValueError):
     """A damaged or incomplete .mhclo or .obj file."""
+
+
+LARGEST_TEXT = 64 * 2**20
+"""Bytes of a file."""
+LARGEST_NUMBER = 1e6
+MOST_VERTICES = 10**7
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -110,6 +118,8 @@ def parse_obj(text: str) -> ObjMesh:
             for k in range(1, len(index) - 1):
                 faces.append((index[0], index[k], index[k + 1]))
                 face_coordinates.append((uv_index[0], uv_index[k], uv_index[k + 1]))
+    if any(not abs(value) <= LARGEST_NUMBER for row in (*vertices, *coordinates) for value in row):
+        raise ProxyFileError(f"the .obj holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again")
     if not faces or not vertices:
         raise ProxyFileError("the .obj has no faces or no vertices: give a mesh of an asset pack")
     face_array = np.array(faces, np.int32)
@@ -158,9 +168,13 @@ def parse_mhclo(text: str) -> Proxy:
             deleted.extend(_vertex_ranges(words))
     if not reference:
         raise ProxyFileError(f"{name or 'the .mhclo'} has no vertices after its line 'verts': the file is damaged")
+    if any(not abs(value) <= LARGEST_NUMBER for row in (*weight, *offset) for value in row):
+        raise ProxyFileError(
+            f"the .mhclo holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again"
+        )
     return Proxy(
         name=name,
-        reference=np.array(reference),
+        reference=np.array(reference, np.int64),
         weight=np.array(weight),
         offset=np.array(offset),
         scales=(scales.get("x"), scales.get("y"), scales.get("z")),
@@ -177,7 +191,10 @@ def _vertex_ranges(words: list[str]) -> list[int]:
         if word == "-":
             in_range = True
         elif in_range:
-            numbers.extend(range(numbers[-1] + 1, int(word) + 1))
+            last = int(word)
+            if last > MOST_VERTICES:
+                raise ProxyFileError(f"the .mhclo deletes vertex {last}, more than there are: fetch it again")
+            numbers.extend(range(numbers[-1] + 1, last + 1))
             in_range = False
         else:
             numbers.append(int(word))
@@ -191,12 +208,14 @@ def read_pair(mhclo: Path, obj: Path) -> tuple[Proxy, ObjMesh]:
         ProxyFileError: the files are damaged or do not belong together.
     """
     try:
-        proxy = parse_mhclo(mhclo.read_text(encoding="utf-8", errors="replace"))
-        mesh = parse_obj(obj.read_text(encoding="utf-8", errors="replace"))
+        proxy = parse_mhclo(read_regular(mhclo, LARGEST_TEXT).decode("utf-8", errors="replace"))
+        mesh = parse_obj(read_regular(obj, LARGEST_TEXT).decode("utf-8", errors="replace"))
     except ProxyFileError as error:
         raise ProxyFileError(f"{mhclo}: {error}") from error
-    except (ValueError, IndexError) as error:
-        raise ProxyFileError(f"{mhclo} or {obj} has an unreadable line ({error}): fetch both again") from error
+    except (ValueError, IndexError, OverflowError) as error:
+        raise ProxyFileError(
+            f"{mhclo.name} or {obj} has an unreadable line ({error!s:.60}): fetch both again"
+        ) from error
     if len(proxy.reference) != len(mesh.vertices):
         raise ProxyFileError(
             f"{mhclo} binds {len(proxy.reference)} vertices but {obj} has {len(mesh.vertices)}: fetch both again"

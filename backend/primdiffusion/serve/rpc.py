@@ -63,7 +63,9 @@ def parse_request(line: bytes) -> RpcRequest:
     try:
         message = parse_message(line)
     except ValueError as e:
-        raise MalformedRequest(PARSE_ERROR, f"the line is not JSON in UTF-8 ({e}): send one JSON object a line") from e
+        raise MalformedRequest(
+            PARSE_ERROR, f"the line is not JSON in UTF-8 ({e!s:.160}): send one JSON object a line"
+        ) from e
     if isinstance(message, list):
         raise MalformedRequest(INVALID_REQUEST, "batches are not supported: send one request a line")
     if not isinstance(message, dict):

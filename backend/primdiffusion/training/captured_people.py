@@ -137,7 +137,7 @@ def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
             try:
                 cards[name] = dict(read_json(card))
             except (ValueError, TypeError) as error:
-                raise ValueError(f"{card} is damaged ({error}): make the human again") from error
+                raise ValueError(f"{card} is damaged ({error!s:.160}): make the human again") from error
     return cards
 
 

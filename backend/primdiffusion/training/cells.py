@@ -156,4 +156,4 @@ def _load_prepared(path: Path) -> Prepared:
             float(about["full_density"]),
         )
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error}): remove it to compute it again") from error
+        raise ValueError(f"{path} is damaged ({error!s:.100}): remove it to compute it again") from error

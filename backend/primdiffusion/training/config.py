@@ -227,7 +227,7 @@ def check_resumable(saved: str, config: RunConfig) -> None:
     try:
         before = _comparable(parse_json(saved))
     except (ValueError, AttributeError) as error:
-        raise ValueError(f"the settings in {config.run} are damaged ({error}): give a new folder") from error
+        raise ValueError(f"the settings in {config.run} are damaged ({error!s:.160}): give a new folder") from error
     now = _comparable(parse_json(to_json(config)))
     for name, value in _ADDED.items():
         if name in now and name not in before:

@@ -163,4 +163,4 @@ def _load_prepared(path: Path) -> PreparedDetail:
             *(parts[name][""] for name in ("forward", "back", "latent_std", "rest_std")),
         )  # fmt: skip
     except (SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error}): remove it to compute it again") from error
+        raise ValueError(f"{path} is damaged ({error!s:.100}): remove it to compute it again") from error

@@ -91,7 +91,7 @@ def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: in
         known, starts = before["people"], before.get("starts", [])
         were = starts[-1]["processes"] if starts else processes
     except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ValueError(f"{config.run / RUN} is damaged ({error}): give a new folder") from error
+        raise ValueError(f"{config.run / RUN} is damaged ({error!s:.160}): give a new folder") from error
     if known != list(people):
         raise ValueError(
             f"the run in {config.run} has another training set than {config.data} ({len(known)} and {len(people)} "

@@ -122,7 +122,7 @@ class PackedPeople:
             self._stored: Sequence[Mapping[str, Any]] = [dict(person["attributes"]) for person in people]
             self._firsts = [0, *itertools.accumulate(len(shard["people"]) for shard in index["shards"])]
         except (KeyError, TypeError, ValueError) as error:
-            raise ShardError(f"{folder / INDEX} is damaged ({error}): pack the humans again") from error
+            raise ShardError(f"{folder / INDEX} is damaged ({error!s:.100}): pack the humans again") from error
         if len(self.names) < 2:
             raise FileNotFoundError(f"{folder / INDEX} lists {len(self.names)} humans: training needs two or more")
         self._open: dict[int, Any] = {}
@@ -173,7 +173,7 @@ class PackedPeople:
             try:
                 self._open[number] = safe_open(self.paths[number], framework="pt")
             except SafetensorError as error:
-                raise ShardError(f"{self.paths[number]} is no safetensors file ({error}): pack again") from error
+                raise ShardError(f"{self.paths[number]} is no safetensors file ({error!s:.100}): pack again") from error
         return self._open[number]
 
 
@@ -183,7 +183,7 @@ def _read_index(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise FileNotFoundError(f"there is no {path}: pack humans with `primdiffusion payloads pack`") from None
     except ValueError as error:
-        raise ShardError(f"{path} is damaged ({error}): pack the humans again") from error
+        raise ShardError(f"{path} is damaged ({error!s:.100}): pack the humans again") from error
     if not isinstance(index, dict) or index.get("format") != FORMAT:
         raise ShardError(f"{path} is not the index of packed humans: choose another folder")
     if index.get("version") != VERSION:

@@ -173,7 +173,7 @@ class AcceleratedState(TrainingState):
             with safe_open(path, framework="pt") as file:
                 return int(file.metadata()["step"])
         except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path} is damaged ({error}): start a new run folder") from error
+            raise ValueError(f"{path} is damaged ({error!s:.100}): start a new run folder") from error
 
 
 def agreed(accelerator: Accelerator, stop: bool) -> bool:

@@ -25,7 +25,7 @@ from primdiffusion.primitives.primitives import K, Payload, S
 
 _DAMAGED = (OSError, KeyError, ValueError, TypeError, OverflowError)
 _ABOUT = ("betas", "attributes", "full_density")
-_NO_PERSON = "{path} is not a payload file or is damaged ({error}): write it again with `primdiffusion payloads`"
+_NO_PERSON = "{path} is not a payload file or is damaged ({error!s:.160}): write it again with `primdiffusion payloads`"
 _VOXELS = (K, S, S, S, 4)
 
 

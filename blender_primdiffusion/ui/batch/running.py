@@ -146,7 +146,7 @@ def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> N
         try:
             there = dict(read_json(path))
         except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is damaged ({error}): choose another folder, or add --resume") from error
+            raise ValueError(f"{path} is damaged ({error!s:.160}): choose another folder, or add --resume") from error
         for name in sorted({*wanted, *there}):
             if there.get(name) != wanted.get(name):
                 raise ValueError(

@@ -204,11 +204,11 @@ class PRIMDIFFUSION_OT_install_from_folder(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
-        if folder is None or not folder.is_dir():
-            self.report({"ERROR"}, f"{self.directory!r} is no folder: choose the one that holds the wheels")
+        folder = bpy.path.abspath(self.directory)
+        if not os.path.isdir(folder):
+            self.report({"ERROR"}, f"{self.directory!r:.200} is no folder: choose the one that holds the wheels")
             return {"CANCELLED"}
-        return _begin(self, lambda: installing(folder))
+        return _begin(self, lambda: installing(Path(folder)))
 
 
 class PRIMDIFFUSION_OT_cancel_set_up(bpy.types.Operator):

@@ -157,7 +157,11 @@ def test_a_preset_holds_everything_but_the_seed(panel_settings, presets_folder):
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("import bpy\nbpy.context.scene.primdiffusion.sampler = 'magic'\n", "'Old One'.*magic"),
+        ("settings.steps = 7\nsettings.sampler = 'magic'\n", "'Old One'.*magic"),
+        ("settings.steps = 7\nsettings.seed = 5\n", "'Old One'.*It sets seed"),
+        ("settings.steps = 7\nsettings.steps = 1" + 400 * "0", "'Old One'"),
+        ("settings.steps = 7\nbpy.app.tempdir", "'Old One'.*line 2 sets nothing"),
+        ("settings.steps = print(7)", "'Old One'"),
         ("x = (\n", "'Old One'"),
         (None, "The preset cannot be read"),
     ],
@@ -166,8 +170,10 @@ def test_a_preset_that_does_not_fit_is_one_sentence(panel_settings, presets_fold
     path = presets_folder / "old_one.py"
     if text is not None:
         path.write_text(text)
+    panel_settings.steps = 30
     with pytest.raises(RuntimeError, match=sentence):
         bpy.ops.primdiffusion.use_generate_preset(filepath=str(path))
+    assert panel_settings.steps == 30
 
 
 def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_of_the_backend(

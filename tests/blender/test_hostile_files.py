@@ -1,0 +1,177 @@
+"""Hostile files in every file picker: each is rejected in one sentence, and nothing is left of it in the .blend."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+import synthetic
+import synthetic_shape
+from exporting import write_person
+from scene_state import state
+
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import armature_of
+
+LONGEST_SENTENCE = 300
+READS = {
+    "import_motion": ("filepath", (".npz", ".npy", ".json", ".bvh", ".fbx")),
+    "import_human": ("filepath", (".human", ".human.safetensors", ".npz")),
+    "use_generate_preset": ("filepath", (".py",)),
+    "mark_human_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
+    "mark_pose_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
+}
+"""Operators that read a file: the property with its path, and endings."""
+WRITES = {
+    "export_motion": ".npz", "export_mesh": ".glb", "export_gaussians": ".ply", "export_human": ".human",
+}  # fmt: skip
+"""Operators that write the file of their `filepath`."""
+FOLDERS = {
+    "find_missing_volumes", "find_volumes_in_folder", "human_from_captures", "make_pose_assets", "export_vdb_sequence",
+    "install_from_folder",
+}  # fmt: skip
+"""Operators on the folder of their `directory`."""
+PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
+
+
+def with_paths() -> dict[str, set[str]]:
+    """Every operator with a path, and its properties of paths."""
+    found = {}
+    for name in dir(bpy.ops.primdiffusion):
+        properties = getattr(bpy.ops.primdiffusion, name).get_rna_type().properties
+        paths = {one.identifier for one in properties if one.type == "STRING" and one.subtype in PATHS}
+        if paths:
+            found[name] = paths
+    return found
+
+
+def contents() -> Iterator[tuple[str, bytes]]:
+    noise = np.random.default_rng(0).integers(0, 256, 4096, np.uint8).tobytes()
+    yield "empty", b""
+    yield "noise", noise
+    yield "deep", b"[" * 100_000
+    yield "header", (2**62).to_bytes(8, "little") + noise
+    yield "long line", b"x" * 2**20
+    yield "code", b"import os\nos.mkdir('ran')\n"
+    yield "zip", b"PK\x03\x04" + noise
+    yield (
+        "npy",
+        b"\x93NUMPY\x01\x00v\x00{'descr': '<f8', 'fortran_order': False, 'shape': (9999999999, 72), }" + b" " * 40,
+    )
+    yield "png", b"\x89PNG\r\n\x1a\n\x00\x00\x00\rIHDR\x7f\xff\xff\xff\x7f\xff\xff\xff\x08\x02\x00\x00\x00" + noise
+    yield (
+        "bvh",
+        b"HIERARCHY\nROOT hips\n{\nOFFSET 0 0 0\nCHANNELS -2\n}\nMOTION\nFrames: 1000000000000\nFrame Time: 1e-320\n",
+    )
+    yield "human", b"\x02\x00\x00\x00\x00\x00\x00\x00{}"
+
+
+def whole(ending: str, folder: Path) -> bytes:
+    """A valid file, to be cut."""
+    path = folder / f"whole{ending}"
+    if ending == ".npz":
+        synthetic_shape.write(path, 8)
+    elif ending in (".human", ".human.safetensors"):
+        write_person(path)
+    elif ending == ".npy":
+        np.save(path, np.zeros((3, 72)))
+    else:
+        path.write_bytes(b"1 2 3 4")
+    return path.read_bytes()
+
+
+def hostile_files(folder: Path, ending: str) -> list[Path]:
+    """Damaged files and things that are no files."""
+    folder.mkdir()
+    for name, content in contents():
+        (folder / f"{name}{ending}").write_bytes(content)
+    content = whole(ending, folder)
+    (folder / f"whole{ending}").unlink()
+    for share in (0.02, 0.3, 0.7):
+        (folder / f"cut {share}{ending}").write_bytes(content[: int(share * len(content))])
+    (folder / f"folder{ending}").mkdir()
+    found = sorted(folder.iterdir())
+    if os.name != "nt":
+        os.mkfifo(folder / f"pipe{ending}")
+        (folder / f"loop{ending}").symlink_to(folder / f"loop{ending}")
+        (folder / f"device{ending}").symlink_to("/dev/zero")
+        found += [folder / f"{name}{ending}" for name in ("pipe", "loop", "device")]
+    return [*found, folder / f"nowhere{ending}", folder / f"{'n' * 240}{ending}"]
+
+
+def fault(name: str, folder: Path, **properties: str) -> str:
+    """What is wrong about an operator's answer to hostile files; empty if nothing is."""
+    before = state()
+    try:
+        answer = getattr(bpy.ops.primdiffusion, name)(**properties)
+    except RuntimeError as error:
+        text = str(error).strip()
+    else:
+        return f"{name} {properties}: {answer}"
+    sentence = re.sub(r"^(Error: |Warning: |Info: )", "", text).replace(str(folder), "")
+    if "Traceback" in text or "\n" in sentence or len(sentence.split()) < 3:
+        return f"{name} {properties}: no sentence: {text!r}"
+    if len(sentence) > LONGEST_SENTENCE:
+        return f"{name} {properties}: {len(sentence)} characters: {sentence!r}"
+    changes = [(a, b) for a, b in zip(before, state(), strict=True) if a != b]
+    return f"{name} {properties}: changed {changes}" if changes else ""
+
+
+@pytest.fixture
+def anna(addon, tmp_path, monkeypatch):
+    npz = synthetic_shape.write(tmp_path / "human.npz", 8)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "first").mkdir()
+    write_person(tmp_path / "first" / "person.human.safetensors", synthetic.arrays(8)["betas"])
+    person = build_human(addon, npz, "Anna", [tmp_path / "first" / "person.human.safetensors"])
+    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.context.scene.frame_end = 2
+    bpy.ops.wm.save_mainfile()
+    return tmp_path
+
+
+@pytest.mark.usefixtures("addon")
+def test_every_operator_with_a_path_gets_hostile_files():
+    expected = {name: {shown} for name, (shown, _) in READS.items()}
+    expected |= {name: {"filepath"} for name in WRITES} | {name: {"directory"} for name in FOLDERS}
+    assert with_paths() == expected
+
+
+@pytest.mark.parametrize("name", READS)
+def test_a_hostile_file_is_rejected_in_one_sentence_and_leaves_nothing(anna, name):
+    shown, endings = READS[name]
+    faults = []
+    for number, ending in enumerate(endings):
+        folder = anna / str(number)
+        faults += [fault(name, folder, **{shown: str(path)}) for path in hostile_files(folder, ending)]
+    assert not list(filter(None, faults)), "\n".join(filter(None, faults))
+    assert not (anna / "ran").exists()
+
+
+@pytest.mark.parametrize("name", WRITES)
+def test_a_place_that_cannot_be_written_is_named_in_one_sentence(anna, name):
+    ending = WRITES[name]
+    (anna / f"folder{ending}").mkdir()
+    (anna / "file").write_bytes(b"a user's file")
+    places = [f"folder{ending}", f"file/a{ending}", f"nowhere/a{ending}", f"{'n' * 300}{ending}", "file.txt/", ""]
+    before = sorted(anna.rglob("*"))
+    faults = [fault(name, anna, filepath=str(anna / place) if place else "") for place in places]
+    assert not list(filter(None, faults)), "\n".join(filter(None, faults))
+    assert sorted(anna.rglob("*")) == before
+    assert (anna / "file").read_bytes() == b"a user's file"
+
+
+@pytest.mark.parametrize("name", sorted(FOLDERS))
+def test_a_folder_that_is_none_is_named_in_one_sentence(anna, name, monkeypatch):
+    monkeypatch.setattr("blender_primdiffusion.ui.setup.operators.follow_session", lambda _: {"FINISHED"})
+    (anna / "shot_humans").rename(anna / "gone")
+    (anna / "file").write_bytes(b"a user's file")
+    places = ["file", "n" * 300, *([] if name == "make_pose_assets" else ["nowhere"])]  # it makes the folder
+    faults = [fault(name, anna, directory=str(anna / place)) for place in places]
+    assert not list(filter(None, faults)), "\n".join(filter(None, faults))
+    assert (anna / "file").read_bytes() == b"a user's file"

@@ -1,0 +1,223 @@
+"""Every request of the child, run by the real server in this process; see `targets`."""
+
+from __future__ import annotations
+
+import functools
+import io
+import itertools
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.random import Generator
+
+from fuzz import mutations
+from fuzz.target import Garbage, Target
+
+LONGEST_S = 8.0
+"""Of a request that is valid after all; the slowest takes two."""
+OUT = "made"
+"""The folder that requests write to."""
+OUTPUTS = {"out": "made/x", "out_dir": "made", "depth": "made/depth.png", "frame": "a.frame"}
+"""Parameters that name what is written, which stays in the folder of the fuzz run."""
+BAD_OUTPUTS = ("taken", "taken/x", "a.human.safetensors", "n" * 300, "", "\0", 3, None, [], "made")
+BAD_INPUTS = ("cut.safetensors", "cut.npz", "cut.json", "empty", "nowhere", "taken", "pipe", "/dev/zero",
+              "/proc/self/mem", "a.human.safetensors", "captures", "n" * 300, "\0", "//server/x")  # fmt: skip
+STILL = np.eye(4)[:3].tolist()
+
+
+def inputs(folder: Path) -> None:
+    """Valid inputs of requests by their relative names, and damaged ones; the current folder is `folder`'s."""
+    from capture_scenes import captured
+    from primdiffusion.human import generate
+    from primdiffusion.human_file import save_human
+    from tiny_encoder import save_tiny_encoder
+    from tiny_model import save_tiny_checkpoint, tiny_model
+
+    from fuzz.data_targets import make_solids, make_weights
+
+    for seed, name in enumerate(("a", "b")):
+        save_human(folder / f"{name}.human.safetensors", generate(tiny_model(), seed=seed, steps=2))
+    save_tiny_checkpoint(folder / "tiny.safetensors")
+    save_tiny_encoder(folder / "encoder.safetensors")
+    shutil.move(captured(folder / "rendered", people=1, frames=1), folder / "captures")
+    make_weights(folder)
+    make_solids(folder)
+    (folder / "pose.json").write_text(json.dumps([0.1] * 72), encoding="utf-8")
+    np.zeros(16 * 16 * 5, np.float32).tofile(folder / "a.frame")
+    for name, whole in (("safetensors", "a.human.safetensors"), ("npz", "weights.npz"), ("json", "pose.json")):
+        content = (folder / whole).read_bytes()
+        (folder / f"cut.{name}").write_bytes(content[: len(content) // 2])
+    (folder / "empty").touch()
+    (folder / "taken").mkdir()
+    (folder / "taken" / "kept.txt").write_text("a user's file", encoding="utf-8")
+    os.mkfifo(folder / "pipe")
+
+
+SAMPLED: dict[str, Any] = {"out_dir": "made", "steps": 2, "size": 16, "checkpoint": "tiny.safetensors"}
+PERSON = {"person": "a.human.safetensors"}
+ASKED = {"attributes": {"outfit": "suit", "height": 1.7}, "guidance": 1.5, "seed": 3}
+POSED = {"human": "a.human.safetensors", "object": STILL, "joints": [STILL] * 24, "betas": [0.5] * 10}
+CALLS: dict[str, dict[str, Any]] = {
+    "generate": {**SAMPLED, **ASKED, "sampler": "ddim", "picture_px": 8},
+    "variations": {**SAMPLED, "seeds": [1, 2], "attributes": {"outfit": "suit"}, "person": None, "amount": 0.5},
+    "attributes": {"checkpoint": "tiny.safetensors"},
+    "vary": {**SAMPLED, **PERSON, **ASKED, "amount": 0.5},
+    "interpolate": {**SAMPLED, **PERSON, "other": "b.human.safetensors", "fraction": 0.5},
+    "inpaint": {**SAMPLED, **PERSON, **ASKED, "region": {"weights": "weights.npz"}, "masking": "repaint"},
+    "transfer": {
+        **SAMPLED, **PERSON, "source": "b.human.safetensors", "region": ["top", "left_hand"], "what": "texture",
+        "harmonise": 0.2, "seed": 3,
+    },
+    "reconstruct": {
+        "capture": "captures", "out_dir": "made", "subject": None, "frame": 0, "views": 2,
+        "checkpoint": "encoder.safetensors", "size": 16,
+    },
+    "render": {
+        "human": "a.human.safetensors", "out": "made/x.png", "width": 16, "height": 16, "yaw": 0.5, "pose": "pose.json",
+        "depth": "made/depth.png",
+    },
+    "draw": {
+        "frame": "a.frame", "width": 16, "height": 16, "region": [0, 0, 16, 16], "clip": [0.1, 100.0],
+        "intrinsics": [[20.0, 0, 8], [0, 20.0, 8], [0, 0, 1]], "world_to_camera": [*STILL[:2], [0, 0, 1, 3.0]],
+        "people": [POSED], "solids": "solids.npz", "background": [0.1, 0.2, 0.3], "view": "colour", "step": 0.02,
+    },
+    "merge": {"people": [POSED], "out": "made/x.npz", "voxel": 0.1},
+    "merge_frames": {"people": [POSED, POSED], "out_dir": "made", "voxel": 0.1},
+    "fit_gain": {"people": [POSED]},
+    "proxy": {**PERSON, "out_dir": "made", "betas": [0.5] * 10, "triangles": 500, "texture_px": 64, "spacing": 0.05},
+    "gaussians": {
+        **PERSON, "out": "made/x.ply", "object": STILL, "joints": [STILL] * 24, "betas": [0.5] * 10, "limit": 50,
+    },
+    "human_npz": {**PERSON, "out_dir": "made", "size": 16},
+    "hello": {},
+    "cancel": {"id": 1},
+    "shutdown": {},
+}  # fmt: skip
+"""Parameters of each method; a test compares the names with the server's."""
+
+
+def call(method: str, params: dict[str, Any]) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        message = {"jsonrpc": "2.0", "id": 1, "method": method, "params": params}
+        (folder / "call.json").write_text(json.dumps(message), encoding="utf-8")
+        return folder / "call.json"
+
+    return make
+
+
+def parameter(content: bytes, rng: Generator) -> bytes:
+    """A parameter, or a number deep in it, becomes a hostile one; or it is missing or unknown."""
+    message = json.loads(content)
+    params = message["params"]
+    if not params:
+        return mutations.as_json(content, rng)
+    name = mutations.pick(rng, list(params))
+    chance = rng.random()
+    if name in OUTPUTS:
+        params[name] = mutations.pick(rng, BAD_OUTPUTS)
+    elif isinstance(params[name], dict | list) and chance < 0.6:
+        params[name] = mutations.tree(params[name], rng)
+    elif isinstance(params[name], str) and chance < 0.6:
+        params[name] = mutations.pick(rng, BAD_INPUTS)
+    elif chance < 0.9:
+        params[name] = mutations.pick(rng, mutations.VALUES)
+    elif chance < 0.95:
+        del params[name]
+    else:
+        params[f"{name} "] = 1
+    return json.dumps(message).encode()
+
+
+def contained(line: bytes) -> bytes:
+    """The line, with outputs that no mutation may send out of the folder of the fuzz run."""
+    try:
+        message = json.loads(line)
+        params = message["params"]
+        wild = [name for name in OUTPUTS if isinstance(params.get(name), str) and params[name] not in BAD_OUTPUTS]
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError):
+        return line
+    if not wild:
+        return line
+    for name in wild:
+        if ".." in params[name] or os.path.isabs(params[name]):
+            params[name] = OUTPUTS[name]
+    return json.dumps(message).encode()
+
+
+@functools.cache
+def session():
+    """One for all requests, as in the child."""
+    from primdiffusion.commands.session import Session
+
+    return Session()
+
+
+@functools.cache
+def place() -> Path:
+    """The folder with the inputs."""
+    folder = Path("served").absolute()
+    folder.mkdir()
+    inputs(folder)
+    return folder
+
+
+def answers(line: bytes) -> Iterator[dict[str, Any]]:
+    """What the server sends after a line, and after having run the request in it."""
+    from primdiffusion.serve.rpc import Wire
+    from primdiffusion.serve.server import Server
+
+    sent = io.BytesIO()
+    server: Any = Server(io.BytesIO(), Wire(sent))
+    server._end = lambda: None  # which would end this process
+    server._dispatch(line)
+    if not server._queue.empty():
+        server._run_request(session(), server._queue.get())
+    return map(json.loads, sent.getvalue().splitlines())
+
+
+def read_call(path: Path) -> None:
+    """Raises the error that the child answers as an RpcError, Garbage for no answer or two, and for a user's file that
+    is changed."""
+    from primdiffusion.serve.rpc import INTERNAL_ERROR, RpcError
+
+    line, before, folder = contained(path.read_bytes()), Path.cwd(), place()
+    os.chdir(folder)
+    Path(OUT).mkdir(exist_ok=True)
+    try:
+        found = [message for message in answers(line.replace(b"\n", b" ")) if "method" not in message]
+        if (folder / "taken" / "kept.txt").read_text(encoding="utf-8") != "a user's file":
+            raise Garbage("a user's file was changed")
+        if left := [name for name in os.listdir(folder) if "partial" in name]:
+            raise Garbage(f"{left[0]} was left over")
+    finally:
+        os.chdir(before)
+        shutil.rmtree(folder / OUT, ignore_errors=True)
+        for name in BAD_OUTPUTS:
+            if isinstance(name, str) and name.startswith("n"):
+                shutil.rmtree(folder / name, ignore_errors=True)
+        for made in itertools.chain((folder / "taken").iterdir()):
+            if made.name != "kept.txt":
+                shutil.rmtree(made, ignore_errors=True) if made.is_dir() else made.unlink()
+    if len(found) > 1 or (not found and b'"id"' in line):
+        raise Garbage(f"{len(found)} answers")
+    for message in found:
+        if "error" in message:
+            error = message["error"]
+            if error["code"] == INTERNAL_ERROR:
+                raise AssertionError(error["message"])
+            remedy = (error.get("data") or {}).get("remedy", "")
+            raise RpcError(error["code"], f"{error['message']}: {remedy}" if remedy else error["message"])
+
+
+TARGETS = tuple(
+    Target(
+        f"request {method}", call(method, params), (*[parameter] * 5, mutations.flip, mutations.truncate), read_call,
+        is_file=False, seconds=LONGEST_S, slow=True,
+    )
+    for method, params in CALLS.items()
+)  # fmt: skip
