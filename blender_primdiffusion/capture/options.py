@@ -10,6 +10,7 @@ from typing import NoReturn, get_args
 import numpy as np
 
 from ..console import UsageError
+from ..formats.arrays import all_finite
 from ..formats.camera_rig import Arrangement, Rig, View
 from ..formats.json_files import read_json
 from ..formats.requests import LAYOUTS, PASSES, check_seed
@@ -115,7 +116,7 @@ def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
         views = []
         for name in sorted(named):
             k, r, t = (np.array(named[name][key], np.float64) for key in "KRT")
-            if (k.shape, r.shape, t.size) != ((3, 3), (3, 3), 3) or not all(np.isfinite(x).all() for x in (k, r, t)):
+            if (k.shape, r.shape, t.size) != ((3, 3), (3, 3), 3) or not all(map(all_finite, (k, r, t))):
                 raise CameraError(f"{path}: {name} has no finite K [3, 3], R [3, 3] and T [3]")
             if not np.allclose(r @ r.T, np.eye(3), atol=1e-5) or np.linalg.det(r) < 0:
                 raise CameraError(f"{path}: R of {name} is no rotation")

@@ -13,7 +13,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, array_names, read_arrays
+from ..formats.arrays import ArrayFileError, all_finite, array_names, read_arrays
 from ..formats.json_files import parse_json
 from ..motion.files import POSE_KEYS, MotionFileError, motion_from_arrays
 
@@ -224,7 +224,7 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
 
 
 def _row(values: NDArray, path: Path, name: str) -> NDArray[np.float64]:
-    if values.dtype.kind not in "iuf" or values.size == 0 or not np.isfinite(values).all():
+    if values.dtype.kind not in "iuf" or values.size == 0 or not all_finite(values):
         raise ScanError(f"{path}: {name!r} holds something else than finite numbers")
     return np.asarray(values, np.float64).reshape(-1, values.shape[-1] if values.ndim else 1)[0]
 

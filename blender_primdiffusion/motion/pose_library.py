@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.arrays import all_finite
 from ..formats.joints import JOINT_NAMES
 from ..scene.armature import bone_bases, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, matrix_to_quaternion, points_to_backend
@@ -82,7 +83,7 @@ def apply_pose(
     """
     check_posable(armature)
     pose = np.asarray(pose, np.float64)
-    if pose.shape != (len(JOINT_NAMES), 3) or not np.isfinite(pose).all():
+    if pose.shape != (len(JOINT_NAMES), 3) or not all_finite(pose):
         raise ValueError(f"a pose is {len(JOINT_NAMES)} axis-angle vectors of finite numbers, not {pose.shape}")
     now, place = current_pose(armature)
     target = place if translation is None else np.asarray(translation, np.float64)

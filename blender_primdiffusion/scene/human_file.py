@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats import compact_human
-from ..formats.arrays import check_shapes
+from ..formats.arrays import all_finite, check_shapes
 from ..formats.json_files import parse_json
 from ..formats.regular_files import read_regular
 from ..formats.removing import remove_file
@@ -132,7 +132,7 @@ def payload_in(human: HumanTensors, name: str) -> HumanPayload:
             raise ValueError(f"{wrong[0]!r} holds no numbers")
         arrays = {field: _loaded(*stored[field]).astype(np.float32, copy=False) for field in shapes}
         check_shapes(name, arrays, shapes, {})
-        if wrong := [field for field, values in arrays.items() if not np.isfinite(values).all()]:
+        if wrong := [field for field, values in arrays.items() if not all_finite(values)]:
             raise ValueError(f"{wrong[0]!r} holds NaN or infinite numbers")
         if wrong := [field for field, values in arrays.items() if np.abs(values).max() > compact_human.LARGEST_VALUE]:
             raise ValueError(f"{wrong[0]!r} holds impossible values")
@@ -214,7 +214,7 @@ def motion_in(human: HumanTensors, name: str) -> HumanMotion | None:
         raise ValueError(f"the motion in {name!r} is damaged ({error!s:.80}); {_REMEDY}") from error
     frames = len(arrays[0])
     for array, shape in zip(arrays, _MOTION.values(), strict=True):
-        if array.shape != tuple(frames if s == "F" else s for s in shape) or not np.isfinite(array).all():
+        if array.shape != tuple(frames if s == "F" else s for s in shape) or not all_finite(array):
             raise ValueError(f"the motion in {name!r} is damaged; {_REMEDY}")
     if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
         raise ValueError(f"the motion in {name!r} has frames out of order; {_REMEDY}")

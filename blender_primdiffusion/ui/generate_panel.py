@@ -229,9 +229,7 @@ class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
             for holder, setting, value in reversed(before):
                 setattr(holder, setting, value)
             reason = sentence(f"{error!s:.120}")
-            self.report(
-                {"ERROR"}, f"The preset {name!r} does not match this checkpoint or version: {reason} Remove it"
-            )
+            self.report({"ERROR"}, f"The preset {name!r} does not match this checkpoint or version: {reason} Remove it")
             return {"CANCELLED"}
         PRIMDIFFUSION_PT_generate_presets.bl_label = name
         return {"FINISHED"}

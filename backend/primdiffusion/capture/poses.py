@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.formats.arrays import ArrayFileError, read_npy, read_numbers
+from primdiffusion.formats.arrays import ArrayFileError, all_finite, read_npy, read_numbers
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.pose_file import body_theta
@@ -51,7 +51,7 @@ def read_motion(path: str | Path) -> BodyPose:
     content = read_numbers(path, (), KEYS) if path.suffix == ".npz" else _read_plain(path)
     turns = _turns(path, content)
     move = np.asarray(_first(content, TRANSLATIONS, np.zeros(3)), np.float64)
-    if move.size not in (3, 3 * len(turns)) or not np.isfinite(move).all():
+    if move.size not in (3, 3 * len(turns)) or not all_finite(move):
         raise MotionFileError(
             f"{path} has {len(turns)} frames, but its translations have shape {move.shape} or are not finite: "
             "export it again"
@@ -138,7 +138,7 @@ def _turns(path: Path, content: Mapping[str, NDArray]) -> NDArray[np.float64]:
         raise MotionFileError(
             f"{path} contains no poses ({e!s:.99}): it needs {3 * J} axis-angle values per frame ({J} x 3, radians)"
         ) from e
-    if not len(turns) or not np.isfinite(turns).all():
+    if not len(turns) or not all_finite(turns):
         raise MotionFileError(f"{path} has no frames, or NaN or infinite values: export it again")
     return turns
 

@@ -17,6 +17,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import SUBJECT_NAME
 from primdiffusion.capture.smpl_parameters import SmplParameters, read_smpl
 from primdiffusion.formats import capture_layout
+from primdiffusion.formats.arrays import all_finite
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.picture_files import DEPTH_UNIT
@@ -278,7 +279,7 @@ def _read_views(folder: Path) -> list[View]:
             k, r, t = (np.asarray(about[key], np.float64) for key in ("K", "R", "T"))
             width, height = _size(folder, camera, k)
             t = t.reshape(3)
-            if k.shape != (3, 3) or r.shape != (3, 3) or not all(np.isfinite(a).all() for a in (k, r, t)):
+            if k.shape != (3, 3) or r.shape != (3, 3) or not all(map(all_finite, (k, r, t))):
                 raise ValueError(f"camera {camera} is not finite, or its shapes are not K 3x3, R 3x3, T 3")
             views.append(View(k, r, t, width, height))
     except FileNotFoundError:

@@ -11,7 +11,7 @@ from jaxtyping import Float32
 
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.body.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
-from primdiffusion.formats.arrays import ArrayFileError, read_numbers, read_pickled_bytes
+from primdiffusion.formats.arrays import ArrayFileError, all_finite, read_numbers, read_pickled_bytes
 from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
@@ -71,7 +71,7 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
         if arrays[name].shape != shape:
             raise ArrayFileError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: render it again")
     betas = arrays["betas"].reshape(-1)
-    if not all(np.isfinite(array).all() for array in arrays.values()) or not frames or arrays["betas"].ndim > 2:
+    if not all(map(all_finite, arrays.values())) or not frames or arrays["betas"].ndim > 2:
         raise ArrayFileError(f"{path} has no frames, or NaN or infinite values: render the subject again")
     return SmplParameters(
         theta=np.concatenate([arrays["global_orient"], arrays["body_pose"]], axis=1).astype(np.float32),

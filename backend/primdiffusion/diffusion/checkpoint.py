@@ -280,7 +280,7 @@ def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
     if metadata.get("format_version") != _READABLE[metadata["format"]]:
         version, readable = metadata.get("format_version"), _READABLE[metadata["format"]]
         raise CheckpointError(
-            f"{path} has format version {version}, this program reads {readable}: use the matching release"
+            f"{path} has format version {version!s:.20}, this program reads {readable}: use the matching release"
         )
     return metadata
 

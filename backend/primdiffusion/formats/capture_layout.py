@@ -99,8 +99,8 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
     if differing:
         key = differing[0]
         raise CaptureFolderError(
-            f"{root} holds other captures: its {key} is {present.get(key)!r}, wanted is {wanted.get(key)!r}; choose "
-            "another folder, or the same settings"
+            f"{root} holds other captures: its {key:.40} is {present.get(key)!r:.60}, wanted is "
+            f"{wanted.get(key)!r:.60}; choose another folder, or the same settings"
         )
 
 
@@ -115,7 +115,11 @@ def read_about(root: Path) -> dict[str, Any]:
     if not isinstance(about, dict) or about.get("format") != FORMAT:
         raise CaptureFolderError(f"{root / DATASET_FILE} is not the {DATASET_FILE} of captures: choose another folder")
     if about.get("version") != VERSION:
-        raise CaptureFolderError(f"{root} is of version {about.get('version')}: this program reads version {VERSION}")
+        version = about.get("version")
+        raise CaptureFolderError(f"{root} is of version {version!s:.20}: this program reads version {VERSION}")
+    passes = about.get("passes", [])
+    if not isinstance(passes, list) or not all(isinstance(name, str) for name in passes):
+        raise CaptureFolderError(f"{root / DATASET_FILE} names no passes: render the captures again")
     return about
 
 

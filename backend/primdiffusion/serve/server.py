@@ -148,7 +148,7 @@ class Server:
             method = self._methods.get(message.method)
             if method is None:
                 known = ", ".join(self._methods)
-                raise RpcError(METHOD_NOT_FOUND, f"there is no method {message.method!r}: the methods are {known}")
+                raise RpcError(METHOD_NOT_FOUND, f"there is no method {message.method!r:.40}: the methods are {known}")
             method(message)
         except OSError:
             raise

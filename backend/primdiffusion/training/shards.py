@@ -187,5 +187,6 @@ def _read_index(path: Path) -> dict[str, Any]:
     if not isinstance(index, dict) or index.get("format") != FORMAT:
         raise ShardError(f"{path} is not the index of packed humans: choose another folder")
     if index.get("version") != VERSION:
-        raise ShardError(f"{path} has version {index.get('version')}, this program reads {VERSION}: pack again")
+        version = index.get("version")
+        raise ShardError(f"{path} has version {version!s:.20}, this program reads {VERSION}: pack again")
     return index

@@ -150,8 +150,8 @@ def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> N
         for name in sorted({*wanted, *there}):
             if there.get(name) != wanted.get(name):
                 raise ValueError(
-                    f"what is in {path.parent} was made with {name} = {there.get(name)}, not {wanted.get(name)}: "
-                    "choose another folder, or add --resume to keep it"
+                    f"what is in {path.parent} was made with {name:.40} = {there.get(name)!s:.60}, not "
+                    f"{wanted.get(name)!s:.60}: choose another folder, or add --resume to keep it"
                 )
     try:
         with replacing(path) as unfinished:

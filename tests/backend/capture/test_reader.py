@@ -81,6 +81,23 @@ def test_joints_project_to_where_the_file_says(root):
             np.testing.assert_allclose(default_joints(subject), noted["world"], atol=1e-5)
 
 
+@pytest.mark.parametrize("passes", [7, "img", [["img"]]])
+def test_passes_that_are_no_names_are_rejected(root, passes):
+    path = root / capture_layout.DATASET_FILE
+    path.write_text(json.dumps({**json.loads(path.read_text()), "passes": passes}))
+    with pytest.raises(capture_layout.CaptureFolderError, match="names no passes"):
+        open_captures(root)
+
+
+def test_cameras_as_far_as_no_camera_is_are_rejected(root):
+    path = root / NAME / "cameras.json"
+    cameras = json.loads(path.read_text())
+    cameras["camera0001"]["K"][0][2] = 2.0**63
+    path.write_text(json.dumps(cameras))
+    with pytest.raises(CaptureFileError, match="camera 1 is not finite"):
+        open_captures(root).view(NAME, 1, 2)
+
+
 def as_released(root):
     """What the authors' files are: no dataset.json, no plain twin, no other passes."""
     (root / capture_layout.DATASET_FILE).unlink()

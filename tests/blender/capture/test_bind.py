@@ -139,6 +139,7 @@ def test_a_scan_without_parameters_is_named(tmp_path, empty_scene):
         ({"body_pose": None, "global_orient": None}, "holds no pose"),
         ({"body_pose": np.full((1, 69), np.nan)}, "NaN or infinite"),
         ({"betas": np.full((1, 10), np.inf)}, "'betas' holds something else than finite numbers"),
+        ({"betas": np.full((1, 10), 1e300)}, "'betas' holds something else than finite numbers"),
         ({"betas": np.array([{"a": 1}], object)}, "pickled Python objects"),
         ({"scale": np.array(0.0)}, "'scale' is 0, not positive"),
         ({"body_pose": np.zeros((1, 30))}, "poses of 11 joints"),
