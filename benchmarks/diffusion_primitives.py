@@ -33,6 +33,7 @@ def main() -> None:
     parser.add_argument("--holdout", type=float, default=0.08)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=45.0)
+    parser.add_argument("--batch", type=int, default=16, help="of the U-Net; fewer give more steps in little time")
     parser.add_argument("--threads", type=int, default=1)
     arguments = parser.parse_args()
     torch.set_num_threads(arguments.threads)
@@ -40,6 +41,7 @@ def main() -> None:
     folder = arguments.prepared or arguments.out
     folder.mkdir(parents=True, exist_ok=True)
     config = TrainingConfig(data=arguments.people, run=folder, holdout=arguments.holdout, seed=arguments.seed)
+    config = dataclasses.replace(config, local=dataclasses.replace(config.local, batch=arguments.batch))
     train_model(config, arguments.model, arguments.out, arguments.minutes, arguments.threads)
 
 
@@ -70,6 +72,7 @@ def train_model(config: TrainingConfig, kind: str, out: Path, minutes: float, th
             "minutes": round(sum(part.seconds for part in done.values()) / 60, 1),
             "threads": threads,
             "steps": {part: progress.steps for part, progress in done.items()},
+            "batch": {part: phase.batch for part, phase in trainee.phases.items()},
         }
         model = dataclasses.replace(trainee.model(), card=card)
         save_checkpoint(out / "model.safetensors", model, str(config.schedule))

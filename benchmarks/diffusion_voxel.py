@@ -10,6 +10,7 @@ takes, is there from the first minute of the U-Net and states how long it was tr
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -54,6 +55,7 @@ def main() -> None:
     parser.add_argument("--holdout", type=float, default=0.08)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=45.0)
+    parser.add_argument("--batch", type=int, default=LOCAL.batch, help="of the U-Net")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--grids-only", action="store_true", help="make the grids, train nothing")
     arguments = parser.parse_args()
@@ -69,7 +71,8 @@ def main() -> None:
     torch.manual_seed(arguments.seed)
     denoiser, shapes = voxel_denoiser(prior, codec), fit_shapes(people, prior)
     objectives = objective_of(denoiser, people, codec, vocabulary)
-    run = Run(objectives, {"person": PERSON, "local": LOCAL}, arguments.out, arguments.seed)
+    phases = {"person": PERSON, "local": dataclasses.replace(LOCAL, batch=arguments.batch)}
+    run = Run(objectives, phases, arguments.out, arguments.seed)
     full_density = read_person(train_paths[0]).full_density
     done: dict[str, Progress] = {}
 
@@ -83,6 +86,7 @@ def main() -> None:
             "minutes": round(sum(part.seconds for part in done.values()) / 60, 1),
             "threads": arguments.threads,
             "steps": {part: progress.steps for part, progress in done.items()},
+            "batch": {part: phase.batch for part, phase in phases.items()},
             "schedule": SCHEDULE,
         }
         model = VoxelModel(denoiser, codec, shapes, full_density, card)
