@@ -57,7 +57,10 @@ Export = Callable[[str, torch.nn.Module, Progress], None]
 
 
 def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export: Export) -> None:
-    """Trains one network for so many seconds, interruptions not counted, and leaves its average in place."""
+    """Trains one network for so many seconds, interruptions not counted, and leaves its average in place.
+
+    The rate falls over the planned steps; further ones have its last value.
+    """
     network = getattr(denoiser, name).requires_grad_(True)
     plan, stored = run.folder / f"{name}.json", run.folder / f"{name}.state.safetensors"
     if not plan.is_file():
@@ -76,7 +79,7 @@ def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export:
         print(name, state.step, "of", config.steps, f"{state.seconds:.0f} s, loss {mean:.4f}", flush=True)
         export(name, state.average, Progress(state.step, state.seconds))
 
-    while state.step < config.steps and state.seconds < seconds:
+    while state.seconds < seconds:
         began = time.process_time()
         loss = objective.loss(state.generator)
         state.update(loss)
