@@ -19,7 +19,12 @@ from encoder_paper_form import FORMS, figures_of, measured, train
 def test_forms_differ_from_the_papers_in_one_setting():
     found = {name: {key for key, value in vars(PRESETS[preset]).items() if value != getattr(PAPER, key)}
              for name, preset in FORMS.items()}  # fmt: skip
-    expected = {"full": set(), "shared_scale": {"delta_scale"}, "template_rt": {"frames"}, "no_attention": {"attention"}}
+    expected = {
+        "full": set(),
+        "shared_scale": {"delta_scale"},
+        "template_rt": {"frames"},
+        "no_attention": {"attention"},
+    }
     assert found == expected
 
 

@@ -9,12 +9,13 @@ import torch
 from diffuse_runs import settings
 from diffusion_people import small_model, write_people
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.evaluation.tables import Cell
+from primdiffusion.evaluation.tables import Cell, Judged, Networks
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import tables
 from diffusion_primitives import train_model
 from latent_baseline import decoded_rest, sample_people
-from tables import Model, check_equal, figures_of
+from tables import Model, check_equal, figures_of, judged
 
 CARD = {"minutes": 3.0, "people": 10, "geometries": 5, "steps": {"local": 7}}
 
@@ -88,3 +89,21 @@ def test_figures_name_model_and_measure():
     assert figures["depth_error_latents"] is None
     assert figures["steps_local_voxels"] == 7
     assert "distance_floor" not in figures
+
+
+def test_what_was_seen_is_not_looked_at_again(tmp_path, monkeypatch):
+    asked = []
+
+    def judge(shots, networks):
+        seeds = list(shots)
+        asked.extend(seeds)
+        features = {"own": torch.tensor(seeds)[:, None].float(), "detail": torch.zeros(len(seeds), 3)}
+        return Judged(len(seeds), features, {"own": [0.5] * len(seeds)}, {"own": []})
+
+    monkeypatch.setattr(tables, "judge", judge)
+    first = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
+    again = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
+    assert asked == list(range(10))
+    assert torch.equal(first.features["own"], again.features["own"])
+    assert again.features["own"][:, 0].tolist() == asked
+    assert len(again.correct["own"]) == again.pictures == 10
