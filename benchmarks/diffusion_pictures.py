@@ -1,10 +1,11 @@
 """Pictures of generated humans beside their nearest training samples, and beside baselines.
 
 `python benchmarks/diffusion_pictures.py --people DIR --reference DIR --voxel voxel.safetensors --neighbours
-docs/pictures/neighbours.png --comparison docs/pictures/generated_comparison.png` renders humans from consecutive seeds,
-not hand-picked: each beside the nearest training samples by features and by latents, with distances (1 is the median of
-the held-out set); and rows of held-out samples, ours, the Gaussian's and the voxel baseline's. --reference is the
-folder of benchmarks/diffusion.py.
+docs/pictures/neighbours.png` renders humans from consecutive seeds, not hand-picked, each beside the nearest training
+samples by features and by latents, with distances (1 is the median of the held-out set). --reference is the folder of
+benchmarks/diffusion.py. `--comparison docs/pictures/generated_comparison.png --checkpoint ours/model.safetensors
+--latents latents/model.safetensors --voxel voxels/voxel.safetensors` renders rows of held-out samples, and of the
+models that benchmarks/tables.py compares.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from diffusion import epoch, progress
-from diffusion_sets import gaussian, generated, placed, seeds_of, stored_voxels, voxels
+from diffusion_sets import generated, placed, seeds_of, voxels
+from latent_baseline import sample_people
 from neighbours import nearest_stored
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.diffusion.checkpoint import load_checkpoint
@@ -55,7 +57,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the training run")
     parser.add_argument("--reference", type=Path, default=Path("runs/reference"))
     parser.add_argument("--checkpoint", type=Path)
-    parser.add_argument("--voxel", type=Path)
+    parser.add_argument("--latents", type=Path, help="baseline of diffusion_primitives.py")
+    parser.add_argument("--voxel", type=Path, help="baseline of diffusion_voxel.py")
     parser.add_argument("--count", type=int, default=8, help="people in a picture")
     parser.add_argument("--neighbours", type=Path, help="PNG of people beside their neighbours")
     parser.add_argument("--comparison", type=Path, help="PNG of people beside baselines'")
@@ -73,7 +76,9 @@ def main() -> None:
         neighbours(reference, model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
         print(arguments.neighbours)
     if arguments.comparison is not None:
-        comparison(model, held, arguments.voxel, arguments.count).save(arguments.comparison, optimize=True)
+        comparison(model, held, arguments.latents, arguments.voxel, arguments.count).save(
+            arguments.comparison, optimize=True
+        )
         print(arguments.comparison)
 
 
@@ -113,18 +118,20 @@ def stored(path: Path, colouring: int) -> Primitives:
     return Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, colouring))
 
 
-def comparison(model: DiffusionModel, held: Sequence[Path], voxel: Path | None, count: int) -> Image.Image:
+def comparison(
+    model: DiffusionModel, held: Sequence[Path], latents: Path | None, voxel: Path | None, count: int
+) -> Image.Image:
     """A row for each way to make people."""
     seeds = seeds_of(count)
     some = held[:: max(len(held) // count, 1)][:count]
     sets: dict[str, Iterable[Primitives]] = {
         "held out": (stored(path, 0) for path in some),
         "ours": placed(generated(model, seeds)),
-        "Gaussian": placed(gaussian(model, seeds)),
-        "held out, voxels": (next(iter(stored_voxels([path]))) for path in some),
     }
+    if latents is not None:
+        sets["latents"] = placed(iter(sample_people(load_checkpoint(latents), seeds)))
     if voxel is not None:
-        sets["voxel diffusion"] = voxels(load_voxel_model(voxel), seeds)
+        sets["voxels"] = voxels(load_voxel_model(voxel), seeds)
     rows = [(name, [(one, "") for one in islice(made, count)]) for name, made in sets.items()]
     return sheet(rows, "In T pose, from the front, and heads; consecutive seeds, evenly spaced held-out samples")
 

@@ -69,7 +69,7 @@ def placed(people: Iterator[Human]) -> Iterator[Primitives]:
 
 
 def voxels(model: VoxelModel, seeds: Sequence[int]) -> Iterator[Primitives]:
-    return (model.primitives(grid) for grid in model.sample(seeds))
+    return (model.primitives(person.grid) for person in model.sample(seeds))
 
 
 def decoded(model: DiffusionModel, paths: Sequence[Path], colourings: int | None = None) -> Iterator[Primitives]:

@@ -12,14 +12,12 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import statistics
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
+from equal_time import PERSON_SHARE, Objectives, Progress, Run, train
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
@@ -29,8 +27,7 @@ from primdiffusion.people.payloads import rest_frames
 from primdiffusion.training.config import PhaseConfig, PriorConfig
 from primdiffusion.training.latents import LatentSet, split_people, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective
-from primdiffusion.training.prior import fit_prior
-from primdiffusion.training.state import TrainingState
+from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.stored_people import find_people, read_outline, read_person
 from safetensors.torch import load_file, save
 from torch import Tensor
@@ -46,11 +43,9 @@ from voxel_grid import voxelise
 
 CHANNELS = 64
 """Numbers of a cell, as many as a primitive has in our codec."""
-PERSON_SHARE = 0.2
-PERSON = PhaseConfig(steps=1, batch=128)
-LOCAL = PhaseConfig(steps=1, batch=8, blend=0.2, weight_decay=0.0, bfloat16=True)
-"""Our model's phases; steps follow from the time."""
-SAVE_EVERY = 60.0
+PERSON = PhaseConfig(steps=1, batch=256)
+LOCAL = PhaseConfig(steps=1, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True)
+"""The default model's phases; steps follow from the time."""
 
 
 def main() -> None:
@@ -60,6 +55,7 @@ def main() -> None:
     parser.add_argument("--holdout", type=float, default=0.08)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--minutes", type=float, default=45.0)
+    parser.add_argument("--batch", type=int, default=LOCAL.batch, help="of the U-Net")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--grids-only", action="store_true", help="make the grids, train nothing")
     arguments = parser.parse_args()
@@ -72,9 +68,11 @@ def main() -> None:
     train_paths, _ = split_people(paths, arguments.holdout, arguments.seed)
     vocabulary = vocabulary_of(each for path in train_paths for each in read_outline(path).known())
     codec, people, prior = prepared(train_paths, vocabulary, arguments.out)
-    run = Run(people, codec, vocabulary, arguments.out, arguments.seed)
     torch.manual_seed(arguments.seed)
-    denoiser = voxel_denoiser(prior, codec)
+    denoiser, shapes = voxel_denoiser(prior, codec), fit_shapes(people, prior)
+    objectives = objective_of(denoiser, people, codec, vocabulary)
+    phases = {"person": PERSON, "local": dataclasses.replace(LOCAL, batch=arguments.batch)}
+    run = Run(objectives, phases, arguments.out, arguments.seed)
     full_density = read_person(train_paths[0]).full_density
     done: dict[str, Progress] = {}
 
@@ -88,9 +86,11 @@ def main() -> None:
             "minutes": round(sum(part.seconds for part in done.values()) / 60, 1),
             "threads": arguments.threads,
             "steps": {part: progress.steps for part, progress in done.items()},
+            "batch": {part: phase.batch for part, phase in phases.items()},
             "schedule": SCHEDULE,
         }
-        save_voxel_model(arguments.out / "voxel.safetensors", VoxelModel(denoiser, codec, full_density, card))
+        model = VoxelModel(denoiser, codec, shapes, full_density, card)
+        save_voxel_model(arguments.out / "voxel.safetensors", model)
         setattr(denoiser, name, trained_one)
         print(json.dumps(card), flush=True)
 
@@ -164,89 +164,20 @@ def encoded(
     return LatentSet(torch.cat(latents), geometry, torch.stack(betas), torch.stack(conditions))
 
 
-class Run(NamedTuple):
-    """What both networks are trained with."""
-
-    people: LatentSet
-    codec: VoxelCodec
-    vocabulary: AttributeVocabulary
-    folder: Path
-    seed: int
-
-
-class Progress(NamedTuple):
-    steps: int
-    seconds: float
-
-
-Export = Callable[[str, torch.nn.Module, Progress], None]
-"""Told of a network's average now and then."""
-
-
-def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export: Export) -> None:
-    """Trains one network for so many seconds, interruptions not counted, and leaves its average in place."""
-    network = getattr(denoiser, name).requires_grad_(True)
-    plan, stored = run.folder / f"{name}.json", run.folder / f"{name}.state.safetensors"
-    if not plan.is_file():
-        plan.write_text(json.dumps(planned_steps(denoiser, name, run, seconds)))
-    config = phase(name, json.loads(plan.read_text()))
-    state = TrainingState(network, config, run.seed + 1)
-    if stored.is_file():
-        state.load(stored)
-    objective = objective_of(denoiser, name, run, config)
-    denoiser.network_dtype = torch.bfloat16 if config.bfloat16 else torch.float32
-    network.train()
-    mean, saved = 0.0, time.monotonic()
-
-    def save_all() -> None:
-        state.save(stored)
-        print(name, state.step, "of", config.steps, f"{state.seconds:.0f} s, loss {mean:.4f}", flush=True)
-        export(name, state.average, Progress(state.step, state.seconds))
-
-    while state.step < config.steps and state.seconds < seconds:
-        began = time.process_time()
-        loss = objective.loss(state.generator)
-        state.update(loss)
-        mean += (float(loss.detach()) - mean) / min(state.step, 200)
-        state.seconds += time.process_time() - began
-        if time.monotonic() - saved > SAVE_EVERY:
-            saved = time.monotonic()
-            save_all()
-    save_all()
-    setattr(denoiser, name, state.average)
-    denoiser.network_dtype = torch.float32
-
-
-def planned_steps(denoiser: PersonDenoiser, name: str, run: Run, seconds: float) -> int:
-    """How many steps fit into the time, by a few of a network that is thrown away: the rate falls over as many."""
-    config = phase(name, 1000)
-    network = getattr(denoiser, name)
-    weights = {key: value.clone() for key, value in network.state_dict().items()}
-    state = TrainingState(network, config, 0)
-    objective = objective_of(denoiser, name, run, config)
-    denoiser.network_dtype = torch.bfloat16 if config.bfloat16 else torch.float32
-    times = []
-    for _ in range(9):
-        began = time.process_time()
-        state.update(objective.loss(state.generator))
-        times.append(time.process_time() - began)
-    network.load_state_dict(weights)
-    return max(1, round(seconds / statistics.median(times)))
-
-
-def phase(name: str, steps: int) -> PhaseConfig:
-    """The settings of a phase of so many steps."""
-    return dataclasses.replace(PERSON if name == "person" else LOCAL, steps=steps)
-
-
-def objective_of(denoiser: PersonDenoiser, name: str, run: Run, config: PhaseConfig) -> PersonObjective | RestObjective:
+def objective_of(
+    denoiser: PersonDenoiser, people: LatentSet, codec: VoxelCodec, vocabulary: AttributeVocabulary
+) -> Objectives:
     """The losses that our model is trained by."""
-    if name == "local":
-        return RestObjective(denoiser, run.people, run.codec, run.vocabulary, config)  # pyright: ignore[reportArgumentType]
-    coefficients = torch.cat([denoiser.prior.split(chunk.float())[0] for chunk in run.people.latents.split(128)])
-    # As in `training.diffuse`: components vary more over the people they are fitted to than over new ones.
-    coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
-    return PersonObjective(denoiser, coefficients, run.people, run.vocabulary, config)
+
+    def of(name: str, config: PhaseConfig) -> PersonObjective | RestObjective:
+        if name == "local":
+            return RestObjective(denoiser, people, codec, vocabulary, config)  # pyright: ignore[reportArgumentType]
+        coefficients = torch.cat([denoiser.prior.split(chunk.float())[0] for chunk in people.latents.split(128)])
+        # As in `training.cells`: components vary more over the people they are fitted to than over new ones.
+        coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
+        return PersonObjective(denoiser, coefficients, people, vocabulary, config)
+
+    return of
 
 
 if __name__ == "__main__":

@@ -34,6 +34,16 @@ SOURCES = {
         "benchmarks/diffusion.py --people DIR --reference DIR --voxel FILE --json docs/results/diffusion.json "
         "--table docs/results/diffusion_table.md",
     ),
+    "tables": (
+        "The paper's Table 2: other representations, trained for equal time",
+        "benchmarks/tables.py --models DIR --assets DIR --json docs/results/tables.json "
+        "--table docs/results/tables_table.md",
+    ),
+    "encoder_paper_form": (
+        "The paper's Table 3 in the paper's own form",
+        "benchmarks/encoder_paper_form.py --train DIR --novel DIR --out DIR "
+        "--json docs/results/encoder_paper_form.json",
+    ),
     "attribute_hits": (
         "Attributes that were asked for",
         "benchmarks/attribute_hits.py --assets DIR --reference DIR --json docs/results/attribute_hits.json",

@@ -11,6 +11,7 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int, UInt8
@@ -18,8 +19,9 @@ from primdiffusion.diffusion.codec import DEAD_ZONE, SLAB_UNIT
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import PersonNetworkConfig
+from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.diffusion.samplers import SAMPLERS
-from primdiffusion.diffusion.schedule import SCHEDULES, trailing_steps
+from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
@@ -36,7 +38,8 @@ BLOCKS = SIDE // BLOCK
 VALUES = 4 * BLOCK**3
 CELLS_EACH = 256
 """Cells of each sample that the principal components are fitted to."""
-SCHEDULE = "linear"
+SCHEDULE, CHAIN = "fine_linear", "dense"
+"""The default model's."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -197,21 +200,30 @@ class VoxelUNet(nn.Module):
         return self.outer(self.norm(x.flatten(2).mT[:, self.cells])).mT[..., None]
 
 
+class VoxelPerson(NamedTuple):
+    """A sample."""
+
+    grid: Float[Tensor, "64 64 64 4"]
+    betas: Float[Tensor, "10"]
+    """Shape of a body that suits the grid, to frame it and to know where its joints are."""
+
+
 @dataclasses.dataclass(frozen=True)
 class VoxelModel:
     """A trained voxel baseline."""
 
     denoiser: PersonDenoiser
     codec: VoxelCodec
+    shapes: ShapePrior
     full_density: float
     """Density that a stored value of 1 encodes, 1/m."""
     card: dict[str, object]
     """Training data and duration."""
 
-    def sample(self, seeds: Sequence[int], steps: int = 30) -> Iterator[Float[Tensor, "64 64 64 4"]]:
-        """Sample a grid for each seed with DDIM, starting as `DiffusionModel.start` does."""
+    def sample(self, seeds: Sequence[int], steps: int = 30) -> Iterator[VoxelPerson]:
+        """Sample a person for each seed with DDIM, starting as `DiffusionModel.start` does."""
         schedule, prior = self.denoiser.schedule, self.denoiser.prior
-        chain = trailing_steps(schedule.length, steps)
+        chain = CHAINS[CHAIN](schedule.length, steps)
 
         def denoise(x: Tensor, t: int) -> Tensor:
             with torch.inference_mode():
@@ -223,7 +235,8 @@ class VoxelModel:
             x = schedule.noise(chain[0]) * noise + schedule.signal(chain[0]) * prior.sample(1, generator)
             for step in SAMPLERS["ddim"](denoise, schedule, x, chain, [generator]):
                 x = step.x0
-            yield self.codec.decode(x.clone())[0]
+            features = (prior.split(x)[0] / self.denoiser.component_std)[:, : self.shapes.weight.shape[1]]
+            yield VoxelPerson(self.codec.decode(x.clone())[0], self.shapes.sample(features, [generator])[0])
 
     def primitives(self, grid: Float[Tensor, "64 64 64 4"]) -> Primitives:
         """Convert a grid to a primitive that the marcher can render."""
@@ -244,6 +257,7 @@ def save_voxel_model(path: Path, model: VoxelModel) -> None:
     """Write the model, atomically."""
     tensors = {f"denoiser.{name}": value for name, value in model.denoiser.state_dict().items()}
     tensors |= {f"codec.{field.name}": getattr(model.codec, field.name) for field in dataclasses.fields(VoxelCodec)}
+    tensors |= {f"shapes.{field.name}": getattr(model.shapes, field.name) for field in dataclasses.fields(ShapePrior)}
     about = {"full_density": model.full_density, "card": model.card}
     with written_whole(path) as unfinished:
         contents = {name: value.detach().contiguous() for name, value in tensors.items()}
@@ -258,14 +272,14 @@ def load_voxel_model(path: Path) -> VoxelModel:
         with safe_open(path, framework="pt") as file:
             about = json.loads(file.metadata()["about"])
             tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-        codec = VoxelCodec(**_under(tensors, "codec."))
+        codec, shapes = VoxelCodec(**_under(tensors, "codec.")), ShapePrior(**_under(tensors, "shapes."))
         weights = _under(tensors, "denoiser.")
         denoiser = voxel_denoiser(PersonPrior(**_under(weights, "prior_")), codec)
         denoiser.load_state_dict(weights)
     except (SafetensorError, KeyError, TypeError, RuntimeError, OSError, ValueError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(f"{path} is not a voxel baseline of this version ({reason}): train it again") from error
-    return VoxelModel(denoiser, codec, about["full_density"], about["card"])
+    return VoxelModel(denoiser, codec, shapes, about["full_density"], about["card"])
 
 
 def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:

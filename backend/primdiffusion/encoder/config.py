@@ -158,9 +158,12 @@ PRESETS: Mapping[str, EncoderConfig] = {
     "template_rt": dataclasses.replace(DEFAULT, frames="template"),
     "no_attention": dataclasses.replace(DEFAULT, attention="none"),
     "paper": PAPER,
+    "paper_shared_scale": dataclasses.replace(PAPER, delta_scale="shared"),
+    "paper_template_rt": dataclasses.replace(PAPER, frames="template"),
+    "paper_no_attention": dataclasses.replace(PAPER, attention="none"),
     "released": RELEASED,
 }
-"""Encoders by name: ours, its three ablations (paper Table 3), and the architectures of the paper and its code."""
+"""Encoders by name: ours and the paper's, each with three ablations (paper Table 3), and that of the paper's code."""
 
 
 _ADDED: Mapping[str, Any] = {"masks": "whole", "compat": "none", "grid_outputs": 0}

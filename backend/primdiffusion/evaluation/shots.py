@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 from torch.nn import functional
 
-from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.body.model import BodyPose, PosedBody, default_body
 from primdiffusion.formats.arrays import read_npy
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
@@ -80,10 +80,17 @@ def human_shots(
     for number in range(len(poses.joint_rotation)):
         posed = pose_body(human.betas, poses.map(lambda t, n=number: t[n]), body)
         primitives = Primitives.place(attach(anchors, posed.vertices, body.faces), human.payload).to(device)
-        for view in range(views):
-            camera = body_camera(posed.vertices, 2 * math.pi * view / views)
-            seen = march(primitives, camera.to(device), settings).to("cpu")
-            yield _shot(f"{name}_{number:02d}_{view:02d}", seen.rgb, seen.alpha, seen.depth, posed.joints, camera)
+        yield from primitive_shots(primitives, posed, views, f"{name}_{number:02d}", settings)
+
+
+def primitive_shots(
+    primitives: Primitives, posed: PosedBody, views: int, name: str, settings: MarchSettings
+) -> Iterator[Shot]:
+    """Primitives from all views around a body, drawn by the marcher on their device."""
+    for view in range(views):
+        camera = body_camera(posed.vertices, 2 * math.pi * view / views)
+        seen = march(primitives, camera.to(primitives.position.device), settings).to("cpu")
+        yield _shot(f"{name}_{view:02d}", seen.rgb, seen.alpha, seen.depth, posed.joints, camera)
 
 
 def mesh_shots(

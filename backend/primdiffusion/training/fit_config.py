@@ -10,7 +10,17 @@ from typing import Literal
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.training.config import Tracker
 
-Preset = Literal["default", "shared_scale", "template_rt", "no_attention", "paper", "released"]
+Preset = Literal[
+    "default",
+    "shared_scale",
+    "template_rt",
+    "no_attention",
+    "paper",
+    "paper_shared_scale",
+    "paper_template_rt",
+    "paper_no_attention",
+    "released",
+]
 AT_LEAST_ONE = (
     "steps",
     "batch",
@@ -62,7 +72,8 @@ class FitConfig:
     held: Path | None = None
     """Captures of held-out subjects for evaluation."""
     encoder: Preset = "default"
-    """default, its ablations shared_scale, template_rt and no_attention, or the architectures paper and released."""
+    """default, its ablations shared_scale, template_rt and no_attention, the same four in the paper's form (paper,
+    paper_shared_scale, ...), or the architecture released."""
     steps: int = 20_000
     """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: int = 4

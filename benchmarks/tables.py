@@ -1,0 +1,204 @@
+"""The paper's Table 2: primitives, one latent vector a human and voxels, trained on equal people for equal time.
+
+`python benchmarks/tables.py --models DIR --assets DIR --json docs/results/tables.json --table
+docs/results/tables_table.md` samples DIR/ours/model.safetensors and DIR/latents/model.safetensors of
+diffusion_primitives.py and DIR/voxels/voxel.safetensors of diffusion_voxel.py, and judges --count humans of each by the
+code of `primdiffusion evaluate generation --table 2`: 512 x 512 pictures over white from --views sides beside renders
+of twice as many meshes of seeds that nobody trains on. All are in the rest pose, since voxels have no other.
+Distances, PCKh and depth errors are of our own network; `_real` are of the renders, `_floor` of its card. `_default` is
+the default model, which had more people and time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from diffusion_sets import TOGETHER, generated, seeds_of
+from latent_baseline import sample_people
+from primdiffusion.body.model import BodyPose, J
+from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.evaluation.pose_depth_network import load_pose_depth_network
+from primdiffusion.evaluation.shots import SIDE, Shot, human_shots, mesh_shots, primitive_shots
+from primdiffusion.evaluation.tables import Cell, Judged, Networks, compare_pictures, floor_cells, judge, table
+from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.human import Human, pose_body
+from primdiffusion.people.assets import Assets, open_assets
+from primdiffusion.people.base_mesh import load_base_mesh
+from primdiffusion.people.person import make_person
+from primdiffusion.render.march import MarchSettings
+from record import command_line, report
+from voxel_baseline import VoxelModel, load_voxel_model
+
+REAL_SEED = 3_000_000
+"""First seed of the meshes, as of `primdiffusion evaluate generation`."""
+REAL_EACH = 2
+"""Meshes for each human of a model: one half of their pictures is compared with all of the model's."""
+REST = BodyPose.from_axis_angle(torch.zeros(1, 3 * J))
+MARCH = MarchSettings()
+MOST_APART = 0.05
+"""Relative difference of training times up to which they are called equal."""
+COMPARED = ("ours", "latents", "voxels")
+COLUMNS = {"own_distance": "distance", "own_pckh": "pckh", "own_depth": "depth_error"}
+Figures = dict[str, float | int | str | None]
+
+
+class Model(NamedTuple):
+    """One of the models that are compared."""
+
+    card: Mapping[str, Any]
+    shots: Callable[[Sequence[int], int], Iterator[Shot]]
+    """Pictures of the humans of these seeds from so many sides."""
+
+
+def main() -> None:
+    arguments = parsed()
+    torch.set_num_threads(arguments.threads)
+    models = read_models(arguments.models, arguments.without_default)
+    rows = judged_rows(models, open_assets(arguments.assets), arguments.count, arguments.views, arguments.found)
+    figures = figures_of(rows, models)
+    figures |= {"samples": arguments.count, "pictures": arguments.count * arguments.views}
+    figures |= {"real_meshes": REAL_EACH * arguments.count}
+    report(figures, arguments.json)
+    choices = {
+        "pictures": f"{arguments.count} humans from {arguments.views} sides in the rest pose; "
+        f"{REAL_EACH * arguments.count} meshes"
+    }
+    text = table(2, rows, choices)
+    print(text)
+    if arguments.table is not None:
+        arguments.table.write_text(text + "\n", encoding="utf-8")
+
+
+def parsed() -> argparse.Namespace:
+    parser = command_line(__doc__)
+    parser.add_argument("--models", type=Path, required=True, help="folder of ours, latents and voxels")
+    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
+    parser.add_argument("--count", type=int, default=64, help="humans of each model")
+    parser.add_argument("--views", type=int, default=4, help="sides of each")
+    parser.add_argument("--found", type=Path, help="folder in which what was seen of humans is kept, to go on later")
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--without-default", action="store_true", help="leave the default model out")
+    parser.add_argument("--table", type=Path, help="markdown file for the table")
+    return parser.parse_args()
+
+
+def read_models(folder: Path, without_default: bool = False) -> dict[str, Model]:
+    """The models by name.
+
+    Raises FileNotFoundError and ValueError for models that are missing, damaged, or not trained on equal people for
+    equal time.
+    """
+    ours, latents = (load_checkpoint(folder / name / "model.safetensors") for name in ("ours", "latents"))
+    voxels = load_voxel_model(folder / "voxels" / "voxel.safetensors")
+
+    models = {
+        "ours": Model(ours.card, lambda seeds, views: shots_of(generated(ours, seeds), seeds, views)),
+        "latents": Model(
+            latents.card, lambda seeds, views: shots_of(iter(sample_people(latents, seeds)), seeds, views)
+        ),
+        "voxels": Model(voxels.card, lambda seeds, views: voxel_shots(voxels, seeds, views)),
+    }
+    check_equal({name: model.card for name, model in models.items()})
+    if not without_default:
+        default = load_checkpoint()
+        models["default"] = Model(default.card, lambda seeds, views: shots_of(generated(default, seeds), seeds, views))
+    return models
+
+
+def check_equal(cards: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raise ValueError unless the models had equal people and time."""
+    minutes = {name: float(card["minutes"]) for name, card in cards.items()}
+    people = {name: int(card["people"]) for name, card in cards.items()}
+    if len(set(people.values())) > 1 or max(minutes.values()) > (1 + MOST_APART) * min(minutes.values()):
+        trained = ", ".join(f"{name} {people[name]} people, {minutes[name]:g} minutes" for name in cards)
+        raise ValueError(f"the models were not trained equally ({trained}): train them again")
+
+
+def shots_of(humans: Iterator[Human], seeds: Sequence[int], views: int) -> Iterator[Shot]:
+    """Pictures of humans of these seeds."""
+    for seed, human in zip(seeds, humans, strict=True):
+        yield from human_shots(human, REST, views, f"{seed:06d}", MARCH, torch.device("cpu"))
+
+
+def voxel_shots(model: VoxelModel, seeds: Sequence[int], views: int) -> Iterator[Shot]:
+    """Pictures of grids around the bodies that were sampled with them."""
+    for seed, person in zip(seeds, model.sample(seeds), strict=True):
+        posed = pose_body(person.betas, REST.map(lambda t: t[0]))
+        yield from primitive_shots(model.primitives(person.grid), posed, views, f"{seed:06d}", MARCH)
+
+
+def real_shots(assets: Assets, seeds: Sequence[int], views: int) -> Iterator[Shot]:
+    """Renders of meshes."""
+    base, yaws = load_base_mesh(), [[2 * math.pi * view / views for view in range(views)]]
+    for seed in seeds:
+        yield from mesh_shots(make_person(assets, base, seed), REST, yaws, f"{seed:08d}", SIDE)
+
+
+def judged_rows(
+    models: Mapping[str, Model], assets: Assets, count: int, views: int, found: Path | None = None
+) -> dict[str, dict[str, Cell]]:
+    """The table's rows: each model's, the real pictures', and the floor."""
+    networks = Networks(load_pose_depth_network())
+    found = None if found is None else found / f"{views}_views"
+    seeds_of_real = seeds_of(REAL_EACH * count, REAL_SEED)
+    real = judged("real", lambda seeds: real_shots(assets, seeds, views), seeds_of_real, networks, found)
+    rows: dict[str, dict[str, Cell]] = {}
+    own: dict[str, Cell] = {}
+    for name, model in models.items():
+        fake = judged(name, lambda seeds, m=model: m.shots(seeds, views), seeds_of(count), networks, found)
+        cells = compare_pictures(fake, real, 100, 1000, 2020)
+        rows[name], own = cells["generated"], cells["real"]
+    return {**rows, "real": own, "floor": floor_cells(networks.own.card)}
+
+
+def judged(
+    name: str,
+    shots: Callable[[Sequence[int]], Iterator[Shot]],
+    seeds: Sequence[int],
+    networks: Networks,
+    found: Path | None = None,
+) -> Judged:
+    """What our network finds in a set, TOGETHER humans at a time; kept in the folder `found`, and read from there."""
+    parts = []
+    for first in range(0, len(seeds), TOGETHER):
+        some = seeds[first : first + TOGETHER]
+        path = None if found is None else found / f"{name}_{some[0]}_{len(some)}.json"
+        if path is not None and path.is_file():
+            parts.append(json.loads(path.read_text()))
+            continue
+        one = judge(shots(some), networks)
+        features = {key: values.tolist() for key, values in one.features.items()}
+        parts.append({"features": features, "own": one.correct["own"], "depth": one.depth["own"]})
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with written_whole(path) as unfinished:
+                unfinished.write_text(json.dumps(parts[-1]))
+        print(name, first + len(some), "of", len(seeds), flush=True)
+    features = {key: torch.cat([torch.tensor(part["features"][key]) for part in parts]) for key in parts[0]["features"]}
+    correct, depth = ([value for part in parts for value in part[key]] for key in ("own", "depth"))
+    return Judged(len(features["own"]), features, {"own": correct, "pose": []}, {"own": depth, "depth": []})
+
+
+def figures_of(rows: Mapping[str, Mapping[str, Cell]], models: Mapping[str, Model]) -> Figures:
+    """Figures by name; null where a row has none."""
+    figures: Figures = {}
+    for row in (*COMPARED, "default", "real", "floor"):
+        for column, name in COLUMNS.items():
+            cell = rows.get(row, {}).get(column, Cell(None))
+            if (row, name) != ("floor", "distance"):
+                figures[f"{name}_{row}"] = None if cell.value is None else round(cell.value, 3)
+    for name in COMPARED:
+        card = models[name].card
+        figures |= {f"{what}_{name}": card[what] for what in ("minutes", "people", "geometries")}
+        figures |= {f"steps_{network}_{name}": steps for network, steps in card["steps"].items()}
+    return figures
+
+
+if __name__ == "__main__":
+    main()

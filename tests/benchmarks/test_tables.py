@@ -1,0 +1,109 @@
+"""The comparison of Table 2: the latent baseline, training by processor time, and the table's figures."""
+
+import dataclasses
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from diffuse_runs import settings
+from diffusion_people import small_model, write_people
+from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.evaluation.tables import Cell, Judged, Networks
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import tables
+from diffusion_primitives import train_model
+from latent_baseline import decoded_rest, sample_people
+from tables import Model, check_equal, figures_of, judged
+
+CARD = {"minutes": 3.0, "people": 10, "geometries": 5, "steps": {"local": 7}}
+
+
+@pytest.fixture(scope="module")
+def baseline():
+    model = small_model()
+    return dataclasses.replace(model, card={**model.card, "baseline": "latents"})
+
+
+def test_everything_of_a_human_follows_from_its_vector(baseline):
+    (human,) = sample_people(baseline, [5], steps=3)
+    prior = baseline.denoiser.prior
+    x0 = baseline.encode(human.payload)[None]
+    coefficients, _ = prior.split(x0)
+    again = prior.join(coefficients, prior.rest_variance.sqrt() * decoded_rest(baseline.denoiser, coefficients))
+    decoded = baseline.decode(again.detach())
+    inside = (human.payload.density > 0) & (human.payload.density < baseline.full_density)
+    assert human.payload.density.std() > 0
+    assert float((decoded.density[0] - human.payload.density)[inside].abs().mean()) < 40
+
+
+def test_latent_samples_follow_from_their_seeds(baseline):
+    first, second = sample_people(baseline, [1, 2], steps=2)
+    (again,) = sample_people(baseline, [2], steps=2)
+    assert torch.allclose(again.payload.rgb, second.payload.rgb, atol=1e-4)
+    assert torch.allclose(again.betas, second.betas, atol=1e-4)
+    assert not torch.allclose(first.payload.rgb, second.payload.rgb, atol=1e-2)
+
+
+def test_another_model_is_no_latent_baseline():
+    with pytest.raises(ValueError, match="no latent baseline"):
+        sample_people(small_model(), [0])
+
+
+@pytest.mark.parametrize("kind", ["ours", "latents"])
+def test_models_are_trained_for_their_time_and_go_on(tmp_path, kind):
+    write_people(tmp_path / "people", 10)
+    config = settings(tmp_path / "people", tmp_path / "prepared")
+    config.run.mkdir()
+    out = tmp_path / "out"
+    out.mkdir()
+    train_model(config, kind, out, minutes=0.01, threads=1)
+    model = load_checkpoint(out / "model.safetensors")
+    assert model.card["baseline"] == kind
+    assert model.card["people"] == 16
+    assert set(model.card["steps"]) == {"person", "local"}
+    written = (out / "local.state.safetensors").stat().st_mtime
+    train_model(config, kind, out, minutes=0.01, threads=1)
+    again = load_checkpoint(out / "model.safetensors")
+    assert again.card["steps"] == model.card["steps"]
+    assert written <= (out / "local.state.safetensors").stat().st_mtime
+
+
+def test_unequal_models_are_not_compared():
+    check_equal({"ours": CARD, "latents": {**CARD, "minutes": 3.1}})
+    with pytest.raises(ValueError, match="not trained equally"):
+        check_equal({"ours": CARD, "latents": {**CARD, "minutes": 4.0}})
+    with pytest.raises(ValueError, match="not trained equally"):
+        check_equal({"ours": CARD, "latents": {**CARD, "people": 11}})
+
+
+def test_figures_name_model_and_measure():
+    def shots(seeds, views):
+        return iter(())
+
+    rows = {"ours": {"own_distance": Cell(1.2345)}, "floor": {"own_pckh": Cell(30.0), "own_depth": Cell(90.0)}}
+    figures = figures_of(rows, dict.fromkeys(("ours", "latents", "voxels"), Model(CARD, shots)))
+    assert figures["distance_ours"] == 1.234
+    assert figures["pckh_floor"] == 30.0
+    assert figures["depth_error_latents"] is None
+    assert figures["steps_local_voxels"] == 7
+    assert "distance_floor" not in figures
+
+
+def test_what_was_seen_is_not_looked_at_again(tmp_path, monkeypatch):
+    asked = []
+
+    def judge(shots, networks):
+        seeds = list(shots)
+        asked.extend(seeds)
+        features = {"own": torch.tensor(seeds)[:, None].float(), "detail": torch.zeros(len(seeds), 3)}
+        return Judged(len(seeds), features, {"own": [0.5] * len(seeds)}, {"own": []})
+
+    monkeypatch.setattr(tables, "judge", judge)
+    first = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
+    again = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
+    assert asked == list(range(10))
+    assert torch.equal(first.features["own"], again.features["own"])
+    assert again.features["own"][:, 0].tolist() == asked
+    assert len(again.correct["own"]) == again.pictures == 10
