@@ -225,10 +225,10 @@ def show(asset: bpy.types.ID, picture: NDArray) -> None:
 
 def picture_of_file(path: Path) -> NDArray[np.float32]:
     """An image file as a picture for `show`: padded to a square, then scaled. Raises OSError for no image."""
-    check_regular(path)  # Blender would wait for a pipe
     try:
+        check_regular(path)  # Blender would wait for a pipe
         image = bpy.data.images.load(str(path))
-    except RuntimeError as error:
+    except (RuntimeError, OSError) as error:
         raise OSError(f"{path} cannot be read as a picture: choose a PNG or JPEG") from error
     try:
         width, height = image.size

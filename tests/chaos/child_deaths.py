@@ -29,7 +29,7 @@ HANG_S = 60.0
 LATEST_S, LATEST_WARM_S = 0.5, 0.15
 """After the start of a request, the time by which a new or a warm child dies: while it starts, works, or has
 finished."""
-NOTICED_S = 6.0
+NOTICED_S = 15.0
 """Of silence, after which the client gives up a child; in Blender it is 20 s."""
 
 

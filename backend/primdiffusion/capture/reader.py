@@ -221,6 +221,10 @@ def open_captures(root: str | Path) -> Captures:
     if not root.is_dir():
         raise FileNotFoundError(f"the folder of captures {root} does not exist: check the path")
     about = capture_layout.read_about(root) if (root / capture_layout.DATASET_FILE).exists() else {}
+    passes = about.get("passes", [])
+    if not isinstance(passes, list) or not all(isinstance(name, str) for name in passes):
+        path = root / capture_layout.DATASET_FILE
+        raise capture_layout.CaptureFolderError(f"{path} names no passes: render the captures again")
     listed = root / capture_layout.LIST_FILE
     if listed.is_file():
         names = [line.strip() for line in listed.read_text(encoding="utf-8", errors="replace").splitlines()]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
@@ -16,7 +17,7 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.capture.smpl_parameters import read_smpl
 from primdiffusion.diffusion.checkpoint import file_hash, under
 from primdiffusion.diffusion.model import BETAS
-from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.primitives.anchors import grid_points_outside
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K
@@ -84,15 +85,19 @@ class ImportReleased:
             encoder_out = self.encoder or self.out.with_name(f"{self.out.stem}.encoder.safetensors")
             if encoder_out.absolute() == self.out.absolute():
                 raise ValueError(f"{self.out} is the output of both stages: give --encoder another name")
-            denoiser, files = under(weights, PREFIX), [self.out, encoder_out]
-            card = _card(self.checkpoint, inventory, denoiser, self.reference, "denoiser")
-            write_imported(self.out, denoiser, inventory.unet, body_setup, reference, self.chain, card)
-        write_encoder(encoder_out, encoder, body_setup, reference, encoder_card)
-        for note in notes:
-            print(note)
-        if self.report is not None:
-            _write_report(self.report, inventory, card, notes, body_setup)
-        print(*files, sep="\n")
+            files = [self.out, encoder_out]
+            card = _card(self.checkpoint, inventory, under(weights, PREFIX), self.reference, "denoiser")
+        with contextlib.ExitStack() as all_or_none:
+            if inventory.unet is not None:
+                out = all_or_none.enter_context(replacing(self.out))
+                write_imported(out, under(weights, PREFIX), inventory.unet, body_setup, reference, self.chain, card)
+            write_encoder(
+                all_or_none.enter_context(replacing(encoder_out)), encoder, body_setup, reference, encoder_card
+            )
+            if self.report is not None:
+                report = all_or_none.enter_context(replacing(self.report))
+                _write_report(report, inventory, card, notes, body_setup)
+        print(*notes, *files, sep="\n")
 
 
 def _reference(folder: Path | None) -> Reference:

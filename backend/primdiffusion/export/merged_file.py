@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from primdiffusion.formats.arrays import write_deflated
 from primdiffusion.formats.requests import VOXEL
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.merge import Merged, merge
@@ -35,14 +36,13 @@ def upright_grid(primitives: Primitives, voxel: float = VOXEL) -> Merged:
 
 def write_grid_npz(path: Path, grid: Merged) -> None:
     """Write density float16 [X, Y, Z] (1/m), colour float16 [X, Y, Z, 3] (linear), origin [3] and voxel (metres)."""
-    with path.open("wb") as file:  # savez would append .npz to a temporary name
-        np.savez_compressed(
-            file,
-            density=grid.density.astype(np.float16),
-            colour=grid.colour.astype(np.float16),
-            origin=grid.origin,
-            voxel=np.float64(grid.voxel),
-        )
+    arrays = {
+        "density": grid.density.astype(np.float16),
+        "colour": grid.colour.astype(np.float16),
+        "origin": np.asarray(grid.origin),
+        "voxel": np.float64(grid.voxel),
+    }
+    write_deflated(path, arrays)
 
 
 def check_openvdb() -> None:

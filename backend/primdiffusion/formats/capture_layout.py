@@ -117,9 +117,6 @@ def read_about(root: Path) -> dict[str, Any]:
     if about.get("version") != VERSION:
         version = about.get("version")
         raise CaptureFolderError(f"{root} is of version {version!s:.20}: this program reads version {VERSION}")
-    passes = about.get("passes", [])
-    if not isinstance(passes, list) or not all(isinstance(name, str) for name in passes):
-        raise CaptureFolderError(f"{root / DATASET_FILE} names no passes: render the captures again")
     return about
 
 
