@@ -90,8 +90,10 @@ class Deaths:
             request.cancel()
             return True
 
-        self._until(request, act, at)
+        stopped = self._until(request, act, at)
         self._judge(request, ("done", "cancelled"), "stopped and cancelled", died=False)
+        if request.state == "done" and stopped:
+            self._idle_silence()
 
     def stopped_and_continued(self) -> None:
         """A child that is stopped for a moment goes on."""
