@@ -53,7 +53,7 @@ class Progress(NamedTuple):
 
 
 Export = Callable[[str, torch.nn.Module, Progress], None]
-"""Told of a network's average now and then."""
+"""Called at intervals with the name of a network, the average of its weights, and its progress."""
 
 
 def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export: Export) -> None:

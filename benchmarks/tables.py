@@ -4,7 +4,7 @@
 docs/results/tables_table.md` samples DIR/ours/model.safetensors and DIR/latents/model.safetensors of
 diffusion_primitives.py and DIR/voxels/voxel.safetensors of diffusion_voxel.py, and judges --count humans of each by the
 code of `primdiffusion evaluate generation --table 2`: 512 x 512 pictures over white from --views sides beside renders
-of twice as many meshes of seeds that nobody trains on. All are in the rest pose, since voxels have no other.
+of twice as many meshes of seeds that no model trains on. All are in the rest pose, since voxels have no other.
 Distances, PCKh and depth errors are of our own network; `_real` are of the renders, `_floor` of its card. `_default` is
 the default model, which had more people and time.
 """
