@@ -30,6 +30,10 @@ _TEMPORARY = re.compile(rf"\.(?P<stem>.*)\.{_WRITER.pattern}\.partial(?P<suffix>
 _REPLACED = "replaced"
 
 
+class FolderInUseError(ValueError):
+    """Another process works in the folder; the message names it."""
+
+
 def writer() -> str:
     """This process, and a random part: for names of temporary files."""
     return f"{_space()}-{os.getpid()}-{secrets.token_hex(4)}"
@@ -164,6 +168,35 @@ def staged_together(folders: Sequence[str | Path], last: str = "") -> Iterator[l
     finally:
         for aside in asides:
             remove_folder(aside, aside.parent)
+        _unmake(made)
+
+
+@contextlib.contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Hold a folder, created if need be, for one process at a time. Raises FolderInUseError, OSError.
+
+    The system lets go of it when the process ends, however it ends. Windows, and disks that know no such locks, hold
+    nothing. A created folder that is still empty in the end is removed.
+    """
+    made = _make(folder)
+    try:
+        if os.name == "nt":
+            yield
+            return
+        import fcntl  # not on Windows
+
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as e:
+                raise FolderInUseError(f"another process works in {folder}: wait for it, or give another folder") from e
+            except OSError:  # a disk without locks
+                pass
+            yield
+        finally:
+            os.close(descriptor)
+    finally:
         _unmake(made)
 
 

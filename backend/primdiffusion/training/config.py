@@ -234,7 +234,8 @@ def check_resumable(saved: str, config: RunConfig) -> None:
             before[name] = value if before.get("preset") == "paper" else now[name]
     changed = sorted(key for key in before.keys() | now.keys() if before.get(key) != now.get(key))
     if changed:
-        differing = ", ".join(f"{key} ({before.get(key)}, not {now.get(key)})" for key in changed)
+        differing = ", ".join(f"{key:.30} ({before.get(key)!s:.20}, not {now.get(key)!s:.20})" for key in changed[:2])
+        differing += f" and {len(changed) - 2} more" if len(changed) > 2 else ""
         raise ValueError(f"the run in {config.run} began with another {differing}: give the same, or a new folder")
 
 

@@ -30,7 +30,7 @@ from primdiffusion.training.detail_latents import NOISE_LEVELS, PREPARED, Prepar
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.phase import state_path, train_phase
 from primdiffusion.training.recorder import Interrupt
-from primdiffusion.training.run_folder import begin
+from primdiffusion.training.run_folder import alone, begin
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.state import AcceleratedState, accelerator_of
 from primdiffusion.training.stored_people import PersonDataset
@@ -68,6 +68,7 @@ class DetailTrainingConfig(RunSettings):
     """Training of the decoder. Levels, weighting and attributes do not apply."""
 
 
+@alone
 def train_detail(config: DetailTrainingConfig) -> DiffusionModel:
     """Run or resume a training run; returns the model with the decoder, which is also in run/model.safetensors.
 

@@ -21,7 +21,7 @@ from primdiffusion.training.config import TrainingConfig
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.phase import state_path, train_phase
 from primdiffusion.training.recorder import Interrupt
-from primdiffusion.training.run_folder import begin, versions
+from primdiffusion.training.run_folder import alone, begin, versions
 from primdiffusion.training.shards import open_people
 from primdiffusion.training.slabs import SlabTrainee
 from primdiffusion.training.state import AcceleratedState, accelerator_of
@@ -44,6 +44,7 @@ CODEC_LIMIT = (
 )
 
 
+@alone
 def train(config: TrainingConfig) -> DiffusionModel:
     """Run or resume a training run; returns the model as trained so far, which is also in run/model.safetensors.
 

@@ -32,7 +32,7 @@ from primdiffusion.training.fit_data import FitDataset, FitSample, betas_of, fit
 from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
 from primdiffusion.training.fit_run import MODEL, STATE, FitRecorder, FitState, begin, save
 from primdiffusion.training.recorder import Interrupt, StepMetrics, StepTimer
-from primdiffusion.training.run_folder import versions
+from primdiffusion.training.run_folder import alone, versions
 from primdiffusion.training.state import NotFiniteError, accelerator_of, agreed
 from primdiffusion.training.trackers import check_tracker, tracking
 
@@ -46,6 +46,7 @@ def run(arguments: Sequence[str]) -> None:
         print(f"{config.run / MODEL}  {model.card['steps']} of {config.steps} steps")
 
 
+@alone
 def fit(config: FitConfig) -> EncoderModel:
     """Start or resume a run; returns the encoder, which is also saved as run/encoder.safetensors.
 

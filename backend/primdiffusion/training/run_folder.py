@@ -8,25 +8,45 @@ pictures/        images at intervals
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import json
 import logging
+import os
 import platform
 import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import accelerate
 import torch
 
 from primdiffusion import __version__
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.whole_files import remove_abandoned, write_atomically
+from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.whole_files import alone_in, remove_abandoned, write_atomically
 from primdiffusion.training.config import RunConfig, check_resumable, to_json
 
 log = logging.getLogger(__name__)
 
+Config = TypeVar("Config", bound=RunConfig)
+Made = TypeVar("Made")
 CONFIG, RUN, METRICS, PICTURES = "config.json", "run.json", "metrics.jsonl", "pictures"
+LARGEST_TEXT = 2**30
+"""Bytes of any of them."""
+
+
+def alone(work: Callable[[Config], Made]) -> Callable[[Config], Made]:
+    """Let a run hold its folder, of several processes of one run the first. Raises FolderInUseError, OSError."""
+
+    @functools.wraps(work)
+    def held(config: Config) -> Made:
+        is_first = os.environ.get("RANK", "0") == "0"
+        with alone_in(config.run) if is_first else contextlib.nullcontext():
+            return work(config)
+
+    return held
 
 
 def begin(
@@ -48,9 +68,9 @@ def begin(
     saved, noted = config.run / CONFIG, config.run / RUN
     started = {"people": list(people), **about, "starts": []}
     if saved.exists():
-        check_resumable(saved.read_text(encoding="utf-8"), config)
+        check_resumable(_text(saved), config)
         if noted.exists():
-            started["starts"] = _earlier(config, people, noted.read_text(encoding="utf-8"), start["processes"])
+            started["starts"] = _earlier(config, people, _text(noted), start["processes"])
         _cut_metrics(config.run / METRICS, is_kept)
         remove_abandoned(config.run)
     now = {**start, "primdiffusion": __version__, **versions()}
@@ -104,7 +124,7 @@ def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: in
 
 def _cut_metrics(path: Path, is_kept: Callable[[Mapping[str, Any]], bool]) -> None:
     if path.exists():
-        lines = path.read_text(encoding="utf-8", errors="replace").splitlines()
+        lines = _text(path).splitlines()
         write_atomically(path, "".join(line + "\n" for line in lines if _is_kept(line, is_kept)))
 
 
@@ -121,3 +141,7 @@ def _git(folder: Path, *arguments: str) -> str:
         ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True
     )  # fmt: skip
     return done.stdout.strip()
+
+
+def _text(path: Path) -> str:
+    return read_regular(path, LARGEST_TEXT).decode("utf-8", "replace")
