@@ -1,15 +1,20 @@
 """The command line: `primdiffusion generate --seed 7 --out DIR`.
 
 Exit codes: 0 success, 1 an error of input, files or memory (one sentence on stderr), 2 a usage error, 70 a bug (with
-traceback), 130 interrupted. Results are printed to stdout, progress to stderr.
+traceback), 130 interrupted. Results are printed to stdout, progress to stderr; where their reader has gone
+(`primdiffusion info | head -0`), the command ends silently with 1.
 """
 
 from __future__ import annotations
 
+import contextlib
 import importlib
+import io
+import os
 import sys
 import traceback
 from collections.abc import Sequence
+from typing import NoReturn
 
 from primdiffusion import __version__
 from primdiffusion.failures import describe
@@ -97,23 +102,54 @@ def _with_device(arguments: Sequence[str]) -> list[str]:
     return others
 
 
+def _repair_streams() -> None:
+    """Let closed streams swallow text, and names of files be printed that are no UTF-8."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  open to the end
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="surrogateescape")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """The console script; exits with the codes above."""
+    _repair_streams()
     share_processors()
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        run([argument for argument in given if argument != TRACEBACK])
+        try:
+            run([argument for argument in given if argument != TRACEBACK])
+        except SystemExit:  # argparse, after --help too
+            sys.stdout.flush()
+            raise
+        sys.stdout.flush()  # while errors are still caught
     except KeyboardInterrupt:
-        print("primdiffusion: interrupted", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        _end(INTERRUPTED, "interrupted")
+    except BrokenPipeError:
+        _end(1)
     except Exception as e:
         failure = describe(e)
         if failure is None or TRACEBACK in given:
-            traceback.print_exc()
+            with contextlib.suppress(BrokenPipeError):
+                traceback.print_exc()
         if failure is None:
-            sys.exit(DEFECT)
-        print(f"primdiffusion: {failure}", file=sys.stderr)
-        sys.exit(1)
+            _end(DEFECT)
+        _end(1, str(failure))
+
+
+def _end(code: int, sentence: str = "") -> NoReturn:
+    """Exit; what cannot be written any more is dropped, about which Python would complain at its end."""
+    with contextlib.suppress(BrokenPipeError):
+        if sentence:
+            print(f"primdiffusion: {sentence}", file=sys.stderr)
+    for stream in (sys.stdout, sys.stderr):
+        try:
+            stream.flush()
+        except OSError:
+            nowhere = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(nowhere, stream.fileno())
+            os.close(nowhere)
+    sys.exit(code)
 
 
 if __name__ == "__main__":

@@ -51,15 +51,17 @@ def optional_package(module: str, extra: str) -> ModuleType:
         ) from error
 
 
-_LONGEST_NAME = 200
-"""Characters of a path in a sentence."""
+_LONGEST_NAME, _LONGEST_VALUE = 200, 80
+"""Characters of a path, and of a quoted text or list, in a sentence."""
+_VALUE = re.compile(r"(?<!\w)'[^'/\\]*'|\[[^\[\]/\\]*\]")
+"""A quoted text or a list that is no path."""
 PICTURE_REMEDY = "choose a smaller resolution, or close other programs, then try again"
 MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture, then try again"
 
 
 def describe(error: BaseException) -> ErrorDescription | None:
     """Return the description of a domain error, or None for a bug."""
-    sentence = " ".join(str(error).split()) or type(error).__name__
+    sentence = shortened(" ".join(str(error).split())) or type(error).__name__
     if isinstance(error, PictureOutOfMemory):
         return ErrorDescription("out_of_memory", sentence, PICTURE_REMEDY)
     if out_of_memory(error):
@@ -83,6 +85,16 @@ def describe(error: BaseException) -> ErrorDescription | None:
     if isinstance(error, ValueError):
         return ErrorDescription("bad_input", sentence, "")
     return None
+
+
+def shortened(sentence: str) -> str:
+    """Return a sentence whose quoted texts and lists, which may be of a hostile file, are cut to a readable length."""
+
+    def cut(value: re.Match[str]) -> str:
+        text = value[0]
+        return text if len(text) <= _LONGEST_VALUE else f"{text[: _LONGEST_VALUE - 4]}...{text[-1]}"
+
+    return _VALUE.sub(cut, sentence)
 
 
 def out_of_memory(error: BaseException) -> bool:

@@ -22,22 +22,21 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
-import safetensors
 import torch
 
+from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyModel
 from primdiffusion.formats import compact_human
 from primdiffusion.formats.arrays import write_stored
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import LARGEST_INTEGER, parse_message
-from primdiffusion.formats.regular_files import check_size
+from primdiffusion.formats.regular_files import TooLargeError
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, body_of
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
 from primdiffusion.primitives.primitives import K, Payload, S
-from primdiffusion.tensor_file import save
 
 FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1
@@ -83,7 +82,7 @@ def save_human(path: str | Path, human: Human, *, compact: bool = False) -> None
         tensors |= {"rgb": torch.from_numpy(rgb), "density": torch.from_numpy(density)}
         metadata |= {"format_version": str(compact_human.FORMAT_VERSION), compact_human.METADATA: scales}
     with written_whole(path) as unfinished:
-        unfinished.write_bytes(save(tensors, metadata))
+        unfinished.write_bytes(tensor_file.save(tensors, metadata))
 
 
 def format_version(human: Human) -> int:
@@ -99,18 +98,16 @@ def load_human(path: str | Path) -> Human:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no human file {path}: check the path, or generate a human")
-    check_size(path, path.stat().st_size, LARGEST_FILE)
     try:
-        with safetensors.safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-            _check_format(path, metadata)
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  safe_open is no mapping
-    except (safetensors.SafetensorError, OSError, RuntimeError) as e:
-        raise HumanFileError(
-            f"{path} is truncated or not a safetensors file ({e!s:.100}): generate the human again"
-        ) from e
+        tensors, metadata = tensor_file.read(path, LARGEST_FILE)
+    except TooLargeError:
+        raise
+    except (ValueError, OSError) as e:
+        raise HumanFileError(f"{path} is damaged or no safetensors file ({e!s:.160}): generate the human again") from e
+    _check_format(path, metadata)
     tensors = _expanded(path, tensors, metadata)
     _check_shapes(path, tensors)
+    tensors |= {name: tensors[name].float() for name in SHAPES}
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
     try:
         body_setup = _body_setup(path, metadata, tensors) if "body" in metadata else None
@@ -147,10 +144,10 @@ def _expanded(path: Path, tensors: dict[str, torch.Tensor], metadata: Mapping[st
     """Tensors of a compact file in float32, others as they are."""
     if compact_human.METADATA not in metadata:
         return tensors
-    stored = {name: tensors[name].numpy() for name in ("rgb", "density") if name in tensors}
     try:
+        stored = {name: tensors[name].numpy() for name in ("rgb", "density") if name in tensors}
         expanded = compact_human.expand(stored, metadata[compact_human.METADATA])
-    except (ValueError, KeyError) as e:
+    except (ValueError, KeyError, TypeError) as e:  # numpy has no bfloat16
         raise HumanFileError(f"{path} does not contain a valid human ({e!s:.100}): generate it again") from e
     return {**tensors, **{name: torch.from_numpy(values) for name, values in expanded.items()}}
 

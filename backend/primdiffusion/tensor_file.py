@@ -1,17 +1,85 @@
-"""Write safetensors files: the same tensors and metadata give the same bytes."""
+"""Read untrusted safetensors files, and write them: the same tensors and metadata give the same bytes."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
 import safetensors.torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import open_regular
 
+LARGEST_FILE = 16 * 2**30
+LARGEST_HEADER = 4 * 2**20
+"""Of names, shapes and metadata, bytes: it takes many times as much in memory."""
+MOST_DIMENSIONS = 8
+_KINDS = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
 _LENGTH = 8
 """Bytes of the header's length, and what the header is padded to a multiple of."""
+
+
+class TensorFileError(ValueError):
+    """A file that is damaged or no safetensors file. The message is a reason without the file's name."""
+
+
+def read(path: Path, limit: int = LARGEST_FILE) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Return the tensors and the metadata of a file of at most `limit` bytes.
+
+    Raises TensorFileError, also for numbers that are not finite or above LARGEST_NUMBER; TooLargeError,
+    FileNotFoundError and other OSErrors.
+    """
+    file = opened(path, limit)
+    try:
+        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  no mapping
+    except (SafetensorError, RuntimeError) as error:
+        raise TensorFileError(str(error)[:120]) from error
+    for name, values in tensors.items():
+        if not ((values >= -LARGEST_NUMBER) & (values <= LARGEST_NUMBER)).all():
+            raise TensorFileError(f"{name!r:.60} holds NaN or infinite values, or numbers above {LARGEST_NUMBER:g}")
+    return tensors, file.metadata() or {}
+
+
+def read_metadata(path: Path, limit: int = LARGEST_FILE) -> dict[str, str]:
+    """Return the metadata without reading tensors. Raises as `read`."""
+    header = _header(path, limit)
+    metadata = header.get("__metadata__") or {}
+    if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
+        raise TensorFileError("its metadata are no texts")
+    return metadata
+
+
+def opened(path: Path, limit: int = LARGEST_FILE) -> Any:
+    """Open a file for reading parts of its tensors (safetensors' `safe_open`). Raises as `read`."""
+    for name, about in _header(path, limit).items():
+        if name == "__metadata__":
+            continue
+        kind, shape = (about.get("dtype"), about.get("shape")) if isinstance(about, dict) else (None, None)
+        if kind not in _KINDS or not isinstance(shape, list) or len(shape) > MOST_DIMENSIONS:
+            raise TensorFileError(f"{name!r:.40} is {kind!s:.20} of a shape or type that no tensor here has")
+    try:
+        return safe_open(path, framework="pt")
+    except (SafetensorError, MemoryError) as error:
+        raise TensorFileError(str(error)[:120]) from error
+
+
+def _header(path: Path, limit: int) -> dict[str, Any]:
+    with open_regular(path, limit) as file:
+        length = int.from_bytes(file.read(_LENGTH), "little")
+        if not 2 <= length <= LARGEST_HEADER:
+            raise TensorFileError(f"its header is not one of 2 bytes to {LARGEST_HEADER // 2**20} MB")
+        text = file.read(length)
+    if len(text) < length:
+        raise TensorFileError("its header is cut short")
+    header = parse_json(text)
+    if not isinstance(header, dict):
+        raise TensorFileError("its header is no object of JSON")
+    return header
 
 
 def save(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> bytes:

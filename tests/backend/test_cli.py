@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -198,11 +199,21 @@ def test_a_picture_that_cannot_be_written_is_named_and_nothing_is(person, tmp_pa
     code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path / "no" / "x.png")
     assert (code, stderr.count("\n")) == (1, 1)
     assert f"{tmp_path / 'no' / 'x.png'}: no such file" in stderr
-    code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path / "x.png", "--depth", tmp_path / "no" / "d")
-    assert f"{tmp_path / 'no' / 'd'}: no such file" in stderr
-    code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path)
-    assert f"{tmp_path}: this is not a regular file" in stderr
-    assert list(tmp_path.iterdir()) == []
+    depth = tmp_path / "no" / "d.png"
+    code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path / "x.png", "--depth", depth)
+    assert f"{depth}: no such file" in stderr
+    (tmp_path / "folder.png").mkdir()
+    code, stderr = fails(capsys, "render", human, *small, "--out", tmp_path / "folder.png")
+    assert f"{tmp_path / 'folder.png'}: this is not a regular file" in stderr
+    assert [path.name for path in tmp_path.rglob("*")] == ["folder.png"]
+
+
+def test_a_human_is_not_overwritten_by_its_picture(person, capsys):
+    human = person / "person.human.safetensors"
+    before = human.read_bytes()
+    _, stderr = fails(capsys, "render", human, "--size", 16, "--out", human)
+    assert "has none of the extensions .png" in stderr
+    assert human.read_bytes() == before
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs a disk that is always full")
@@ -259,3 +270,38 @@ def test_help_does_not_load_torch():
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0
     assert done.stdout.splitlines()[-1] == "False"
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names of files are text there")
+def test_a_name_that_is_no_utf8_is_printed_and_closed_streams_do_no_harm():
+    code = "import os; from primdiffusion.cli import main; main(['--help']); print(os.fsdecode(b'\\xff'))"
+    environment = {**os.environ, "PYTHONIOENCODING": "utf-8:strict"}
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, env=environment, check=True)
+    assert run.stdout.endswith(b"\xff\n")
+    closed = subprocess.run(["sh", "-c", '"$0" -c "$1" >&- 2>&-', sys.executable, code], check=False)
+    assert closed.returncode == 0
+
+
+@pytest.mark.skipif(os.name == "nt", reason="pipes break in another way there")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("line", [("info",), ("--help",), ("generate", "--help"), ("captures", "--help")])
+def test_a_reader_that_has_gone_ends_a_command_silently(line, unbuffered):
+    command = [sys.executable, "-m", "primdiffusion", *line]
+    reader, writer = os.pipe()
+    os.close(reader)
+    environment = {**os.environ, "PYTHONUNBUFFERED": unbuffered}
+    with os.fdopen(writer, "wb") as pipe:
+        done = subprocess.run(command, stdout=pipe, stderr=subprocess.PIPE, env=environment, check=False)
+        assert (done.returncode, done.stderr) == (1, b"")
+        both = subprocess.run(command, stdout=pipe, stderr=pipe, env=environment, check=False)
+        assert both.returncode == 1
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="a device of Linux")
+def test_results_for_which_the_disk_has_no_room_are_one_sentence():
+    with open("/dev/full", "wb") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "primdiffusion", "info"], stdout=full, stderr=subprocess.PIPE, check=False
+        )
+    assert (done.returncode, done.stderr.count(b"\n")) == (1, 1)
+    assert b"no space left on device" in done.stderr.lower()

@@ -51,3 +51,17 @@ def test_a_domain_error_is_one_sentence_of_its_kind(error, kind, text):
 @pytest.mark.parametrize("error", [KeyError("x"), RuntimeError("shape mismatch"), TypeError(), AssertionError()])
 def test_a_defect_is_not_dressed_up_as_the_users_mistake(error):
     assert describe(error) is None
+
+
+@pytest.mark.parametrize(
+    ("given", "shown"),
+    [
+        (f"there is no outfit '{'x' * 500}': choose", f"there is no outfit '{'x' * 75}...': choose"),
+        (f"region is [0, [{', '.join(['1e+300'] * 30)}], 2]: give", "region is [0, [1e+300, "),
+        (f"SMPL's file '/tmp/{'x' * 200}' is the user's", f"SMPL's file '/tmp/{'x' * 200}' is the user's"),
+    ],
+)
+def test_long_values_of_a_file_are_cut_and_paths_stay(given, shown):
+    sentence = str(describe(ValueError(given)))
+    assert sentence.startswith(shown)
+    assert len(sentence) < 250

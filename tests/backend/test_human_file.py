@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
+from primdiffusion import tensor_file
 from primdiffusion.body.model import default_body
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.srgb import encode_srgb
@@ -33,6 +34,17 @@ def test_a_saved_person_comes_back_bit_for_bit(human, tmp_path):
     assert torch.equal(back.betas, human.betas)
     assert back.provenance == human.provenance
     assert [p.name for p in tmp_path.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize("kind", [torch.float16, torch.bfloat16, torch.float64])
+def test_numbers_of_other_precision_become_float32(human, tmp_path, kind):
+    path = tmp_path / "person.human.safetensors"
+    save_human(path, human)
+    tensors, metadata = tensor_file.read(path)
+    path.write_bytes(tensor_file.save({name: values.to(kind) for name, values in tensors.items()}, metadata))
+    back = load_human(path)
+    assert {value.dtype for value in (*vars(back.payload).values(), back.betas)} == {torch.float32}
+    assert torch.equal(back.payload.delta_scale, human.payload.delta_scale.to(kind).float())
 
 
 def test_a_compact_file_renders_as_the_whole_one_to_a_level_of_255(human, tmp_path):
@@ -113,17 +125,17 @@ def damage(path, human, how):
 @pytest.mark.parametrize(
     ("how", "message"),
     [
-        ("truncated", "truncated"),
-        ("cut in its header", "truncated"),
-        ("empty", "truncated"),
-        ("text", "not a safetensors file"),
+        ("truncated", "damaged"),
+        ("cut in its header", "damaged"),
+        ("empty", "damaged"),
+        ("text", "no safetensors file"),
         ("no metadata", "without a human"),
         ("no density", "density is missing"),
         ("wrong shape", "rgb is torch.float32"),
         ("whole numbers", "betas is torch.int64"),
         ("NaN", "'density' holds NaN"),
         ("giant", "largest beta is 6"),
-        ("8 bits", "rgb is torch.float8_e4m3fn"),
+        ("8 bits", "'rgb' is F8_E4M3"),
         ("long version", "format version"),
         ("deep", "nested more than 64 deep"),
         ("deep body", "malformed body metadata"),

@@ -1,19 +1,24 @@
 """Safetensors files whose bytes depend on their content alone."""
 
+import json
+import os
+import pathlib
 import subprocess
 import sys
 
 import pytest
 import safetensors.torch
 import torch
-from primdiffusion.tensor_file import save
+from primdiffusion.formats.regular_files import TooLargeError
+from primdiffusion.tensor_file import LARGEST_FILE, LARGEST_HEADER, TensorFileError, opened, read, read_metadata, save
 from safetensors import safe_open
 
 TENSORS = {"b": torch.arange(6.0).reshape(2, 3), "a": torch.ones(3, dtype=torch.float16), "ä": torch.zeros(0)}
 METADATA = {name: f"{name} ä" for name in ["the", "quick", "brown", "fox", "jumps", "over", "a", "lazy", "dog"]}
 CODE = """
 import hashlib, torch
-from primdiffusion.tensor_file import save
+from primdiffusion.formats.regular_files import TooLargeError
+from primdiffusion.tensor_file import LARGEST_FILE, LARGEST_HEADER, TensorFileError, opened, read, read_metadata, save
 print(hashlib.sha256(save({"x": torch.ones(3), "y": torch.ones(2)}, {str(n): str(n) for n in range(20)})).hexdigest())
 """
 
@@ -42,3 +47,48 @@ def test_without_metadata_only_the_order_can_differ_from_safetensors():
 def test_a_view_is_refused():
     with pytest.raises(ValueError, match="contiguous"):
         save({"x": torch.ones(3, 4).T})
+
+
+def with_header(path, header):
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    path.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))
+    return path
+
+
+def test_what_was_saved_is_read(tmp_path):
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(save(TENSORS, METADATA))
+    tensors, metadata = read(path)
+    assert metadata == read_metadata(path) == METADATA
+    assert all(torch.equal(tensors[name], value) for name, value in TENSORS.items())
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        {"a": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}},
+        {"a": {"dtype": "C64", "shape": [1], "data_offsets": [0, 8]}},
+        {"a": {"dtype": "F32", "shape": [1] * 200, "data_offsets": [0, 4]}},
+        {"a": {"dtype": "F32", "shape": [2**62, 2**62], "data_offsets": [0, 4]}},
+        {"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 2**63]}},
+        {"a": None}, [], b"{", b"[" * 9000, b" " * (LARGEST_HEADER + 1),
+    ],
+)  # fmt: skip
+def test_a_hostile_header_is_one_short_reason(tmp_path, header):
+    with pytest.raises(ValueError, match=r"^.{1,200}$"):
+        opened(with_header(tmp_path / "a.safetensors", header))
+
+
+def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
+    path = tmp_path / "a.safetensors"
+    with path.open("wb") as file:
+        file.truncate(LARGEST_FILE + 1)
+    with pytest.raises(TooLargeError, match=r"a\.safetensors"):
+        read(path)
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(PermissionError):
+        read(path)
+    if os.path.exists("/proc/self/pagemap"):
+        with pytest.raises(TensorFileError):
+            read(pathlib.Path("/proc/self/pagemap"))

@@ -18,6 +18,8 @@ from primdiffusion.formats.arrays import ArrayFileError, all_finite, array_names
 from primdiffusion.formats.regular_files import read_regular
 
 LARGEST_OBJ = 32 * 2**20
+LARGEST_BODY_M = 1000.0
+"""The automatic unwrap of larger ones takes minutes."""
 SHAPE_COMPONENTS = 10
 """Shape components loaded by default, of the up to 300 in SMPL files."""
 POSE_FEATURES = (J - 1) * 9
@@ -50,6 +52,8 @@ def load_body(
     arrays = _ArrayFile(path)
     template = arrays.real("v_template", ("V", 3))
     vertex_count = len(template)
+    if np.abs(template).max() > LARGEST_BODY_M:
+        raise arrays.wrong("v_template", f"has vertices more than {LARGEST_BODY_M:g} m away")
     faces = arrays.whole("f", ("F", 3), vertex_count)
     shape_basis = arrays.real("shapedirs", (vertex_count, 3, "N"))[..., :shape_components]
     pose_basis = arrays.real("posedirs", (vertex_count, 3, POSE_FEATURES))
@@ -159,11 +163,12 @@ def _texture_coordinates(
         coordinates, coordinate_faces, source = arrays.raw("vt"), arrays.raw("ft"), str(arrays.path)
     else:
         coordinate_faces, coordinates = _unwrapped(template, faces)
-        source = "the automatic unwrap"
-    if coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
+        source = f"the automatic unwrap of {arrays.path.name}"
+    numbers = coordinates.dtype.kind in "iuf" and coordinate_faces.dtype.kind in "iuf"
+    if not numbers or coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
         raise BodyFileError(
             f"{source}: texture coordinates of shapes {coordinates.shape} and {coordinate_faces.shape} do not fit a "
-            f"body of {len(faces)} faces; they must be T x 2 and {len(faces)} x 3, in the body's face order."
+            f"body of {len(faces)} faces; they must be numbers, T x 2 and {len(faces)} x 3, in the body's face order."
         )
     coordinate_faces = coordinate_faces.astype(np.int64)
     if not all_finite(coordinates) or coordinate_faces.min() < 0 or coordinate_faces.max() >= len(coordinates):

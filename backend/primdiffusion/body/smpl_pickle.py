@@ -14,7 +14,7 @@ import re
 import numpy as np
 import scipy.sparse
 
-from primdiffusion.body.pickle_opcodes import Inert, PickleError, load_pickle
+from primdiffusion.body.pickle_opcodes import Inert, load_pickle
 from primdiffusion.formats.regular_files import read_regular
 
 LARGEST_PICKLE = 512 * 2**20
@@ -136,7 +136,7 @@ def load_restricted(data: bytes, name: str) -> object:
         return load_pickle(data, _find)
     except UnsafePickleError as error:
         raise UnsafePickleError(f"{name}: {error}") from None
-    except PickleError as error:
+    except ValueError as error:  # also of numbers and texts that are none
         raise BodyFileError(f"{name} is not a whole pickle file ({error!s:.100}); download it again.") from error
 
 

@@ -39,7 +39,9 @@ from primdiffusion.capture.reader import (
 )
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import map_npy
-from primdiffusion.formats.json_files import read_json
+from primdiffusion.formats.json_files import LARGEST_BYTES, read_json
+from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.removing import check_inside
 from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
@@ -79,6 +81,7 @@ def pack_subject(subject: Subject) -> None:
         raise CaptureFileError(
             f"{subject.folder} has images of several sizes, which cannot be packed: render it with one size"
         )
+    check_inside(pack_path(subject), subject.folder.parent)
     stamp = source_stamp(subject)
     shape = (subject.frames, len(subject.views), *sizes.pop(), 4)
     with replacing(pack_path(subject)) as path, path.open("wb") as file:  # a full disk kills a writer of mapped memory
@@ -117,7 +120,7 @@ def source_stamp(subject: Subject) -> str:
     digest = hashlib.sha256()
     mark = subject.folder / capture_layout.COMPLETE_FILE
     if mark.is_file():
-        digest.update(mark.read_bytes())
+        digest.update(read_regular(mark, LARGEST_BYTES))
     else:
         for path in sorted(p for kind in ("img", "mask") for p in (subject.folder / kind).rglob("*.*")):
             about = path.stat()

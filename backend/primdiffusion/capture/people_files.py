@@ -17,10 +17,11 @@ from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 
 from primdiffusion.body.model import J, default_body
+from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import JsonError, parse_json
 from primdiffusion.formats.regular_files import read_regular
-from primdiffusion.geometry.pictures import opened_picture
+from primdiffusion.geometry.pictures import MOST_PIXELS, opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 
@@ -30,6 +31,10 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 LARGEST_GLB = 256 * 2**20
+MOST_PARTS, MOST_CORNERS, MOST_TEXELS = 100, 20_000_000, 2 * MOST_PIXELS
+"""Of a human: nodes may share meshes, and materials pictures, so that small files name gigabytes."""
+LARGEST_UV = 1e4
+"""Repeats of a texture."""
 
 
 class GlbError(ValueError):
@@ -118,7 +123,7 @@ def read_glb(path: str | Path) -> Glb:
     return Glb(path, content, chunks.get(BINARY_CHUNK, b""))
 
 
-SUBJECT_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]*")
+SUBJECT_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
 FARTHEST = 10.0
 """Largest distance of a vertex from the origin, metres; a stray vertex would move the cameras far away."""
 LARGEST_BETA = 20.0
@@ -179,7 +184,7 @@ def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
     if extras is None:
         raise GlbError(f"{glb.path} has no betas: only files from primdiffusion people can be read")
     if extras.get("body", "default") != "default":
-        raise GlbError(f"{glb.path} is rigged on the body {extras['body']!r}: only the default body is supported")
+        raise GlbError(f"{glb.path} is rigged on the body {extras['body']!r:.60}: only the default body is supported")
     betas = np.asarray(extras["betas"], np.float64)
     components = default_body().shape_basis.shape[-1]
     if betas.ndim != 1 or len(betas) > components or not (np.abs(betas) <= LARGEST_BETA).all():
@@ -191,16 +196,27 @@ def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
 
 
 def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
-    nodes, parts = glb.content["nodes"], []
+    nodes, parts, corners, texels = glb.content["nodes"], [], 0, 0
+    textures: dict[int | None, UInt8[np.ndarray, "H W 4"]] = {}
     for node in nodes:
         if "mesh" not in node:
             continue
         if "skin" not in node:
-            raise GlbError(f"{glb.path}: the mesh {node.get('name')!r} has no skin: make the human again")
+            raise GlbError(f"{glb.path}: the mesh {node.get('name')!r:.60} has no skin: make the human again")
         joints = _joints(glb, node["skin"])
         for number, primitive in enumerate(glb.content["meshes"][node["mesh"]]["primitives"]):
             name = str(node.get("name", f"part {len(parts)}")) + (f" {number}" if number else "")
-            parts.append(_part(glb, name, primitive, joints))
+            material = primitive.get("material")
+            if material not in textures:
+                textures[material] = _texture(glb, material)
+                texels += textures[material].size // 4
+            parts.append(_part(glb, name, primitive, joints, textures[material]))
+            corners += parts[-1].faces.size + parts[-1].vertices.size
+            if len(parts) > MOST_PARTS or corners > MOST_CORNERS or texels > MOST_TEXELS:
+                raise GlbError(
+                    f"{glb.path} has more than {MOST_PARTS} parts, {MOST_CORNERS} corners or {MOST_TEXELS} texels: "
+                    "make a simpler human"
+                )
     if not parts:
         raise GlbError(f"{glb.path} contains no mesh: make the human again")
     return tuple(parts)
@@ -210,53 +226,60 @@ def _joints(glb: Glb, skin: int) -> Int[np.ndarray, "n"]:
     """SMPL index of each joint of a skin."""
     names = [glb.content["nodes"][node].get("name") for node in glb.content["skins"][skin]["joints"]]
     if unknown := sorted({str(name) for name in names if name not in JOINT_NAMES}):
-        raise GlbError(f"{glb.path} has joints {', '.join(unknown[:3])}: rig it with SMPL's {J} joints")
+        raise GlbError(f"{glb.path} has joints {', '.join(unknown[:3])!s:.100}: rig it with SMPL's {J} joints")
     return np.array([JOINT_NAMES.index(name) for name in names], np.int32)
 
 
-def _part(glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray, "n"]) -> TexturedPart:
+def _part(
+    glb: Glb, name: str, primitive: dict[str, Any], joints: Int[np.ndarray, "n"], texture: UInt8[np.ndarray, "H W 4"]
+) -> TexturedPart:
     attributes = primitive["attributes"]
     vertices = glb.array(attributes["POSITION"]).astype(np.float64)
     faces = glb.array(primitive["indices"]).astype(np.int64) if "indices" in primitive else np.arange(len(vertices))
-    if primitive.get("mode", 4) != 4 or len(faces) % 3 or int(faces.max(initial=0)) >= len(vertices):
-        raise GlbError(f"{glb.path}: the faces of {name!r} are not triangles of its vertices: make the human again")
+    if primitive.get("mode", 4) != 4 or len(faces) % 3 or not ((faces >= 0) & (faces < len(vertices))).all():
+        raise GlbError(f"{glb.path}: the faces of {name!r:.60} are not triangles of its vertices: make the human again")
     faces = faces.reshape(-1, 3).astype(np.int32)
     uv = glb.array(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((len(vertices), 2), np.float32)
     index = joints[glb.array(attributes["JOINTS_0"]).astype(np.int64)]
     weight = glb.array(attributes["WEIGHTS_0"]).astype(np.float64)
     total = weight.sum(1, keepdims=True)
-    if not (np.abs(vertices) < FARTHEST).all() or not (total > 0).all():
+    weighted = (weight >= 0).all() and (total > 0).all() and (total < LARGEST_NUMBER).all()
+    if not (np.abs(vertices) < FARTHEST).all() or not weighted:
         raise GlbError(
-            f"{glb.path}: {name!r} has vertices that are not finite, without joints, or {FARTHEST:g} m from "
+            f"{glb.path}: {name!r:.60} has vertices that are not finite, without joints, or {FARTHEST:g} m from "
             "the origin: make the human again"
         )
+    if not (np.abs(uv) <= LARGEST_UV).all():
+        raise GlbError(f"{glb.path}: {name!r:.60} has texture coordinates out of range: make the human again")
     return TexturedPart(
         name=name,
         vertices=vertices,
         faces=faces,
         corner_uv=np.stack([uv[..., 0], 1 - uv[..., 1]], -1)[faces].astype(np.float32),  # glTF's v points down
-        texture=_texture(glb, primitive),
+        texture=texture,
         skin_index=index.astype(np.int32),
         skin_weight=weight / total,
     )
 
 
-def _texture(glb: Glb, primitive: dict[str, Any]) -> UInt8[np.ndarray, "H W 4"]:
+def _texture(glb: Glb, number: int | None) -> UInt8[np.ndarray, "H W 4"]:
     """Base colour times factor; opaque unless the material uses alpha."""
-    material = glb.content["materials"][primitive["material"]] if "material" in primitive else {}
+    material = {} if number is None else glb.content["materials"][number]
     surface = material.get("pbrMetallicRoughness", {})
     picture = np.full((1, 1, 4), 255, np.uint8)
     if "baseColorTexture" in surface:
         picture = glb.picture(glb.content["textures"][surface["baseColorTexture"]["index"]]["source"]).copy()
     factor = np.asarray(surface.get("baseColorFactor", (1, 1, 1, 1)), np.float64)
     if not (factor[:3] == 1).all():
-        linear = decode_srgb(picture[..., :3] / 255.0) * factor[:3]
-        picture[..., :3] = np.round(encode_srgb(np.clip(linear, 0, 1)) * 255)
+        linear = decode_srgb(np.arange(256)[:, None] / 255.0) * factor[:3]
+        table = np.round(encode_srgb(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
+        for channel in range(3):
+            picture[..., channel] = table[picture[..., channel], channel]
     if material.get("alphaMode", "OPAQUE") == "OPAQUE":
         picture[..., 3] = 255
     else:
         # Scale alpha so that the cutoff is one half, as the rasteriser tests.
         cutoff = float(material.get("alphaCutoff", 0.5)) if material["alphaMode"] == "MASK" else 0.5
-        scaled = picture[..., 3] * (factor[3] * 0.5 / max(cutoff, 1e-3))
-        picture[..., 3] = np.round(np.clip(scaled, 0, 255))
+        scaled = np.arange(256) * (factor[3] * 0.5 / max(cutoff, 1e-3))
+        picture[..., 3] = np.round(np.clip(scaled, 0, 255)).astype(np.uint8)[picture[..., 3]]
     return picture

@@ -227,12 +227,11 @@ def open_captures(root: str | Path) -> Captures:
         raise capture_layout.CaptureFolderError(f"{path} names no passes: render the captures again")
     listed = root / capture_layout.LIST_FILE
     if listed.is_file():
-        names = [line.strip() for line in listed.read_text(encoding="utf-8", errors="replace").splitlines()]
-        names = sorted({name for name in names if name})
+        names = sorted(set(capture_layout.read_list(root)))
     else:
         names = sorted(path.parent.name for path in root.glob(f"*/{CAMERAS_FILE}"))
     if wrong := next((name for name in names if not SUBJECT_NAME.fullmatch(name)), None):
-        raise CaptureFileError(f"{listed} contains {wrong!r}: names of subjects have only letters, digits and . _ -")
+        raise CaptureFileError(f"{listed} contains {wrong!r:.80}: subjects are named by letters, digits and . _ -")
     if not names:
         raise FileNotFoundError(f"there are no finished captures in {root}: render some, or check the path")
     return Captures(root, tuple(names), about)
@@ -257,6 +256,8 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
         with opened_picture(path) as picture:
             size = picture.size
             if size == (width, height) and kind == "depth":
+                if len(picture.getbands()) != 1:
+                    raise ValueError(f"it has {len(picture.getbands())} channels instead of one")
                 return np.asarray(picture).astype(np.uint16)
             if size == (width, height):
                 return np.array(picture.convert("RGB" if kind in ("img", "normal") else "L"))

@@ -136,12 +136,16 @@ class Region:
             raise ValueError("give either --region NAME or --weights FILE")
 
     def primitives(self, human: Human) -> Bool[Tensor, "k"]:
-        """Return the region as a mask. Raises ValueError for unknown names, and as `read_weights`."""
+        """Return the region as a mask. Raises ValueError for unknown names and unusable weights, and OSError."""
         # torch is loaded late
         from primdiffusion.editing.regions import read_weights, region_from_weights, region_of
 
         if self.weights is not None:
-            return region_from_weights(read_weights(self.weights), body_setup=human.body_setup)
+            weights = read_weights(self.weights)
+            try:
+                return region_from_weights(weights, body_setup=human.body_setup)
+            except ValueError as error:
+                raise ValueError(f"{self.weights}: {error}") from error
         return region_of(self.names, human.body_setup)
 
 

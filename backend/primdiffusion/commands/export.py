@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import tyro
 
-from primdiffusion.commands.request import ReportProgress, check_betas, check_numbers, check_size, parse
+from primdiffusion.commands.request import ReportProgress, check_betas, check_ending, check_numbers, check_size, parse
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.whole_files import staged
@@ -86,6 +86,7 @@ class GaussiansRequest:
 
     def check(self) -> None:
         """See `RequestRecord`."""
+        check_ending(self.out, ".ply")
         check_betas(self.betas)
         if (self.object is None) != (self.joints is None):
             raise ValueError("object and joints go together: give both, or neither for the T pose")
@@ -203,8 +204,7 @@ class ExportCommand:
 
 def _writer(out: Path) -> Callable[[ExportCommand, Human], None]:
     writers = {".glb": _write_mesh, ".obj": _write_mesh, ".ply": _write_gaussians}
-    if out.suffix.lower() not in writers:
-        raise ValueError(f"{out.name!r} has none of the extensions {', '.join(writers)}: choose one")
+    check_ending(out, *writers)
     return writers[out.suffix.lower()]
 
 

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import tyro
 
 from primdiffusion.commands.frame import PosedPerson
-from primdiffusion.commands.request import Pace, ReportProgress, check_voxel, parse
+from primdiffusion.commands.request import Pace, ReportProgress, check_ending, check_voxel, parse
 from primdiffusion.formats.requests import DENSITY_GAIN, VOXEL
 from primdiffusion.formats.whole_files import written_whole
 
@@ -43,6 +43,7 @@ class MergeRequest:
 
     def check(self) -> None:
         """See `RequestRecord`."""
+        check_ending(self.out, ".npz")
         check_voxel(self.voxel)
         _check_people(self.people)
 
@@ -210,8 +211,7 @@ class MergeCommand:
         """See `RequestRecord`."""
         if not self.humans:
             raise ValueError("no file was given: give at least one .human file")
-        if self.out.suffix.lower() not in (".vdb", ".npz"):
-            raise ValueError(f"{self.out.name!r} has none of the extensions .vdb, .npz: choose one")
+        check_ending(self.out, ".vdb", ".npz")
         if not self.out.parent.is_dir():
             raise FileNotFoundError(f"there is no folder {self.out.parent}: create it, or choose another")
         check_voxel(self.voxel)

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from primdiffusion.commands.frame import FrameSpec
-from primdiffusion.commands.request import ReportProgress, check_angle, check_sides, parse
+from primdiffusion.commands.request import ReportProgress, check_angle, check_ending, check_sides, parse
+from primdiffusion.formats.regular_files import real_path
 from primdiffusion.formats.requests import PICTURE_SIZE, RAY_STEP, VIEWS, View, check_step
 from primdiffusion.formats.whole_files import written_whole
 
@@ -42,6 +43,8 @@ class RenderRequest:
 
     def check(self) -> None:
         """See `RequestRecord`."""
+        for path in (self.out, self.depth):
+            check_ending(path, ".png")
         check_sides(self.width, self.height)
         check_angle("yaw", self.yaw, "radians")
 
@@ -145,9 +148,11 @@ class RenderCommand:
 
     def check(self) -> None:
         """See `RequestRecord`."""
+        for path in (self.out, self.depth):
+            check_ending(path, ".png")
         check_angle("yaw", self.yaw, "degrees")
         check_step(self.step)
-        if self.depth is not None and self.depth.resolve() == self.out.resolve():
+        if self.depth is not None and real_path(self.depth) == real_path(self.out):
             raise ValueError(f"out and depth are both {self.out}: give two different files")
         if self.frame and self.pose is None:
             raise ValueError(f"frame {self.frame} was requested without a pose file: give one with --pose")

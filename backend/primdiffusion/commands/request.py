@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import math
+import os
 import time
 import types
 import typing
@@ -79,7 +80,7 @@ def read_record(record: type[R], params: dict[str, Any], name: str) -> R:
     fields = {field.name: field for field in dataclasses.fields(record)}  # type: ignore[arg-type]
     if unknown := sorted(set(params) - set(fields)):
         known = ", ".join(fields) or "none"
-        raise ParameterError(f"{name!r} does not know the parameter {unknown[0]!r}: its parameters are {known}")
+        raise ParameterError(f"{name!r} does not know the parameter {unknown[0]!r:.60}: its parameters are {known}")
     for field in fields.values():
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and field.name not in params:
@@ -98,13 +99,15 @@ def _value(kind: Any, value: Any, name: str) -> Any:
     if origin in (list, tuple) and isinstance(value, list):
         return origin(_value(arguments[0], entry, f"{name}[{i}]") for i, entry in enumerate(value))
     if origin is dict and isinstance(value, dict):
-        return {key: _value(arguments[1], entry, f"{name}[{key!r}]") for key, entry in value.items()}
+        return {key: _value(arguments[1], entry, f"{name}[{key!r:.60}]") for key, entry in value.items()}
     if dataclasses.is_dataclass(kind) and hasattr(kind, "from_json"):
         return kind.from_json(value, name)  # type: ignore[attr-defined]
     if dataclasses.is_dataclass(kind) and isinstance(value, dict):
         return read_record(kind, value, name)  # type: ignore[arg-type]
     if kind is Path and isinstance(value, str) and value and "\0" not in value:
-        return Path(value)
+        with contextlib.suppress(UnicodeEncodeError):  # half a character
+            os.fsencode(value)
+            return Path(value)
     if kind is float and isinstance(value, int | float) and not isinstance(value, bool):
         if not -LARGEST_NUMBER <= value <= LARGEST_NUMBER:
             raise ParameterError(f"{name} is {value!r:.40}: give a finite number, of at most {LARGEST_NUMBER:g}")
@@ -231,6 +234,12 @@ def check_sides(width: int, height: int) -> None:
     """Raise ValueError for a picture that is empty or larger than LARGEST_SIDE."""
     if min(width, height) < 1 or max(width, height) > LARGEST_SIDE:
         raise ValueError(f"the image size is {width} x {height} pixels: choose sides of 1 to {LARGEST_SIDE}")
+
+
+def check_ending(path: Path | None, *endings: str) -> None:
+    """Raise ValueError for a file of another kind: a human that is named by mistake would be overwritten."""
+    if path is not None and path.suffix.lower() not in endings:
+        raise ValueError(f"{path.name!r:.80} has none of the extensions {', '.join(endings)}: choose one")
 
 
 def check_picture_px(picture_px: int) -> None:

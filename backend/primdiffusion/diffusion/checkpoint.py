@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
@@ -25,12 +25,13 @@ from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkCon
 from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import JsonError, parse_json
+from primdiffusion.formats.regular_files import TooLargeError, open_regular
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
-from primdiffusion.tensor_file import save
 
 FORMAT = "primdiffusion-checkpoint"
 RELEASED = "released"
@@ -84,7 +85,7 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     }
     contents = {key: value.detach().cpu().contiguous().clone() for key, value in halved.items()}
     check_finite(path, contents)
-    write_atomically(path, save(contents, metadata=metadata))
+    write_atomically(path, tensor_file.save(contents, metadata=metadata))
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
@@ -96,17 +97,17 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict
     tensors, metadata = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
         architecture, card = parse_json(metadata["architecture"]), parse_json(metadata["card"])
+        if not 0 < architecture["full_density"] <= LARGEST_NUMBER:
+            raise RuntimeError(f"a full density of {architecture['full_density']!r:.20}")
         return tensors, architecture, {**card, "sha256": file_hash(path)}
 
 
 def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return tensors in float32 and metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
     metadata = read_metadata(path, formats)
-    with safe_open(path, framework="pt") as file:
-        tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-    numbers = {key: value.float() for key, value in tensors.items()}  # types of 8 bits have no isfinite
-    check_finite(path, numbers)
-    return numbers, metadata
+    with _damage_named(path):
+        tensors, _ = tensor_file.read(path)
+    return {key: value.float() for key, value in tensors.items()}, metadata
 
 
 @contextlib.contextmanager
@@ -123,7 +124,7 @@ def mismatches_named(path: Path, *also: type[Exception]) -> Iterator[None]:
 
 def file_hash(path: Path) -> str:
     """SHA-256 of a file, as hexadecimal digits."""
-    with path.open("rb") as file:
+    with open_regular(path, tensor_file.LARGEST_FILE) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -150,10 +151,9 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
     tensors, architecture, card = read_checkpoint(path)
     with mismatches_named(path):
         if architecture["kind"] == RELEASED:
-            model = _released_model(tensors, architecture, card, path.parent)
-        else:
-            model = _model(tensors, architecture, card)
-    return model.to(device)
+            return _released_model(tensors, architecture, card, path.parent).to(device)
+    with mismatches_named(path, ValueError, AttributeError):
+        return _model(tensors, architecture, card).to(device)
 
 
 def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any]) -> DiffusionModel:
@@ -265,16 +265,11 @@ def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
         raise FileNotFoundError(
             f"there is no checkpoint at {path}: give the path of a .safetensors file, or reinstall the package"
         )
-    try:
-        with safe_open(path, framework="pt") as file:
-            metadata = file.metadata() or {}
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(
-            f"{path} is truncated or not a safetensors file ({error!s:.100}): download or train it again"
-        ) from error
+    with _damage_named(path):
+        metadata = tensor_file.read_metadata(path)
     if metadata.get("format") not in formats:
         raise CheckpointError(
-            f"{path} is a safetensors file of format {metadata.get('format')!r}, not "
+            f"{path} is a safetensors file of format {metadata.get('format')!r:.40}, not "
             f"{formats[0]!r}: choose another file"
         )
     if metadata.get("format_version") != _READABLE[metadata["format"]]:
@@ -283,6 +278,18 @@ def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
             f"{path} has format version {version!s:.20}, this program reads {readable}: use the matching release"
         )
     return metadata
+
+
+@contextlib.contextmanager
+def _damage_named(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except TooLargeError:
+        raise
+    except (ValueError, OSError) as error:
+        raise CheckpointError(
+            f"{path} is damaged or no safetensors file ({error!s:.160}): download or train it again"
+        ) from error
 
 
 def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:

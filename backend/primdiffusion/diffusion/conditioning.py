@@ -82,9 +82,11 @@ class AttributeVocabulary:
 
     @classmethod
     def from_json(cls, tree: Mapping[str, Any]) -> AttributeVocabulary:
-        """Inverse of `to_json`; raises KeyError, TypeError or ValueError for other input."""
+        """Inverse of `to_json`; raises KeyError, TypeError, AttributeError or ValueError for other input."""
         categories = {name: tuple(map(str, values)) for name, values in tree["categories"].items()}
         scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree["scalars"].items()}
+        if not all(std > 0 for _, std in scalars.values()):
+            raise ValueError("a standard deviation is not above 0")
         return cls(categories, scalars)
 
     def _check_names(self, attributes: Attributes) -> None:

@@ -7,17 +7,17 @@ supplies them.
 from __future__ import annotations
 
 import dataclasses
-import pickle
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Literal
 
 import torch
 from jaxtyping import Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn import functional
+
+from primdiffusion import tensor_file, torch_file
+from primdiffusion.formats.regular_files import TooLargeError
 
 
 class WeightsFileError(ValueError):
@@ -123,21 +123,25 @@ def read_weights(path: Path | str) -> dict[str, Tensor]:
         raise FileNotFoundError(f"no weights file at {path}: check the path")
     try:
         if path.suffix == ".safetensors":
-            return load_file(path)
-        content = torch.load(path, map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, SafetensorError, RuntimeError, EOFError, ValueError, LookupError) as e:
+            return tensor_file.read(path)[0]
+        content = torch_file.load(path)
+    except TooLargeError:
+        raise
+    except torch_file.PICKLE_ERRORS as e:
         raise WeightsFileError(
             f"{path} is truncated or not a plain weights file ({_reason(e)}): download it again, or save "
             "the network's state_dict()"
         ) from e
-    if not isinstance(content, Mapping) or not all(isinstance(value, Tensor) for value in content.values()):
+    if not isinstance(content, Mapping) or not all(
+        isinstance(value, Tensor) and torch_file.is_plain(value) for value in content.values()
+    ):
         raise WeightsFileError(f"{path} is not a dictionary of named tensors: save the network's state_dict()")
     return dict(content)
 
 
 def _reason(error: Exception) -> str:
     """First sentence of the message; torch's messages continue with advice to unpickle."""
-    return next(iter(str(error).split(". ")[0].splitlines()), type(error).__name__)
+    return next(iter(str(error).split(". ")[0].splitlines()), type(error).__name__)[:120]
 
 
 def fill(network: nn.Module, weights: Mapping[str, Tensor], what: str, source: str) -> None:

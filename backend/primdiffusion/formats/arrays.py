@@ -7,6 +7,7 @@ import io
 import math
 import struct
 import tokenize
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,7 +31,8 @@ _LARGEST_DIRECTORY = 4 * 2**20
 _LONGEST_HEADER = 10_000
 """Of an array, bytes, as in numpy."""
 _CHUNK = 2**20
-_KINDS = "biufcUSmMV"
+_KINDS = "biufUS"
+"""Numbers and text: no complex numbers, dates or records."""
 _UNREADABLE = (
     zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error, EOFError, OSError, NotImplementedError,
     RuntimeError, ValueError, OverflowError, LookupError,
@@ -96,7 +98,10 @@ def read_numbers(path: str | Path, required: Sequence[str] = (), optional: Seque
 
 def all_finite(values: NDArray) -> bool:
     """Whether no number is NaN, infinite, or too large for products in float32."""
-    return bool(np.isfinite(values).all() and (values.size == 0 or float(np.abs(values).max()) <= LARGEST_NUMBER))
+    if not np.isfinite(values).all() or values.size == 0:
+        return values.size == 0
+    # not of magnitudes: the smallest integer has none
+    return float(values.max()) <= LARGEST_NUMBER and float(values.min()) >= -LARGEST_NUMBER
 
 
 def check_shapes(
@@ -146,6 +151,21 @@ def read_pickled_bytes(path: str | Path, name: str) -> bytes:
             return b"".join(iter(lambda: stream.read(_CHUNK), b""))
 
 
+def read_stored_member(path: str | Path, ending: str, limit: int, largest_file: int) -> bytes:
+    """Return the first member whose name ends so, of an archive without compression, as torch.save writes it.
+
+    Raises as `read_arrays`.
+    """
+    with _archive(path, largest_file) as archive:
+        if any(one.compress_type != zipfile.ZIP_STORED for one in archive.infolist()):
+            raise ArrayFileError(f"{path} is compressed, which torch.save never does: save it again")
+        member = next((one for one in archive.infolist() if one.filename.endswith(ending)), None)
+        if member is None or member.file_size > limit or member.flag_bits & 1:
+            raise ArrayFileError(f"{path} holds no {ending} of at most {limit / 2**20:.0f} MB: save it again")
+        with archive.open(member) as stream:
+            return b"".join(iter(lambda: stream.read(_CHUNK), b""))
+
+
 def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
     """Write an .npz at the fastest level: higher ones take long and gain little. Raises OSError."""
     _write(zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1), arrays)
@@ -182,8 +202,8 @@ class _Reads:
 
 
 @contextlib.contextmanager
-def _archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
-    with open_regular(path, LARGEST_FILE) as file:
+def _archive(path: str | Path, limit: int = LARGEST_FILE) -> Iterator[zipfile.ZipFile]:
+    with open_regular(path, limit) as file:
         try:
             with zipfile.ZipFile(_Reads(file)) as archive:  # type: ignore[arg-type]
                 yield archive
@@ -234,13 +254,15 @@ def _head(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype
             raise ValueError("a long header")
         text = io.BytesIO(length + stream.read(count))
         read = np.lib.format.read_array_header_1_0 if wide == 2 else np.lib.format.read_array_header_2_0
-        shape, fortran, dtype = read(text)
-        usable = len(shape) <= 32 and all(0 <= side < 2**62 for side in shape)
-        usable = usable and (dtype.hasobject or (dtype.kind in _KINDS and dtype.itemsize > 0))
-        if not usable:
-            raise ValueError("an impossible shape or type")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy warns of headers that Python 2 wrote
+            shape, fortran, dtype = read(text)
+        if len(shape) > 32 or not all(type(side) is int and 0 <= side < 2**62 for side in shape):
+            raise ValueError("an impossible shape")
     except _NO_ARRAY as e:
         raise ArrayFileError(f"{what} is not an array of numpy's format: save it with numpy.save or savez") from e
+    if not dtype.hasobject and (dtype.kind not in _KINDS or dtype.itemsize <= 0):  # sizes of long texts wrap
+        raise ArrayFileError(f"{what} holds {dtype!s:.60}, not numbers or text: save it as one of these")
     return shape, fortran, dtype
 
 

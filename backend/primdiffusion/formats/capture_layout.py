@@ -39,6 +39,7 @@ from numpy.typing import NDArray
 from .arrays import ArrayFileError, read_numbers
 from .camera_rig import View
 from .json_files import parse_json, read_json
+from .regular_files import open_regular, read_regular
 from .removing import check_inside, remove_file
 from .whole_files import remove_abandoned, replacing, temporary_name
 
@@ -49,6 +50,10 @@ SMPL_FOLDER, SMPL_FILE, SMPL_PLAIN_FILE = "outputs_re_fitting", "refit_smpl_2nd.
 RELEASED_REFERENCE = "seq_000016-rp_alison_rigged_002"
 """Name of the subject that determines the rest sizes of primitives in the released code."""
 LIST_FILE, DATASET_FILE, COMPLETE_FILE = "release_human_list.txt", "dataset.json", "complete.json"
+
+
+LARGEST_FILE, LARGEST_LIST = 512 * 2**20, 32 * 2**20
+"""Bytes of a file of a subject, and of the list of subjects."""
 
 
 class CaptureFolderError(ValueError):
@@ -92,6 +97,8 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
             unlike.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
             with contextlib.suppress(FileExistsError):
                 os.link(unlike, root / DATASET_FILE)
+        except OSError as e:
+            raise type(e)(e.errno, e.strerror or str(e), str(root / DATASET_FILE)) from e
         finally:
             remove_file(unlike, root)
     present = read_about(root)
@@ -118,6 +125,15 @@ def read_about(root: Path) -> dict[str, Any]:
         version = about.get("version")
         raise CaptureFolderError(f"{root} is of version {version!s:.20}: this program reads version {VERSION}")
     return about
+
+
+def read_list(root: Path) -> list[str]:
+    """Return the names in the list of finished subjects; none without one. Raises as `read_regular`."""
+    try:
+        text = read_regular(root / LIST_FILE, LARGEST_LIST).decode("utf-8", "replace")
+    except FileNotFoundError:
+        return []
+    return [name for line in text.splitlines() if (name := line.strip())]
 
 
 def write_list(root: Path, subjects: Sequence[str]) -> None:
@@ -177,7 +193,9 @@ def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
     """
     try:
         files = read_json(subject / COMPLETE_FILE)
-        noted = {_inside(subject, name): (int(size), int(crc)) for name, (size, crc) in files.items()}
+        noted = {_inside(subject, name): (size, crc) for name, (size, crc) in files.items()}
+        if not all(type(number) is int for numbers in noted.values() for number in numbers):
+            raise TypeError("a size or a checksum is no integer")
     except (OSError, ValueError, AttributeError, TypeError):
         return {subject: "not finished"}
     wrong = {}
@@ -186,6 +204,8 @@ def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
             wrong[path] = "missing"
         elif path.stat().st_size != size:
             wrong[path] = f"{path.stat().st_size} bytes instead of {size}"
+        elif size > LARGEST_FILE:
+            wrong[path] = f"larger than {LARGEST_FILE // 2**20} MB"
         elif checksums and _crc(path) != crc:
             wrong[path] = "altered"
     return wrong
@@ -211,4 +231,9 @@ def _inside(subject: Path, name: str) -> Path:
 
 
 def _crc(path: Path) -> int:
-    return zlib.crc32(path.read_bytes())
+    """Raises as `open_regular`."""
+    crc = 0
+    with open_regular(path, LARGEST_FILE) as file:
+        while chunk := file.read(1 << 20):
+            crc = zlib.crc32(chunk, crc)
+    return crc

@@ -16,9 +16,11 @@ from .capture_layout import (
     damage,
     picture_path,
     read_about,
+    read_list,
     write_list,
 )
 from .picture_files import is_whole_picture
+from .regular_files import TooLargeError
 from .removing import check_inside, remove_file
 from .whole_files import is_abandoned
 
@@ -38,9 +40,13 @@ def verify(root: Path, *, checksums: bool = True) -> dict[Path, str]:
         wrong |= _problems(subject, about, checksums)
         wrong |= dict.fromkeys(_partial_files(subject), "left behind by a killed process")
     path, finished = root / LIST_FILE, finished_subjects(root)
-    listed = path.read_text(encoding="utf-8", errors="replace").split() if path.is_file() else []
-    if differing := set(listed).symmetric_difference(finished):
-        wrong[path] = f"differs from the finished subjects by {', '.join(sorted(differing))}"
+    try:
+        differing = set(read_list(root)).symmetric_difference(finished)
+    except (OSError, TooLargeError):
+        wrong[path] = "cannot be read"
+    else:
+        if differing:
+            wrong[path] = f"differs from the finished subjects by {', '.join(sorted(differing))!s:.160}"
     return wrong
 
 

@@ -10,10 +10,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from .regular_files import TooLargeError, open_regular
 from .whole_files import replacing
 
 DEPTH_UNIT = 0.00025
 """Metres per unit of a depth file, which reaches 16.38 m."""
+LARGEST_PICTURE = 512 * 2**20
+"""Bytes."""
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
 
@@ -54,9 +57,9 @@ def is_whole_picture(path: Path) -> bool:
     """Return whether a .png or .jpg has its first and last bytes; does not decode it."""
     head, tail = (_PNG, _PNG_END) if path.suffix == ".png" else (_JPEG, _JPEG_END)
     try:
-        with path.open("rb") as file:
+        with open_regular(path, LARGEST_PICTURE) as file:
             begins = file.read(len(head)) == head
             file.seek(-len(tail), os.SEEK_END)
             return begins and file.read() == tail
-    except OSError:
+    except (OSError, TooLargeError):
         return False

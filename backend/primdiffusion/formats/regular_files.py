@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import errno
+import io
 import os
 import re
 import stat
 from pathlib import Path
-from typing import BinaryIO
 
 _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 """Starts of UNC paths, Windows' devices and URLs."""
@@ -15,6 +15,11 @@ _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 
 class TooLargeError(ValueError):
     """A file is larger than its kind may be; the message names it."""
+
+
+def real_path(path: str | Path) -> Path:
+    """Return the absolute path with all links followed; Path.resolve raises RuntimeError for links in a circle."""
+    return Path(os.path.realpath(path))
 
 
 def check_regular(path: str | Path) -> os.stat_result:
@@ -33,16 +38,20 @@ def check_regular(path: str | Path) -> os.stat_result:
     return status
 
 
-def open_regular(path: str | Path, limit: int) -> BinaryIO:
-    """Open a regular file of at most `limit` bytes for reading. Raises as `check_regular`, and TooLargeError."""
-    check_size(path, check_regular(path).st_size, limit)
-    return open(path, "rb")
+def open_regular(path: str | Path, limit: int) -> io.BufferedReader | io.BytesIO:
+    """Open a regular file of at most `limit` bytes for reading. Raises as `check_regular`, and TooLargeError.
+
+    A file that states no size is read as empty: those of /proc may be endless.
+    """
+    size = check_regular(path).st_size
+    check_size(path, size, limit)
+    return open(path, "rb") if size else io.BytesIO()
 
 
 def read_regular(path: str | Path, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes. Raises as `open_regular`."""
     with open_regular(path, limit) as file:
-        data = file.read(limit + 1)  # some files grow, and those of /proc state no size
+        data = file.read(limit + 1)  # some files grow
     check_size(path, len(data), limit)
     return data
 

@@ -6,6 +6,8 @@ import os
 import shutil
 from pathlib import Path
 
+from .regular_files import real_path
+
 
 class OutsideFolderError(ValueError):
     """A path leads out of its folder, through a link or `..`; nothing was removed."""
@@ -16,8 +18,8 @@ def check_inside(path: Path, folder: Path) -> None:
 
     `folder` itself may be reached through links. A link in the last component is not followed.
     """
-    name, root = path.name, folder.resolve()
-    place = path.parent.resolve() / name
+    name, root = path.name, real_path(folder)
+    place = real_path(path.parent) / name
     if name in ("", "..") or place == root or not place.is_relative_to(root):
         raise OutsideFolderError(
             f"{path} lies outside of {folder}, behind a link: it stays as it is; remove the link, or the file itself"

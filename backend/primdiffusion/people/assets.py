@@ -21,6 +21,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
+from primdiffusion.formats.regular_files import open_regular, read_regular, real_path
 from primdiffusion.geometry.pictures import PictureError, opened_picture
 from primdiffusion.people.mhclo import ObjMesh, Proxy, read_pair
 
@@ -97,7 +98,7 @@ def open_assets(folder: str | os.PathLike[str] | None = None, required: tuple[st
             f"no MakeHuman asset folder was given: pass one with --assets or set {ENVIRONMENT_VARIABLE}; "
             f"the pack is CC0: {SOURCE}, folder 'base'"
         )
-    root = Path(named).expanduser().resolve()
+    root = real_path(Path(named).expanduser())
     if not root.is_dir():
         raise AssetsMissingError(
             f"the MakeHuman asset folder {root} does not exist: pass the folder with {', '.join(SUBFOLDERS)}"
@@ -152,6 +153,8 @@ LIST = "LICENSES.txt"
 LEVELS = 3
 """Number of folders searched for a list: the asset folder and its parents."""
 HEADER_BYTES = 4096
+LARGEST_LIST = 32 * 2**20
+"""Bytes."""
 STATED = (
     (re.compile(r"\b(?:released as|licen[cs]ed? (?:under|is|:)?)\s*\W{0,3}(?:CC0\b|CC-0\b)", re.IGNORECASE), "CC0-1.0"),
     (re.compile(r"\bCC[- ]?BY(?:[- ](?:SA|NC|ND))*(?:[- ]\d\.\d)?", re.IGNORECASE), ""),
@@ -188,7 +191,7 @@ def _listed(root: Path) -> dict[str, str]:
     licences: dict[str, str] = {}
     for folder in reversed((root, *root.parents)[:LEVELS]):
         if (folder / LIST).is_file():
-            for path, licence in _table((folder / LIST).read_text(encoding="utf-8", errors="replace")).items():
+            for path, licence in _table(read_regular(folder / LIST, LARGEST_LIST).decode("utf-8", "replace")).items():
                 for start in (folder, root):
                     if (start / path).is_relative_to(root):
                         licences[(start / path).relative_to(root).as_posix()] = licence
@@ -225,7 +228,7 @@ def _stated(file: Path) -> str:
 @functools.lru_cache(maxsize=1024)
 def _head(file: Path) -> str:
     try:
-        with file.open("rb") as stream:
+        with open_regular(file, 2**62) as stream:
             return stream.read(HEADER_BYTES).decode("utf-8", errors="replace")
     except OSError:
         return ""

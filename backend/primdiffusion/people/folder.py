@@ -22,8 +22,10 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import default_body
+from primdiffusion.capture.people_files import LARGEST_GLB
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
+from primdiffusion.formats.regular_files import TooLargeError, read_regular
 from primdiffusion.formats.removing import remove_folder
 from primdiffusion.formats.requests import check_seed
 from primdiffusion.formats.whole_files import remove_abandoned, temporary_name, written_whole
@@ -142,9 +144,9 @@ def is_whole(folder: Path, seed: int) -> bool:
         return (
             card is not None
             and card["seed"] == seed
-            and card["sha256"] == hashlib.sha256((folder / GLB).read_bytes()).hexdigest()
+            and card["sha256"] == hashlib.sha256(read_regular(folder / GLB, LARGEST_GLB)).hexdigest()
         )
-    except (OSError, KeyError):
+    except (OSError, TooLargeError, KeyError):
         return False
 
 

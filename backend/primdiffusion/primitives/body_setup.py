@@ -20,7 +20,14 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.body.smpl_pickle import LARGEST_PICKLE
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import TooLargeError, check_regular, check_size, is_plain_path
+from primdiffusion.formats.regular_files import (
+    TooLargeError,
+    check_regular,
+    check_size,
+    is_plain_path,
+    open_regular,
+    real_path,
+)
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors, build_anchors
 from primdiffusion.primitives.primitives import K
@@ -39,9 +46,9 @@ class FileFingerprint:
 
     @classmethod
     def of(cls, path: Path) -> FileFingerprint:
-        """Hash the file. Raises OSError."""
-        with open(path, "rb") as file:
-            return cls(str(path.resolve()), hashlib.file_digest(file, "sha256").hexdigest())
+        """Hash the file. Raises as `open_regular`."""
+        with open_regular(path, LARGEST_PICKLE) as file:
+            return cls(str(real_path(path)), hashlib.file_digest(file, "sha256").hexdigest())
 
 
 @dataclasses.dataclass(frozen=True)

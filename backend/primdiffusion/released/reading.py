@@ -5,27 +5,20 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-import pickle
 import re
-import struct
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-import torch
 from torch import Tensor
+
+from primdiffusion import torch_file
+from primdiffusion.formats.regular_files import TooLargeError
 
 Fate = Literal["imported", "checked", "dropped"]
 """imported: in the new file; checked: validated, then not needed; dropped: not used by design."""
 STATE = "model_state_dict"
 """Top-level key of the weights in released checkpoints; the other is "optimizer"."""
-PICKLE_ERRORS = (
-    pickle.UnpicklingError, RuntimeError, EOFError, ValueError, TypeError, LookupError, AttributeError, OverflowError,
-    MemoryError, NotImplementedError, AssertionError, OSError, struct.error,
-)  # fmt: skip
-"""Exceptions that torch raises for invalid files; its restricted unpickler has no exception class of its own."""
-_ZIP_MAGIC = b"PK\x03\x04"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -97,7 +90,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
             f"{path} contains a {type(state).__name__} instead of {STATE!r}: give the authors' primdiffusion.pt"
         )
     for key, value in state.items():
-        if not isinstance(key, str) or not isinstance(value, Tensor) or value.layout != torch.strided:
+        if not isinstance(key, str) or not isinstance(value, Tensor) or not torch_file.is_plain(value):
             raise ReleasedFileError(
                 f"{key!r} in {path} is a {type(value).__name__}, not a dense tensor: give the authors' "
                 f"primdiffusion.pt, with top-level keys {STATE!r} and 'optimizer'"
@@ -106,13 +99,11 @@ def read_weights(path: Path) -> dict[str, Tensor]:
 
 
 def _load(path: Path) -> object:
-    with open(path, "rb") as file:
-        mappable = file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # torch warns about pickles that it then rejects
-            return torch.load(path, map_location="cpu", weights_only=True, mmap=mappable)
-    except PICKLE_ERRORS as error:
+        return torch_file.load(path, mapped=True)
+    except TooLargeError:
+        raise
+    except torch_file.PICKLE_ERRORS as error:
         asked = re.search(r"GLOBAL:? (\S+)|global (\S+)", str(error))
         if asked:
             raise ReleasedFileError(

@@ -81,7 +81,7 @@ def parse_request(line: bytes) -> RpcRequest:
     if not isinstance(method, str):
         raise MalformedRequest(INVALID_REQUEST, "a request needs a method name", id)
     if not isinstance(params, dict):
-        raise MalformedRequest(INVALID_PARAMS, f"params of {method!r} must be a JSON object with names", id)
+        raise MalformedRequest(INVALID_PARAMS, f"params of {method!r:.60} must be a JSON object with names", id)
     return RpcRequest(method, params, id, "id" in message)
 
 

@@ -31,7 +31,8 @@ from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, Mer
 from primdiffusion.commands.reconstruct import ReconstructRequest
 from primdiffusion.commands.render import DrawRequest, RenderRequest
 from primdiffusion.commands.request import ParameterError, RequestRecord, parse, read_record, read_request
-from primdiffusion.failures import ErrorDescription, describe
+from primdiffusion.failures import ErrorDescription, describe, shortened
+from primdiffusion.formats.json_files import LARGEST_BYTES
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.rpc import (
     CANCELLED,
@@ -52,6 +53,8 @@ if TYPE_CHECKING:
 R = TypeVar("R")
 PROTOCOL = 1
 HEARTBEAT_S = 0.5
+LONGEST_LINE = LARGEST_BYTES + 2
+"""Bytes read of a line; a longer one is answered as no JSON, and its rest is skipped."""
 REQUESTS: dict[str, type[RequestRecord]] = {
     "generate": GenerateRequest,
     "variations": VariationsRequest,
@@ -129,9 +132,11 @@ class Server:
     # reader thread
 
     def _read(self) -> None:
-        for line in iter(self._source.readline, b""):
-            if not line.strip() or self._ended.is_set():
-                continue
+        whole = True
+        for line in iter(lambda: self._source.readline(LONGEST_LINE), b""):
+            begins, whole = whole, line.endswith(b"\n") or len(line) < LONGEST_LINE
+            if not begins or not line.strip() or self._ended.is_set():
+                continue  # the rest of a line whose beginning was answered
             try:
                 self._dispatch(line)
             except OSError:
@@ -263,9 +268,9 @@ def _parameters(read: Callable[[type[R], dict[str, Any], str], R], record: type[
     try:
         return read(record, message.params, message.method)
     except ParameterError as e:
-        raise RpcError(INVALID_PARAMS, str(e)) from e
+        raise RpcError(INVALID_PARAMS, shortened(str(e))) from e
     except ValueError as e:
-        raise RpcError(INVALID_PARAMS, f"{message.method!r}: {e}") from e
+        raise RpcError(INVALID_PARAMS, shortened(f"{message.method!r}: {e}")) from e
 
 
 def _as_rpc_error(error: Exception) -> RpcError:

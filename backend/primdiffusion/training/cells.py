@@ -6,12 +6,11 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from primdiffusion import tensor_file
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
@@ -20,7 +19,6 @@ from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.whole_files import write_atomically
-from primdiffusion.tensor_file import save
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
@@ -134,14 +132,12 @@ def _save_prepared(path: Path, prepared: Prepared) -> None:
             value = getattr(record, field.name)
             tensors[f"{name}.{field.name}"] = value.contiguous()
     about = {"full_density": repr(prepared.full_density), "vocabulary": json.dumps(prepared.vocabulary.to_json())}
-    write_atomically(path, save(tensors, metadata=about))
+    write_atomically(path, tensor_file.save(tensors, metadata=about))
 
 
 def _load_prepared(path: Path) -> Prepared:
     try:
-        with safe_open(path, framework="pt") as file:
-            tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-            about: dict[str, Any] = file.metadata()
+        tensors, about = tensor_file.read(path)
 
         def part(name: str) -> dict[str, Tensor]:
             return {key.removeprefix(f"{name}."): value for key, value in tensors.items() if key.startswith(f"{name}.")}
@@ -155,5 +151,5 @@ def _load_prepared(path: Path) -> Prepared:
             AttributeVocabulary.from_json(parse_json(about["vocabulary"])),
             float(about["full_density"]),
         )
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
         raise ValueError(f"{path} is damaged ({error!s:.100}): remove it to compute it again") from error

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from primdiffusion import tensor_file
 from primdiffusion.diffusion.codec import LinearCodec, cells_from_voxels
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
-from primdiffusion.tensor_file import save
 from primdiffusion.training.config import CodecConfig
 from primdiffusion.training.latents import fit_codec_to
 from primdiffusion.training.stored_people import PersonDataset
@@ -148,19 +147,18 @@ def _save_prepared(path: Path, prepared: PreparedDetail) -> None:
         value = getattr(prepared, field.name)
         parts = {"": value} if isinstance(value, Tensor) else vars(value)
         tensors |= {f"{field.name}.{key}": part.contiguous() for key, part in parts.items()}
-    write_atomically(path, save(tensors))
+    write_atomically(path, tensor_file.save(tensors))
 
 
 def _load_prepared(path: Path) -> PreparedDetail:
     try:
-        with safe_open(path, framework="pt") as file:
-            parts: dict[str, dict[str, Tensor]] = {}
-            for key in file.keys():  # noqa: SIM118 - safe_open is no mapping
-                name, _, part = key.partition(".")
-                parts.setdefault(name, {})[part] = file.get_tensor(key)
+        parts: dict[str, dict[str, Tensor]] = {}
+        for key, value in tensor_file.read(path)[0].items():
+            name, _, part = key.partition(".")
+            parts.setdefault(name, {})[part] = value
         return PreparedDetail(
             DetailSet(**parts["train"]), DetailSet(**parts["held"]), LinearCodec(**parts["codec"]),
             *(parts[name][""] for name in ("forward", "back", "latent_std", "rest_std")),
         )  # fmt: skip
-    except (SafetensorError, KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"{path} is damaged ({error!s:.100}): remove it to compute it again") from error

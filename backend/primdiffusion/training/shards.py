@@ -15,22 +15,27 @@ import hashlib
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
+from primdiffusion import tensor_file
 from primdiffusion.diffusion.conditioning import Attributes
+from primdiffusion.diffusion.model import BETAS
+from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import read_json
+from primdiffusion.formats.regular_files import TooLargeError, is_plain_path, open_regular
 from primdiffusion.formats.whole_files import staged, write_atomically, written_whole
-from primdiffusion.primitives.primitives import K
-from primdiffusion.tensor_file import save
+from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.stored_people import PersonDataset, PersonFolder, PersonVariants, attributes_of
 
 INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1
 PEOPLE_EACH = 32
+LARGEST_SHARD = 4 * 2**30
+"""Bytes."""
+_KINDS = {"voxels": ("U8",), "betas": ("F32",), "delta_scale": ("F16", "F32")}
 
 
 class ShardError(ValueError):
@@ -86,12 +91,12 @@ def _write_shard(path: Path, people: Sequence[PersonVariants]) -> None:
     if (scales != 1).any():
         tensors["delta_scale"] = scales.half()
     with written_whole(path) as unfinished:
-        unfinished.write_bytes(save(tensors))
+        unfinished.write_bytes(tensor_file.save(tensors))
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a file, hexadecimal. Raises OSError."""
-    with path.open("rb") as file:
+    """SHA-256 of a regular file, hexadecimal. Raises OSError and TooLargeError."""
+    with open_regular(path, LARGEST_SHARD) as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
@@ -111,10 +116,11 @@ class PackedPeople:
 
     def __init__(self, folder: Path) -> None:
         """Read the index. Raises FileNotFoundError, and ShardError if it is damaged or of another version."""
-        index = _read_index(folder / INDEX)
+        self._index = folder / INDEX
+        index = _read_index(self._index)
         try:
             self.full_density = float(index["full_density"])
-            self.paths = [folder / shard["file"] for shard in index["shards"]]
+            self.paths = [folder / _plain_name(shard["file"]) for shard in index["shards"]]
             self._digests = [str(shard["sha256"]) for shard in index["shards"]]
             people = [person for shard in index["shards"] for person in shard["people"]]
             self.names: Sequence[str] = [str(person["name"]) for person in people]
@@ -130,7 +136,13 @@ class PackedPeople:
     def known(self, index: int) -> tuple[Attributes, ...]:
         """Return the attributes of each colouring of a person. Raises as `person`."""
         shard, place, _ = self._rows(index)
-        return attributes_of(self._stored[index], self._slice(shard, "betas")[place], self.variants[index])
+        betas = self._slice(shard, "betas")[place]
+        try:
+            return attributes_of(self._stored[index], betas, self.variants[index])
+        except (TypeError, AttributeError, LookupError) as error:
+            raise ShardError(
+                f"{self._index} is damaged: the attributes of {self.names[index]!r:.60} ({error!s:.80}): pack again"
+            ) from error
 
     def person(self, index: int) -> PersonVariants:
         """Read a person. Raises ShardError, naming a damaged shard, and OSError."""
@@ -152,6 +164,21 @@ class PackedPeople:
         if digest_of(path) != self._digests[shard]:
             raise ShardError(f"{path} is damaged: its SHA-256 differs from {INDEX}: pack the humans again")
 
+    def _check_content(self, number: int, file: Any) -> None:
+        people = range(self._firsts[number], self._firsts[number + 1])
+        rows = sum(self.variants[index] for index in people)
+        wanted = {"voxels": [rows, K, S, S, S, 4], "betas": [len(people), BETAS], "delta_scale": [rows, K, 3]}
+        for name, shape in wanted.items():
+            if name == "delta_scale" and name not in file.keys():  # noqa: SIM118 - safe_open is no mapping
+                continue
+            if name not in file.keys():  # noqa: SIM118
+                raise ValueError(f"{name!r} is missing")
+            part = file.get_slice(name)
+            if part.get_shape() != shape or part.get_dtype() not in _KINDS[name]:
+                raise ValueError(f"{name!r} is {part.get_dtype()} {part.get_shape()}, not {shape}")
+            if name != "voxels" and not (part[:].float().abs() <= LARGEST_NUMBER).all():
+                raise ValueError(f"{name!r} holds impossible numbers")
+
     def _rows(self, index: int) -> tuple[int, int, slice]:
         """Return the shard of a person, the index in it, and the rows."""
         shard = bisect.bisect_right(self._firsts, index) - 1
@@ -171,10 +198,21 @@ class PackedPeople:
         if number not in self._open:
             self.check(number)
             try:
-                self._open[number] = safe_open(self.paths[number], framework="pt")
-            except SafetensorError as error:
-                raise ShardError(f"{self.paths[number]} is no safetensors file ({error!s:.100}): pack again") from error
+                file = tensor_file.opened(self.paths[number], LARGEST_SHARD)
+                self._check_content(number, file)
+            except TooLargeError:
+                raise
+            except ValueError as error:
+                raise ShardError(f"{self.paths[number]} is no shard ({error!s:.100}): pack the humans again") from error
+            self._open[number] = file
         return self._open[number]
+
+
+def _plain_name(name: Any) -> str:
+    plain = isinstance(name, str) and is_plain_path(name) and PurePath(name).name == name and name != ".."
+    if not plain or "\\" in name:
+        raise ValueError(f"{name!r:.60} is not the name of a file beside it")
+    return name
 
 
 def _read_index(path: Path) -> dict[str, Any]:

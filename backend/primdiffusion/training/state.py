@@ -5,18 +5,18 @@ from __future__ import annotations
 import copy
 import datetime
 import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
 import torch
 from accelerate import Accelerator
 from accelerate.utils import InitProcessGroupKwargs
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 
+from primdiffusion import tensor_file
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.machine import best_device
-from primdiffusion.tensor_file import save
 
 PATIENCE = datetime.timedelta(hours=3)
 """How long processes wait for the main process, which alone evaluates, renders and prepares data."""
@@ -97,28 +97,28 @@ class TrainingState:
         tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
-        if bad := next((key for key, value in tensors.items() if not torch.isfinite(value).all()), None):
+        if bad := _not_finite(tensors):
             raise NotFiniteError(
                 f"{bad} is not finite after step {self.step}: lower the learning rate in a new run folder; {path} "
                 "was not overwritten"
             )
         tensors |= {"random.data": self.generator.get_state(), "random.torch": torch.get_rng_state()}
         place = {"step": str(self.step), "seconds": repr(self.seconds), **self.place}
-        write_atomically(path, save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata=place))
+        write_atomically(
+            path, tensor_file.save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata=place)
+        )
 
     def load(self, path: Path) -> None:
         """Restore a saved state; ValueError if it belongs to another network or is damaged."""
         try:
-            with safe_open(path, framework="pt") as file:
-                tensors = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118 - safe_open is no mapping
-                place = dict(file.metadata() or {})
+            tensors, place = tensor_file.read(path)
             step, seconds = int(place.pop("step")), float(place.pop("seconds"))
             for name, module in (("network", self.network), ("average", self.average)):
                 module.load_state_dict(_under(tensors, name))
             self._load_moments(_under(tensors, "optimiser"))
             self.generator.set_state(tensors["random.data"])
             torch.set_rng_state(tensors["random.torch"])
-        except (SafetensorError, OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split())[:200]
             raise ValueError(
                 f"{path} does not fit this network or is damaged ({reason}): start a new run folder"
@@ -137,6 +137,10 @@ def learning_rate_factor(step: int, steps: int, warm_up: int = 100, last: float 
     """A linear rise over `warm_up` steps times a cosine from 1 to `last` over `steps`."""
     cosine = 0.5 + 0.5 * math.cos(math.pi * min(1.0, step / steps))
     return min(1.0, (step + 1) / warm_up) * (last + (1 - last) * cosine)
+
+
+def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
+    return next((key for key, value in tensors.items() if not torch.isfinite(value).all()), None)
 
 
 def _under(tensors: dict[str, Tensor], prefix: str) -> dict[str, Tensor]:
@@ -170,9 +174,8 @@ class AcceleratedState(TrainingState):
         if not path.exists():
             return 0
         try:
-            with safe_open(path, framework="pt") as file:
-                return int(file.metadata()["step"])
-        except (SafetensorError, OSError, KeyError, TypeError, ValueError) as error:
+            return int(tensor_file.read_metadata(path)["step"])
+        except (OSError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path} is damaged ({error!s:.100}): start a new run folder") from error
 
 

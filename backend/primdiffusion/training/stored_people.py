@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Protocol
@@ -17,7 +16,7 @@ from primdiffusion.body.measures import LARGEST_BETA, measure
 from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
-from primdiffusion.formats.arrays import array_shape, read_arrays
+from primdiffusion.formats.arrays import LARGEST_NUMBER, array_shape, read_arrays
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.wardrobe import words_of
@@ -153,7 +152,7 @@ def _outline_of(arrays: Mapping[str, NDArray], shape: tuple[int, ...]) -> Outlin
     if not isinstance(variants, list) or len(variants) != count or not all(isinstance(v, dict) for v in variants):
         raise ValueError(f"attributes that do not describe {count} colourings")
     density = float(arrays["full_density"])
-    if not 0 < density < math.inf:
+    if not 0 < density <= LARGEST_NUMBER:
         raise ValueError(f"a full density of {density}")
     return Outline(count, betas, stored, density)
 

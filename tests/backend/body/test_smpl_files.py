@@ -227,6 +227,7 @@ NAN = np.where(np.arange(V * 3).reshape(V, 3) == 7, np.nan, 0.0)
         (spoiled("weights", np.zeros((V, 52))), "'weights' has shape 60 x 52 where 60 x 24"),
         (spoiled("weights", np.zeros((V, J))), "'weights' has rows that are no weights"),
         (spoiled("v_template", NAN), "'v_template' holds NaN"),
+        (spoiled("v_template", np.full((V, 3), 9e8)), "'v_template' has vertices more than 1000 m away"),
         (spoiled("f", np.full((F, 3), V)), "'f' holds numbers that are not whole and from 0 to 59"),
         (spoiled("f", np.full((F, 3), 0.5)), "'f' holds numbers that are not whole"),
         (spoiled("kintree_table", np.array([PARENTS[::-1], range(J)])), "'kintree_table' is not a tree"),
@@ -272,6 +273,9 @@ def test_wrong_paths_and_texture_files_are_named(tmp_path, uv_pair):
     np.save(tmp_path / "far.npy", np.full((F, 3), 70))
     with pytest.raises(BodyFileError, match="out of range"):
         load_body(path, uv=(uv_pair[0], tmp_path / "far.npy"))
+    np.savez(tmp_path / "texts.npz", vt=np.full((F, 2), "a"), ft=np.zeros((F, 3), int))
+    with pytest.raises(BodyFileError, match="must be numbers"):
+        load_body(path, uv=tmp_path / "texts.npz")
     np.save(tmp_path / "objects.npy", np.array([Hostile(print, "ran")]), allow_pickle=True)
     with pytest.raises(BodyFileError, match=r"objects\.npy holds pickled Python objects"):
         load_body(path, uv=(uv_pair[0], tmp_path / "objects.npy"))

@@ -14,6 +14,7 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose
 from primdiffusion.body.smpl_pickle import UnsafePickleError
+from primdiffusion.capture.dataset import PACK_FOLDER, pack
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import CaptureFileError, open_captures
 from primdiffusion.capture.render import render, set_up_capture
@@ -21,6 +22,7 @@ from primdiffusion.capture.sheet import default_joints, draw_sheet, reprojection
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.capture_repair import verify
+from primdiffusion.formats.removing import OutsideFolderError
 from primdiffusion.raster.multisample import render_view
 
 NAME = "person_000000"
@@ -271,3 +273,19 @@ def test_info_and_sheet_say_and_show_what_is_there(root, tmp_path, capsys):
     with Image.open(tmp_path / "sheet.png") as sheet:
         assert sheet.size == (3 * 64, 6 * 64)
         assert np.asarray(sheet).any(-1).mean() > 0.02
+
+
+@pytest.mark.parametrize("mode", ["RGB", "LA", "RGBA"])
+def test_depth_with_several_channels_is_rejected(root, mode):
+    path = capture_layout.picture_path(root / NAME, "depth", 0, 0)
+    Image.new(mode, Image.open(path).size).save(path)
+    with pytest.raises(CaptureFileError, match="channels"):
+        open_captures(root).view(NAME, 0, 0)
+
+
+def test_a_pack_is_not_written_through_a_link(root, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    (root / PACK_FOLDER).symlink_to(tmp_path / "elsewhere")
+    with pytest.raises(OutsideFolderError):
+        list(pack(open_captures(root)))
+    assert not list((tmp_path / "elsewhere").iterdir())

@@ -141,7 +141,9 @@ def test_paint_of_another_body_is_rejected_with_the_number_of_vertices(line, fol
     np.savez(folder / "other_body.npz", weights=np.ones(6890, np.float32))
     with pytest.raises(SystemExit):
         cli.main(line("inpaint", "--weights", "other_body.npz"))
-    assert "12196 vertices" in capsys.readouterr().err
+    error = capsys.readouterr().err
+    assert "12196 vertices" in error
+    assert "other_body.npz" in error
     np.savez(folder / "texts.npz", weights=np.array(["a", "b"]))
     with pytest.raises(SystemExit):
         cli.main(line("inpaint", "--weights", "texts.npz"))

@@ -179,7 +179,7 @@ def test_a_missing_folder_picture_or_dataset_is_named(dataset, line, tmp_path, c
 def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, tmp_path, capsys):
     cut, other = tmp_path / "cut.safetensors", save_tiny_checkpoint(tmp_path / "diffusion.safetensors")
     cut.write_bytes(checkpoint.read_bytes()[:-100])
-    for path, fault in ((cut, "is truncated"), (other, "of format"), (tmp_path / "none", "there is no encoder at")):
+    for path, fault in ((cut, "is damaged"), (other, "of format"), (tmp_path / "none", "there is no encoder at")):
         line = ["reconstruct", "--capture", dataset / FIRST, "--checkpoint", path, "--out", tmp_path / "out"]
         sentence = failure(capsys, [str(word) for word in line])
         assert fault in sentence

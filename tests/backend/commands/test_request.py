@@ -6,7 +6,10 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
-from primdiffusion.commands.request import read_request
+from primdiffusion.commands.export import GaussiansRequest
+from primdiffusion.commands.merge import MergeRequest
+from primdiffusion.commands.render import RenderRequest
+from primdiffusion.commands.request import ParameterError, read_request
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,6 +25,12 @@ class Params:
     def check(self) -> None:
         if self.count < 0:
             raise ValueError(f"count {self.count} is negative")
+
+
+@pytest.mark.parametrize("path", ["", "a\0b", "\ud800"])
+def test_a_path_that_no_system_has_is_named_by_its_parameter(path):
+    with pytest.raises(ParameterError, match=r"m\.pose must be"):
+        read_request(Params, {"count": 2, "pose": path}, "m")
 
 
 def test_parameters_get_their_defaults_and_whole_numbers_pass_for_floats():
@@ -59,3 +68,17 @@ def test_parameters_get_their_defaults_and_whole_numbers_pass_for_floats():
 def test_a_wrong_parameter_is_named(params, named):
     with pytest.raises(ValueError, match=named):
         read_request(Params, params, "m")
+
+
+@pytest.mark.parametrize(
+    "request_for",
+    [
+        lambda out: GaussiansRequest(person=Path("anna.human"), out=out),
+        lambda out: RenderRequest(human=Path("anna.human"), out=out),
+        lambda out: RenderRequest(human=Path("anna.human"), out=Path("a.png"), depth=out),
+        lambda out: MergeRequest(people=[], out=out),
+    ],
+)
+def test_a_human_is_no_output(request_for):
+    with pytest.raises(ValueError, match="none of the extensions"):
+        request_for(Path("anna.human.safetensors")).check()

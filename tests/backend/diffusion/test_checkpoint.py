@@ -103,7 +103,7 @@ def test_a_missing_file_is_named(tmp_path):
 def test_a_truncated_file_is_rejected(path, keep):
     content = path.read_bytes()
     path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
-    with pytest.raises(CheckpointError, match="truncated"):
+    with pytest.raises(CheckpointError, match="is damaged"):
         load_checkpoint(path)
 
 
@@ -136,6 +136,25 @@ def test_weights_that_are_not_numbers_are_named(path):
 )
 def test_weights_that_do_not_fit_are_rejected(path, damage):
     rewrite(path, damage)
+    with pytest.raises(CheckpointError, match="does not match its own description"):
+        load_checkpoint(path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"full_density": -200.0},
+        {"full_density": "200"},
+        {"vocabulary": {"categories": "sex", "scalars": {}}},
+        {"vocabulary": {"categories": {}, "scalars": {"height": [1.7, 0]}}},
+        {"vocabulary": {"categories": {}, "scalars": {"height": [1.7]}}},
+    ],
+)
+def test_an_impossible_architecture_is_rejected(path, changes):
+    def change(metadata):
+        return metadata | {"architecture": json.dumps(json.loads(metadata["architecture"]) | changes)}
+
+    rewrite(path, change_metadata=change)
     with pytest.raises(CheckpointError, match="does not match its own description"):
         load_checkpoint(path)
 

@@ -48,7 +48,7 @@ def test_a_missing_file_is_named(tmp_path):
 @pytest.mark.parametrize("kept", [0, 5, 400, -100])
 def test_a_truncated_file_is_rejected(saved, tmp_path, kept):
     (tmp_path / "cut").write_bytes(saved.read_bytes()[:kept])
-    with pytest.raises(CheckpointError, match="truncated"):
+    with pytest.raises(CheckpointError, match="is damaged"):
         load_encoder(tmp_path / "cut")
 
 

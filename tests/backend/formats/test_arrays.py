@@ -170,3 +170,39 @@ def test_numbers_of_half_precision_are_checked_without_a_warning():
         assert all_finite(np.float16([-65504, 1]))
         assert not all_finite(np.float16([1, np.inf]))
         assert not all_finite(np.float32([1e31]))
+
+
+def test_the_smallest_integer_is_too_large(tmp_path):
+    assert not all_finite(np.array([0, -(2**63)]))
+    np.savez(tmp_path / "a.npz", a=np.array([-(2**63)]))
+    with pytest.raises(ArrayFileError, match="NaN or infinite"):
+        read_numbers(tmp_path / "a.npz", ("a",))
+
+
+@pytest.mark.parametrize("shape", ["(True,)", "(1.0,)", "[1]", "(1e3,)"])
+def test_sides_of_a_shape_are_integers(tmp_path, shape):
+    head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
+    with pytest.raises(ArrayFileError, match=r"a\.npy is not an array"):
+        read_npy(tmp_path / "a.npy")
+
+
+@pytest.mark.parametrize("values", [np.ones(2, complex), np.zeros(2, "M8[s]"), np.zeros(2, [("a", "f4")])])
+def test_neither_complex_numbers_nor_dates_nor_records_are_read(tmp_path, values):
+    np.save(tmp_path / "a.npy", values)
+    with pytest.raises(ArrayFileError, match="not numbers or text"):
+        read_npy(tmp_path / "a.npy")
+
+
+def test_a_text_whose_size_wraps_is_rejected(tmp_path):
+    head = b"{'descr': '<U1000000000', 'fortran_order': False, 'shape': (), }".ljust(117) + b"\n"
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
+    with pytest.raises(ArrayFileError, match=r"a\.npy"):
+        read_npy(tmp_path / "a.npy")
+
+
+def test_headers_of_python_2_are_read_without_a_warning(tmp_path, recwarn):
+    head = b"{'descr': '<f4', 'fortran_order': False, 'shape': (1L,), }".ljust(117) + b"\n"
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
+    assert read_npy(tmp_path / "a.npy").shape == (1,)
+    assert not recwarn

@@ -99,3 +99,35 @@ def test_a_dataset_that_cannot_be_is_named(root, about):
     file.write_text(json.dumps({**json.loads(file.read_text()), **about}))
     with pytest.raises(capture_layout.CaptureFolderError, match=r"dataset\.json"):
         verify(root)
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_pipe_in_place_of_a_picture_is_damage(root, finished):
+    path = capture_layout.picture_path(root / "anna", "mask", 0, 0)
+    path.unlink()
+    os.mkfifo(path)
+    if not finished:
+        (root / "anna" / capture_layout.COMPLETE_FILE).unlink()
+    wrong = verify(root)
+    assert wrong
+    repair(root, wrong)
+    assert path.exists() is not finished
+
+
+def test_files_without_end_are_not_read(root):
+    for name in ("anna/big.bin", capture_layout.LIST_FILE):
+        with (root / name).open("wb") as file:
+            file.truncate(capture_layout.LARGEST_FILE + 1)
+    mark = root / "anna" / capture_layout.COMPLETE_FILE
+    mark.write_text(json.dumps({**json.loads(mark.read_text()), "big.bin": [capture_layout.LARGEST_FILE + 1, 0]}))
+    wrong = verify(root)
+    assert wrong == {root / "anna" / "big.bin": "larger than 512 MB", root / capture_layout.LIST_FILE: "cannot be read"}
+    repair(root, wrong)
+    assert not (root / "anna" / "big.bin").exists()
+    assert (root / capture_layout.LIST_FILE).read_text() == "bert\n"
+
+
+def test_sizes_that_are_no_integers_make_a_subject_unfinished(root):
+    mark = root / "anna" / capture_layout.COMPLETE_FILE
+    mark.write_text('{"mask/camera0000/0000.png": [1e300, 0]}')
+    assert [*verify(root)] == [root / "anna"]

@@ -1,5 +1,7 @@
 """Removal that stays within a folder."""
 
+import os
+
 import pytest
 from primdiffusion.formats.removing import OutsideFolderError, check_unlinked, remove_file, remove_folder
 
@@ -39,3 +41,11 @@ def test_links_to_folders_are_found_before_anything_is_written(linked):
     for folder in (linked, linked / "extra"):
         with pytest.raises(OutsideFolderError, match="link to another folder"):
             check_unlinked(folder)
+
+
+def test_links_in_a_circle_are_an_error_of_files(tmp_path):
+    (tmp_path / "circle").symlink_to("circle")
+    with pytest.raises(OSError, match="circle"):
+        remove_file(tmp_path / "circle" / "x", tmp_path)
+    remove_file(tmp_path / "circle", tmp_path)
+    assert not os.path.lexists(tmp_path / "circle")

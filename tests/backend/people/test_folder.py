@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import psutil
@@ -194,3 +195,24 @@ def _within(seconds, reached):
     while time.monotonic() < deadline and not reached():
         time.sleep(0.2)
     return reached()
+
+
+def test_links_in_place_of_a_sample_and_in_it_are_not_followed(monkeypatch, tmp_path):
+    sample = SimpleNamespace(mesh=None, attributes={}, sources=[], betas=np.zeros(10))
+    for name, value in (("make_person", sample), ("load_base_mesh", None), ("skeleton_of", None), ("glb", b"glb")):
+        monkeypatch.setattr(folder_module, name, lambda *_, value=value: value)
+    (tmp_path / "outside").mkdir()
+    mine = tmp_path / "outside" / "person.glb"
+    mine.write_text("mine")
+    root = tmp_path / "people"
+    (root / "person_000004").mkdir(parents=True)
+    (root / "person_000004" / "person.glb").symlink_to(mine)
+    (root / "person_000004" / "more").symlink_to(mine.parent)
+    folder_module.write_person(None, root / "person_000004", 4)
+    assert (root / "person_000004" / "person.glb").read_bytes() == b"glb"
+    (root / "person_000005").symlink_to(mine.parent)
+    with pytest.raises(OSError, match="person_000005"):
+        folder_module.write_person(None, root / "person_000005", 5)
+    assert [path.name for path in mine.parent.iterdir()] == ["person.glb"]
+    assert mine.read_text() == "mine"
+    assert sorted(path.name for path in root.iterdir()) == ["person_000004", "person_000005"]

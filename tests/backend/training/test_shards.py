@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from diffusion_people import write_people
+from primdiffusion import tensor_file
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import K
 from primdiffusion.training import shards
@@ -179,3 +180,31 @@ def test_the_index_is_plain_json_with_all_known_attributes(packed):
     assert [len(shard["people"]) for shard in index["shards"]] == [2, 2, 1]
     assert index["shards"][0]["people"][1]["attributes"] == {"outfit": "outfit1"}
     assert all(len(shard["sha256"]) == 64 for shard in index["shards"])
+
+
+@pytest.mark.parametrize("name", ["../shard_0000.safetensors", "/proc/self/pagemap", "a/b", "C:\\x", "", "..", 3])
+def test_an_index_names_only_files_beside_it(copied, name):
+    index = json.loads((copied / INDEX).read_text())
+    index["shards"][0]["file"] = name
+    (copied / INDEX).write_text(json.dumps(index))
+    with pytest.raises(ShardError, match="index"):
+        PackedPeople(copied)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("betas", torch.full((2, 10), torch.nan)),
+        ("betas", torch.ones(2, 10).half()),
+        ("voxels", torch.zeros(1, dtype=torch.uint8)),
+    ],
+)
+def test_a_shard_with_the_right_checksum_and_other_tensors_is_rejected(copied, name, value):
+    path = copied / "shard_0000.safetensors"
+    tensors, _ = tensor_file.read(path)
+    path.write_bytes(tensor_file.save({**tensors, name: value}))
+    index = json.loads((copied / INDEX).read_text())
+    index["shards"][0]["sha256"] = shards.digest_of(path)
+    (copied / INDEX).write_text(json.dumps(index))
+    with pytest.raises(ShardError, match="shard_0000"):
+        PackedPeople(copied).person(0)

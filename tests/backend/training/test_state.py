@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from primdiffusion import tensor_file
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.state import TrainingState, learning_rate_factor
 
@@ -56,6 +57,16 @@ def test_a_damaged_or_foreign_state_is_rejected(tmp_path):
     (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:100])
     with pytest.raises(ValueError, match="damaged"):
         state_of_a_line().load(tmp_path / "state")
+
+
+@pytest.mark.parametrize("number", [float("nan"), 1e30])
+def test_impossible_numbers_in_a_state_are_rejected(tmp_path, number):
+    path = tmp_path / "state"
+    state_of_a_line().save(path)
+    tensors, place = tensor_file.read(path)
+    path.write_bytes(tensor_file.save({**tensors, "average.bias": torch.tensor([number])}, place))
+    with pytest.raises(ValueError, match=r"'average.bias' holds NaN or infinite values, or numbers above"):
+        state_of_a_line().load(path)
 
 
 def test_a_gradient_that_is_not_finite_stops_the_run():

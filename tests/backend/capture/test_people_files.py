@@ -1,0 +1,57 @@
+"""Meshes of humans that are whole glTF and hold what no mesh has."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+from capture_scenes import save_person
+from primdiffusion.capture.people_files import GlbError, read_person
+
+FLOAT, BYTE = 5126, 5120
+
+
+@pytest.fixture
+def person(tmp_path):
+    """A file, its JSON and its binary chunk."""
+    path = save_person(tmp_path / "person.glb")
+    data = path.read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    return path, json.loads(data[20 : 20 + size]), data[28 + size :]
+
+
+def write(path, tree, binary):
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "value"),
+    [
+        ("indices", BYTE, -1), ("indices", FLOAT, np.nan), ("TEXCOORD_0", FLOAT, np.nan), ("TEXCOORD_0", FLOAT, 1e38),
+        ("WEIGHTS_0", FLOAT, np.inf), ("WEIGHTS_0", FLOAT, -1), ("POSITION", FLOAT, np.inf),
+    ],
+)  # fmt: skip
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_numbers_that_no_mesh_has_are_rejected(person, name, kind, value):
+    path, tree, binary = person
+    primitive = tree["meshes"][0]["primitives"][0]
+    about = tree["accessors"][primitive["indices"] if name == "indices" else primitive["attributes"][name]]
+    width = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}[about["type"]]
+    values = np.full(about["count"] * width, value, np.float32 if kind == FLOAT else np.int8).tobytes()
+    values += bytes(-len(values) % 4)
+    tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(values)})
+    about.update(bufferView=len(tree["bufferViews"]) - 1, componentType=kind, byteOffset=0)
+    write(path, tree, binary + values)
+    with pytest.raises(GlbError, match=r"person\.glb"):
+        read_person(path)
+
+
+def test_a_small_file_cannot_name_endless_parts(person):
+    path, tree, binary = person
+    tree["nodes"] += [node for node in tree["nodes"] if "mesh" in node] * 50_000
+    write(path, tree, binary)
+    with pytest.raises(GlbError, match="more than 100 parts"):
+        read_person(path)
