@@ -134,6 +134,8 @@ class BackendClient:
         self._reported_silence = False
         self._polled_at = time.monotonic()
         self._abandoned: set[int] = set()
+        self._asked: dict[int, str] = {}
+        """Methods of the requests that have had no answer, by id."""
         self.info: dict[str, Any] = {}
         """What the child reported about itself: version, python, memory, and device once torch is loaded (`ready`)."""
 
@@ -185,6 +187,7 @@ class BackendClient:
     def request(self, method: str, params: Mapping[str, Any]) -> int:
         """Sends a request and returns its id; the answer comes through `poll`. A dead child answers with Died there."""
         id = next(self._ids)
+        self._asked[id] = method
         self._send({"jsonrpc": "2.0", "id": id, "method": method, "params": dict(params)})
         return id
 
@@ -296,8 +299,10 @@ class BackendClient:
                 return
 
     def _checked(self, message: dict[str, Any]) -> dict[str, Any]:
-        if fault := fault_of(message, self._hello):
+        if fault := fault_of(message, self._asked):
             raise MessageError(fault)
+        if "method" not in message:
+            del self._asked[message["id"]]
         return message
 
     def _event(self, message: dict[str, Any]) -> Event:

@@ -15,6 +15,8 @@ import sys
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 
+from ..formats.regular_files import read_regular
+
 CUDA_DRIVER = 580
 """The oldest NVIDIA driver that torch's CUDA 13 builds run on."""
 MACOS = 14
@@ -26,6 +28,8 @@ _REQUIREMENT = re.compile(
     r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;#]+) +--hash=sha256:[0-9a-f]{64}"
     r"(?: +# (?P<bytes>\d+) bytes, (?P<installed>\d+|\?) installed)?"
 )
+_LARGEST_LOCK = 4 << 20
+"""Bytes."""
 _UNPACKED_TO_PACKED = 3.0
 """For a wheel of which it is not known what it unpacks to; torch's CPU build for Linux has 3.6."""
 
@@ -64,14 +68,14 @@ class Lock:
 
 def read_lock(path: Path) -> Lock:
     """The lock in a file. Raises OSError, and ValueError for a line that is not `name==version --hash=sha256:...`."""
-    data = path.read_bytes()
+    data = read_regular(path, _LARGEST_LOCK)
     packages = []
     for number, line in enumerate(map(str.strip, data.decode("utf-8", "replace").splitlines()), 1):
         if not line or line.startswith(("#", "--extra-index-url ")):
             continue
         found = _REQUIREMENT.fullmatch(line)
         if found is None:
-            raise ValueError(f"line {number} of {path} is not 'name==version --hash=sha256:...': {line[:60]!r}")
+            raise ValueError(f"line {number} of {path} is not 'name==version --hash=sha256:...': {line[:60]!r:.80}")
         size = int(found["bytes"] or 0)
         unknown = found["installed"] in (None, "?")
         installed = int(size * _UNPACKED_TO_PACKED) if unknown else int(found["installed"])
@@ -195,6 +199,10 @@ _WHAT_WENT_WRONG = (
         r"Connection(?:Reset|Aborted)Error|IncompleteRead",
         "the package index cannot be reached: check the network and the proxy, then try again, "
         "or use Install from Folder",
+    ),
+    (
+        r"because they point to directories:\s+\S+ from \S*/(\S+)",
+        "{0} is a folder where the wheel of this name should be: fetch the wheels with 'pip download' (see the manual)",
     ),
     (
         r"No matching distribution found for (\S+)",

@@ -23,6 +23,7 @@ from typing import Any, Literal
 
 from ..formats.json_files import read_json
 from ..formats.removing import remove_file, remove_folder
+from ..formats.whole_files import write_atomically
 from .client import BackendClient
 from .environment import MARK, BackendPython, SetUpFolder, search, tried
 from .packages import Lock, SetUpFailed, clean_environment, followed, what_went_wrong
@@ -80,6 +81,7 @@ def set_up(
     """Rebuild the environment from the package index, or from a folder of `wheels`; it is ready once it has generated
     a human. `compute` (cpu, cuda or apple) is for its mark."""
     python, host = folder.python, sys.executable
+    _check_own(folder)
     folder.root.mkdir(parents=True, exist_ok=True)
     remove_file(folder.environment / MARK, folder.environment)
     remove_folder(folder.temporary, folder.temporary.parent)
@@ -104,9 +106,7 @@ def set_up(
         "bytes": lock.installed_bytes,
         "base": host,
     }
-    unfinished = folder.environment / f"{MARK}.part"
-    unfinished.write_text(json.dumps(marked, indent=1), encoding="utf-8")
-    os.replace(unfinished, folder.environment / MARK)
+    write_atomically(folder.environment / MARK, json.dumps(marked, indent=1))
     for leftover in (folder.downloads, folder.temporary):
         remove_folder(leftover, leftover.parent)
     return _ready(about)
@@ -122,6 +122,7 @@ def self_test(folder: SetUpFolder, python: Path | None, module_path: Path, cache
 def remove(folder: SetUpFolder, cache: Path | None) -> Steps:
     """Environment, downloads and `cache`, where it is not shared, are gone; nothing else in the folder is touched."""
     _, about = state_of(folder)
+    _check_own(folder)
     remove_file(folder.environment / MARK, folder.environment)
     going = [folder.environment, folder.downloads, folder.temporary, *([cache] if cache is not None else ())]
     program = "import shutil, sys; [shutil.rmtree(path) for path in sys.argv[1:]]"
@@ -132,6 +133,13 @@ def remove(folder: SetUpFolder, cache: Path | None) -> Steps:
         yield Step("Removing the environment", 0.5)
     freed = f"; {about['bytes'] / 1e6:.0f} MB are free again" if "bytes" in about else ""
     return f"The backend was removed{freed}"
+
+
+def _check_own(folder: SetUpFolder) -> None:
+    """Raises SetUpFailed for links: what they lead to is not ours to empty."""
+    for path in (folder.environment, folder.downloads, folder.temporary):
+        if path.is_symlink():
+            raise SetUpFailed(f"{path} is a link to another folder: remove the link, then set the backend up again")
 
 
 def _pip(python: Path) -> list[str]:

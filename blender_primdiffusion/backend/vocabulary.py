@@ -11,9 +11,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..formats.json_files import parse_json
+from ..formats.regular_files import open_regular
 
-_LONGEST_HEADER = 100_000_000
-"""What safetensors itself accepts."""
+_LARGEST_FILE, _LONGEST_HEADER = 16 << 30, 4 << 20
+"""Bytes, as in the backend's `tensor_file`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +32,7 @@ def read_vocabulary(path: Path) -> Vocabulary:
 
     Raises OSError for a file that cannot be read and ValueError for one that is no checkpoint.
     """
-    with path.open("rb") as file:
+    with open_regular(path, _LARGEST_FILE) as file:
         length = int.from_bytes(file.read(8), "little")
         header = file.read(length) if length <= _LONGEST_HEADER else b""
     try:

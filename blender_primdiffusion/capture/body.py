@@ -125,7 +125,7 @@ def _check(source: Path, arrays: dict[str, NDArray]) -> None:
     missing = [key for key in _KEYS if key not in arrays]
     if missing:
         raise BodyError(f"{source} holds no {missing[0]!r}: use an .npz of SMPL's form with plain arrays")
-    count = len(arrays["v_template"])
+    count = len(np.atleast_1d(arrays["v_template"]))
     shapes = {
         "v_template": (count, 3), "shapedirs": (count, 3, None), "posedirs": (count, 3, 207),
         "J_regressor": (24, count), "weights": (count, 24), "f": (None, 3), "kintree_table": (2, 24),
@@ -137,7 +137,7 @@ def _check(source: Path, arrays: dict[str, NDArray]) -> None:
             raise BodyError(f"{source}: {key!r} has shape {array.shape} of {array.dtype}, not SMPL's finite numbers")
     if tuple(arrays["kintree_table"][0][1:].tolist()) != PARENTS[1:]:
         raise BodyError(f"{source}: its joints are not SMPL's 24; SMPL-H and SMPL-X bodies do not serve here")
-    if arrays["f"].max(initial=0) >= count:
+    if arrays["f"].max(initial=0) >= count or arrays["f"].min(initial=0) < 0:
         raise BodyError(f"{source}: its faces name vertices that are not there")
 
 

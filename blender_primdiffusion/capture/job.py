@@ -20,7 +20,7 @@ from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
 from ..formats.removing import check_unlinked
-from ..formats.whole_files import remove_abandoned, temporary_name
+from ..formats.whole_files import remove_abandoned, temporary_folder
 from ..motion.files import MotionFileError, read_motion
 from ..motion.motion import Motion
 from ..motion.poses import built_in_poses, pick_poses
@@ -165,15 +165,15 @@ def _try_subject(
 def _name_reference(root: Path, subject: str) -> None:
     """Link the finished `subject` under the name from which the released code takes its rest sizes."""
     reference = root / RELEASED_REFERENCE
-    if subject == RELEASED_REFERENCE or reference.exists():
+    if subject == RELEASED_REFERENCE or os.path.lexists(reference):
         return
     try:
         os.symlink(subject, reference, target_is_directory=True)
     except OSError:  # Windows without the right to links, or a disk that has none
         remove_abandoned(root, reference)
-        partial = temporary_name(reference)
-        shutil.copytree(root / subject, partial)
-        os.replace(partial, reference)
+        with temporary_folder(reference) as partial:
+            shutil.copytree(root / subject, partial / subject)
+            os.replace(partial / subject, reference)
 
 
 def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> Generator[CaptureProgress, None, None]:

@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from ..formats.capture_layout import picture_path
 from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_png
+from ..formats.regular_files import read_regular
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from .surfaces import PART
 
+_LARGEST_FILE = 2**32
 _MAGIC, _MULTIPART = 20000630, 0x1000
 _DTYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
 
@@ -38,10 +40,10 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
 
     Names are as Blender gives them: "ViewLayer.Combined.R". Raises ExrError.
     """
-    data = path.read_bytes()
+    data = read_regular(path, _LARGEST_FILE)
     try:
         return _read(data)
-    except (struct.error, IndexError, ValueError, KeyError) as error:
+    except (struct.error, IndexError, ValueError, KeyError, OverflowError) as error:
         raise ExrError(f"{path} is no whole, uncompressed OpenEXR picture ({error!s:.160}): render it again") from error
 
 
@@ -73,6 +75,8 @@ def _header(data: bytes, at: int) -> tuple[dict[str, bytes], int]:
         name, at = _text(data, at)
         _kind, at = _text(data, at)
         (size,) = struct.unpack_from("<i", data, at)
+        if size < 0:  # which would lead back
+            raise ValueError(f"an attribute of {size} bytes")
         attributes[name] = data[at + 4 : at + 4 + size]
         at += 4 + size
     return attributes, at + 1
@@ -96,15 +100,19 @@ def _channels(data: bytes) -> Iterator[tuple[str, np.dtype]]:
 
 def _planes(data: bytes, part: _Part, offsets: list[int]) -> dict[str, NDArray[np.float32]]:
     """Each line is its y, its size in bytes, then its channels one after the other."""
-    row = np.dtype([(f"c{i}", dtype, part.width) for i, (_, dtype) in enumerate(part.channels)])
-    lines = np.empty(part.height, row)
+    row = np.dtype([(f"c{i}", dtype, (part.width,)) for i, (_, dtype) in enumerate(part.channels)])
+    if part.height * row.itemsize > len(data):
+        raise ValueError(f"it is cut short: {part.height} lines of {row.itemsize} bytes are announced")
+    lines, seen = np.empty(part.height, row), np.zeros(part.height, bool)
     (first,) = struct.unpack_from("<i", data, offsets[0])
     top = min(first, struct.unpack_from("<i", data, offsets[-1])[0])
     for offset in offsets:
         y, size = struct.unpack_from("<ii", data, offset)
         if size != row.itemsize:
             raise ValueError(f"a line of {size} bytes instead of {row.itemsize}")
-        lines[y - top] = np.frombuffer(data, row, 1, offset + 8)[0]
+        if not 0 <= y - top < part.height or seen[y - top]:
+            raise ValueError(f"line {y} twice, or outside of the picture")
+        lines[y - top], seen[y - top] = np.frombuffer(data, row, 1, offset + 8)[0], True
     return {name: lines[f"c{i}"].astype(np.float32) for i, (name, _) in enumerate(part.channels)}
 
 
@@ -142,18 +150,16 @@ class Centres:
 
 def read_colours(path: Path) -> Colours:
     """The combined pass of a multilayer EXR; with denoising only its colours are denoised, not its alpha."""
-    planes = read_exr(path)
-    rgb = np.stack([_plane(planes, f"Combined.{channel}") for channel in "RGB"], -1)
-    return Colours(rgb, _plane(planes, "Combined.A"))
+    red, green, blue, alpha = _chosen(path, [f"Combined.{channel}" for channel in "RGBA"])
+    return Colours(np.stack([red, green, blue], -1), alpha)
 
 
 def read_centres(path: Path) -> Centres:
     """The passes of a multilayer EXR that was rendered through the pixels' centres."""
-    planes = read_exr(path)
-    depth = _plane(planes, "Depth.Z")
+    depth, x, y, z, part = _chosen(path, ["Depth.Z", "Normal.X", "Normal.Y", "Normal.Z", f"{PART}.X"])
     depth = np.where(depth < _NOTHING_M, depth, np.float32(np.inf))
-    normal = points_to_backend(np.stack([_plane(planes, f"Normal.{axis}") for axis in "XYZ"], -1))
-    part = np.where(np.isfinite(depth), np.round(_plane(planes, f"{PART}.X")), 0)  # behind a hole it is the hole's
+    normal = points_to_backend(np.stack([x, y, z], -1))
+    part = np.where(np.isfinite(depth), np.round(part), 0)  # behind a hole it is the hole's
     return Centres(depth, normal, part.clip(0, 24).astype(np.uint8))
 
 
@@ -212,5 +218,13 @@ def _write_jpeg(path: Path, pixels: NDArray[np.uint8]) -> None:
         bpy.data.images.remove(sheet)
 
 
-def _plane(planes: dict[str, NDArray[np.float32]], ending: str) -> NDArray[np.float32]:
-    return next(plane for name, plane in planes.items() if name.endswith(f".{ending}"))
+def _chosen(path: Path, endings: list[str]) -> list[NDArray[np.float32]]:
+    """Planes by the ends of their names, of one size and without NaN: that is 0. Raises ExrError."""
+    planes = read_exr(path)
+    found = [next((plane for name, plane in planes.items() if name.endswith(f".{ending}")), None) for ending in endings]
+    shapes = {plane.shape for plane in found if plane is not None}
+    missing = [ending for ending, plane in zip(endings, found, strict=True) if plane is None]
+    if missing or len(shapes) != 1:
+        what = f"holds no pass {missing[0]}" if missing else "holds passes of several sizes"
+        raise ExrError(f"{path} {what}: render it again")
+    return [np.nan_to_num(plane, nan=0.0, posinf=np.inf, neginf=-np.inf) for plane in found if plane is not None]

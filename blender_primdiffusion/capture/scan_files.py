@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, all_finite, array_names, read_arrays
 from ..formats.json_files import parse_json
+from ..formats.regular_files import open_regular, real_path
 from ..motion.files import POSE_KEYS, MotionFileError, motion_from_arrays
 
 ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
@@ -22,7 +23,8 @@ ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
 _GENERIC = {"person", "model", "scan", "mesh", "scene", "body", "human", "untitled", "object"}
 """Generic names: the folder's name is used instead."""
 _RELEASED = ("outputs_re_fitting/refit_smpl_2nd_plain.npz", "refit_smpl_2nd_plain.npz")
-_LARGEST_JSON = 64 * 2**20
+_LARGEST_JSON, _LARGEST_SCAN = 64 * 2**20, 2**40
+"""Bytes; the importers of Blender read the scans."""
 
 
 class ScanError(ValueError):
@@ -83,7 +85,7 @@ def own_betas(path: Path) -> tuple[list[float], str] | None:
     if path.suffix.lower() != ".glb":
         return None
     try:
-        with path.open("rb") as stream:
+        with open_regular(path, _LARGEST_SCAN) as stream:
             magic, _, _, length, kind = struct.unpack("<4sIII4s", stream.read(20))
             if magic != b"glTF" or kind != b"JSON" or length > _LARGEST_JSON:
                 return None
@@ -117,7 +119,7 @@ def _rank(path: Path) -> int:
 
 
 def _slug(path: Path) -> str:
-    stem = path.stem if path.stem.lower() not in _GENERIC else path.resolve().parent.name
+    stem = path.stem if path.stem.lower() not in _GENERIC else real_path(path).parent.name
     return re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("_.") or "person"
 
 
@@ -209,7 +211,7 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
     except (ArrayFileError, MotionFileError, OSError) as e:
         raise ScanError(str(e)) from e
     except StopIteration:
-        names = ", ".join(array_names(path)[:8])
+        names = ", ".join(name[:16] for name in array_names(path)[:8])
         raise ScanError(f"{path} holds no pose ({names}): it needs global_orient and body_pose, or pose") from None
     betas = next((arrays[key] for key in _SHAPE_KEYS if key in arrays), np.zeros(10))
     scale = arrays.get("scale", np.ones(1))

@@ -108,7 +108,8 @@ def _new_folder(within: Path | None) -> Path:
 
 
 def _reserve(path: Path, size: int) -> Path:
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
+    remove_file(path, path.parent)
+    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)  # follows no link
     try:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(descriptor, 0, size)

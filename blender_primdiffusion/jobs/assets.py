@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.json_files import parse_json
 from ..formats.regular_files import check_regular
-from ..formats.removing import remove_file
+from ..formats.whole_files import written_whole
 from ..motion.pose_library import builtin_poses, current_pose
 from ..motion.poses import grounding
 from ..motion.rotation import from_axis_angle, to_axis_angle
@@ -168,7 +167,7 @@ def write_pose_library(context: bpy.types.Context, folder: Path | None = None) -
     """
     folder = folder if folder is not None else own_folder() / "assets"
     folder.mkdir(parents=True, exist_ok=True)
-    path, unfinished = folder / FILE, folder / f".{FILE}"
+    path = folder / FILE
     armature = build_armature("PrimDiffusion Poses", points_to_blender(REST_JOINTS))
     context.scene.collection.objects.link(armature)  # objects in no scene have no pose
     actions: set[bpy.types.Action] = set()
@@ -176,12 +175,11 @@ def write_pose_library(context: bpy.types.Context, folder: Path | None = None) -
         context.view_layer.update()
         for name, vectors in builtin_poses().items():
             actions.add(_asset(armature, name, from_axis_angle(vectors)))
-        bpy.data.libraries.write(str(unfinished), actions, fake_user=True, compress=True)
-        os.replace(unfinished, path)
+        with written_whole(path) as unfinished:
+            bpy.data.libraries.write(str(unfinished), actions, fake_user=True, compress=True)
     except RuntimeError as error:
         raise OSError(f"{path} could not be written: {error}") from error
     finally:
-        remove_file(unfinished, unfinished.parent)
         data = armature.data
         bpy.data.batch_remove([*actions, armature, data])
     _add_library(folder)

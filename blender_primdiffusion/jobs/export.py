@@ -13,6 +13,7 @@ import numpy as np
 
 from ..engine.picture import pose_of
 from ..formats.removing import remove_file
+from ..formats.whole_files import written_whole
 from ..motion.skeleton import unchain
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
@@ -325,12 +326,8 @@ def name_of(path: str) -> str:
 
 def put(source: Path, target: Path) -> None:
     """Copy a finished file to its destination, where it appears whole. Raises OSError."""
-    unfinished = target.with_name(f".{target.name}.part")
-    try:
+    with written_whole(target) as unfinished:
         shutil.copyfile(source, unfinished)
-        unfinished.replace(target)
-    finally:
-        remove_file(unfinished, unfinished.parent)
 
 
 def _for_other_programs(grid: MergedGrid) -> MergedGrid:

@@ -21,6 +21,8 @@ from .skeleton import REST_JOINTS, unchain
 LARGEST_BYTES = 64 * 2**20
 LONGEST_HIERARCHY = 2**20
 MOST_JOINTS = 1000
+LONGEST_NUMBER = 40
+"""Characters with the space around it: what is much longer than all numbers that are announced holds others."""
 MOST_ROTATIONS = 5_000_000
 """Joints times frames: 24 joints for an hour at 60 frames/s, 65 joints for 20 minutes."""
 LONGEST_FRAME_TIME, SHORTEST_FRAME_TIME = 10.0, 1e-4
@@ -186,6 +188,8 @@ def _parse_motion(text: str, columns: int, joints: int) -> tuple[NDArray[np.floa
         raise ValueError(f"{frames} frames of {joints} joints are more than {MOST_ROTATIONS} rotations, cut the motion")
     if not (frame_time <= 0 or SHORTEST_FRAME_TIME <= frame_time <= LONGEST_FRAME_TIME):
         raise ValueError(f"a frame time of {frame_time:g} s")
+    if len(text) - found.end() > LONGEST_NUMBER * frames * columns + LONGEST_HIERARCHY:
+        raise ValueError(f"much more than the {frames} frames of {columns} numbers that are announced")
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # numpy warns, or newer ones fail, at the first word that is no number
         try:

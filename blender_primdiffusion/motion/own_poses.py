@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import contextlib
 import json
-import os
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..formats.json_files import read_json
 from ..formats.removing import remove_file
+from ..formats.whole_files import write_atomically
 
 if TYPE_CHECKING:
     import numpy as np
@@ -64,11 +64,8 @@ def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> P
     if path.exists():
         raise PoseFileError(f"there is a pose {name!r} already: give another name, or delete that one first")
     content = {"name": name, "pose": np.round(pose, 6).tolist(), "transl": np.round(translation, 6).tolist()}
-    unfinished = path.with_suffix(".part")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        unfinished.write_text(json.dumps(content, indent=1), encoding="utf-8")
-        os.replace(unfinished, path)
+        write_atomically(path, json.dumps(content, indent=1))
     except OSError as error:
         raise PoseFileError(f"the pose could not be written to {str(path)!r} ({error.strerror or error})") from error
     return path

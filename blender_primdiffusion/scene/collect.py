@@ -14,6 +14,7 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
+from ..formats.regular_files import real_path
 from ..formats.removing import remove_file
 from .body_file import BODY_FILE, BODY_NPZ, body_files
 from .human import (
@@ -112,14 +113,14 @@ def unused(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         return []
-    used = {path.resolve() for volume in bpy.data.volumes if volume.filepath for path in sequence_files(volume)}
+    used = {real_path(path) for volume in bpy.data.volumes if volume.filepath for path in sequence_files(volume)}
     in_use = _person_files() | body_files()
     later = {path.parent for path in used if not path.is_file()}
     found = []
     for path in sorted(folder.rglob("*")):
         named_so = any(pattern.fullmatch(path.name) for pattern in _OURS)
-        needed = UNWRITTEN_NPZ.fullmatch(path.name) and path.parent.resolve() in later
-        if named_so and path.name not in in_use and path.resolve() not in used and not needed:
+        needed = UNWRITTEN_NPZ.fullmatch(path.name) and real_path(path.parent) in later
+        if named_so and path.name not in in_use and real_path(path) not in used and not needed:
             found.append(path)
     return found
 
@@ -214,4 +215,4 @@ def _temporary(path: Path) -> bool:
 
 
 def _inside(path: Path, folder: Path) -> bool:
-    return path.resolve().is_relative_to(folder.resolve())
+    return real_path(path).is_relative_to(real_path(folder))

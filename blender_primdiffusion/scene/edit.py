@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.regular_files import real_path
 from .attachment import volumes_may_wait
 from .body_file import saved_body
 from .human import (
@@ -122,8 +123,8 @@ def restore_volumes(collection: bpy.types.Collection, written: WrittenHuman, per
     VolumeWriteError or ValueError before the scene is touched. Makes no undo step.
     """
     shown = [obj for objects in volumes_of(collection).values() for obj in objects]
-    made = {path.resolve() for path in written.made}
-    lost = _without_files(collection) | {obj for obj in shown if volume_path(obj.data).resolve() in made}
+    made = {real_path(path) for path in written.made}
+    lost = _without_files(collection) | {obj for obj in shown if real_path(volume_path(obj.data)) in made}
     with written.entering(lambda: home_of(collection)):
         return _restore(collection, written, lost, person)
 

@@ -15,8 +15,11 @@ from pathlib import Path
 
 import bpy
 
-from ..formats.removing import remove_file
+from ..formats.regular_files import read_regular, real_path
+from ..formats.whole_files import written_whole
 
+LARGEST_PERSON = 256 << 20
+"""Bytes of a human of the backend."""
 TEMPORARY = "primdiffusion_humans"
 """Folder, among Blender's temporary files, for the humans of a .blend that was never saved."""
 PERSON_FILE = "person.human.safetensors"
@@ -54,7 +57,7 @@ def humans_folder(blend_path: str | None = None) -> Path:
     """The folder of a .blend's humans: `<blendname>_humans` beside it, a temporary folder while it is unsaved."""
     blend = Path(blend_path if blend_path is not None else bpy.data.filepath)
     if blend.name:
-        return blend.resolve().parent / f"{blend.stem}_humans"
+        return real_path(blend).parent / f"{blend.stem}_humans"
     return Path(bpy.app.tempdir) / TEMPORARY
 
 
@@ -114,7 +117,7 @@ def home_of(collection: bpy.types.Collection) -> Path:
     folders = folders_of(collection)
     home = next((folder for folder in folders if (folder / person_file_name(collection)).is_file()), folders[0])
     for own in (humans_folder(), humans_folder("")):
-        if home.resolve().is_relative_to(own.resolve()):
+        if real_path(home).is_relative_to(real_path(own)):
             return home
     return folder_of(collection)
 
@@ -138,7 +141,7 @@ def person_file(collection: bpy.types.Collection) -> Path:
 
 def content_name(person: Path) -> str:
     """A name for the backend's file of a human that no other content has."""
-    return f"person_{hashlib.sha256(person.read_bytes()).hexdigest()[:12]}.human.safetensors"
+    return f"person_{hashlib.sha256(read_regular(person, LARGEST_PERSON)).hexdigest()[:12]}.human.safetensors"
 
 
 def available_name(person: Path, folder: Path, name: str) -> str:
@@ -154,12 +157,8 @@ def copy_file(source: Path, destination: Path) -> bool:
     """Copy a file, which appears whole or not at all; returns whether it is new. Raises OSError."""
     new = not destination.exists()
     destination.parent.mkdir(parents=True, exist_ok=True)
-    unfinished = destination.with_name(f".{source.name}.part")
-    try:
+    with written_whole(destination) as unfinished:
         shutil.copyfile(source, unfinished)
-        os.replace(unfinished, destination)
-    finally:
-        remove_file(unfinished, unfinished.parent)
     return new
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import json
-import os
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +18,9 @@ from ..formats import compact_human
 from ..formats.arrays import all_finite, check_shapes
 from ..formats.json_files import parse_json
 from ..formats.regular_files import read_regular
-from ..formats.removing import remove_file
-from .human import BETA_COUNT
+from ..formats.whole_files import written_whole
+from .human import BETA_COUNT, LARGEST_PERSON
 
-_LARGEST_FILE = 256 << 20
 _LARGEST_HEADER = 1 << 20
 _METADATA = "__metadata__"
 _DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BF16": "<u2"}
@@ -62,7 +60,7 @@ class HumanTensors:
 
 def read_tensors(path: Path) -> HumanTensors:
     """Read a .human file. Raises ValueError for a file of another kind or a damaged one, OSError."""
-    data = read_regular(path, _LARGEST_FILE)
+    data = read_regular(path, LARGEST_PERSON)
     length = int.from_bytes(data[:8], "little")
     try:
         if not 2 <= length <= min(_LARGEST_HEADER, len(data) - 8):
@@ -233,15 +231,10 @@ def write_tensors(path: Path, human: HumanTensors) -> None:
         offset += len(raw)
     text = json.dumps(header, separators=(",", ":")).encode()
     text += b" " * (-len(text) % 8)
-    unfinished = path.with_name(f".{path.name}.part")
-    try:
-        with unfinished.open("wb") as file:
-            file.write(len(text).to_bytes(8, "little") + text)
-            for name in ordered:
-                file.write(human.arrays[name][2])
-        os.replace(unfinished, path)
-    finally:
-        remove_file(unfinished, unfinished.parent)
+    with written_whole(path) as unfinished, unfinished.open("wb") as file:
+        file.write(len(text).to_bytes(8, "little") + text)
+        for name in ordered:
+            file.write(human.arrays[name][2])
 
 
 def _stored(array: NDArray[np.float32]) -> tuple[str, tuple[int, ...], bytes]:

@@ -102,7 +102,7 @@ def _read(path: Path) -> HumanFile:
     version = int(_scalar(arrays, "format_version", path))
     if not 1 <= version <= FORMAT_VERSION:
         raise HumanNpzError(
-            f"{path.name!r} has format version {version}, this add-on reads 1 to {FORMAT_VERSION}; "
+            f"{path.name!r} has format version {version!s:.20}, this add-on reads 1 to {FORMAT_VERSION}; "
             "use an add-on and a backend of the same release"
         )
     try:

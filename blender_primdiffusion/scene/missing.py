@@ -15,6 +15,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
+from ..formats.regular_files import real_path
 from .body_file import BODY_FILE
 from .human import (
     HOME,
@@ -46,10 +47,11 @@ class Listing:
         self._names: dict[Path, frozenset[str]] = {}
 
     def names(self, folder: Path) -> frozenset[str]:
-        """Names in a folder; none where it does not exist or cannot be read."""
+        """Names of the files in a folder; none where it does not exist or cannot be read."""
         if folder not in self._names:
             try:
-                self._names[folder] = frozenset(os.listdir(folder))
+                with os.scandir(folder) as entries:  # a pipe named like a volume would hang Blender
+                    self._names[folder] = frozenset(entry.name for entry in entries if os.path.isfile(entry))
             except OSError:
                 self._names[folder] = frozenset()
         return self._names[folder]
@@ -231,7 +233,7 @@ def _likely_folders() -> Iterator[Path]:
     roots = [humans_folder(), *(folder.parent for folder in (*homes, *sorted(shown)))]
     blend = Path(bpy.data.filepath)
     if blend.name:
-        roots += _folders_in(blend.resolve().parent, "_humans")  # of a .blend that had another name
+        roots += _folders_in(real_path(blend).parent, "_humans")  # of a .blend that had another name
     for root in dict.fromkeys(roots):
         yield root
         yield from _folders_in(root)
@@ -240,7 +242,9 @@ def _likely_folders() -> Iterator[Path]:
 def _folders_in(folder: Path, ending: str = "") -> list[Path]:
     try:
         with os.scandir(folder) as entries:
-            return sorted(folder / entry.name for entry in entries if entry.is_dir() and entry.name.endswith(ending))
+            return sorted(
+                folder / entry.name for entry in entries if os.path.isdir(entry) and entry.name.endswith(ending)
+            )
     except OSError:
         return []
 

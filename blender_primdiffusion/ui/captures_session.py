@@ -15,8 +15,8 @@ from pathlib import Path
 import bpy
 
 from ..backend.child_streams import Output
+from ..backend.messages import MessageError, captures_message
 from ..console import CANCELLED, DONE
-from ..formats.json_files import parse_json
 from ..formats.removing import remove_folder
 
 PATIENCE_S = 0.7
@@ -39,6 +39,7 @@ class CaptureSession:
         self.message = ""
         self.fraction = 0.0
         self.eta_s: float | None = None
+        self._fault = ""
         self.lines: collections.deque[str] = collections.deque(maxlen=_MOST_LINES)
         """Lines of the child, newest last."""
         self.exit_code: int | None = None
@@ -65,7 +66,7 @@ class CaptureSession:
         if self.busy:
             raise Busy("captures are being rendered; wait for them or press Cancel")
         folder = str(self.new_folder())
-        self.error = self.notice = ""
+        self.error = self.notice = self._fault = ""
         self.message, self.fraction, self.eta_s, self.exit_code = "Starting Blender", 0.0, None, None
         self.lines.clear()
         self._asked_to_stop_at = None
@@ -124,7 +125,12 @@ class CaptureSession:
 
         if not line.startswith(MARK):
             return  # printed by Blender
-        progress = parse_json(line[len(MARK) :])
+        try:
+            progress = captures_message(line[len(MARK) :])
+        except MessageError as fault:
+            self._fault = f"Blender was ended because it sent a malformed message ({fault}): render again"
+            self._process.kill()
+            return
         if "line" in progress:
             self.lines.append(progress["line"])
             return
@@ -142,7 +148,9 @@ class CaptureSession:
         self._close_streams()
         self._clear_folder()
         last = self.lines[-1] if self.lines else ""
-        if stopped or code == CANCELLED:
+        if self._fault and not stopped:
+            self.error = self._fault
+        elif stopped or code == CANCELLED:
             self.notice = "Cancelled; the same settings resume from here."
         elif code == DONE:
             self.notice, self.fraction = last, 1.0

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from ..formats.regular_files import read_regular
 
-_LARGEST = 2**16
+_LARGEST, _LARGEST_NUMBER = 2**16, 2**31
+"""Bytes of a preset, and Blender's largest integer."""
 _ROOT = "settings"
 
 
@@ -35,7 +36,8 @@ def _assignments(tree: ast.Module) -> Iterator[tuple[tuple[str, ...], bool | int
             raise ValueError(f"line {line.lineno} sets nothing")
         root, *names = _names(line.targets[0]) or ("",)
         value = ast.literal_eval(line.value)
-        if root != _ROOT or not names or not isinstance(value, bool | int | float | str):
+        possible = isinstance(value, str) or (isinstance(value, bool | int | float) and abs(value) <= _LARGEST_NUMBER)
+        if root != _ROOT or not names or not possible:
             raise ValueError(f"line {line.lineno} sets something else than a setting")
         yield tuple(names), value
 

@@ -16,16 +16,15 @@ _CAMERAS_FILE = "cameras.json"
 
 def subjects_in(folder: Path) -> list[str]:
     """Names of the humans in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
-    from ..formats.capture_layout import LIST_FILE  # needs numpy
+    from ..formats.capture_layout import LIST_FILE, read_list  # needs numpy
 
     try:
         if (folder / _CAMERAS_FILE).is_file():
             return []
         if (folder / LIST_FILE).is_file():
-            text = (folder / LIST_FILE).read_text(encoding="utf-8", errors="replace")
-            return sorted({line.strip() for line in text.splitlines()} - {""})
+            return sorted(set(read_list(folder)))
         return sorted(path.parent.name for path in folder.glob(f"*/{_CAMERAS_FILE}"))
-    except OSError:
+    except (OSError, ValueError):
         return []
 
 

@@ -144,7 +144,7 @@ def test_a_child_that_dies_at_once_reports_its_exit_code_and_last_words(fake_chi
 def test_the_last_messages_of_a_dying_child_come_before_its_death(fake_child):
     client = fake_child("""
         for i in range(500):
-            print(json.dumps({"jsonrpc": "2.0", "method": "progress", "params": {"i": i}}))
+            print(json.dumps({"jsonrpc": "2.0", "method": "news", "params": {"i": i}}))
     """)
     seen = []
     wait_for(client, lambda e: isinstance(e, Died), into=seen)
@@ -181,7 +181,15 @@ def test_lines_that_are_no_messages_are_kept_for_the_log_and_disturb_nothing(fak
         ({"method": "progress", "params": {"id": 1, "step": "3"}}, "step"),
         ({"method": "progress", "params": {"id": 1, "picture": {}}}, "picture"),
         ({"method": "progress", "params": {"id": 1, "eta_s": 1e999}}, "eta_s"),
+        ({"method": "progress", "params": {"id": 1, "stage": "load", "step": 1}}, "total"),
+        ({"method": "progress", "params": {"id": 1, "stage": "load", "step": -1, "total": 2}}, "step"),
+        (
+            {"method": "progress", "params": {"id": 1, "stage": "load", "step": 1, "total": 2, "picture": "\0"}},
+            "picture",
+        ),
         ({"method": "ready", "params": {"ready": "yes"}}, "ready"),
+        ({"id": 99, "result": {}}, "id"),
+        ({"id": None, "error": {"code": -32700, "message": "the line is not JSON"}}, "id"),
     ],
 )
 def test_a_malformed_message_ends_the_child_with_a_sentence(fake_child, message, fault):
@@ -190,6 +198,37 @@ def test_a_malformed_message_ends_the_child_with_a_sentence(fake_child, message,
     assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
     assert client.gone_within(10)
     assert client.poll() == []
+
+
+@pytest.mark.parametrize(
+    ("method", "result", "fault"),
+    [
+        ("generate", {}, "human"),
+        ("generate", {"human": 3, "person": "a", "seconds": 1}, "human"),
+        ("generate", {"human": "a", "person": "a", "seconds": 1e999}, "seconds"),
+        ("variations", {"people": [{"seed": 1}], "seconds": 1}, "people"),
+        ("reconstruct", {"human": "a", "person": "a", "seconds": 1, "warnings": [None]}, "warnings"),
+        ("proxy", {"proxy": "a", "texture": "b", "betas": ["x"], "triangles": 1, "seconds": 1}, "betas"),
+        ("merge_frames", {"files": 3, "seconds": 1}, "files"),
+    ],
+)
+def test_a_result_without_what_its_method_promises_ends_the_child(fake_child, method, result, fault):
+    client = fake_child(f"""
+        for line in sys.stdin:
+            asked = json.loads(line)
+            result = {{}} if asked["method"] == "hello" else {result!r}
+            print(json.dumps({{"id": asked["id"], "result": result}}), flush=True)
+    """.replace("inf", "1e999"))  # fmt: skip
+    client.request(method, {})
+    died = wait_for(client, lambda e: isinstance(e, Died))
+    assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
+
+
+def test_a_second_answer_ends_the_child(fake_child):
+    client = fake_child('print(\'{"id": 1, "result": {}}\\n\' * 2, flush=True)\ntime.sleep(60)')
+    events = []
+    wait_for(client, lambda e: isinstance(e, Died), into=events)
+    assert [type(event) for event in events] == [Response, Died]
 
 
 @pytest.mark.parametrize(
@@ -258,7 +297,7 @@ def test_a_child_that_closes_its_output_and_hangs_is_silent(fake_child):
 def test_polling_a_child_that_reads_nothing_never_waits(fake_child):
     client = fake_child("time.sleep(60)")
     for _ in range(200):
-        client.request("generate", {"padding": "x" * 10_000})  # far more than a pipe holds
+        client.request("attributes", {"padding": "x" * 10_000})  # far more than a pipe holds
     assert client.poll() == []
     assert client.alive
 
@@ -268,7 +307,7 @@ def test_a_poll_ends_when_its_time_is_over_and_a_flood_loses_no_message(fake_chi
     count = 20_000
     client = fake_child(f"""
         for i in range({count}):
-            sys.stdout.write(json.dumps({{"jsonrpc": "2.0", "method": "progress", "params": {{"i": i}}}}) + "\\n")
+            sys.stdout.write(json.dumps({{"jsonrpc": "2.0", "method": "news", "params": {{"i": i}}}}) + "\\n")
     """)
     client._process.wait(60)
     assert len(client.poll()) == 1
@@ -298,7 +337,7 @@ def test_what_the_pipe_does_not_take_at_once_arrives_later_whole(fake_child):
             size = len(request["params"].get("padding", ""))
             print(json.dumps({"jsonrpc": "2.0", "id": request["id"], "result": {"size": size}}), flush=True)
     """)
-    ids = [client.request("generate", {"padding": "x" * 100_000}) for _ in range(20)]
+    ids = [client.request("attributes", {"padding": "x" * 100_000}) for _ in range(20)]
     seen = []
     wait_for(client, lambda e: isinstance(e, Response) and e.id == ids[-1], into=seen)
     assert [(e.id, e.result["size"]) for e in seen if e.id in ids] == [(id, 100_000) for id in ids]

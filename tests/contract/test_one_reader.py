@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,8 +17,10 @@ ALLOWED = {
     "numpy.lib.format.read_array": set(),
     "json.load": set(),
     "json.loads": {"formats/json_files.py"},
-    "pickle": {"released/reading.py", "evaluation/pretrained_networks.py"},  # exceptions of torch.load, weights_only
-    "torch.load": {"released/reading.py", "evaluation/pretrained_networks.py"},
+    "pickle": {"torch_file.py"},  # an exception of torch.load, weights_only
+    "torch.load": {"torch_file.py"},
+    "safetensors.safe_open": {"tensor_file.py"},
+    "safetensors.torch.load_file": set(),
     "safetensors.torch.save": {"tensor_file.py"},
     "safetensors.torch.save_file": set(),
     "PIL.Image.open": {"geometry/pictures.py"},
@@ -25,6 +28,23 @@ ALLOWED = {
     "unlink": {"formats/removing.py"},
     "os.unlink": {"backend/child_streams.py"},  # a temporary file while it is open
     "os.remove": set(),
+    "read_text": {"formats/whole_files.py", "backend/packages.py"},  # facts about the machine
+    "read_bytes": set(),
+    "resolve": set(),  # raises RuntimeError for links in a circle: `real_path` does not
+    "open": {
+        "formats/regular_files.py",
+        "backend/child_streams.py",
+        "capture/dataset.py",
+        "evaluation/gallery.py",
+        "formats/picture_files.py",
+        "motion/files.py",
+        "scene/body_file.py",
+        "scene/human_file.py",
+        "training/run_folder.py",
+        "backend/packages.py",
+        "ui/jobs_panel.py",
+        "cli.py",
+    },  # of what this program writes, or has written itself
 }
 """What only some modules may call or import."""
 _SHORT = {"np": "numpy", "Image": "PIL.Image"}
@@ -34,6 +54,12 @@ def dotted(node: ast.AST) -> str:
     if isinstance(node, ast.Attribute):
         return f"{dotted(node.value)}.{node.attr}"
     return _SHORT.get(node.id, node.id) if isinstance(node, ast.Name) else ""
+
+
+def _opens_a_path(call: ast.Call) -> bool:
+    mode = call.args[0] if call.args else None
+    is_mode = isinstance(mode, ast.Constant) and re.fullmatch("[rwxabt+]{1,3}", str(mode.value))
+    return isinstance(call.func, ast.Attribute) and call.func.attr == "open" and bool(is_mode)
 
 
 def used(tree: ast.AST) -> Iterator[str]:
@@ -48,6 +74,12 @@ def used(tree: ast.AST) -> Iterator[str]:
             yield dotted(node.func)
             if isinstance(node.func, ast.Attribute) and node.func.attr == "unlink" and not node.args:
                 yield "unlink"  # of a path: Blender's collections unlink an argument
+            if isinstance(node.func, ast.Attribute) and node.func.attr in ("read_text", "read_bytes"):
+                yield node.func.attr
+            if re.fullmatch(r"(\w+\.)+resolve", dotted(node.func)):
+                yield "resolve"  # not Path(__file__).resolve()
+            if dotted(node.func) == "open" or _opens_a_path(node):
+                yield "open"
 
 
 @pytest.mark.parametrize("root", [BACKEND, EXTENSION], ids=["backend", "extension"])
@@ -64,6 +96,8 @@ def test_only_the_readers_open_archives_and_only_the_remover_removes(root):
 @pytest.mark.parametrize(
     "line",
     ["import zipfile", "np.load(x)", "json.load(file)", "json.loads(text)", "from json import loads", "import pickle",
+     "from safetensors import safe_open", "open(path)", "path.open('rb')", "path.read_text()", "path.read_bytes()",
+     "path.parent.resolve()",
      "shutil.rmtree(path)", "path.unlink()", "path.unlink(missing_ok=True)", "os.remove(path)", "Image.open(path)"],
 )  # fmt: skip
 def test_the_rule_sees(line):

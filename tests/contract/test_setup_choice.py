@@ -10,7 +10,14 @@ import pytest
 from packaging.requirements import Requirement
 
 from blender_primdiffusion.backend.environment import LONGEST_INSIDE, WINDOWS_LONGEST, short_root
-from blender_primdiffusion.backend.packages import Machine, chosen_compute, locks_for, read_lock, this_machine
+from blender_primdiffusion.backend.packages import (
+    Machine,
+    chosen_compute,
+    locks_for,
+    read_lock,
+    this_machine,
+    what_went_wrong,
+)
 
 ROOT = Path(__file__).parents[2]
 LOCKS = ROOT / "blender_primdiffusion" / "requirements"
@@ -129,3 +136,20 @@ def _holds_the_pins(path: Path, pins: dict[str, str]) -> None:
 def test_cpu_locks_hold_no_cuda_packages():
     for path in LOCKS.glob("*-cpu.txt"):
         assert not [package.name for package in read_lock(path).packages if package.name.startswith(("nvidia", "cuda"))]
+
+
+@pytest.mark.parametrize("content", [b"\0" * 100, bytes(range(128, 256)) * 20, b"x" * 100_000, b"x" * 5_000_000])
+def test_a_list_of_packages_that_is_none_is_one_short_sentence(tmp_path, content):
+    path = tmp_path / "requirements.txt"
+    path.write_bytes(content)
+    with pytest.raises(ValueError, match=r"requirements\.txt is") as caught:
+        read_lock(path)
+    assert len(str(caught.value)) < 200 + len(str(path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_folder_in_place_of_a_wheel_is_named():
+    said = """ERROR: Can't verify hashes for these file:// requirements because they point to directories:
+    idna==3.10 from file:///srv/wheels/idna-3.10-py3-none-any.whl (from -r /srv/wheels/requirements.txt (line 1))
+"""
+    assert what_went_wrong(said, 1).startswith("idna-3.10-py3-none-any.whl is a folder")

@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import psutil
 import pytest
+from blender_primdiffusion.formats.whole_files import write_atomically
 from tiny_packages import BACKEND, own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
 
 from blender_primdiffusion.backend import setup
@@ -89,6 +90,18 @@ def test_removing_takes_environment_and_caches_and_nothing_else(place):
     assert state_of(place.folder)[0] == "absent"
     assert not place.cache.exists()
     assert other.exists()
+
+
+@pytest.mark.parametrize("name", ["environment", "downloads", "temporary"])
+def test_what_a_link_leads_to_is_neither_emptied_nor_removed(place, tmp_path, name):
+    own = tmp_path / "own" / MARK
+    write_atomically(own, "mine")
+    link = getattr(place.folder, name)
+    link.parent.mkdir(parents=True, exist_ok=True)
+    link.symlink_to(own.parent, target_is_directory=True)
+    for steps in (place.from_folder(), setup.remove(place.folder, None)):
+        assert failed(steps).endswith("is a link to another folder: remove the link, then set the backend up again")
+    assert own.read_text() == "mine"
 
 
 def test_removing_leaves_a_cache_that_is_shared(place):

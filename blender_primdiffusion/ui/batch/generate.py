@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING
 from ...backend.requests import Backend, ChildRequest
 from ...capture.report import Report
 from ...console import Stop, duration
+from ...formats.regular_files import real_path
 from ...formats.removing import check_unlinked
 from ...places import missing_packages, preference
 from ...scene.human import NPZ_FILE, PERSON_FILE
@@ -69,7 +70,7 @@ def person_name(seed: int) -> str:
 
 def _params(options: argparse.Namespace, attributes: Attributes) -> dict[str, object]:
     """Parameters of the child's method that all humans share."""
-    checkpoint = options.checkpoint.resolve() if options.checkpoint is not None else preference("checkpoint")
+    checkpoint = real_path(options.checkpoint) if options.checkpoint is not None else preference("checkpoint")
     return {
         "steps": options.steps,
         "sampler": options.sampler,

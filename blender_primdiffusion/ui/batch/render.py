@@ -21,6 +21,7 @@ from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
+from ...formats.regular_files import real_path
 from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
 from ...jobs import cycles_check
@@ -76,7 +77,7 @@ class RenderSource:
 
 def sources(path: Path) -> list[RenderSource]:
     """All human files that `path` names, sorted by name. Raises ValueError if there are none."""
-    path = path.resolve()
+    path = real_path(path)
     if path.is_dir():
         found = sorted(_in_folder(path), key=lambda source: source.name)
         if not found:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import NoReturn
 
 from ...console import UsageError
+from ...formats.regular_files import real_path
 from ...formats.requests import GUIDANCE, PICTURE_SIZE, SAMPLERS, STEPS, check_seed
 
 ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
@@ -85,7 +86,7 @@ def parse_render(argv: Sequence[str]) -> argparse.Namespace:
 def motion_name(options: argparse.Namespace) -> str | None:
     """The absolute path of what --pose or --motion names."""
     path = options.pose or options.motion
-    return None if path is None else str(path.resolve())
+    return None if path is None else str(real_path(path))
 
 
 def _parser(name: str, description: str) -> argparse.ArgumentParser:

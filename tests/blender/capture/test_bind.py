@@ -37,20 +37,7 @@ def write_scan(path: Path, matrix: np.ndarray | None = None, **parameters: objec
     return path
 
 
-@pytest.mark.parametrize(
-    ("ending", "matrix", "note"),
-    [
-        (".obj", np.eye(3), ""),
-        (".glb", np.eye(3), ""),
-        (".fbx", np.eye(3), ""),
-        (".obj", np.eye(3) * 100, "scaled by 0.01: its unit seems to be centimetres"),
-        (".obj", about_axis(0, np.pi / 2), "turned to meet its parameters: their y is its z"),
-        (".glb", np.eye(3) * 0.1, "scaled by 10: it is ten times too small"),
-    ],
-)
-def test_a_static_scan_is_posed_as_the_body_is(tmp_path, empty_scene, ending, matrix, note):
-    scan = load(write_scan(tmp_path / f"anna{ending}", matrix))
-    assert not note or note in scan.notes
+def assert_posed_as_the_body(scan) -> None:
     np.testing.assert_allclose(scan.betas, BETAS)
     joints = scan.pose(ROTATIONS, MOVE)
     vertices, expected, _ = BODY.pose(BETAS, ROTATIONS, MOVE)
@@ -60,6 +47,27 @@ def test_a_static_scan_is_posed_as_the_body_is(tmp_path, empty_scene, ending, ma
     assert off.max() < 0.015
 
 
+@pytest.mark.parametrize("ending", [".obj", ".glb", ".fbx"])
+def test_a_static_scan_is_posed_as_the_body_is(tmp_path, empty_scene, ending):
+    assert_posed_as_the_body(load(write_scan(tmp_path / f"anna{ending}")))
+
+
+@pytest.mark.any_blender
+@pytest.mark.parametrize(
+    ("ending", "matrix", "note"),
+    [
+        (".obj", np.eye(3) * 100, "scaled by 0.01: its unit seems to be centimetres"),
+        (".obj", about_axis(0, np.pi / 2), "turned to meet its parameters: their y is its z"),
+        (".glb", np.eye(3) * 0.1, "scaled by 10: it is ten times too small"),
+    ],
+)
+def test_other_units_and_axes_are_corrected_and_reported(tmp_path, empty_scene, ending, matrix, note):
+    scan = load(write_scan(tmp_path / f"anna{ending}", matrix))
+    assert note in scan.notes
+    assert_posed_as_the_body(scan)
+
+
+@pytest.mark.any_blender
 def test_betas_of_another_body_give_way_to_those_of_the_surface(tmp_path, empty_scene):
     scan = load(write_scan(tmp_path / "anna.glb", betas=np.full((1, 10), 0.5)))
     assert any("shape of the default body fitted to its surface" in note for note in scan.notes)
@@ -68,6 +76,7 @@ def test_betas_of_another_body_give_way_to_those_of_the_surface(tmp_path, empty_
     assert distance_m(scan, vertices).mean() < 0.004
 
 
+@pytest.mark.any_blender
 def test_a_scan_elsewhere_than_its_parameters_is_moved_and_that_is_reported(tmp_path, empty_scene):
     scan = load(write_scan(tmp_path / "anna.obj", transl=np.array([[5.0, 0, 0]])))
     assert any(note.startswith("moved by") for note in scan.notes)
@@ -75,6 +84,7 @@ def test_a_scan_elsewhere_than_its_parameters_is_moved_and_that_is_reported(tmp_
     assert np.linalg.norm(scan.pose(ROTATIONS, MOVE) - expected, axis=-1).max() < 0.01
 
 
+@pytest.mark.any_blender
 def test_an_arm_beside_the_trunk_stays_an_arm():
     rotations = np.tile(np.eye(3), (24, 1, 1))
     for side, sign in (("left", 1), ("right", -1)):
@@ -89,6 +99,7 @@ def test_an_arm_beside_the_trunk_stays_an_arm():
     assert off[forearm].max() < 0.02
 
 
+@pytest.mark.any_blender
 def test_unposing_undoes_posing():
     vertices, _, skinning = BODY.pose(BETAS, ROTATIONS, MOVE)
     rest, _ = BODY.rest(BETAS)
@@ -97,6 +108,7 @@ def test_unposing_undoes_posing():
     assert np.quantile(np.linalg.norm(back - rest, axis=-1), 0.99) < 1e-6
 
 
+@pytest.mark.any_blender
 def test_vertices_in_one_place_move_as_one():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 0], [1, 0, 0], [0, 0, 1]])
     surface = join_surface(points, np.array([[0, 1, 2], [3, 5, 4]]))
@@ -104,6 +116,7 @@ def test_vertices_in_one_place_move_as_one():
     assert surface.point_of[0] == surface.point_of[3]
 
 
+@pytest.mark.any_blender
 def test_loose_cloth_takes_the_weights_of_what_it_hangs_on(tmp_path, empty_scene):
     """A skirt far from the legs, one sheet with the waist: no part of it stays behind."""
     body_vertices = BODY.pose(BETAS, np.tile(np.eye(3), (24, 1, 1)), np.zeros(3))[0]
@@ -122,6 +135,7 @@ def test_loose_cloth_takes_the_weights_of_what_it_hangs_on(tmp_path, empty_scene
     assert steps.max() < 0.8  # of 2, from one joint to another
 
 
+@pytest.mark.any_blender
 def test_a_scan_without_parameters_is_named(tmp_path, empty_scene):
     path = write_scan(tmp_path / "anna.obj")
     path.with_suffix(".npz").rename(tmp_path / "other.txt")
@@ -133,6 +147,7 @@ def test_a_scan_without_parameters_is_named(tmp_path, empty_scene):
     assert len(bpy.data.objects) == 0
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -152,6 +167,7 @@ def test_parameters_that_are_none_are_named(tmp_path, empty_scene, changes, mess
     assert len(bpy.data.objects) == 0
 
 
+@pytest.mark.any_blender
 def test_parameters_of_another_scan_are_named(tmp_path, empty_scene):
     lying = from_axis_angle(np.random.default_rng(9).normal(0, 1.2, (24, 3)))
     path = write_scan(tmp_path / "anna.obj", body_pose=to_axis_angle(lying)[1:].reshape(1, 69))
@@ -159,6 +175,7 @@ def test_parameters_of_another_scan_are_named(tmp_path, empty_scene):
         load(path)
 
 
+@pytest.mark.any_blender
 def test_a_scale_in_the_parameters_is_taken_into_account(tmp_path, empty_scene):
     vertices = BODY.pose(BETAS, SCANNED, np.zeros(3))[0] * 0.6 + PLACE
     scan_fixtures.static(BODY, vertices)
@@ -168,6 +185,7 @@ def test_a_scale_in_the_parameters_is_taken_into_account(tmp_path, empty_scene):
     np.testing.assert_allclose(scan.pose(ROTATIONS, MOVE), BODY.pose(BETAS, ROTATIONS, MOVE)[1], atol=5e-5)
 
 
+@pytest.mark.any_blender
 def test_a_broken_surface_still_works(tmp_path, empty_scene):
     """Holes, a doubled face, a face on edge of three others, loose points, two parts, no texture coordinates."""
     vertices = BODY.pose(BETAS, SCANNED, PLACE)[0]

@@ -12,6 +12,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from unittest.mock import Mock
 
 import bpy
 import numpy as np
@@ -25,11 +26,12 @@ from blender_primdiffusion.formats.capture_layout import (
     picture_path,
 )
 from blender_primdiffusion.formats.capture_repair import repair, verify
+from blender_primdiffusion.formats.whole_files import writer
 from capture_child import PEOPLE, small
 from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
 
 from blender_primdiffusion.capture import passes
-from blender_primdiffusion.capture.job import CaptureError, run
+from blender_primdiffusion.capture.job import CaptureError, _name_reference, run
 from blender_primdiffusion.capture.report import Report
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.stage import data_blocks
@@ -357,3 +359,26 @@ def test_memory_stays_flat_over_200_views(empty_scene, tmp_path):
 def resident_mb() -> float:
     status = Path("/proc/self/status").read_text()
     return int(status.split("VmRSS:")[1].split()[0]) / 1024
+
+
+@pytest.mark.parametrize("links", [True, False])
+def test_links_where_the_reference_goes_lose_nothing_outside(tmp_path, monkeypatch, links):
+    mine = tmp_path / "outside" / "mine"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    root = tmp_path / "captures"
+    (root / "anna").mkdir(parents=True)
+    (root / "anna" / "a").write_text("a")
+    space, _, rest = writer().split("-")
+    abandoned = root / f".{RELEASED_REFERENCE}.{space}-99999999-{rest}.partial"
+    abandoned.symlink_to(mine.parent)
+    (root / RELEASED_REFERENCE).symlink_to(mine.parent)
+    _name_reference(root, "anna")
+    assert (root / RELEASED_REFERENCE / "mine").read_text() == "mine"
+    (root / RELEASED_REFERENCE).unlink()
+    if not links:
+        monkeypatch.setattr(os, "symlink", Mock(side_effect=OSError))
+    _name_reference(root, "anna")
+    assert (root / RELEASED_REFERENCE / "a").read_text() == "a"
+    assert abandoned.is_symlink() == links
+    assert mine.read_text() == "mine"

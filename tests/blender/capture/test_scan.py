@@ -65,6 +65,7 @@ def test_a_rig_is_posed_as_the_body_is(tmp_path, empty_scene, case):
     assert any("mm off on average" in note for note in scan.notes) or any("file tells" in note for note in scan.notes)
 
 
+@pytest.mark.any_blender
 def test_units_and_axes_that_were_corrected_are_reported(tmp_path, empty_scene):
     _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     scan_fixtures.move([armature], quarter(0) @ np.diag([10.0, 10, 10, 1]))
@@ -110,6 +111,7 @@ def test_removing_a_scan_leaves_nothing_and_keeps_what_was_there(tmp_path, empty
     assert [len(getattr(bpy.data, kind)) for kind in ("meshes", "armatures", "materials", "images")] == [1, 0, 0, 0]
 
 
+@pytest.mark.any_blender
 def test_groups_of_fingers_belong_to_the_wrist(tmp_path, empty_scene):
     scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     scan = load(scan_fixtures.save(tmp_path / "anna.glb"))
@@ -135,6 +137,7 @@ def test_an_animated_person_with_a_bone_glued_to_its_parent_is_still_posed(tmp_p
     assert np.nanmax(np.abs(bone_heads(scan) - joints)) < 1e-4
 
 
+@pytest.mark.any_blender
 def test_a_lamp_and_a_mesh_that_nothing_moves_are_left_out_and_reported(tmp_path, empty_scene):
     scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     bpy.ops.mesh.primitive_cube_add()
@@ -163,6 +166,7 @@ def test_a_size_that_no_unit_explains_is_named(tmp_path, empty_scene):
         load(path)
 
 
+@pytest.mark.any_blender
 def test_two_people_in_a_file_are_named(tmp_path, empty_scene):
     for _ in range(2):
         scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)

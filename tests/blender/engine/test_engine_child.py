@@ -333,3 +333,26 @@ def test_a_full_memory_file_system_gives_way_to_the_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("numpy.memmap", lambda *_, **__: np.zeros(8 * 4 * CHANNELS, np.float32))
     assert tmp_path not in frames.take("a", 8, 4).path.parents
     frames.close()
+
+
+@pytest.mark.any_blender
+def test_links_in_shared_memory_lose_nothing_outside(tmp_path, monkeypatch):
+    memory = tmp_path / "memory"
+    memory.mkdir()
+    monkeypatch.setattr("blender_primdiffusion.engine.frames.SHARED_MEMORY", memory)
+    (tmp_path / "outside").mkdir()
+    mine = tmp_path / "outside" / "mine"
+    mine.write_text("mine")
+    space, _, rest = writer().split("-")
+    ended = memory / f"primdiffusion_{space}-99999999-{rest}_x"
+    ended.symlink_to(mine.parent)
+    frames = SharedFrames()
+    (frames.folder / f"view_{8 * 8 * CHANNELS * 4}.frame").symlink_to(mine)
+    frames.take("view", 8, 8).clear()
+    frames.drop("view")
+    folder = frames.folder
+    folder.rmdir()
+    folder.symlink_to(mine.parent)
+    frames.close()
+    assert [path.name for path in mine.parent.iterdir()] == ["mine"]
+    assert mine.read_text() == "mine"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from engine_stage import add_human, cube, material, render_exr, render_png, set_up_render
 
-from blender_primdiffusion.engine.solids import base_colour, changed_by, scene_solids, stored
+from blender_primdiffusion.engine.solids import SceneSolids, base_colour, changed_by, scene_solids, stored
 
 
 @pytest.fixture
@@ -243,3 +243,22 @@ def test_an_empty_scene_is_its_background(stage):
     picture = render_png(stage.out)
     assert not picture[..., :3].any()
     assert (picture[..., 3] == 255).all()
+
+
+@pytest.mark.any_blender
+def test_links_in_place_of_solids_files_lose_nothing_outside(tmp_path):
+    (tmp_path / "outside").mkdir()
+    mine = tmp_path / "outside" / "mine"
+    mine.write_text("mine")
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    solids = SceneSolids(np.zeros((1, 3, 3), np.float32), np.zeros((1, 3), np.float32), np.zeros(1, bool))
+    path = stored(solids, folder)
+    path.unlink()
+    path.symlink_to(mine.with_name("nothing"))
+    for number in range(12):
+        (folder / f"solids_{number}.npz").symlink_to(mine)
+    assert stored(solids, folder) == path
+    assert len(list(folder.iterdir())) == 8
+    assert [path.name for path in mine.parent.iterdir()] == ["mine"]
+    assert mine.read_text() == "mine"

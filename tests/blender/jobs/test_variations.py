@@ -11,7 +11,7 @@ from jobs_driven import drive, error_of, shown, until_running
 
 from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.jobs.variations import VariationsJob, sheet
+from blender_primdiffusion.jobs.variations import Sheet, VariationsJob, sheet
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.ui import variations_panel
 
@@ -228,3 +228,24 @@ def test_none_can_be_redone_with_a_slider():
         variations_panel.PRIMDIFFUSION_OT_more_like_variation,
     ):
         assert not {"REGISTER", "UNDO"} & operator.bl_options
+
+
+@pytest.mark.any_blender
+def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
+    mine = tmp_path / "outside" / "mine"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    person = {"seed": 7}
+    for name in ("human", "person", "picture"):
+        person[name] = str(tmp_path / name)
+        Path(person[name]).symlink_to(mine)
+    own = Sheet()
+    own.fill([person], "")
+    (own.variations[0].folder / "more").symlink_to(mine.parent)
+    folder = own.variations[0].folder.parent
+    own.clear()
+    assert not folder.exists()
+    Path(person["human"]).write_text("")
+    with pytest.raises(OSError, match="person"):
+        own.fill([person], "")
+    assert mine.read_text() == "mine"

@@ -120,6 +120,7 @@ def test_blenders_own_export_comes_back(tmp_path, empty_scene):
         (lambda text: text.replace("0.0083333\n", "0.0083333\n1e300 "), "no angles or lengths"),
         (lambda text: text.replace("0.0083333\n", "0.0083333\nword "), "a word where"),
         (lambda text: re.sub(r"OFFSET \S+", "OFFSET 1e200", text, count=1), "no angles or lengths"),
+        (lambda text: text + "0 " * 2_000_000, "much more than the 6 frames of"),
         (lambda text: text.replace("MOTION", " JOINT a { " * 1001 + "MOTION"), "more than 1000 joints"),
     ],
 )

@@ -13,7 +13,7 @@ import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.jobs.assets import clay_figure, picture_of_file
-from blender_primdiffusion.motion.own_poses import PoseFileError, load_pose, own_poses, save_pose
+from blender_primdiffusion.motion.own_poses import PoseFileError, delete_pose, load_pose, own_poses, save_pose
 from blender_primdiffusion.motion.pose_library import (
     apply_pose,
     builtin_poses,
@@ -255,3 +255,20 @@ def test_a_hand_keyed_pose_is_where_it_was(addon, armature):
     np.testing.assert_allclose(current_pose(armature)[0][15], wanted, atol=1e-6)
     assert len(action_curves(armature)) == 24 * 4 + 3
     np.testing.assert_allclose(from_axis_angle(to_axis_angle(wanted)), wanted, atol=1e-6)
+
+
+@pytest.mark.any_blender
+def test_links_in_place_of_poses_lose_no_file_outside(tmp_path):
+    (tmp_path / "outside").mkdir()
+    mine = tmp_path / "outside" / "mine"
+    mine.write_text("mine")
+    folder = tmp_path / "poses"
+    folder.mkdir()
+    for name in ("sit.pose.json", "sit.pose.png"):
+        (folder / name).symlink_to(mine)
+    (folder / "lie.pose.json").symlink_to(mine.with_name("nothing"))
+    save_pose(folder, "lie", np.zeros((24, 3)), np.zeros(3))
+    delete_pose(folder / "sit.pose.json")
+    assert [path.name for path in folder.iterdir()] == ["lie.pose.json"]
+    assert [path.name for path in mine.parent.iterdir()] == ["mine"]
+    assert mine.read_text() == "mine"

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import errno
+
 import bpy
 import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
 
-from blender_primdiffusion.scene import build
-from blender_primdiffusion.scene.body_file import read_body_file, shape_model_of
+from blender_primdiffusion.scene import build, collect
+from blender_primdiffusion.scene.body_file import body_file_name, read_body_file, saved_body_file, shape_model_of
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
-from blender_primdiffusion.scene.human import folder_of, humans, remove_human
+from blender_primdiffusion.scene.human import copy_file, folder_of, humans, remove_human
 from blender_primdiffusion.scene.human_npz import HumanNpzError, read_human
 from blender_primdiffusion.scene.shape import FIELDS
 
@@ -124,3 +126,45 @@ def test_saving_for_the_first_time_brings_the_file_along(empty_scene, tmp_path):
     assert body_file(person).parent == tmp_path / "shöt of two_humans"
     read_body_file.cache_clear()
     assert shape_model_of(person).template.shape == (736, 3)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_a_link_in_place_of_the_bodys_file_loses_nothing_outside(tmp_path, there):
+    model = read_human(synthetic_shape.write(tmp_path / "human.npz")).shape_model
+    (tmp_path / "outside").mkdir()
+    mine = tmp_path / "outside" / "mine"
+    if there:
+        mine.write_text("mine")
+    folder = tmp_path / "humans"
+    folder.mkdir()
+    (folder / body_file_name(model)).symlink_to(mine)
+    with pytest.raises(KeyboardInterrupt), saved_body_file(model, folder):
+        raise KeyboardInterrupt
+    assert [path.read_text() for path in mine.parent.iterdir()] == ["mine"] * there
+
+
+@pytest.mark.parametrize("full", [True, False])
+def test_links_where_a_save_puts_files_lose_nothing_outside(addon, tmp_path, monkeypatch, full):
+    bpy.ops.wm.read_factory_settings(use_empty=True)  # a file that was never saved
+    person = build_human(bpy.context, synthetic_shape.write(tmp_path / "human.npz"))
+    (tmp_path / "outside").mkdir()
+    mine = tmp_path / "outside" / "mine"
+    mine.write_text("mine")
+    source = folder_of(person)
+    target = tmp_path / "new_humans" / source.name
+    target.mkdir(parents=True)
+    links = [target.parent / body_file(person).name, *(target / path.name for path in source.glob("*.vdb"))]
+    for link in links:
+        link.symlink_to(mine)
+    copied = []
+
+    def copy_some(one, destination):
+        copied.append(destination)
+        if full and len(copied) == len(links):
+            raise OSError(errno.ENOSPC, "no space left")
+        return copy_file(one, destination)
+
+    monkeypatch.setattr(collect, "copy_file", copy_some)
+    collect_before_saving(str(tmp_path / "new.blend"))
+    assert set(copied) == set(links)
+    assert [path.read_text() for path in mine.parent.iterdir()] == ["mine"]

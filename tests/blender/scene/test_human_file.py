@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import os
+
 import bpy
 import numpy as np
 import pytest
 import synthetic_shape
 
+from blender_primdiffusion.jobs.export import put
+from blender_primdiffusion.motion.own_poses import save_pose
 from blender_primdiffusion.scene.body_file import BODY_FILE
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import person_file
+from blender_primdiffusion.scene.collect import collect_before_saving, unused
+from blender_primdiffusion.scene.human import copy_file, folder_of, person_file
 from blender_primdiffusion.scene.human_file import HumanTensors, read_tensors, write_tensors
+from blender_primdiffusion.scene.missing import missing_files
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of
 
@@ -59,3 +65,31 @@ def test_boxes_of_people_of_an_earlier_version_keep_their_size(person, tmp_path)
     reshape(person, betas_of(person) + CHANGE)
     del person[BODY_FILE]
     np.testing.assert_array_equal(exported(person, tmp_path), SIZES)
+
+
+def test_nothing_is_written_through_a_link_with_a_temporary_name(tmp_path):
+    (tmp_path / "source").write_text("new")
+    (tmp_path / "mine").write_text("mine")
+    for name in (".a.part", ".source.part", "sit.part", ".a.human.part"):
+        (tmp_path / name).symlink_to("mine")
+    copy_file(tmp_path / "source", tmp_path / "a")
+    put(tmp_path / "source", tmp_path / "b")
+    write_tensors(tmp_path / "a.human", HumanTensors({}, {}))
+    save_pose(tmp_path, "sit", np.zeros((24, 3)), np.zeros(3))
+    assert (tmp_path / "mine").read_text() == "mine"
+    assert (tmp_path / "a").read_text() == (tmp_path / "b").read_text() == "new"
+
+
+def test_pipes_in_place_of_volumes_count_as_missing_and_links_in_a_circle_do_no_harm(addon, tmp_path):
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
+    npz = synthetic_shape.write(tmp_path / "human.npz", COUNT)
+    person = build_human(addon, npz, "Anna", [])
+    first, second = sorted(folder_of(person).glob("*.vdb"))[:2]
+    first.unlink()
+    second.unlink()
+    os.mkfifo(first)
+    second.symlink_to(second.name)
+    (found,) = missing_files()
+    assert len(found.volumes) == 2
+    collect_before_saving(bpy.data.filepath)
+    assert unused(first.parent) == []

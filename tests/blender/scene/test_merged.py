@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+
 import bpy
 import numpy as np
 import pytest
@@ -249,3 +252,22 @@ def test_a_grid_of_impossible_numbers_is_rejected(tmp_path, change):
     np.savez(tmp_path / "merged.npz", **{**arrays, name: np.full_like(arrays[name], value)})
     with pytest.raises(ValueError, match=r"merged\.npz"):
         read_grid(tmp_path / "merged.npz")
+
+
+@pytest.mark.any_blender
+@pytest.mark.parametrize("outside", ["mine", "nothing", "."])
+def test_links_in_place_of_merged_files_lose_nothing_outside(tmp_path, outside):
+    (tmp_path / "outside").mkdir()
+    mine = tmp_path / "outside" / "mine"
+    mine.write_text("mine")
+    sources = [tmp_path / "a.vdb", tmp_path / "lost.vdb"]
+    sources[0].write_text("a")
+    digest = hashlib.sha256(b"ab").hexdigest()[:12]
+    folder = tmp_path / "humans"
+    folder.mkdir()
+    for number in (1, 2):
+        (folder / f"merged_{digest}_{number:04d}.vdb").symlink_to(mine.parent / outside)
+    with contextlib.suppress(VolumeWriteError):
+        publish(sources, ["a", "b"], folder)
+    assert [path.name for path in mine.parent.iterdir()] == ["mine"]
+    assert mine.read_text() == "mine"

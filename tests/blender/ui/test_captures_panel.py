@@ -26,6 +26,7 @@ from blender_primdiffusion.capture.stage import data_blocks
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
+from blender_primdiffusion.ui import captures_session
 from blender_primdiffusion.ui.captures_panel import RIG, PRIMDIFFUSION_OT_render_captures
 from blender_primdiffusion.ui.captures_session import captures
 from blender_primdiffusion.ui.captures_settings import words_of
@@ -210,6 +211,24 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
 
 
 @pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("message", "fault"),
+    [("[1]", "not an object"), ('{"line"', "not JSON"), ('{"line": 3}', "line"),
+     ('{"subject": "a", "done": 1}', "total"),
+     ('{"subject": "a", "done": 1, "total": 2, "eta_s": null, "news": [3]}', "news")],
+)  # fmt: skip
+def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypatch, message, fault):
+    program = f"import time; print({MARK + message!r}, flush=True); time.sleep(60)"
+    monkeypatch.setattr(captures_session, "child_command", lambda: [sys.executable, "-c", program])
+    session = captures_session.CaptureSession()
+    session.start([])
+    end = time.monotonic() + 30
+    while session.busy and time.monotonic() < end:
+        session.tick()
+        time.sleep(0.01)
+    assert session.error == f"Blender was ended because it sent a malformed message ({fault}): render again"
+
+
 def test_cancelling_ends_the_child_and_the_next_run_resumes(extension, only_good, tmp_path):
     asked = extension.scene.primdiffusion_captures
     asked.people, asked.out = str(only_good), str(tmp_path / "captures")

@@ -15,6 +15,7 @@ from mathutils import Vector
 
 from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
+from blender_primdiffusion.scene.human import humans_folder
 from blender_primdiffusion.ui.batch import execute
 from blender_primdiffusion.ui.batch.people import go_round, moving_extent
 
@@ -164,3 +165,20 @@ def test_what_is_no_source_is_named(addon, tmp_path, out, capfd):
     ):
         assert render(tmp_path / source, out) == UNUSABLE
         assert sentence in capfd.readouterr().err
+
+
+def test_links_where_pictures_and_temporary_humans_go_lose_nothing_outside(people, out, tmp_path):
+    mine = tmp_path / "outside" / "mine.png"
+    mine.parent.mkdir()
+    mine.write_text("mine")
+    out.mkdir()
+    (out / "person_000007.png").symlink_to(mine.with_name("nothing"))
+    (out / "person_000008.png").symlink_to(mine.parent)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    humans_folder("").symlink_to(mine.parent)
+    assert render(people, out, *SMALL) == FAILED
+    assert (out / "person_000007.png").stat().st_size > 0
+    assert not (out / "person_000007.png").is_symlink()
+    assert report(out)["done"] == ["person_000007"]
+    assert mine.read_text() == "mine"
+    assert not mine.with_name("nothing").exists()

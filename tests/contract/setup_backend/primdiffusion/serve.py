@@ -23,6 +23,6 @@ for line in sys.stdin:
         Path(params["out_dir"]).mkdir(parents=True)
         human = Path(params["out_dir"], "human.npz")
         human.touch()
-        say(id=id, result={"human": str(human)})
+        say(id=id, result={"human": str(human), "person": "", "seconds": 0.0})
     elif request["method"] == "shutdown":
         break
