@@ -60,7 +60,7 @@ def _is_whole(path: Path) -> bool:
             reader(path)
     except Exception:
         return False
-    return path.stat().st_size > 0 or path.suffix == ".txt"  # a list may be empty
+    return path.stat().st_size > 0 or path.suffix in (".txt", ".jsonl")  # a list and a log may be empty
 
 
 def _same(path: Path, other: Path) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import struct
 import zipfile
 from collections.abc import Callable, Sequence
@@ -34,14 +35,24 @@ VALUES: tuple[Any, ...] = (
     None, True, 0, -1, 2**31, 2**63, 10**400, 1e300, 5e-324, float("nan"), float("inf"), "", "x" * 300, "../..", "\0",
     [], {}, [[]], [None], [1e300] * 24, {"a": 1}, "/dev/zero", [[[[[[[[1]]]]]]]],
 )  # fmt: skip
-EXTREMES = (float("nan"), float("inf"), 1e300, -1e300, 1e38, -1e38, -1.0)
+EXTREMES = (float("nan"), float("inf"), 1e300, -1e300, 1e38, -1e38, 9e8, -1.0)
 LENGTHS = (0, 1, 2, 7, 255, 2**16, 2**31 - 1, 2**31, 2**32 - 1, 2**62, 2**63 - 1)
 
 SHAPES = (
     "()", "(0,)", "(-1,)", "(1,)", "(1000000000,)", "(50000000, 72)", "(2, 2)", "(4611686018427387904, 8)",
-    "None", "(1.5,)",
+    "None", "(1.5,)", "(True,)",
 )  # fmt: skip
 KINDS = ("'<f8'", "'<f4'", "'|O'", "'|S5'", "'<i8'", "'<c16'", "'|b1'", "'<U9'", "'>f2'", "[('a', '<f4')]")
+
+PICKLES = (
+    b"cbuiltins\nbytearray\nI8000000000\n\x85R.", b"ctorch\nFloatTensor\nI2000000000\n\x85R.", b"(" * 2_000_000 + b".",
+    b"cos\nsystem\n(S'touch CANARY'\ntR.", b"Np300000000\n.", b"ctorch._utils\n_rebuild_meta_tensor_no_storage\n)R.",
+)  # fmt: skip
+TENSOR_KINDS = (
+    ("F64", 8), ("F32", 4), ("F16", 2), ("BF16", 2), ("F8_E4M3", 1), ("C64", 8), ("I64", 8), ("U16", 2), ("U8", 1),
+    ("BOOL", 1),
+)  # fmt: skip
+"""And their bytes."""
 
 Mutation = Callable[[bytes, Generator], bytes]
 
@@ -148,6 +159,25 @@ def safetensors_header(content: bytes, rng: Generator) -> bytes:
     return len(text).to_bytes(8, "little") + text + content[end:]
 
 
+def safetensors_kind(content: bytes, rng: Generator) -> bytes:
+    """A tensor has another type and as many bytes as that needs, so that the file is whole."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
+    names = sorted((name for name in header if name != "__metadata__"), key=lambda one: header[one]["data_offsets"])
+    chosen, (kind, size) = pick(rng, names), pick(rng, TENSOR_KINDS)
+    data = b""
+    for name in names:
+        begin, stop = header[name]["data_offsets"]
+        raw = content[end + begin : end + stop]
+        if name == chosen:
+            raw = pick(rng, (b"\0", b"\1", b"\xff")) * (math.prod(header[name]["shape"]) * size)
+            header[name]["dtype"] = kind
+        header[name]["data_offsets"] = [len(data), len(data) + len(raw)]
+        data += raw
+    text = json.dumps(header).encode()
+    return len(text).to_bytes(8, "little") + text + data
+
+
 def archive(content: bytes, rng: Generator) -> bytes:
     """A member of a zip archive is damaged, missing, doubled, renamed or replaced by another."""
     with zipfile.ZipFile(io.BytesIO(content)) as file:
@@ -172,6 +202,16 @@ def archive(content: bytes, rng: Generator) -> bytes:
     return out.getvalue() if rng.random() < 0.9 else flip(out.getvalue(), rng)
 
 
+def torch_pickle(content: bytes, rng: Generator) -> bytes:
+    """The pickle of a file of torch.save becomes one that calls, or takes memory."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as file, zipfile.ZipFile(out, "w") as changed:
+        for info in file.infolist():
+            is_pickle = info.filename.endswith("data.pkl")
+            changed.writestr(info.filename, pick(rng, PICKLES) if is_pickle else file.read(info))
+    return out.getvalue()
+
+
 def npy_header(content: bytes, rng: Generator) -> bytes:
     """The header of an array promises another shape, type or order."""
     if content[:6] != b"\x93NUMPY":
@@ -193,6 +233,10 @@ def npy_values(content: bytes, rng: Generator) -> bytes:
         return flip(content, rng)
     start = 10 + int.from_bytes(content[8:10], "little")
     value = pick(rng, EXTREMES)
+    if rng.random() < 0.1:  # as an array of integers, whose smallest has no magnitude
+        count = (len(content) - start) // 8
+        head = f"{{'descr': '<i8', 'fortran_order': False, 'shape': ({count},), }}".ljust(117).encode() + b"\n"
+        return content[:8] + len(head).to_bytes(2, "little") + head + struct.pack("<q", -(2**63)) * count
     value = struct.pack("<d", value) if abs(value) > 1e38 or rng.random() < 0.5 else struct.pack("<f", value)
     places = max(1, (len(content) - start) // len(value))
     place = start + len(value) * int(rng.integers(places))
@@ -203,7 +247,9 @@ PLAIN: tuple[Mutation, ...] = (flip, truncate, splice, integer)
 TEXT: tuple[Mutation, ...] = (flip, truncate, words, words, words, lines, lines)
 JSON: tuple[Mutation, ...] = (as_json, as_json, as_json, as_json, words, flip, truncate)
 NPZ: tuple[Mutation, ...] = (archive, archive, archive, archive, flip, truncate, integer)
+TORCH: tuple[Mutation, ...] = (*NPZ, *PLAIN, torch_pickle)
 SAFETENSORS: tuple[Mutation, ...] = (
+    safetensors_kind,
     safetensors_header,
     safetensors_header,
     safetensors_header,

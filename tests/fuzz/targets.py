@@ -235,11 +235,30 @@ def glb_header(content: bytes, rng: np.random.Generator) -> bytes:
     return content[:8] + size + len(text).to_bytes(4, "little") + content[16:20] + text + rest
 
 
+def glb_numbers(content: bytes, rng: np.random.Generator) -> bytes:
+    """An accessor has another type, or reads its numbers from another place."""
+    length = int.from_bytes(content[12:16], "little")
+    tree = json.loads(content[20 : 20 + length])
+    about = mutations.pick(rng, tree["accessors"])
+    about["componentType"] = mutations.pick(rng, (5120, 5121, 5122, 5123, 5125, 5126))
+    about["bufferView"] = int(rng.integers(len(tree["bufferViews"])))
+    about["normalized"] = bool(rng.random() < 0.2)
+    if rng.random() < 0.2:
+        tree["nodes"] += [node for node in tree["nodes"] if "mesh" in node] * 50_000
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    rest = content[20 + length :]
+    size = (20 + len(text) + len(rest)).to_bytes(4, "little")
+    return content[:8] + size + len(text).to_bytes(4, "little") + content[16:20] + text + rest
+
+
 def read_glb_person(path: Path) -> None:
     from primdiffusion.capture.people_files import read_person
 
-    person = read_person(path)
-    finite_members(*person.mesh.parts)
+    for part in read_person(path).mesh.parts:
+        finite_members(part)
+        if (part.skin_weight < 0).any() or (part.faces < 0).any() or (part.faces >= len(part.vertices)).any():
+            raise Garbage("weights below zero, or faces without vertices")
 
 
 _DATASET: dict[str, Path] = {}
@@ -348,13 +367,28 @@ def make_answer(folder: Path) -> Path:
     return folder / "answer.json"
 
 
+def make_sheet(folder: Path) -> Path:
+    people = [{"seed": 3, "human": "a.npz", "person": "a.human", "picture": "a.png"}]
+    (folder / "answer.json").write_text(json.dumps({"id": 1, "result": {"people": people, "seconds": 0.1}}))
+    return folder / "answer.json"
+
+
 def read_answer(path: Path) -> None:
+    """As requests and jobs use what is in it."""
     from blender_primdiffusion.backend.messages import fault_of, parsed
 
     message = parsed(path.read_bytes())
-    if message is not None and fault_of(message, 0) is None and isinstance(message.get("params"), dict):
-        step, total = message["params"].get("step", 0), message["params"].get("total", 1)
-        f"{float(step) / max(float(total), 1.0):.0%}"
+    if message is None or fault_of(message, {1: "variations"}) is not None:
+        return
+    params = message.get("params") or {}
+    if message.get("method") == "progress":
+        f"{params['stage'].capitalize()} {params['step'] / max(params['total'], 1):.0%}".encode()
+        Path(params.get("picture") or "x").exists()
+    elif "result" in message and "method" not in message and "error" not in message:
+        f"{message['result']['seconds']:.1f}"
+        for person in message["result"]["people"]:
+            int(person["seed"])
+            [Path(person[name]).exists() for name in ("human", "person", "picture")]
 
 
 TARGETS = (
@@ -363,7 +397,7 @@ TARGETS = (
     Target("human.npz", make_npz, mutations.NPZ, read_npz),
     Target("small human.npz", make_synthetic_npz, mutations.NPZ, read_npz),
     Target("checkpoint", make_checkpoint, mutations.SAFETENSORS, read_checkpoint),
-    Target("released checkpoint", make_released, (*mutations.NPZ, *mutations.PLAIN), read_released),
+    Target("released checkpoint", make_released, mutations.TORCH, read_released),
     Target("SMPL .npz", make_smpl_npz, mutations.NPZ, read_body),
     Target("SMPL .pkl", make_smpl_pickle, (*mutations.PLAIN, opcodes, opcodes), read_body),
     Target("UV .obj", make_uv, mutations.TEXT, read_uv),
@@ -372,7 +406,7 @@ TARGETS = (
     Target("BVH", make_bvh, mutations.TEXT, read_motion_file),
     Target("AMASS", make_amass, mutations.NPZ, read_motion_file),
     Target("payload", make_payload, mutations.NPZ, read_payload),
-    Target("glb", make_glb, (*mutations.PLAIN, glb_header, glb_header, glb_header), read_glb_person),
+    Target("glb", make_glb, (*mutations.PLAIN, glb_header, glb_header, glb_header, glb_numbers), read_glb_person),
     Target("dataset.json", of_dataset("dataset.json"), mutations.JSON, read_dataset),
     Target("complete.json", of_dataset("complete.json"), mutations.JSON, read_dataset),
     Target("cameras.json", of_dataset("cameras.json"), mutations.JSON, read_dataset),
@@ -381,6 +415,7 @@ TARGETS = (
     Target("picture", make_picture, mutations.PLAIN, read_picture),
     Target("merged grid", make_grid, mutations.NPZ, read_merged),
     Target("child's message", make_answer, mutations.JSON, read_answer, is_file=False),
+    Target("child's result", make_sheet, mutations.JSON, read_answer, is_file=False),
     *data_targets.TARGETS,
     *extension_targets.TARGETS,
     *served.TARGETS,
