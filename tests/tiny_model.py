@@ -8,6 +8,7 @@ from primdiffusion.diffusion.codec import SCALE_VALUE, CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.local_unet import LocalUNetConfig
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import SCHEDULES
 from primdiffusion.primitives.primitives import GRID, K, S
@@ -18,7 +19,11 @@ COMPONENTS = 3
 VOCABULARY = AttributeVocabulary({"outfit": ("jeans", "suit")}, {"height": (1.75, 0.1), "weight": (66.0, 8.0)})
 
 
-def tiny_model() -> DiffusionModel:
+SLOW = LocalUNetConfig(widths=(128,))
+"""Untrained, it adds nothing to what the prior says, in some 15 ms a step."""
+
+
+def tiny_model(local: LocalUNetConfig | None = None) -> DiffusionModel:
     """Grey people, solid below the skin, whose garment colours (red, green, blue as a whole) vary."""
     voxels = torch.full((4, S, S, S), 0.5)
     voxels[3] = torch.linspace(1.0, 0.0, S)[:, None, None]
@@ -41,12 +46,12 @@ def tiny_model() -> DiffusionModel:
         kind=torch.nn.functional.pad(torch.eye(2), (0, VOCABULARY.width - 2))[None],
     )
     schedule = SCHEDULES["linear"]()
-    denoiser = PersonDenoiser(DenoiserConfig(person=None, local=None), prior, schedule)
+    denoiser = PersonDenoiser(DenoiserConfig(person=None, local=local), prior, schedule)
     card = {"name": "tiny", "full_density": FULL_DENSITY}
     return DiffusionModel(denoiser, schedule, CellCodec(codec), STANDARD_SHAPES, FULL_DENSITY, card, VOCABULARY)
 
 
-def save_tiny_checkpoint(path: Path) -> Path:
+def save_tiny_checkpoint(path: Path, local: LocalUNetConfig | None = None) -> Path:
     """Writes `tiny_model` as a checkpoint file."""
-    save_checkpoint(path, tiny_model(), "linear")
+    save_checkpoint(path, tiny_model(local), "linear")
     return path

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 BUSY_STEPS = 1000
-"""With the tiny checkpoint this takes a few seconds: long enough to interrupt."""
+"""With the slow checkpoint this takes ten seconds and more: long enough to interrupt."""
 
 
 class Conversation:
@@ -49,10 +49,15 @@ class Conversation:
 
     def until(self, wanted, timeout_s: float = 60) -> dict[str, Any]:
         """The first message that `wanted` accepts; others are passed over."""
-        end = time.monotonic() + timeout_s
-        while (message := self.next(max(end - time.monotonic(), 0.001))) is not None:
-            if wanted(message):
-                return message
+        end, passed = time.monotonic() + timeout_s, []
+        try:
+            while (message := self.next(max(end - time.monotonic(), 0.001))) is not None:
+                if wanted(message):
+                    return message
+                if message.get("method") != "heartbeat":
+                    passed.append(message)
+        except queue.Empty:
+            raise AssertionError(f"nothing that was wanted in {timeout_s} s, at last {passed[-3:]}") from None
         raise AssertionError(f"the child ended: {self.stderr.decode()}")
 
     def answer(self, id: int | str | None, timeout_s: float = 60) -> dict[str, Any]:

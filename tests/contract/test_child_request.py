@@ -85,8 +85,8 @@ def test_a_second_request_uses_the_same_child(start, backend):
     assert backend.connect() is first
 
 
-def test_a_cancelled_request_leaves_nothing(start, tmp_path):
-    request = start(BUSY_STEPS)
+def test_a_cancelled_request_leaves_nothing(start, slow_checkpoint, tmp_path):
+    request = start(BUSY_STEPS, checkpoint=slow_checkpoint)
     follow(request, lambda request: request.step > 2)
     request.cancel()
     assert request.state == "cancelling"
@@ -112,8 +112,8 @@ def test_the_second_of_two_clicks_is_rejected_with_a_sentence_and_the_first_goes
     assert follow(first)[-1] == "done"
 
 
-def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_works(start, tmp_path):
-    request = start(BUSY_STEPS)
+def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_works(start, slow_checkpoint, tmp_path):
+    request = start(BUSY_STEPS, checkpoint=slow_checkpoint)
     follow(request, lambda request: request.step > 2)
     assert list((tmp_path / "out").iterdir()), "the child keeps half-written files here"
     os.kill(request._client.pid, signal.SIGKILL)
@@ -161,9 +161,9 @@ def test_a_python_that_took_too_long_is_an_error_of_its_own(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs SIGSTOP to hang a process")
-def test_a_child_that_hangs_is_ended_and_fails_the_request(checkpoint, tmp_path):
+def test_a_child_that_hangs_is_ended_and_fails_the_request(slow_checkpoint, tmp_path):
     backend = this_pythons_backend(silence_s=5.0)
-    request = generate_request(backend, seed=1, steps=BUSY_STEPS, out_dir=tmp_path / "out", checkpoint=checkpoint)
+    request = generate_request(backend, seed=1, steps=BUSY_STEPS, out_dir=tmp_path / "out", checkpoint=slow_checkpoint)
     follow(request, lambda request: request.step > 2)
     os.kill(request._client.pid, signal.SIGSTOP)
     assert follow(request)[-1] == "failed"

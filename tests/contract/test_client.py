@@ -83,9 +83,10 @@ def test_info_fills_from_hello_and_then_from_ready(client):
     assert client.alive
 
 
-def test_a_killed_child_is_one_clear_event(client, checkpoint, tmp_path):
+def test_a_killed_child_is_one_clear_event(client, slow_checkpoint, tmp_path):
     out = tmp_path / "out"
-    client.request("generate", {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(checkpoint)})
+    params = {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(slow_checkpoint)}
+    client.request("generate", params)
     wait_for(client, sampling)
     os.kill(client.pid, signal.SIGKILL)
     died = wait_for(client, lambda e: isinstance(e, Died))
@@ -115,9 +116,9 @@ def test_shutdown_ends_the_child_without_a_died_event(client):
     client.shutdown()
 
 
-def test_a_cancel_fails_the_request_with_its_code(client, checkpoint, tmp_path):
+def test_a_cancel_fails_the_request_with_its_code(client, slow_checkpoint, tmp_path):
     out = tmp_path / "out"
-    params = {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(checkpoint)}
+    params = {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(slow_checkpoint)}
     id = client.request("generate", params)
     wait_for(client, sampling)
     client.cancel(id)

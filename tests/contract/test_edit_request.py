@@ -63,8 +63,8 @@ def test_an_edit_takes_steps_and_leaves_another_person(backend, people, checkpoi
     assert Path(request.result["human"]).is_file()
 
 
-def test_a_cancelled_edit_leaves_nothing(backend, people, checkpoint, tmp_path):
-    request = edit(backend, people, checkpoint, "vary", tmp_path / "out", BUSY_STEPS, amount=1.0)
+def test_a_cancelled_edit_leaves_nothing(backend, people, slow_checkpoint, tmp_path):
+    request = edit(backend, people, slow_checkpoint, "vary", tmp_path / "out", BUSY_STEPS, amount=1.0)
     follow(request, lambda request: request.step > 2)
     request.cancel()
     assert follow(request).state == "cancelled"

@@ -135,10 +135,10 @@ def test_notifications_and_blank_lines_are_not_answered(child):
 
 
 def test_a_second_generate_is_rejected_while_one_runs_and_cancel_stops_the_first_within_a_step(
-    child, checkpoint, tmp_path
+    child, checkpoint, slow_checkpoint, tmp_path
 ):
     first, second = tmp_path / "first", tmp_path / "second"
-    child.busy(70, first, checkpoint)
+    child.busy(70, first, slow_checkpoint)
     error = child.ask(71, "generate", seed=1, out_dir=str(second), checkpoint=str(checkpoint))["error"]
     assert error["code"] == DOMAIN_ERROR
     assert error["data"]["kind"] == "busy"
@@ -157,9 +157,9 @@ def test_a_second_generate_is_rejected_while_one_runs_and_cancel_stops_the_first
     assert done["result"]["steps"] == 1
 
 
-def test_cancelling_in_a_folder_that_was_there_keeps_what_was_in_it(child, checkpoint, tmp_path):
+def test_cancelling_in_a_folder_that_was_there_keeps_what_was_in_it(child, slow_checkpoint, tmp_path):
     (tmp_path / "human.npz").write_bytes(b"an older person")
-    child.busy(80, tmp_path, checkpoint)
+    child.busy(80, tmp_path, slow_checkpoint)
     child.ask(81, "cancel", id=80)
     child.answer(80)
     assert [path.name for path in tmp_path.iterdir()] == ["human.npz"]
@@ -221,16 +221,16 @@ def test_a_folder_that_cannot_be_written_to_is_rejected_before_any_step(child, c
 def test_the_child_ends_when_its_input_does(own_child):
     own_child.until(lambda m: m.get("method") == "ready")
     own_child.process.stdin.close()
-    assert own_child.process.wait(1.0) == 0
+    assert own_child.process.wait(10.0) == 0
 
 
 def test_the_child_ends_within_a_step_and_tidies_up_when_its_parent_goes_while_it_samples(
-    own_child, checkpoint, tmp_path
+    own_child, slow_checkpoint, tmp_path
 ):
     out = tmp_path / "out"
-    own_child.busy(1, out, checkpoint)
+    own_child.busy(1, out, slow_checkpoint)
     own_child.process.stdin.close()
-    assert own_child.process.wait(1.0) == 0
+    assert own_child.process.wait(10.0) == 0
     assert not out.exists()
 
 

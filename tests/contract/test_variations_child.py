@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import pytest
-from conversation import Conversation
+from conversation import BUSY_STEPS, Conversation
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +39,10 @@ def test_wrong_seeds_are_rejected_in_a_sentence(child, tmp_path):
     assert "picture_px is -5" in error["message"]
 
 
-def test_a_long_generation_shows_pictures_and_cancelling_removes_them(child, checkpoint, tmp_path):
+def test_a_long_generation_shows_pictures_and_cancelling_removes_them(child, slow_checkpoint, tmp_path):
     out = tmp_path / "person"
-    child.send(4, "generate", seed=1, steps=1000, out_dir=str(out), checkpoint=str(checkpoint), picture_px=48)
+    params = {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(slow_checkpoint)}
+    child.send(4, "generate", **params, picture_px=48)
     news = child.until(lambda message: "picture" in message.get("params", {}))["params"]
     assert Path(news["picture"]).read_bytes().startswith(b"\x89PNG")
     child.send(5, "cancel", id=4)
