@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import json
 import os
+import re
 import resource
 import subprocess
 import sys
@@ -162,7 +163,9 @@ def _outcome(target: Any, path: Path) -> tuple[list[str], str]:
     from fuzz.target import Garbage, said
 
     outcome, about = ["read"], ""
-    before, memory = time.process_time(), _peak_mb()
+    before, memory = time.process_time(), _memory_mb("VmRSS")
+    with contextlib.suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
     try:
         target.read(path)
     except Garbage as error:
@@ -177,7 +180,7 @@ def _outcome(target: Any, path: Path) -> tuple[list[str], str]:
             outcome, about = ["sentences"], sentence
             if fault := _fault_of(sentence, path, target.is_file):
                 outcome, about = ["tracebacks"], f"{fault}: {sentence}"
-    seconds, grown = time.process_time() - before, _peak_mb() - memory
+    seconds, grown = time.process_time() - before, _memory_mb("VmHWM") - memory
     if seconds > target.seconds:
         outcome, about = [*outcome, "hangs"], f"{about} ({seconds:.1f} s)"
     if grown > MOST_MEMORY_MB:
@@ -200,8 +203,12 @@ def _say(**message: Any) -> None:
     sys.__stdout__.flush()  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def _peak_mb() -> float:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+def _memory_mb(kind: str) -> float:
+    """Memory of this process now (VmRSS) or its peak (VmHWM); 0 on other systems than Linux."""
+    if sys.platform != "linux":
+        return 0.0
+    (kilobytes,) = re.findall(rf"^{kind}:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
+    return int(kilobytes) / 1024
 
 
 def _cpu_s(pid: int) -> float:
