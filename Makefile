@@ -22,11 +22,12 @@ VENV_MB := $(VENV):3700
 VENV45_MB := $(VENV45):850
 VENV52_MB := $(VENV52):1300
 
-# One worker per core with one thread each: more threads would compete for the cores.
+# One worker more than cores, since some tests wait for other processes, with one thread each: more would compete.
+WORKERS := $(shell cores=$$(getconf _NPROCESSORS_ONLN || echo 2); echo $$((cores < 8 ? cores + 1 : 8)))
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE
 # Rerun a test if Blender itself crashed (seen once in ed.undo_push), never if the test failed.
 AGAIN_AFTER_A_CRASH := --reruns 1 --only-rerun "no exception says this"
-PYTEST := -m pytest -n logical --maxprocesses 8 --dist worksteal $(AGAIN_AFTER_A_CRASH)
+PYTEST := -m pytest -n $(WORKERS) --dist worksteal $(AGAIN_AFTER_A_CRASH)
 PYTEST_BLENDER := $(PYTEST) tests/blender --confcutdir tests/blender -m "not slow and not gpu and not any_blender"
 
 # Containers set it, and hundreds of child processes would each compile the backend again.
