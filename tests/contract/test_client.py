@@ -1,16 +1,14 @@
 """Blender's side of the pipe with the real child, and with children that misbehave."""
 
-import json
 import os
 import signal
-import sys
-import textwrap
 import threading
 import time
 from pathlib import Path
 
 import pytest
 from conversation import BUSY_STEPS
+from waiting import PYTHON, wait_for
 
 from blender_primdiffusion.backend.child_streams import LONGEST_LINE
 from blender_primdiffusion.backend.client import (
@@ -24,21 +22,6 @@ from blender_primdiffusion.backend.client import (
     death_sentence,
 )
 
-PYTHON = Path(sys.executable)
-
-
-def wait_for(client: BackendClient, wanted, timeout_s: float = 60, into: list | None = None):
-    """The first event that `wanted` accepts; all events seen go `into` a list."""
-    seen = into if into is not None else []
-    end = time.monotonic() + timeout_s
-    while time.monotonic() < end:
-        for event in client.poll():
-            seen.append(event)
-            if wanted(event):
-                return event
-        time.sleep(0.005)
-    raise AssertionError(f"not within {timeout_s} s; seen {seen}; stderr {client.stderr}")
-
 
 def sampling(event) -> bool:
     return isinstance(event, Notification) and event.params.get("stage") == "sample" and event.params["step"] > 2
@@ -50,26 +33,6 @@ def client():
     client.start()
     yield client
     client.kill()
-
-
-@pytest.fixture
-def fake_child(tmp_path):
-    """A client whose child is a script of a few lines in place of the backend."""
-    clients = []
-
-    def make(script: str, **settings) -> BackendClient:
-        package = tmp_path / "backend" / "primdiffusion"
-        package.mkdir(parents=True)
-        (package / "__init__.py").touch()
-        (package / "serve.py").write_text("import json, os, sys, time\n" + textwrap.dedent(script), encoding="utf-8")
-        client = BackendClient(PYTHON, tmp_path / "backend", **settings)
-        clients.append(client)
-        client.start()
-        return client
-
-    yield make
-    for client in clients:
-        client.kill()
 
 
 def test_info_fills_from_hello_and_then_from_ready(client):
@@ -164,88 +127,6 @@ def test_lines_that_are_no_messages_are_kept_for_the_log_and_disturb_nothing(fak
     wait_for(client, lambda e: isinstance(e, Response))
     assert client.info["version"] == "x"
     assert any("Welcome to torch!" in line for line in client.stderr)
-
-
-@pytest.mark.parametrize(
-    ("message", "fault"),
-    [
-        ({"id": [1], "result": {}}, "id"),
-        ({"id": 1, "error": "all is lost"}, "error"),
-        ({"id": 1, "error": {"code": "x", "message": "y"}}, "error"),
-        ({"id": 1, "error": {"code": 1, "message": "y", "data": {"kind": 3}}}, "data of error"),
-        ({"id": 1, "result": 3}, "result"),
-        ({"id": 1}, "result"),
-        ({"id": 1, "result": {"memory_gb": "much"}}, "memory_gb"),
-        ({"method": 3}, "method"),
-        ({"method": "progress", "params": [1]}, "params"),
-        ({"method": "progress", "params": {"id": 1, "stage": 7}}, "stage"),
-        ({"method": "progress", "params": {"id": 1, "step": "3"}}, "step"),
-        ({"method": "progress", "params": {"id": 1, "picture": {}}}, "picture"),
-        ({"method": "progress", "params": {"id": 1, "eta_s": 1e999}}, "eta_s"),
-        ({"method": "progress", "params": {"id": 1, "stage": "load", "step": 1}}, "total"),
-        ({"method": "progress", "params": {"id": 1, "stage": "load", "step": -1, "total": 2}}, "step"),
-        (
-            {"method": "progress", "params": {"id": 1, "stage": "load", "step": 1, "total": 2, "picture": "\0"}},
-            "picture",
-        ),
-        ({"method": "ready", "params": {"ready": "yes"}}, "ready"),
-        ({"id": 99, "result": {}}, "id"),
-        ({"id": None, "error": {"code": -32700, "message": "the line is not JSON"}}, "id"),
-    ],
-)
-def test_a_malformed_message_ends_the_child_with_a_sentence(fake_child, message, fault):
-    client = fake_child(f"print({json.dumps(message)!r}, flush=True)\ntime.sleep(60)")
-    died = wait_for(client, lambda e: isinstance(e, Died))
-    assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
-    assert client.gone_within(10)
-    assert client.poll() == []
-
-
-@pytest.mark.parametrize(
-    ("method", "result", "fault"),
-    [
-        ("generate", {}, "human"),
-        ("generate", {"human": 3, "person": "a", "seconds": 1}, "human"),
-        ("generate", {"human": "a", "person": "a", "seconds": 1e999}, "seconds"),
-        ("variations", {"people": [{"seed": 1}], "seconds": 1}, "people"),
-        ("reconstruct", {"human": "a", "person": "a", "seconds": 1, "warnings": [None]}, "warnings"),
-        ("proxy", {"proxy": "a", "texture": "b", "betas": ["x"], "triangles": 1, "seconds": 1}, "betas"),
-        ("merge_frames", {"files": 3, "seconds": 1}, "files"),
-    ],
-)
-def test_a_result_without_what_its_method_promises_ends_the_child(fake_child, method, result, fault):
-    client = fake_child(f"""
-        for line in sys.stdin:
-            asked = json.loads(line)
-            result = {{}} if asked["method"] == "hello" else {result!r}
-            print(json.dumps({{"id": asked["id"], "result": result}}), flush=True)
-    """.replace("inf", "1e999"))  # fmt: skip
-    client.request(method, {})
-    died = wait_for(client, lambda e: isinstance(e, Died))
-    assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
-
-
-def test_a_second_answer_ends_the_child(fake_child):
-    client = fake_child('print(\'{"id": 1, "result": {}}\\n\' * 2, flush=True)\ntime.sleep(60)')
-    events = []
-    wait_for(client, lambda e: isinstance(e, Died), into=events)
-    assert [type(event) for event in events] == [Response, Died]
-
-
-@pytest.mark.parametrize(
-    ("line", "fault"),
-    [
-        ('\'{"id": 1, "result": {"version"\'', "not JSON"),
-        ("'{' * 1000", "not JSON"),
-        ("'{\"id\": 1, \"result\": \"' + 'x' * 5_000_000 + '\"}'", "longer than 4 MB"),
-    ],
-    ids=["cut off", "nested", "long"],
-)
-def test_a_line_that_begins_as_a_message_and_cannot_be_read_ends_the_child(fake_child, line, fault):
-    client = fake_child(f"print({line}, flush=True)\ntime.sleep(60)")
-    died = wait_for(client, lambda e: isinstance(e, Died))
-    assert died.message == f"the backend was ended because it sent a malformed message ({fault})"
-    assert client.gone_within(10)
 
 
 def test_a_message_cut_off_by_the_childs_death_is_reported_as_its_death(fake_child):

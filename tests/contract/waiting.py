@@ -1,0 +1,22 @@
+"""Waiting for what a child tells the client."""
+
+import sys
+import time
+from pathlib import Path
+
+from blender_primdiffusion.backend.client import BackendClient
+
+PYTHON = Path(sys.executable)
+
+
+def wait_for(client: BackendClient, wanted, timeout_s: float = 60, into: list | None = None):
+    """The first event that `wanted` accepts; all events seen go `into` a list."""
+    seen = into if into is not None else []
+    end = time.monotonic() + timeout_s
+    while time.monotonic() < end:
+        for event in client.poll():
+            seen.append(event)
+            if wanted(event):
+                return event
+        time.sleep(0.005)
+    raise AssertionError(f"not within {timeout_s} s; seen {seen}; stderr {client.stderr}")
