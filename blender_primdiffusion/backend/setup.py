@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..formats.json_files import read_json
+from ..formats.regular_files import check_regular
 from ..formats.removing import remove_file, remove_folder
 from ..formats.whole_files import write_atomically
 from .client import BackendClient
@@ -79,9 +80,12 @@ def set_up(
     folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path, wheels: Path | None = None
 ) -> Steps:
     """Rebuild the environment from the package index, or from a folder of `wheels`; it is ready once it has generated
-    a human. `compute` (cpu, cuda or apple) is for its mark."""
+    a human. `compute` (cpu, cuda or apple) is for its mark. Raises SetUpFailed, and OSError."""
     python, host = folder.python, sys.executable
     _check_own(folder)
+    for path in () if wheels is None else wheels.iterdir():
+        with contextlib.suppress(IsADirectoryError, FileNotFoundError):  # pip says so of those that it needs
+            check_regular(path)  # pip would wait for ever for a pipe
     folder.root.mkdir(parents=True, exist_ok=True)
     remove_file(folder.environment / MARK, folder.environment)
     remove_folder(folder.temporary, folder.temporary.parent)

@@ -131,6 +131,14 @@ def test_a_wheel_that_is_not_the_locked_one_is_not_installed(place, monkeypatch)
     assert not list(place.folder.environment.rglob("torch.py"))
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
+def test_a_pipe_among_the_wheels_is_named_before_anything_is_made(place):
+    os.mkfifo(place.wheels / "torch-9-py3-none-any.whl")
+    with pytest.raises(PermissionError, match="torch-9"):
+        done(place.from_folder())
+    assert not place.folder.root.exists()
+
+
 def test_a_wheel_that_is_missing_in_the_folder_is_named(place):
     next(place.wheels.glob("torch-*")).unlink()
     assert failed(place.from_folder()).startswith("there is no torch")

@@ -10,6 +10,7 @@ from pathlib import Path
 import bpy
 
 from ...backend import environment, setup
+from ...backend.packages import read_lock
 from ...backend.requests import sentence
 from ...backend.setup import Steps
 from ...jobs.queue import queue
@@ -120,7 +121,7 @@ def installing(wheels: Path | None = None) -> Steps:
     if wheels is None and not bpy.app.online_access:
         raise ValueError(setup.OFFLINE)
     if wheels is not None and (wheels / OWN_LOCK).is_file():
-        lock = known.read_once(wheels / OWN_LOCK)
+        lock = read_lock(wheels / OWN_LOCK)  # the user may have changed it since
     return setup.set_up(set_up_folder(), lock, compute, _module_path(), cache_folder(), wheels)
 
 

@@ -156,10 +156,20 @@ def test_a_folder_that_is_none_is_rejected(wheels, folder):
         press.install_from_folder(directory=folder)
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
+def test_a_pipe_among_the_wheels_is_named(wheels):
+    os.mkfifo(wheels / "tensorflow.whl")
+    with pytest.raises(RuntimeError, match=r"tensorflow\.whl: this is not a regular file"):
+        press.install_from_folder(directory=str(wheels))
+
+
 def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypatch):
     ours = write_lock(tmp_path / "ours.txt", [write_wheel(tmp_path / "elsewhere", "torch", "")])
     monkeypatch.setattr(known, "available", lambda: {"cpu": ours})
     with pytest.raises(RuntimeError, match="hash differs"):
+        press.install_from_folder(directory=str(wheels))
+    write_lock(wheels / operators.OWN_LOCK, sorted(wheels.glob("*.whl"))[:1])
+    with pytest.raises(RuntimeError, match="torch"):
         press.install_from_folder(directory=str(wheels))
     write_lock(wheels / operators.OWN_LOCK, sorted(wheels.glob("*.whl")))
     assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
