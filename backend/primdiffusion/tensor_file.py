@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import safetensors.torch
+import torch
 from safetensors import SafetensorError, safe_open
-from torch import Tensor
+from torch import Tensor, nn
+from torch.overrides import TorchFunctionMode
 
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import parse_json
@@ -22,6 +25,12 @@ MOST_DIMENSIONS = 8
 _KINDS = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
 _LENGTH = 8
 """Bytes of the header's length, and what the header is padded to a multiple of."""
+
+
+_MAKERS = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
+_ROOM, _SMALL = 2, 100_000
+"""Layers with weight normalisation make their weights twice; networks count and place with small tensors."""
+Network = TypeVar("Network", bound=nn.Module)
 
 
 class TensorFileError(ValueError):
@@ -95,3 +104,32 @@ def save(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = Non
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
     text += b" " * (-len(text) % _LENGTH)
     return len(text).to_bytes(_LENGTH, "little") + text + content[end:]
+
+
+def load_network(build: Callable[[], Network], tensors: Mapping[str, Tensor]) -> Network:
+    """Build a network whose sizes an untrusted file states, and load the file's `tensors` into it.
+
+    Raises RuntimeError where they do not fit, and as `RoomFor`; what `build` raises.
+    """
+    with RoomFor(tensors):
+        network = build()
+    network.load_state_dict(tensors)
+    return network
+
+
+class RoomFor(TorchFunctionMode):
+    """While it is entered, no more values are made than a network with these tensors takes: RuntimeError."""
+
+    def __init__(self, tensors: Mapping[str, Tensor]) -> None:
+        super().__init__()
+        self._room = _ROOM * sum(values.numel() for values in tensors.values()) + _SMALL
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Count the values of a new tensor before it takes memory."""
+        kwargs = kwargs or {}
+        if func in _MAKERS:
+            size = (args or (kwargs["size"],))[0]
+            self._room -= math.prod(args if isinstance(size, int) else size)
+            if self._room < 0:
+                raise RuntimeError("the network has more parameters than the file has values")
+        return func(*args, **kwargs)

@@ -10,8 +10,19 @@ import pytest
 import safetensors.torch
 import torch
 from primdiffusion.formats.regular_files import TooLargeError
-from primdiffusion.tensor_file import LARGEST_FILE, LARGEST_HEADER, TensorFileError, opened, read, read_metadata, save
+from primdiffusion.tensor_file import (
+    LARGEST_FILE,
+    LARGEST_HEADER,
+    RoomFor,
+    TensorFileError,
+    load_network,
+    opened,
+    read,
+    read_metadata,
+    save,
+)
 from safetensors import safe_open
+from torch import nn
 
 TENSORS = {"b": torch.arange(6.0).reshape(2, 3), "a": torch.ones(3, dtype=torch.float16), "ä": torch.zeros(0)}
 METADATA = {name: f"{name} ä" for name in ["the", "quick", "brown", "fox", "jumps", "over", "a", "lazy", "dog"]}
@@ -92,3 +103,25 @@ def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
     if os.path.exists("/proc/self/pagemap"):
         with pytest.raises(TensorFileError):
             read(pathlib.Path("/proc/self/pagemap"))
+
+
+def test_a_network_gets_the_weights_of_a_file():
+    weights = {"weight": torch.ones(2, 3), "bias": torch.zeros(2)}
+    network = load_network(lambda: nn.Linear(3, 2), weights)
+    assert torch.equal(network(torch.ones(1, 3)), torch.full((1, 2), 3.0))
+    with pytest.raises(RuntimeError, match="bias"):
+        load_network(lambda: nn.Linear(3, 2), {"weight": torch.ones(2, 3)})
+
+
+@pytest.mark.parametrize(
+    "build",
+    [
+        lambda: nn.Linear(10**12, 10**5),
+        lambda: nn.Parameter(torch.randn(size=(10**6, 10**6))),
+        lambda: torch.full((10**6, 10**6), 1.0),
+        lambda: nn.ModuleList(nn.Conv2d(8, 8, 3) for _ in range(10**12)),
+    ],
+)
+def test_what_is_larger_than_the_file_gets_no_memory(build):
+    with pytest.raises(RuntimeError, match="more parameters than the file"), RoomFor({"a": torch.zeros(10)}):
+        build()

@@ -180,12 +180,23 @@ def _outcome(target: Any, path: Path) -> tuple[list[str], str]:
             outcome, about = ["sentences"], sentence
             if fault := _fault_of(sentence, path, target.is_file):
                 outcome, about = ["tracebacks"], f"{fault}: {sentence}"
+        if _asked_for_too_much(error):
+            outcome, about = [*outcome, "over_500mb"], f"{about} (more than this process may have)"
     seconds, grown = time.process_time() - before, _memory_mb("VmHWM") - memory
     if seconds > target.seconds:
         outcome, about = [*outcome, "hangs"], f"{about} ({seconds:.1f} s)"
     if grown > MOST_MEMORY_MB:
         outcome, about = [*outcome, "over_500mb"], f"{about} ({grown:.0f} MB)"
     return outcome, about
+
+
+def _asked_for_too_much(error: BaseException | None) -> bool:
+    """Whether memory was refused to the reader, whatever it made of that."""
+    while error is not None:
+        if isinstance(error, MemoryError) or "allocate memory" in str(error):
+            return True
+        error = error.__cause__ or error.__context__
+    return False
 
 
 def _fault_of(sentence: str, path: Path, is_file: bool) -> str:

@@ -161,16 +161,15 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
     config = architecture["config"]
     weights = under(tensors, "denoiser.")
     if architecture["kind"] == "slab":
-        denoiser: torch.nn.Module = SlabUNet(_unet_config(config))
+        denoiser: torch.nn.Module = tensor_file.load_network(lambda: SlabUNet(_unet_config(config)), weights)
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
         prior = PersonPrior(**under(weights, "prior_"))
-        denoiser = PersonDenoiser(denoiser_config(config), prior, schedule)
+        denoiser = tensor_file.load_network(lambda: PersonDenoiser(denoiser_config(config), prior, schedule), weights)
         codec = _cell_codec(tensors, architecture.get("detail"))
         if codec.shape != tuple(prior.mean.shape):
             raise RuntimeError(f"codec latents are {codec.shape}, the network expects {tuple(prior.mean.shape)}")
         shapes = ShapePrior(**under(tensors, "shapes."))
-    denoiser.load_state_dict(weights)
     denoiser.eval().requires_grad_(False)
     vocabulary = AttributeVocabulary.from_json(architecture["vocabulary"])
     chain = CHAINS[architecture.get("chain", "trailing")]
@@ -185,8 +184,9 @@ def _cell_codec(tensors: Mapping[str, Tensor], detail: Mapping[str, Any] | None)
         return CellCodec(codec)
     fine = LinearCodec(**under(tensors, "fine."))
     config = DetailConfig(**{**detail, "widths": tuple(detail["widths"])})
-    decoder = DetailDecoder(len(codec.basis), len(fine.basis), config)
-    decoder.load_state_dict(under(tensors, "detail."))
+    decoder = tensor_file.load_network(
+        lambda: DetailDecoder(len(codec.basis), len(fine.basis), config), under(tensors, "detail.")
+    )
     decoder.eval().requires_grad_(False)
     return DetailCodec(codec, FineCodec(fine, tensors["back"]), decoder)
 
@@ -195,9 +195,10 @@ def _released_model(
     tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any], folder: Path
 ) -> DiffusionModel:
     """Build an imported model; `folder` is that of its file."""
-    with torch.device("meta"):
+    weights = under(tensors, "denoiser.")
+    with tensor_file.RoomFor(weights), torch.device("meta"):
         network = SlabUNet(_unet_config(architecture["config"]))
-    network.load_state_dict(under(tensors, "denoiser."), assign=True)
+    network.load_state_dict(weights, assign=True)
     network.eval().requires_grad_(False)
     body_setup = stored_body_setup(tensors, architecture["body"], folder)
     fixed_betas = (

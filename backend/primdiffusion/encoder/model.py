@@ -33,7 +33,7 @@ from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.tensor_file import save
+from primdiffusion.tensor_file import load_network, save
 
 FORMAT_VERSION = 1
 
@@ -159,9 +159,10 @@ def load_encoder(path: Path | str | None = None, device: torch.device | str = "c
         raise FileNotFoundError(f"there is no encoder at {path}: give the path of a .safetensors file")
     tensors, metadata = read_tensors(path, (ENCODER_FORMAT,))
     with mismatches_named(path, ValueError):
-        encoder = Encoder(config_from_json(parse_json(metadata["config"])))
+        config = config_from_json(parse_json(metadata["config"]))
         anchors = {f"stand.{name}": value for name, value in under(tensors, "stand.").items()}
-        encoder.load_state_dict({name: value for name, value in tensors.items() if name not in anchors})
+        weights = {name: value for name, value in tensors.items() if name not in anchors}
+        encoder = load_network(lambda: Encoder(config), weights)
         card = parse_json(metadata["card"])
     body_setup = None
     if "body" in metadata:

@@ -250,8 +250,7 @@ def load_attribute_network(path: Path) -> AttributeNetwork:
             {name: tuple(values) for name, values in stated["categories"].items()},
             {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
         )
-        network = AttributeNetwork(space)
-        network.load_state_dict(tensors)
+        network = tensor_file.load_network(lambda: AttributeNetwork(space), tensors)
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ValueError(

@@ -159,13 +159,11 @@ def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
     try:
         tensors, metadata = tensor_file.read(path)
         stated = parse_json(metadata["space"])
-        network = PoseDepthNetwork(
-            AttributeSpace(
-                {name: tuple(values) for name, values in stated["categories"].items()},
-                {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
-            )
+        space = AttributeSpace(
+            {name: tuple(values) for name, values in stated["categories"].items()},
+            {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
         )
-        network.load_state_dict(tensors)
+        network = tensor_file.load_network(lambda: PoseDepthNetwork(space), tensors)
         network.card = dict(parse_json(metadata["card"]))
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
         reason = " ".join(str(error).split())[:200]

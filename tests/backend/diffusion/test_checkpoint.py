@@ -159,6 +159,18 @@ def test_an_impossible_architecture_is_rejected(path, changes):
         load_checkpoint(path)
 
 
+@pytest.mark.parametrize("local", [{"blocks": 10**9}, {"widths": [10**6]}, {"condition_width": 10**15}])
+def test_a_network_larger_than_its_file_is_not_built(path, local):
+    def change(metadata):
+        architecture = json.loads(metadata["architecture"])
+        architecture["config"]["local"] |= local
+        return metadata | {"architecture": json.dumps(architecture)}
+
+    rewrite(path, change_metadata=change)
+    with pytest.raises(CheckpointError, match="more parameters than the file has values"):
+        load_checkpoint(path)
+
+
 def test_an_unfinished_model_is_not_saved(tmp_path):
     model = small_model()
     model.denoiser.person.outer.bias.fill_(float("inf"))

@@ -63,6 +63,11 @@ def test_a_truncated_file_is_rejected(saved, tmp_path, kept):
         ({"card": "["}, "does not match its own description"),
         ({"config": json.dumps(dataclasses.asdict(dataclasses.replace(TINY, fused=8)))}, "does not match its own"),
         ({"config": json.dumps(dataclasses.asdict(TINY) | {"stem": 3})}, "does not match its own description"),
+        (
+            {"config": json.dumps(dataclasses.asdict(TINY) | {"attention_blocks": 10**9})},
+            "more parameters than the file",
+        ),
+        ({"config": json.dumps(dataclasses.asdict(TINY) | {"fused": 10**6})}, "more parameters than the file"),
     ],
 )
 def test_a_file_that_is_something_else_is_rejected_in_one_line(saved, tmp_path, metadata, message):
