@@ -38,6 +38,8 @@ SIDE = 512
 """Width and height of a picture, pixels."""
 MARGIN = 1.08
 """Radius of the view over that of the sphere around the body."""
+FAR_OUTSIDE = 100
+"""Widths of the picture that no joint is away from its corner."""
 WHITE_DISTANCE = 6
 """Pictures without alpha: a pixel whose channels are all within this of white (255) is background."""
 SUPERSAMPLE = 2
@@ -187,10 +189,12 @@ def _joints(given: Any, size: int, source: Path, name: str) -> tuple[Tensor | No
         return None, None
     try:
         pixels = torch.tensor(given, dtype=torch.float32) * (SIDE / size)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{source}: the joints of {name} are not numbers ({error!s:.160})") from error
     if pixels.shape != (len(JOINT_NAMES), 2) or not torch.isfinite(pixels).all():
         raise ValueError(f"{source}: the joints of {name} have shape {tuple(pixels.shape)}: give 24 finite rows x, y")
+    if pixels.abs().max() > FAR_OUTSIDE * SIDE:
+        raise ValueError(f"{source}: joints of {name} are not in its picture or near it: give them in pixels")
     neck, head = (pixels[JOINT_NAMES.index(joint)] for joint in HEAD)
     return pixels[[JOINT_NAMES.index(joint) for joint in JOINTS]], float((neck - head).norm())
 

@@ -89,6 +89,8 @@ def test_pictures_of_other_sizes_are_resized_with_their_truth(tmp_path):
         (lambda folder: Image.new("RGB", (8, 9)).save(folder / "a.png"), "8 x 9"),
         (lambda folder: (folder / "a.png").write_bytes(b"no picture"), r"a\.png"),
         (lambda folder: (folder / "joints.json").write_text('{"a.png": [[1, 2]]}'), "24 finite rows"),
+        (lambda folder: (folder / "joints.json").write_text(json.dumps({"a.png": [[1e9, 2]] * 24})), "near it"),
+        (lambda folder: (folder / "joints.json").write_text(json.dumps({"a.png": [[10**400, 2]] * 24})), "joints"),
     ],
 )
 def test_a_folder_that_does_not_fit_is_one_sentence(tmp_path, spoil, words):
