@@ -27,6 +27,8 @@ BOX_PADDING = 1.25
 """Size of the crop given to a pose network over that of the human's bounding box."""
 POSE_SIZE, DEPTH_SIZE = (256, 192), (384, 384)
 """Height and width of inputs where the file leaves them open."""
+LARGEST_SIZE = 2048
+"""Height and width of a network's input, pixels."""
 COCO_FIRST, COCO_LAST = 5, 17
 """COCO's keypoints from the left shoulder to the right ankle, in the order of `shots.JOINTS`."""
 
@@ -79,6 +81,10 @@ def open_onnx(path: Path, size: tuple[int, int]) -> OnnxNetwork:
     height, width = (
         given if isinstance(given, int) and given > 0 else own for given, own in zip(shape[2:], size, strict=True)
     )
+    if max(height, width) > LARGEST_SIZE:
+        raise ValueError(
+            f"{path} takes pictures of {width} x {height} pixels, over {LARGEST_SIZE}: give another network"
+        )
     return OnnxNetwork(path, session, height, width)
 
 

@@ -108,6 +108,9 @@ def test_files_that_do_not_fit_are_one_sentence(shot, tmp_path):
     (tmp_path / "text.onnx").write_text("no network")
     with pytest.raises(ValueError, match=r"text\.onnx is not a readable ONNX file"):
         open_onnx(tmp_path / "text.onnx", (8, 8))
+    large = save(tmp_path / "large.onnx", [onnx.helper.make_node("Neg", ["picture"], ["a"])], ["a"], size=(64, 10**7))
+    with pytest.raises(ValueError, match="10000000 x 64 pixels, over 2048"):
+        open_onnx(large, (8, 8))
     few = always(tmp_path / "few.onnx", heatmap=np.zeros((1, 5, 64, 48), np.float32))
     with pytest.raises(ValueError, match="finds 5 keypoints"):
         open_pose_network(few).joints(shot)
