@@ -19,7 +19,7 @@ from torch import Tensor
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.formats.arrays import read_numbers
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.requests import PARTS, SIDED_PARTS
+from primdiffusion.formats.requests import PARTS, SIDED_PARTS, WHOLE_PARTS
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach, default_anchors, default_texels
 from primdiffusion.primitives.body_setup import BodySetup
@@ -63,6 +63,7 @@ _UNIONS = {
     "skin": ("face", "neck", "hands"),
 }
 """Names for several parts together."""
+_CHOICES = f"{', '.join(WHOLE_PARTS)}, and left_ or right_ with {', '.join(_ONE_OF.values())}"
 DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDED_PARTS)
 """A partition of all primitives."""
 
@@ -81,11 +82,11 @@ def region_of(names: Sequence[str], body_setup: BodySetup | None = None) -> Bool
     Raises ValueError for no names or an unknown one.
     """
     if not names:
-        raise ValueError(f"the region is empty: name one or more of {', '.join(PARTS)}")
+        raise ValueError(f"the region is empty: name one or more of {_CHOICES}")
     parts = parts_of(body_setup)
     for name in names:
         if name not in parts:
-            raise ValueError(f"unknown part of the body {name!r}: choose from {', '.join(PARTS)}")
+            raise ValueError(f"unknown part of the body {name!r:.40}: choose from {_CHOICES}")
     return torch.stack([parts[name] for name in names]).any(0)
 
 
