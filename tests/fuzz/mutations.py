@@ -161,17 +161,43 @@ def safetensors_header(content: bytes, rng: Generator) -> bytes:
 
 def safetensors_kind(content: bytes, rng: Generator) -> bytes:
     """A tensor has another type and as many bytes as that needs, so that the file is whole."""
+
+    def change(entry: dict[str, Any], _raw: bytes) -> bytes:
+        entry["dtype"], size = pick(rng, TENSOR_KINDS)
+        return pick(rng, (b"\0", b"\1", b"\xff")) * (math.prod(entry["shape"]) * size)
+
+    return _one_tensor(content, rng, change)
+
+
+def safetensors_shape(content: bytes, rng: Generator) -> bytes:
+    """A tensor has another shape and the bytes that it needs, so that the file is whole."""
+
+    def change(entry: dict[str, Any], raw: bytes) -> bytes:
+        shape, values = entry["shape"], max(math.prod(entry["shape"]), 1)
+        size = max(len(raw) // values, 1)
+        axis = int(rng.integers(len(shape) + 1))
+        if axis == len(shape):
+            entry["shape"] = pick(rng, ([], [0], [1, *shape], [*shape, 1], shape[1:], shape[::-1]))
+        else:
+            shape[axis] = pick(rng, (0, 1, shape[axis] - 1, shape[axis] + 1, 2 * shape[axis]))
+            entry["shape"] = [max(length, 0) for length in shape]
+        needed = math.prod(entry["shape"]) * size
+        return (raw * (needed // max(len(raw), 1) + 1) if raw else b"\0" * needed)[:needed]
+
+    return _one_tensor(content, rng, change)
+
+
+def _one_tensor(content: bytes, rng: Generator, change: Callable[[dict[str, Any], bytes], bytes]) -> bytes:
+    """A file in which one tensor is what `change` makes of its entry and bytes."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.loads(content[8:end])
     names = sorted((name for name in header if name != "__metadata__"), key=lambda one: header[one]["data_offsets"])
-    chosen, (kind, size) = pick(rng, names), pick(rng, TENSOR_KINDS)
-    data = b""
+    chosen, data = pick(rng, names), b""
     for name in names:
         begin, stop = header[name]["data_offsets"]
         raw = content[end + begin : end + stop]
         if name == chosen:
-            raw = pick(rng, (b"\0", b"\1", b"\xff")) * (math.prod(header[name]["shape"]) * size)
-            header[name]["dtype"] = kind
+            raw = change(header[name], raw)
         header[name]["data_offsets"] = [len(data), len(data) + len(raw)]
         data += raw
     text = json.dumps(header).encode()
@@ -250,6 +276,8 @@ NPZ: tuple[Mutation, ...] = (archive, archive, archive, archive, flip, truncate,
 TORCH: tuple[Mutation, ...] = (*NPZ, *PLAIN, torch_pickle)
 SAFETENSORS: tuple[Mutation, ...] = (
     safetensors_kind,
+    safetensors_shape,
+    safetensors_shape,
     safetensors_header,
     safetensors_header,
     safetensors_header,

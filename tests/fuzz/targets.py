@@ -73,12 +73,18 @@ def make_checkpoint(folder: Path) -> Path:
 
 def read_checkpoint(path: Path) -> None:
     from primdiffusion.diffusion.checkpoint import load_checkpoint, model_card
+    from primdiffusion.human import generate
 
     model = load_checkpoint(path)
     finite(*model.denoiser.state_dict().values(), model.full_density)
     if not model.full_density > 0:
         raise Garbage(f"full density {model.full_density}")
     model_card({"held_out_rms_x0_error": {"x": {"0": 1.0}}, **model.card})
+    try:
+        generate(model, 1, 1)
+    except ValueError as error:  # weights of any size may be read
+        if "NaN" not in str(error):
+            raise
 
 
 def make_released(folder: Path) -> Path:
