@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from numpy.random import Generator
 
 NUMBERS = (
@@ -220,7 +221,10 @@ def archive(content: bytes, rng: Generator) -> bytes:
     elif chance < 0.4:
         members[place] = (name, pick(rng, members)[1])
     else:
-        members[place] = (name, pick(rng, (npy_header, npy_header, npy_values, flip, truncate, integer))(data, rng))
+        members[place] = (
+            name,
+            pick(rng, (npy_header, npy_header, npy_shape, npy_shape, npy_values, flip, truncate, integer))(data, rng),
+        )
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as file:
         for name, data in members:
@@ -251,6 +255,22 @@ def npy_header(content: bytes, rng: Generator) -> bytes:
         text = b"[" * 20_000 + text
     text += b" " * (63 - (10 + len(text)) % 64) + b"\n"
     return content[:8] + (len(text) % 65536).to_bytes(2, "little") + text + content[10 + length :]
+
+
+def npy_shape(content: bytes, rng: Generator) -> bytes:
+    """An array is shorter, longer, of more or fewer axes, or of another type, and whole."""
+    array = np.load(io.BytesIO(content), allow_pickle=False)
+    axis = int(rng.integers(array.ndim + 1))
+    if axis == array.ndim:
+        array = pick(rng, (array[None], array[..., None], array.T, array.ravel()[:1].reshape(()), array.ravel()[:0]))
+    elif rng.random() < 0.3:
+        array = array.astype(pick(rng, ("u1", "i8", "?", "f2", "f8", "c8", "U3", "S3", "M8[s]")))
+    else:
+        length = pick(rng, (0, 1, max(array.shape[axis] - 1, 0), array.shape[axis] + 1, 2 * array.shape[axis]))
+        array = np.take(array, np.arange(length) % max(array.shape[axis], 1), axis)
+    out = io.BytesIO()
+    np.save(out, array)
+    return out.getvalue()
 
 
 def npy_values(content: bytes, rng: Generator) -> bytes:

@@ -130,10 +130,12 @@ def make_uv(folder: Path) -> Path:
 
 
 def read_body(path: Path) -> None:
+    from primdiffusion.body.model import BodyPose
     from primdiffusion.body.smpl_files import load_body
 
     body = load_body(path)
     finite(body.template, body.skin_weights, body.shape_basis, body.joint_regressor)
+    finite(body.shape(torch.zeros(1)).pose(BodyPose.from_axis_angle(torch.zeros(72))).vertices)
 
 
 def read_uv(path: Path) -> None:
