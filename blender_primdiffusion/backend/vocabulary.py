@@ -15,6 +15,7 @@ from ..formats.regular_files import open_regular
 
 _LARGEST_FILE, _LONGEST_HEADER = 16 << 30, 4 << 20
 """Bytes, as in the backend's `tensor_file`."""
+_LARGEST_NUMBER = 1e9
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,6 +40,8 @@ def read_vocabulary(path: Path) -> Vocabulary:
         tree = parse_json(parse_json(header)["__metadata__"]["architecture"]).get("vocabulary") or {}
         categories = {name: tuple(map(str, values)) for name, values in tree.get("categories", {}).items()}
         scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree.get("scalars", {}).items()}
+        if not all(abs(mean) <= _LARGEST_NUMBER and 0 < std <= _LARGEST_NUMBER for mean, std in scalars.values()):
+            raise ValueError("a mean or standard deviation that no quantity has")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is damaged or no checkpoint of a diffusion model: choose another file") from error
     return Vocabulary(categories, scalars)

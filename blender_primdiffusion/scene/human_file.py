@@ -210,7 +210,7 @@ def motion_in(human: HumanTensors, name: str) -> HumanMotion | None:
         arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
     except (ValueError, KeyError, TypeError, OverflowError) as error:
         raise ValueError(f"the motion in {name!r} is damaged ({error!s:.80}); {_REMEDY}") from error
-    frames = len(arrays[0])
+    frames = len(arrays[0]) if arrays[0].ndim else 0
     for array, shape in zip(arrays, _MOTION.values(), strict=True):
         if array.shape != tuple(frames if s == "F" else s for s in shape) or not all_finite(array):
             raise ValueError(f"the motion in {name!r} is damaged; {_REMEDY}")

@@ -59,6 +59,15 @@ def test_a_compact_file_renders_as_the_whole_one_to_a_level_of_255(human, tmp_pa
     assert torch.quantile((pictures[1] - pictures[0])[drawn].abs(), 0.99) <= 1 / 255
 
 
+def test_a_compact_file_with_a_single_colour_is_rejected(human, tmp_path):
+    path = tmp_path / "a.human"
+    save_human(path, human, compact=True)
+    tensors, metadata = tensor_file.read(path)
+    path.write_bytes(tensor_file.save({**tensors, "rgb": torch.zeros((), dtype=torch.uint8)}, metadata))
+    with pytest.raises(ValueError, match=r"a\.human"):
+        load_human(path)
+
+
 def test_a_person_with_nan_is_not_written(human, tmp_path):
     broken = dataclasses.replace(human, betas=torch.full((10,), float("nan")))
     for write in (save_human, export_for_blender):

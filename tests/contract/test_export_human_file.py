@@ -65,7 +65,7 @@ def test_a_motion_comes_back_as_it_was_and_can_be_taken_away(saved, tmp_path):
     assert motion_in(read_tensors(tmp_path / "c.human"), "c.human") is None
 
 
-@pytest.mark.parametrize("damage", ["fps", "order", "shape"])
+@pytest.mark.parametrize("damage", ["fps", "order", "shape", "single"])
 def test_a_damaged_motion_is_rejected_with_a_sentence(saved, damage):
     motion = walk()
     if damage == "order":
@@ -73,6 +73,8 @@ def test_a_damaged_motion_is_rejected_with_a_sentence(saved, damage):
     if damage == "shape":
         motion = HumanMotion(motion.frames, motion.rotations[:2], motion.translations, 24.0)
     human = with_motion(read_tensors(saved), motion)
+    if damage == "single":
+        human.arrays["motion.frames"] = ("F32", (), bytes(4))
     if damage == "fps":
         human.metadata["motion"] = '{"fps": "fast"}'
     with pytest.raises(ValueError, match="export the human again"):

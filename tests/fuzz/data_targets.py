@@ -14,7 +14,13 @@ from fuzz import mutations
 from fuzz.mutations import Mutation
 from fuzz.target import Garbage, Target, finite, finite_members
 
-NPY: tuple[Mutation, ...] = (mutations.npy_header, mutations.npy_values, mutations.flip, mutations.truncate)
+NPY: tuple[Mutation, ...] = (
+    mutations.npy_header,
+    mutations.npy_shape,
+    mutations.npy_values,
+    mutations.flip,
+    mutations.truncate,
+)
 
 
 def random_pose() -> np.ndarray:

@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 from numpy.random import Generator
 
 NUMBERS = (
@@ -161,17 +162,43 @@ def safetensors_header(content: bytes, rng: Generator) -> bytes:
 
 def safetensors_kind(content: bytes, rng: Generator) -> bytes:
     """A tensor has another type and as many bytes as that needs, so that the file is whole."""
+
+    def change(entry: dict[str, Any], _raw: bytes) -> bytes:
+        entry["dtype"], size = pick(rng, TENSOR_KINDS)
+        return pick(rng, (b"\0", b"\1", b"\xff")) * (math.prod(entry["shape"]) * size)
+
+    return _one_tensor(content, rng, change)
+
+
+def safetensors_shape(content: bytes, rng: Generator) -> bytes:
+    """A tensor has another shape and the bytes that it needs, so that the file is whole."""
+
+    def change(entry: dict[str, Any], raw: bytes) -> bytes:
+        shape, values = entry["shape"], max(math.prod(entry["shape"]), 1)
+        size = max(len(raw) // values, 1)
+        axis = int(rng.integers(len(shape) + 1))
+        if axis == len(shape):
+            entry["shape"] = pick(rng, ([], [0], [1, *shape], [*shape, 1], shape[1:], shape[::-1]))
+        else:
+            shape[axis] = pick(rng, (0, 1, shape[axis] - 1, shape[axis] + 1, 2 * shape[axis]))
+            entry["shape"] = [max(length, 0) for length in shape]
+        needed = math.prod(entry["shape"]) * size
+        return (raw * (needed // max(len(raw), 1) + 1) if raw else b"\0" * needed)[:needed]
+
+    return _one_tensor(content, rng, change)
+
+
+def _one_tensor(content: bytes, rng: Generator, change: Callable[[dict[str, Any], bytes], bytes]) -> bytes:
+    """A file in which one tensor is what `change` makes of its entry and bytes."""
     end = 8 + int.from_bytes(content[:8], "little")
     header = json.loads(content[8:end])
     names = sorted((name for name in header if name != "__metadata__"), key=lambda one: header[one]["data_offsets"])
-    chosen, (kind, size) = pick(rng, names), pick(rng, TENSOR_KINDS)
-    data = b""
+    chosen, data = pick(rng, names), b""
     for name in names:
         begin, stop = header[name]["data_offsets"]
         raw = content[end + begin : end + stop]
         if name == chosen:
-            raw = pick(rng, (b"\0", b"\1", b"\xff")) * (math.prod(header[name]["shape"]) * size)
-            header[name]["dtype"] = kind
+            raw = change(header[name], raw)
         header[name]["data_offsets"] = [len(data), len(data) + len(raw)]
         data += raw
     text = json.dumps(header).encode()
@@ -194,7 +221,10 @@ def archive(content: bytes, rng: Generator) -> bytes:
     elif chance < 0.4:
         members[place] = (name, pick(rng, members)[1])
     else:
-        members[place] = (name, pick(rng, (npy_header, npy_header, npy_values, flip, truncate, integer))(data, rng))
+        members[place] = (
+            name,
+            pick(rng, (npy_header, npy_header, npy_shape, npy_shape, npy_values, flip, truncate, integer))(data, rng),
+        )
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", pick(rng, (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))) as file:
         for name, data in members:
@@ -227,6 +257,22 @@ def npy_header(content: bytes, rng: Generator) -> bytes:
     return content[:8] + (len(text) % 65536).to_bytes(2, "little") + text + content[10 + length :]
 
 
+def npy_shape(content: bytes, rng: Generator) -> bytes:
+    """An array is shorter, longer, of more or fewer axes, or of another type, and whole."""
+    array = np.load(io.BytesIO(content), allow_pickle=False)
+    axis = int(rng.integers(array.ndim + 1))
+    if axis == array.ndim:
+        array = pick(rng, (array[None], array[..., None], array.T, array.ravel()[:1].reshape(()), array.ravel()[:0]))
+    elif rng.random() < 0.3:
+        array = array.astype(pick(rng, ("u1", "i8", "?", "f2", "f8", "c8", "U3", "S3", "M8[s]")))
+    else:
+        length = pick(rng, (0, 1, max(array.shape[axis] - 1, 0), array.shape[axis] + 1, 2 * array.shape[axis]))
+        array = np.take(array, np.arange(length) % max(array.shape[axis], 1), axis)
+    out = io.BytesIO()
+    np.save(out, array)
+    return out.getvalue()
+
+
 def npy_values(content: bytes, rng: Generator) -> bytes:
     """Values of an array become extreme ones."""
     if content[:6] != b"\x93NUMPY" or len(content) < 140:
@@ -250,6 +296,8 @@ NPZ: tuple[Mutation, ...] = (archive, archive, archive, archive, flip, truncate,
 TORCH: tuple[Mutation, ...] = (*NPZ, *PLAIN, torch_pickle)
 SAFETENSORS: tuple[Mutation, ...] = (
     safetensors_kind,
+    safetensors_shape,
+    safetensors_shape,
     safetensors_header,
     safetensors_header,
     safetensors_header,

@@ -73,12 +73,18 @@ def make_checkpoint(folder: Path) -> Path:
 
 def read_checkpoint(path: Path) -> None:
     from primdiffusion.diffusion.checkpoint import load_checkpoint, model_card
+    from primdiffusion.human import generate
 
     model = load_checkpoint(path)
     finite(*model.denoiser.state_dict().values(), model.full_density)
     if not model.full_density > 0:
         raise Garbage(f"full density {model.full_density}")
     model_card({"held_out_rms_x0_error": {"x": {"0": 1.0}}, **model.card})
+    try:
+        generate(model, 1, 1)
+    except ValueError as error:  # weights of any size may be read
+        if "NaN" not in str(error):
+            raise
 
 
 def make_released(folder: Path) -> Path:
@@ -124,10 +130,12 @@ def make_uv(folder: Path) -> Path:
 
 
 def read_body(path: Path) -> None:
+    from primdiffusion.body.model import BodyPose
     from primdiffusion.body.smpl_files import load_body
 
     body = load_body(path)
     finite(body.template, body.skin_weights, body.shape_basis, body.joint_regressor)
+    finite(body.shape(torch.zeros(1)).pose(BodyPose.from_axis_angle(torch.zeros(72))).vertices)
 
 
 def read_uv(path: Path) -> None:

@@ -18,6 +18,7 @@ from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.diffusion.consistency import check_fine, check_parts
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.detail import DetailCodec, DetailConfig, DetailDecoder, FineCodec
 from primdiffusion.diffusion.gaussian import PersonPrior
@@ -29,7 +30,7 @@ from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import JsonError, parse_json
 from primdiffusion.formats.regular_files import TooLargeError, open_regular
 from primdiffusion.formats.whole_files import write_atomically
-from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.geometry.records import TensorRecord, check_shapes
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
 
@@ -160,18 +161,17 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
     schedule = SCHEDULES[architecture["schedule"]]()
     config = architecture["config"]
     weights = under(tensors, "denoiser.")
+    vocabulary = AttributeVocabulary.from_json(architecture["vocabulary"])
     if architecture["kind"] == "slab":
         denoiser: torch.nn.Module = tensor_file.load_network(lambda: SlabUNet(_unet_config(config)), weights)
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
         prior = PersonPrior(**under(weights, "prior_"))
-        denoiser = tensor_file.load_network(lambda: PersonDenoiser(denoiser_config(config), prior, schedule), weights)
         codec = _cell_codec(tensors, architecture.get("detail"))
-        if codec.shape != tuple(prior.mean.shape):
-            raise RuntimeError(f"codec latents are {codec.shape}, the network expects {tuple(prior.mean.shape)}")
         shapes = ShapePrior(**under(tensors, "shapes."))
+        check_parts(codec.codec, prior, shapes, vocabulary)
+        denoiser = tensor_file.load_network(lambda: PersonDenoiser(denoiser_config(config), prior, schedule), weights)
     denoiser.eval().requires_grad_(False)
-    vocabulary = AttributeVocabulary.from_json(architecture["vocabulary"])
     chain = CHAINS[architecture.get("chain", "trailing")]
     density = float(architecture["full_density"])
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
@@ -182,13 +182,14 @@ def _cell_codec(tensors: Mapping[str, Tensor], detail: Mapping[str, Any] | None)
     codec = LinearCodec(**under(tensors, "codec."))
     if detail is None:
         return CellCodec(codec)
-    fine = LinearCodec(**under(tensors, "fine."))
+    fine = FineCodec(LinearCodec(**under(tensors, "fine.")), tensors["back"])
+    check_fine(fine, codec)
     config = DetailConfig(**{**detail, "widths": tuple(detail["widths"])})
     decoder = tensor_file.load_network(
-        lambda: DetailDecoder(len(codec.basis), len(fine.basis), config), under(tensors, "detail.")
+        lambda: DetailDecoder(len(codec.basis), len(fine.codec.basis), config), under(tensors, "detail.")
     )
     decoder.eval().requires_grad_(False)
-    return DetailCodec(codec, FineCodec(fine, tensors["back"]), decoder)
+    return DetailCodec(codec, fine, decoder)
 
 
 def _released_model(
@@ -207,11 +208,13 @@ def _released_model(
         torch.zeros(BETAS, BETAS),
         torch.full((BETAS,), LARGEST_BETA),
     )
+    shapes = ShapePrior(*fixed_betas)
+    check_shapes(shapes)
     return DiffusionModel(
         denoiser=network,
         schedule=SCHEDULES[architecture["schedule"]](),
         codec=ReleasedSlab(),
-        shapes=ShapePrior(*fixed_betas),
+        shapes=shapes,
         full_density=float(architecture["full_density"]),
         card=card,
         chain=CHAINS[architecture["chain"]],

@@ -15,6 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from primdiffusion.formats.arrays import LARGEST_NUMBER
+
 Attributes = Mapping[str, str | float]
 """Requested attributes of a person: {"sex": "female", "height": 1.7}."""
 FARTHEST = 4.0
@@ -85,8 +87,8 @@ class AttributeVocabulary:
         """Inverse of `to_json`; raises KeyError, TypeError, AttributeError or ValueError for other input."""
         categories = {name: tuple(map(str, values)) for name, values in tree["categories"].items()}
         scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree["scalars"].items()}
-        if not all(std > 0 for _, std in scalars.values()):
-            raise ValueError("a standard deviation is not above 0")
+        if not all(abs(mean) <= LARGEST_NUMBER and 0 < std <= LARGEST_NUMBER for mean, std in scalars.values()):
+            raise ValueError("a mean or standard deviation is one that no quantity has")
         return cls(categories, scalars)
 
     def _check_names(self, attributes: Attributes) -> None:

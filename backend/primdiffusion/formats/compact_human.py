@@ -48,4 +48,4 @@ def expand(arrays: Mapping[str, NDArray], metadata: str) -> dict[str, NDArray]:
     level = np.arange(LEVELS + 1) / LEVELS
     colour = np.where(level <= _KNEE, level / 12.92, ((np.maximum(level, _KNEE) + 0.055) / 1.055) ** 2.4)
     tables = {"rgb": colour * scales["rgb"], "density": level**2 * scales["density"]}
-    return {**arrays, **{name: table.astype(np.float32)[arrays[name]] for name, table in tables.items()}}
+    return {**arrays, **{name: np.asarray(table.astype(np.float32)[arrays[name]]) for name, table in tables.items()}}

@@ -32,6 +32,12 @@ def test_a_vocabulary_survives_json():
     assert AttributeVocabulary.from_json(WORDS.to_json()) == WORDS
 
 
+@pytest.mark.parametrize("scalar", [[1e300, 0.1], [1.7, 0.0], [1.7, -1.0], [1.7, 1e300], [float("nan"), 0.1]])
+def test_means_and_deviations_that_no_quantity_has_are_rejected(scalar):
+    with pytest.raises(ValueError, match="no quantity has"):
+        AttributeVocabulary.from_json({"categories": {}, "scalars": {"height": scalar}})
+
+
 def test_all_subsets_of_attributes_are_learnt():
     whole = WORDS.encode({"sex": "male", "hair": "bob", "height": 1.75}).expand(4000, -1)
     part = WORDS.forget(whole, 0.5, torch.Generator().manual_seed(0))

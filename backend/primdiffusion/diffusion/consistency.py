@@ -1,0 +1,63 @@
+"""Whether the parts of a model that were read from a file fit each other."""
+
+from __future__ import annotations
+
+from primdiffusion.body.measures import LARGEST_BETA
+from primdiffusion.diffusion.codec import VALUES, LinearCodec
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.diffusion.detail import FineCodec
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.model import ShapePrior
+from primdiffusion.geometry.records import check_shapes
+from primdiffusion.primitives.primitives import GRID, K
+
+LARGEST_COSINE = 1.01
+"""Of an orthonormal row, rounded to half precision."""
+
+
+def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, vocabulary: AttributeVocabulary) -> None:
+    """Raise ValueError unless codec and prior have the same latents, of our grid, and body shapes depend on them alone.
+
+    Attributes have as many values as the parts of the prior.
+    """
+    latents = (len(codec.basis), GRID, GRID)
+    if latents != tuple(prior.mean.shape):
+        raise ValueError(f"codec latents are {latents}, the network expects {tuple(prior.mean.shape)}")
+    check_shapes(codec, prior)
+    check_shapes(shapes)
+    _check_values(prior, shapes)
+    _check_cells(codec)
+    components, drawn = prior.basis.shape
+    if drawn % GRID**2 or not 0 < drawn <= prior.mean.numel():
+        raise ValueError(f"basis has rows of {drawn}, which are no whole channels of {tuple(prior.mean.shape)}")
+    if shapes.weight.shape[1] > components:
+        raise ValueError(f"body shapes depend on {shapes.weight.shape[1]} components of {components}")
+    if prior.kind.shape[-1] not in (0, vocabulary.width):
+        raise ValueError(f"parts are described by {prior.kind.shape[-1]} values, attributes by {vocabulary.width}")
+
+
+def check_fine(fine: FineCodec, codec: LinearCodec) -> None:
+    """Raise ValueError unless the codec of a detail decoder leads back to the latents of `codec`."""
+    check_shapes(fine.codec)
+    _check_cells(fine.codec)
+    channels = len(codec.basis)
+    if tuple(fine.back.shape) != (channels, channels):
+        raise ValueError(f"back has shape {tuple(fine.back.shape)}, not {channels} x {channels}")
+
+
+def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:
+    for name, values in (("rest_variance", prior.rest_variance), ("variance", prior.variance), ("limit", shapes.limit)):
+        if bool((values < 0).any()):
+            raise ValueError(f"{name} has negative values")
+    if bool((shapes.limit > LARGEST_BETA).any()):
+        raise ValueError(f"body shapes may have betas over {LARGEST_BETA:g}")
+    for name, rows in (("basis", prior.basis), ("axes", prior.axes)):
+        if bool((rows.abs() > LARGEST_COSINE).any()):
+            raise ValueError(f"{name} has rows longer than 1")
+
+
+def _check_cells(codec: LinearCodec) -> None:
+    if not bool((codec.weight > 0).all()) or bool((codec.basis.abs() > LARGEST_COSINE).any()):
+        raise ValueError("a weight of the codec is not positive, or its basis has rows longer than 1")
+    if tuple(codec.mean.shape) != (K, VALUES):
+        raise ValueError(f"mean has shape {tuple(codec.mean.shape)}, not {K} x {VALUES}")
