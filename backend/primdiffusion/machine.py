@@ -38,12 +38,14 @@ def peak_memory_gb() -> float:
     """Peak memory of this process, GB (1e9 bytes)."""
     if sys.platform == "win32":
         return psutil.Process().memory_info().peak_wset / GB
-    if sys.platform == "linux":  # its ru_maxrss begins with the peak of the program that started this one
-        (kilobytes,) = re.findall(r"^VmHWM:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
-        return int(kilobytes) * 1024 / GB
     import resource  # not on Windows
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / GB
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    if sys.platform == "darwin":
+        return peak / GB
+    # Linux's ru_maxrss begins with the peak of the program that started this one; not every sandbox has VmHWM.
+    own = re.search(r"^VmHWM:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
+    return (int(own[1]) if own else peak) * 1024 / GB
 
 
 def choose_device(name: str) -> None:

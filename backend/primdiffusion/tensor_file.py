@@ -25,8 +25,6 @@ MOST_DIMENSIONS = 8
 _KINDS = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
 _LENGTH = 8
 """Bytes of the header's length, and what the header is padded to a multiple of."""
-
-
 _MAKERS = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
 _ROOM, _SMALL = 2, 100_000
 """Layers with weight normalisation make their weights twice; networks count and place with small tensors."""

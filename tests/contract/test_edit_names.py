@@ -1,5 +1,6 @@
 """What the extension offers to ask for is what the backend knows; the card of a checkpoint is read without torch."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -31,6 +32,15 @@ def test_the_default_checkpoint_is_read_as_the_backend_reads_it():
     model = load_checkpoint()
     read = read_vocabulary(Path(default_checkpoint()))
     assert (read.categories, read.scalars) == (model.vocabulary.categories, model.vocabulary.scalars)
+
+
+def test_means_that_no_quantity_has_are_rejected(tmp_path):
+    vocabulary = {"categories": {}, "scalars": {"height": [1e300, 0.1]}}
+    header = json.dumps({"__metadata__": {"architecture": json.dumps({"vocabulary": vocabulary})}}).encode()
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(len(header).to_bytes(8, "little") + header)
+    with pytest.raises(ValueError, match=r"a\.safetensors is damaged"):
+        read_vocabulary(path)
 
 
 DAMAGED = [b"", b"PK\x03\x04", b"\xff" * 64, b"\x02" + bytes(7) + b"{}", b"\x09" + bytes(7) + b"{"]

@@ -82,11 +82,7 @@ def used(tree: ast.AST) -> Iterator[str]:
             yield dotted(node.func)
             if isinstance(node.func, ast.Attribute) and node.func.attr == "unlink" and not node.args:
                 yield "unlink"  # of a path: Blender's collections unlink an argument
-            if isinstance(node.func, ast.Attribute) and node.func.attr in (
-                "read_text",
-                "read_bytes",
-                "load_state_dict",
-            ):
+            if isinstance(node.func, ast.Attribute) and node.func.attr in _METHODS:
                 yield node.func.attr
             if re.fullmatch(r"(\w+\.)+resolve", dotted(node.func)):
                 yield "resolve"  # not Path(__file__).resolve()

@@ -30,7 +30,7 @@ from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import JsonError, parse_json
 from primdiffusion.formats.regular_files import TooLargeError, open_regular
 from primdiffusion.formats.whole_files import write_atomically
-from primdiffusion.geometry.records import TensorRecord, check_shapes
+from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
 
@@ -202,19 +202,19 @@ def _released_model(
     network.load_state_dict(weights, assign=True)
     network.eval().requires_grad_(False)
     body_setup = stored_body_setup(tensors, architecture["body"], folder)
+    if tensors["stand.betas"].shape != (BETAS,):
+        raise RuntimeError(f"betas have shape {tuple(tensors['stand.betas'].shape)}, not ({BETAS},)")
     fixed_betas = (
         torch.zeros(BETAS, 0),
         tensors["stand.betas"],
         torch.zeros(BETAS, BETAS),
         torch.full((BETAS,), LARGEST_BETA),
     )
-    shapes = ShapePrior(*fixed_betas)
-    check_shapes(shapes)
     return DiffusionModel(
         denoiser=network,
         schedule=SCHEDULES[architecture["schedule"]](),
         codec=ReleasedSlab(),
-        shapes=shapes,
+        shapes=ShapePrior(*fixed_betas),
         full_density=float(architecture["full_density"]),
         card=card,
         chain=CHAINS[architecture["chain"]],

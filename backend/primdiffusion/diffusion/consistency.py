@@ -11,15 +11,12 @@ from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.geometry.records import check_shapes
 from primdiffusion.primitives.primitives import GRID, K
 
-LARGEST_COSINE = 1.01
-"""Of an orthonormal row, rounded to half precision."""
+LARGEST_ENTRY = 1.01
+"""Of a row of length 1, rounded to half precision."""
 
 
 def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, vocabulary: AttributeVocabulary) -> None:
-    """Raise ValueError unless codec and prior have the same latents, of our grid, and body shapes depend on them alone.
-
-    Attributes have as many values as the parts of the prior.
-    """
+    """Raise ValueError unless codec, prior, body shapes and vocabulary have the sizes and values of one model."""
     latents = (len(codec.basis), GRID, GRID)
     if latents != tuple(prior.mean.shape):
         raise ValueError(f"codec latents are {latents}, the network expects {tuple(prior.mean.shape)}")
@@ -52,12 +49,12 @@ def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:
     if bool((shapes.limit > LARGEST_BETA).any()):
         raise ValueError(f"body shapes may have betas over {LARGEST_BETA:g}")
     for name, rows in (("basis", prior.basis), ("axes", prior.axes)):
-        if bool((rows.abs() > LARGEST_COSINE).any()):
+        if bool((rows.abs() > LARGEST_ENTRY).any()):
             raise ValueError(f"{name} has rows longer than 1")
 
 
 def _check_cells(codec: LinearCodec) -> None:
-    if not bool((codec.weight > 0).all()) or bool((codec.basis.abs() > LARGEST_COSINE).any()):
+    if not bool((codec.weight > 0).all()) or bool((codec.basis.abs() > LARGEST_ENTRY).any()):
         raise ValueError("a weight of the codec is not positive, or its basis has rows longer than 1")
     if tuple(codec.mean.shape) != (K, VALUES):
         raise ValueError(f"mean has shape {tuple(codec.mean.shape)}, not {K} x {VALUES}")

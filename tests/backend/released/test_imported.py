@@ -208,6 +208,9 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
     safetensors.torch.save_file(moved, path, metadata)
     with pytest.raises(BodySetupError, match="anchors"):
         load_checkpoint(path)
+    safetensors.torch.save_file({**tensors, "stand.betas": torch.zeros(9)}, path, metadata)
+    with pytest.raises(CheckpointError, match=r"imported\.safetensors.*betas have shape \(9,\)"):
+        load_checkpoint(path)
     del tensors["denoiser.time_embed.0.bias"]
     safetensors.torch.save_file(tensors, path, metadata)
     with pytest.raises(CheckpointError, match=r"time_embed\.0\.bias"):
