@@ -31,7 +31,9 @@ def tiny_model(local: LocalUNetConfig | None = None) -> DiffusionModel:
     basis[torch.arange(CHANNELS), torch.arange(CHANNELS)] = S**-1.5
     values = torch.cat([voxels.flatten(), torch.full((3,), SCALE_VALUE)])
     basis = torch.nn.functional.pad(basis.flatten(1), (0, 3))
-    codec = LinearCodec(values.expand(K, -1).contiguous(), basis, torch.ones(CHANNELS))
+    codec = LinearCodec(
+        values.expand(K, -1).contiguous(), basis[None], torch.ones(1, CHANNELS), torch.zeros(K, dtype=torch.int64)
+    )
     person = torch.zeros(COMPONENTS, CHANNELS, GRID * GRID)
     person[torch.arange(COMPONENTS), torch.arange(COMPONENTS)] = 1 / GRID
     prior = PersonPrior(

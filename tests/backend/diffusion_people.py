@@ -68,7 +68,7 @@ def small_model(seed: int = 0, scale: float = 3.0) -> DiffusionModel:
     basis = torch.linalg.qr(basis.T)[0].T.contiguous()
     mean = torch.full((K, VALUES), 0.5)
     mean[:, -3:] = SCALE_VALUE
-    codec = LinearCodec(mean, basis, torch.ones(CHANNELS))
+    codec = LinearCodec(mean, basis[None], torch.ones(1, CHANNELS), torch.zeros(K, dtype=torch.int64))
     shapes = ShapePrior(torch.randn(10, 3), torch.zeros(10), torch.eye(10), torch.full((10,), 2.5))
     return DiffusionModel(
         denoiser.requires_grad_(False),

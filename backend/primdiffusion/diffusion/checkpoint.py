@@ -33,6 +33,7 @@ from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
+from primdiffusion.primitives.primitives import K
 
 FORMAT = "primdiffusion-checkpoint"
 RELEASED = "released"
@@ -179,17 +180,25 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
 
 def _cell_codec(tensors: Mapping[str, Tensor], detail: Mapping[str, Any] | None) -> CellCodec:
     """The codec of latents, with its detail decoder if the checkpoint has one."""
-    codec = LinearCodec(**under(tensors, "codec."))
+    codec = _linear_codec(under(tensors, "codec."))
     if detail is None:
         return CellCodec(codec)
-    fine = FineCodec(LinearCodec(**under(tensors, "fine.")), tensors["back"])
+    fine = FineCodec(_linear_codec(under(tensors, "fine.")), tensors["back"])
     check_fine(fine, codec)
     config = DetailConfig(**{**detail, "widths": tuple(detail["widths"])})
     decoder = tensor_file.load_network(
-        lambda: DetailDecoder(len(codec.basis), len(fine.codec.basis), config), under(tensors, "detail.")
+        lambda: DetailDecoder(codec.channels, fine.codec.channels, config), under(tensors, "detail.")
     )
     decoder.eval().requires_grad_(False)
     return DetailCodec(codec, fine, decoder)
+
+
+def _linear_codec(tensors: Mapping[str, Tensor]) -> LinearCodec:
+    """A codec; files older than `region` have one basis for all primitives."""
+    if "region" not in tensors:
+        one = {key: tensors[key][None] for key in ("basis", "parity")}
+        tensors = {**tensors, **one, "region": torch.zeros(K)}
+    return LinearCodec(**{**tensors, "region": tensors["region"].long()})
 
 
 def _released_model(

@@ -2,8 +2,9 @@
 
 The linear codec is the first and last layer of slab diffusion, in closed form, orthonormal and frozen. A primitive's
 4 x 8^3 values (sRGB-encoded colour, density / full density; the slab's values, SPEC 3) and its delta scale become C
-numbers in one basis that all primitives share. Noise of the slab projected on orthonormal rows is standard normal
-again, and nothing outside the basis feeds back, so diffusing latents is diffusing the slab with these two layers fixed.
+numbers in a basis that all primitives of a region share: what varies at the head differs from what varies at a leg.
+Noise of the slab projected on orthonormal rows is standard normal again, and nothing outside the basis feeds back, so
+diffusing latents is diffusing the slab with these two layers fixed.
 The slab repeats a delta scale over 8^3 voxels; here it is one number of the same energy.
 """
 
@@ -11,14 +12,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Sequence
 from typing import Protocol
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.primitives.anchors import CHARTS, default_anchors
 from primdiffusion.primitives.primitives import GRID, WINDOW_POWER, WINDOW_SHARPNESS, K, Payload, S
 from primdiffusion.primitives.slab import CHANNELS_PER_LAYER, DELTA_SCALE_UNIT, NETWORK_SCALE, pack, unpack
 
@@ -49,10 +52,12 @@ class LinearCodec(TensorRecord):
 
     mean: Float[Tensor, "k v"]
     """Mean values of every primitive; equal to its own mirror image."""
-    basis: Float[Tensor, "c v"]
-    """Orthonormal rows, each even or odd under the mirror of a cell."""
-    parity: Float[Tensor, "c"]
+    basis: Float[Tensor, "b c v"]
+    """Orthonormal rows of each region's basis, each row even or odd under the mirror of a cell."""
+    parity: Float[Tensor, "b c"]
     """1 for even rows, -1 for odd ones."""
+    region: Int[Tensor, "k"]
+    """Index of the basis of every primitive; equal to its own mirror image."""
     weight: Float[Tensor, "v"] = dataclasses.field(default_factory=lambda: torch.ones(VALUES))
     """How visible each value is in a picture; equal to its own mirror image."""
     dead_zone: Float[Tensor, "2"] = dataclasses.field(default_factory=lambda: torch.tensor(DEAD_ZONE))
@@ -64,21 +69,38 @@ class LinearCodec(TensorRecord):
         start, width = self.dead_zone.tolist()
         return start, width
 
+    @property
+    def channels(self) -> int:
+        """C, the latent channels of a primitive."""
+        return self.basis.shape[1]
+
     def encode(self, cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b c 32 32"]:
-        """Project cells onto the basis; the remainder is lost."""
-        latents = (cells - self.mean) @ (self.basis * self.weight).T * SLAB_UNIT
+        """Project cells onto the bases of their regions; the remainder is lost."""
+        values = (cells - self.mean) * self.weight
+        latents = values.new_empty((*values.shape[:-1], self.channels))
+        for basis, members in zip(self.basis, self._members(), strict=True):
+            latents[..., members, :] = values[..., members, :] @ basis.T * SLAB_UNIT
         return latents.transpose(-1, -2).unflatten(-1, (GRID, GRID))
 
     def decode(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b k v"]:
         """Cells of latents, unclamped."""
-        return latents.flatten(-2).transpose(-1, -2) @ (self.basis / self.weight) / SLAB_UNIT + self.mean
+        coefficients = latents.flatten(-2).transpose(-1, -2) / SLAB_UNIT
+        values = coefficients.new_empty((*coefficients.shape[:-1], VALUES))
+        for basis, members in zip(self.basis, self._members(), strict=True):
+            values[..., members, :] = coefficients[..., members, :] @ basis
+        return values / self.weight + self.mean
 
     def mirror(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b c 32 32"]:
         """Mirror a person: columns reversed, each cell reversed along W (the layout is symmetric).
 
         Accepts the leading channels alone.
         """
-        return latents.flip(-1) * self.parity[: latents.shape[-3], None, None]
+        parity = self.parity[self.region].T.unflatten(-1, (GRID, GRID))
+        return latents.flip(-1) * parity[: latents.shape[-3]]
+
+    def _members(self) -> list[Int[Tensor, "m"]]:
+        """The primitives of each basis."""
+        return [(self.region == number).nonzero()[:, 0] for number in range(len(self.basis))]
 
 
 def cells_from_voxels(
@@ -125,9 +147,10 @@ def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:
 def fit_codec(
     cells: Float[Tensor, "n k v"], channels: int, generator: torch.Generator, cells_each: int = 512
 ) -> LinearCodec:
-    """Fit each cell's mean, and shared principal components of `cells_each` random cells a sample and their mirrors.
+    """Fit each cell's mean, and the principal components of each region in `cells_each` random cells a sample.
 
-    Values are weighted by the marcher's window, so invisible values take no component.
+    Regions are the parts of `codec_regions`. Mirror images count too. Values are weighted by the marcher's window, so
+    invisible values take no component.
 
     Raises ValueError for fewer samples than channels.
     """
@@ -137,12 +160,33 @@ def fit_codec(
         )
     mean = cells.mean(0)
     mean = ((mean + mirror_cells(mean)) / 2).half().float()  # stored in half precision: encode with what is stored
-    weight = window_weight()
-    moments = [torch.zeros(count, count, dtype=torch.float64) for count in (VOXEL_VALUES // 2 + 3, VOXEL_VALUES // 2)]
+    weight, region = window_weight(), codec_regions()
+    count = int(region.max()) + 1
+    moments = [
+        [torch.zeros(half, half, dtype=torch.float64) for half in (VOXEL_VALUES // 2 + 3, VOXEL_VALUES // 2)]
+        for _ in range(count)
+    ]
     for person in cells:
         chosen = torch.randperm(K, generator=generator)[:cells_each]
-        for moment, part in zip(moments, _parity_parts((person[chosen] - mean[chosen]) * weight), strict=True):
-            moment += (part.T @ part).double()
+        for number in range(count):
+            members = chosen[region[chosen] == number]
+            parts = _parity_parts((person[members] - mean[members]) * weight)
+            for moment, part in zip(moments[number], parts, strict=True):
+                moment += (part.T @ part).double()
+    bases, parities = zip(*(_components(each, channels) for each in moments), strict=True)
+    return LinearCodec(mean, torch.stack(bases), torch.stack(parities), region, weight, torch.tensor(FITTED_DEAD_ZONE))
+
+
+@functools.cache
+def codec_regions() -> Int[Tensor, "k"]:
+    """The region of every primitive: torso, head, arms, hands, legs or feet; left and right are one."""
+    parts = [name.removeprefix("left_").removeprefix("right_") for name in CHARTS]
+    names = list(dict.fromkeys(parts))
+    return torch.tensor([names.index(part) for part in parts])[default_anchors().chart.long()]
+
+
+def _components(moments: Sequence[Float[Tensor, "h h"]], channels: int) -> tuple[Tensor, Tensor]:
+    """Leading components [channels, v] of second moments of `_parity_parts`, and their parities."""
     variances, rows, parity = [], [], []
     for sign, moment in zip((1.0, -1.0), moments, strict=True):
         value, vector = torch.linalg.eigh(moment)
@@ -150,8 +194,7 @@ def fit_codec(
         rows.append(_whole(vector.T.float(), sign))
         parity.append(torch.full_like(value, sign))
     order = torch.cat(variances).argsort(descending=True)[:channels]
-    basis, parity = torch.cat(rows)[order], torch.cat(parity)[order].float()
-    return LinearCodec(mean, basis.contiguous(), parity, weight, torch.tensor(FITTED_DEAD_ZONE))
+    return torch.cat(rows)[order], torch.cat(parity)[order].float()
 
 
 @functools.cache
@@ -213,7 +256,7 @@ class CellCodec:
     @property
     def shape(self) -> tuple[int, int, int]:
         """[C, 32, 32]."""
-        return self.codec.basis.shape[0], GRID, GRID
+        return self.codec.channels, GRID, GRID
 
     def to_payload(self, x0: Float[Tensor, "*b c h w"], full_density: float) -> Payload:
         """Decode; clamped, with the dead zone applied."""

@@ -17,7 +17,7 @@ LARGEST_ENTRY = 1.01
 
 def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, vocabulary: AttributeVocabulary) -> None:
     """Raise ValueError unless codec, prior, body shapes and vocabulary have the sizes and values of one model."""
-    latents = (len(codec.basis), GRID, GRID)
+    latents = (codec.channels, GRID, GRID)
     if latents != tuple(prior.mean.shape):
         raise ValueError(f"codec latents are {latents}, the network expects {tuple(prior.mean.shape)}")
     check_shapes(codec, prior)
@@ -37,7 +37,7 @@ def check_fine(fine: FineCodec, codec: LinearCodec) -> None:
     """Raise ValueError unless the codec of a detail decoder leads back to the latents of `codec`."""
     check_shapes(fine.codec)
     _check_cells(fine.codec)
-    channels = len(codec.basis)
+    channels = codec.channels
     if tuple(fine.back.shape) != (channels, channels):
         raise ValueError(f"back has shape {tuple(fine.back.shape)}, not {channels} x {channels}")
 
@@ -56,5 +56,7 @@ def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:
 def _check_cells(codec: LinearCodec) -> None:
     if not bool((codec.weight > 0).all()) or bool((codec.basis.abs() > LARGEST_ENTRY).any()):
         raise ValueError("a weight of the codec is not positive, or its basis has rows longer than 1")
+    if codec.region.shape != (K,) or not bool(((codec.region >= 0) & (codec.region < len(codec.basis))).all()):
+        raise ValueError(f"regions of the codec are not {K} numbers below {len(codec.basis)}")
     if tuple(codec.mean.shape) != (K, VALUES):
         raise ValueError(f"mean has shape {tuple(codec.mean.shape)}, not {K} x {VALUES}")

@@ -64,9 +64,22 @@ def test_a_codec_of_before_weights_is_read_as_it_was(path):
     assert codec.dead_zone.tolist() == pytest.approx(DEAD_ZONE)
 
 
+def test_a_codec_of_before_regions_has_one_basis(path):
+    codec = load_checkpoint(path).codec.codec
+
+    def one_basis(tensors):
+        kept = {k: v[0].contiguous() if k in ("codec.basis", "codec.parity") else v for k, v in tensors.items()}
+        return {k: v for k, v in kept.items() if k != "codec.region"}
+
+    rewrite(path, one_basis)
+    older = load_checkpoint(path).codec.codec
+    latents = torch.randn(1, codec.channels, 32, 32)
+    assert torch.equal(older.decode(latents), codec.decode(latents))
+
+
 def test_a_codec_of_another_network_is_named(path):
     def narrow(tensors):
-        return {k: v[:-1].contiguous() if k in ("codec.basis", "codec.parity") else v for k, v in tensors.items()}
+        return {k: v[:, :-1].contiguous() if k in ("codec.basis", "codec.parity") else v for k, v in tensors.items()}
 
     rewrite(path, narrow)
     with pytest.raises(CheckpointError, match=r"\(3, 32, 32\).*\(4, 32, 32\)"):

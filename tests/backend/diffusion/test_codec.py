@@ -1,5 +1,6 @@
 import dataclasses
 
+import numpy as np
 import pytest
 import torch
 from primdiffusion.diffusion.codec import (
@@ -12,7 +13,7 @@ from primdiffusion.diffusion.codec import (
     mirror_cells,
     payload_from_cells,
 )
-from primdiffusion.primitives.anchors import attach, default_anchors
+from primdiffusion.primitives.anchors import CHARTS, attach, default_anchors
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
 from primdiffusion.primitives.slab import pack
 
@@ -37,9 +38,19 @@ def codec(cells):
 
 
 def test_basis_is_orthonormal_so_projected_noise_is_standard(codec):
-    assert torch.allclose(codec.basis @ codec.basis.T, torch.eye(16), atol=1e-5)
-    projected = torch.randn(4000, VALUES, generator=torch.Generator().manual_seed(2)) @ codec.basis.T
-    assert (torch.cov(projected.T) - torch.eye(16)).abs().max() < 0.1
+    noise = torch.randn(4000, VALUES, generator=torch.Generator().manual_seed(2))
+    for basis in codec.basis:
+        assert torch.allclose(basis @ basis.T, torch.eye(16), atol=1e-5)
+        assert (torch.cov((noise @ basis.T).T) - torch.eye(16)).abs().max() < 0.1
+
+
+def test_each_region_of_the_body_has_a_basis_that_its_mirror_image_shares(codec):
+    names = np.array(CHARTS)[default_anchors().chart]
+    parts = np.char.replace(np.char.replace(names, "left_", ""), "right_", "")
+    assert len(codec.basis) == len(set(parts)) == 6
+    for part in set(parts):
+        assert len(set(codec.region[torch.from_numpy(parts == part)].tolist())) == 1
+    assert torch.equal(codec.region.unflatten(0, (GRID, GRID)).flip(1).flatten(), codec.region)
 
 
 def test_what_the_basis_spans_survives_the_round_trip(codec):
@@ -79,7 +90,7 @@ def test_mirroring_latents_mirrors_cells(codec):
     latents = torch.randn(1, 16, GRID, GRID, generator=torch.Generator().manual_seed(4))
     assert torch.allclose(codec.decode(codec.mirror(latents)), mirror_cells(codec.decode(latents)), atol=1e-4)
     assert torch.equal(codec.mirror(codec.mirror(latents)), latents)
-    assert set(codec.parity.tolist()) == {1.0, -1.0}
+    assert set(codec.parity.flatten().tolist()) == {1.0, -1.0}
 
 
 def test_mirrored_cells_lie_where_the_default_layout_mirrors_them(default_body):
