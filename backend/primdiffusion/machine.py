@@ -81,6 +81,20 @@ def best_device() -> torch.device:
     return torch.device(name)
 
 
+def has_fast_bfloat16(device: torch.device) -> bool:
+    """Whether the device multiplies bfloat16 faster than float32.
+
+    A processor without instructions for it takes three times as long; so do those of which torch before 2.8 tells
+    nothing. Graphics cards always count as faster.
+    """
+    import torch  # late: `memory` does not need it
+
+    if device.type != "cpu":
+        return True
+    capabilities = getattr(torch.cpu, "get_capabilities", dict)()
+    return any(capabilities.get(name, False) for name in ("avx512_bf16", "amx_bf16", "bf16", "sve_bf16"))
+
+
 def device_info(device: torch.device) -> dict[str, Any]:
     """Name and memory of the device, for `hello` and the panel; None for the CPU's memory."""
     import torch  # late: `memory` does not need it

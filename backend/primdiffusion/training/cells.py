@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from primdiffusion import tensor_file
+from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
@@ -19,6 +20,7 @@ from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.machine import has_fast_bfloat16
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
@@ -41,14 +43,27 @@ class Prepared:
     full_density: float
 
 
-def prepare(config: TrainingConfig, people: PersonDataset, train: Sequence[int], held: Sequence[int]) -> Prepared:
+def prepare(
+    config: TrainingConfig,
+    people: PersonDataset,
+    train: Sequence[int],
+    held: Sequence[int],
+    base: DiffusionModel | None = None,
+) -> Prepared:
     """Return codec, latents, prior and shape prior of a run; loaded from the run folder if they are saved there.
 
-    Raises ValueError for a person's file, or prepared ones, that are damaged; OSError.
+    With a `base` (`load_base`) all but the latents are those of that model.
+
+    Raises ValueError for a person's file, or prepared ones, that are damaged, and for people of another full density
+    than those of `base`; OSError.
     """
     path = config.run / PREPARED
     if path.exists():
         return _load_prepared(path)
+    if base is not None:
+        prepared = _prepared_with(base, people, train, held)
+        _save_prepared(path, prepared)
+        return prepared
     generator = torch.Generator().manual_seed(config.seed)
     vocabulary = vocabulary_of(each for index in train for each in people.known(index))
     codec = fit_codec_to(people, train, config.codec, generator)
@@ -60,16 +75,46 @@ def prepare(config: TrainingConfig, people: PersonDataset, train: Sequence[int],
     return prepared
 
 
-class CellTrainee:
-    """Trains a `PersonDenoiser`: first its network over person components, then the one over the grid."""
+def load_base(path: Path) -> DiffusionModel:
+    """Load a checkpoint to go on from. Raises ValueError unless it is of the default preset; FileNotFoundError."""
+    model = load_checkpoint(path)
+    if not isinstance(model.denoiser, PersonDenoiser):
+        raise ValueError(f"{path} is no checkpoint of the default preset: give another --start-from")
+    return model
 
-    def __init__(self, config: TrainingConfig, prepared: Prepared, device: torch.device) -> None:
+
+def _prepared_with(base: DiffusionModel, people: PersonDataset, train: Sequence[int], held: Sequence[int]) -> Prepared:
+    assert isinstance(base.codec, CellCodec)
+    assert isinstance(base.denoiser, PersonDenoiser)
+    if people.full_density != base.full_density:
+        raise ValueError(
+            f"humans with a full density of {people.full_density:g} cannot go on from a checkpoint of "
+            f"{base.full_density:g}: make them with `primdiffusion payloads`"
+        )
+    codec, vocabulary = base.codec.codec, base.vocabulary
+    latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
+    return Prepared(latents, unseen, codec, base.denoiser.prior, base.shapes, vocabulary, people.full_density)
+
+
+class CellTrainee:
+    """Trains a `PersonDenoiser`: first its network over person components, then the one over the grid.
+
+    The networks start with the weights of `base` if it is given.
+    """
+
+    def __init__(
+        self, config: TrainingConfig, prepared: Prepared, device: torch.device, base: DiffusionModel | None = None
+    ) -> None:
         torch.manual_seed(config.seed)
         self.config, self.device = config, device
         self.codec, self.shapes = prepared.codec.to(device), prepared.shapes.to(device)
         self.train, self.held = prepared.train.to(device), prepared.held.to(device)
         self.vocabulary, self.full_density = prepared.vocabulary, prepared.full_density
-        self.denoiser = PersonDenoiser(config.model, prepared.prior, SCHEDULES[str(config.schedule)]())
+        schedule = SCHEDULES[str(config.schedule)]()
+        sizes = config.model if base is None else base.denoiser.config
+        self.denoiser = PersonDenoiser(sizes, prepared.prior, schedule)
+        if base is not None:
+            self.denoiser.load_state_dict(base.denoiser.state_dict())
         self.denoiser.eval().requires_grad_(False).to(device)
         phases = {"person": config.person, "local": config.local}
         self.phases: Mapping[str, PhaseConfig] = {
@@ -84,7 +129,8 @@ class CellTrainee:
     def put(self, name: str, network: nn.Module) -> None:
         """Install a network, in the precision of its phase."""
         setattr(self.denoiser, name, network)
-        self.denoiser.network_dtype = torch.bfloat16 if self.phases[name].bfloat16 else torch.float32
+        fast = self.phases[name].bfloat16 and has_fast_bfloat16(self.device)
+        self.denoiser.network_dtype = torch.bfloat16 if fast else torch.float32
 
     def loss(self, name: str, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""

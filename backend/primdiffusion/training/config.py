@@ -78,7 +78,7 @@ class PhaseConfig:
     evaluate_every: int = 500
     """Steps between evaluations on held-out people."""
     bfloat16: bool = False
-    """Run the network in bfloat16 if the device is faster with it."""
+    """Run the network in bfloat16 where the device multiplies it faster than float32."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values out of range."""
@@ -143,11 +143,14 @@ class TrainingConfig(RunSettings):
     chain: Literal["trailing", "dense"] | None = None
     """Timesteps in sampling: trailing (evenly spaced; for the paper preset) or dense (denser at low noise; for the
     default preset)."""
+    start_from: Path | None = None
+    """Checkpoint of the default preset to go on from in a new run: its codec, closed form, attributes and sizes of
+    networks are kept, and the networks start with its weights."""
     codec: CodecConfig = dataclasses.field(default_factory=CodecConfig)
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
     person: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=8000, batch=256, evaluate_every=1000)
+        default_factory=lambda: PhaseConfig(steps=8000, batch=256, evaluate_every=1000, bfloat16=True)
     )
     """The default preset's network over person components, trained first."""
     local: PhaseConfig = dataclasses.field(
@@ -175,6 +178,8 @@ class TrainingConfig(RunSettings):
         super().__post_init__()
         if self.preset == "paper" and self.slab.weighting == "whitened":
             raise ValueError("slab.weighting is whitened, for which slabs have no closed form: choose plain or min_snr")
+        if self.preset == "paper" and self.start_from is not None:
+            raise ValueError("start_from is for the default preset: leave it out, or give --preset default")
 
 
 def _check(name: str, value: object, fits: bool, wanted: str) -> None:

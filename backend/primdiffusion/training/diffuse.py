@@ -12,11 +12,11 @@ import tyro
 from accelerate import Accelerator, PartialState
 
 from primdiffusion import __version__
-from primdiffusion.diffusion.checkpoint import save_checkpoint
+from primdiffusion.diffusion.checkpoint import file_hash, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.machine import device_info
-from primdiffusion.training.cells import CellTrainee, prepare
+from primdiffusion.training.cells import CellTrainee, load_base, prepare
 from primdiffusion.training.config import TrainingConfig
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.phase import state_path, train_phase
@@ -98,7 +98,8 @@ def _trainee(
 ) -> CellTrainee | SlabTrainee:
     if config.preset == "paper":
         return SlabTrainee(config, people, chosen, held, accelerator.device)
-    return CellTrainee(config, prepare(config, people, chosen, held), accelerator.device)
+    base = None if config.start_from is None else load_base(config.start_from)
+    return CellTrainee(config, prepare(config, people, chosen, held, base), accelerator.device, base)
 
 
 def _card(
@@ -129,6 +130,8 @@ def _card(
         "weighting": {name: trainee.phases[name].weighting for name in states},
         "parameters": sum(p.numel() for state in states.values() for p in state.network.parameters()),
     }
+    if config.start_from is not None:
+        card |= {"started_from": file_hash(config.start_from)}
     if config.made_of == "makehuman":
         card |= {"licence": "CC0-1.0", "data": DATA, "limits": _limits(config)}
     if isinstance(trainee, SlabTrainee):

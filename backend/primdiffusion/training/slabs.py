@@ -13,6 +13,7 @@ from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet
+from primdiffusion.machine import has_fast_bfloat16
 from primdiffusion.primitives.slab import pack
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.losses import level_weight, random_steps, x0_errors
@@ -85,5 +86,6 @@ class SlabTrainee:
         return DiffusionModel(self.denoiser, self.schedule, WholeSlab(), STANDARD_SHAPES, density, {}, chain=self.chain)
 
     def _guess(self, x: Float[Tensor, "b 56 256 256"], t: Tensor) -> Float[Tensor, "b 56 256 256"]:
-        with torch.autocast(x.device.type, torch.bfloat16, enabled=self.config.bfloat16):
+        fast = self.config.bfloat16 and has_fast_bfloat16(x.device)
+        with torch.autocast(x.device.type, torch.bfloat16, enabled=fast):
             return self.denoiser(x, t).float()

@@ -19,8 +19,8 @@ from PIL import Image
 from primdiffusion.diffusion.checkpoint import load_checkpoint, model_card
 from primdiffusion.failures import describe
 from primdiffusion.human import generate
-from primdiffusion.training import phase
-from primdiffusion.training.cells import CellTrainee
+from primdiffusion.training import phase, slabs
+from primdiffusion.training.cells import CellTrainee, prepare
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.diffuse import MODEL, train
 from primdiffusion.training.losses import LEVELS
@@ -169,6 +169,28 @@ def test_a_run_in_parts_is_bit_identical_to_one_in_one_go(people, whole, run, mo
     assert starts[:2] == [{}, {"person": 2}]
 
 
+def test_a_new_run_starts_from_a_checkpoints_closed_form_and_weights(people, whole, tmp_path):
+    base = load_checkpoint(whole / MODEL)
+    config = settings(people, tmp_path / "run", start_from=whole / MODEL, person=PhaseConfig(steps=1, batch=4))
+    folder = PersonFolder(people)
+    trainee = CellTrainee(config, prepare(config, folder, [0, 1], [2], base), torch.device("cpu"), base)
+    for name, value in trainee.denoiser.state_dict().items():
+        assert torch.equal(value, base.denoiser.state_dict()[name]), name
+    assert torch.equal(trainee.codec.basis, base.codec.codec.basis)
+    assert trainee.vocabulary == base.vocabulary
+    model = train(config)
+    assert model.card["started_from"] == base.card["sha256"]
+    assert torch.equal(model.denoiser.prior.basis, base.denoiser.prior.basis)
+
+
+def test_a_checkpoint_of_other_slabs_or_densities_is_no_start(people, few, paper, whole, tmp_path):
+    with pytest.raises(ValueError, match="no checkpoint of the default preset"):
+        train(settings(people, tmp_path / "run", start_from=paper / MODEL))
+    denser = dataclasses.replace(load_checkpoint(whole / MODEL), full_density=1.0)
+    with pytest.raises(ValueError, match="cannot go on from a checkpoint of 1"):
+        prepare(settings(people, tmp_path / "other"), PersonFolder(people), [0, 1], [2], denser)
+
+
 def test_a_kill_in_the_middle_of_a_save_loses_one_interval(people, whole, run):
     died = subprocess.run(
         [sys.executable, "-c", DIES_IN_THE_FIFTH_SAVE, str(people), str(run)],
@@ -302,7 +324,9 @@ def test_an_untrained_paper_network_has_the_loss_of_guessing_nothing(few):
     assert min(energy) - 1e-6 <= loss <= max(energy) + 1e-6
 
 
-def test_bfloat16_computes_the_network_in_it_and_nothing_else(few):
+@pytest.mark.parametrize(("fast", "dtype"), [(True, torch.bfloat16), (False, torch.float32)])
+def test_bfloat16_computes_the_network_in_it_where_that_is_faster(few, monkeypatch, fast, dtype):
+    monkeypatch.setattr(slabs, "has_fast_bfloat16", lambda device: fast)
     config = settings(
         few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=1, weighting="plain", bfloat16=True)
     )
@@ -315,7 +339,7 @@ def test_bfloat16_computes_the_network_in_it_and_nothing_else(few):
 
     trainee.denoiser = network
     loss = trainee.loss("slab", torch.Generator().manual_seed(0))
-    assert seen == [torch.bfloat16]
+    assert seen == [dtype]
     assert loss.dtype == torch.float32
 
 
