@@ -112,9 +112,11 @@ class CellTrainee:
         self.vocabulary, self.full_density = prepared.vocabulary, prepared.full_density
         schedule = SCHEDULES[str(config.schedule)]()
         sizes = config.model if base is None else base.denoiser.config
-        self.denoiser = PersonDenoiser(sizes, prepared.prior, schedule)
-        if base is not None:
-            self.denoiser.load_state_dict(base.denoiser.state_dict())
+
+        def build() -> PersonDenoiser:
+            return PersonDenoiser(sizes, prepared.prior, schedule)
+
+        self.denoiser = build() if base is None else tensor_file.load_network(build, base.denoiser.state_dict())
         self.denoiser.eval().requires_grad_(False).to(device)
         phases = {"person": config.person, "local": config.local}
         self.phases: Mapping[str, PhaseConfig] = {

@@ -6,7 +6,6 @@ import diffuse_runs
 import fit_scenes
 import pytest
 from primdiffusion.formats.whole_files import FolderInUseError, alone_in
-from primdiffusion.training.detail import DetailTrainingConfig, train_detail
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
 
@@ -17,9 +16,8 @@ from primdiffusion.training.fit import fit
     [
         lambda data, run: train(diffuse_runs.settings(data, run)),
         lambda data, run: fit(fit_scenes.settings(data, run)),
-        lambda data, run: train_detail(DetailTrainingConfig(data=data, coarse=data, run=run)),
     ],
-    ids=["train", "fit", "train_detail"],
+    ids=["train", "fit"],
 )
 def test_a_second_run_in_a_folder_is_rejected(tmp_path, start):
     run = tmp_path / "run"
