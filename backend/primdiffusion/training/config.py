@@ -53,6 +53,9 @@ class PhaseConfig:
     """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: int
     """Samples per step, each at a random noise level."""
+    optimiser: Literal["adamw", "muon"] = "adamw"
+    """adamw; or muon, Muon for hidden layers at three times the learning rate, AdamW for the rest. Muon is for the
+    default preset."""
     learning_rate: float = 1e-3
     """Learning rate of AdamW after a warm-up of 100 steps."""
     weight_decay: float = 0.01
@@ -155,7 +158,7 @@ class TrainingConfig(RunSettings):
     """The default preset's network over person components, trained first."""
     local: PhaseConfig = dataclasses.field(
         default_factory=lambda: PhaseConfig(
-            steps=38_000, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True
+            steps=38_000, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True, optimiser="muon"
         )
     )
     """The default preset's network over the grid."""
@@ -178,6 +181,8 @@ class TrainingConfig(RunSettings):
         super().__post_init__()
         if self.preset == "paper" and self.slab.weighting == "whitened":
             raise ValueError("slab.weighting is whitened, for which slabs have no closed form: choose plain or min_snr")
+        if self.preset == "paper" and self.slab.optimiser == "muon":
+            raise ValueError("slab.optimiser is muon, which is for the default preset: choose adamw")
         if self.preset == "paper" and self.start_from is not None:
             raise ValueError("start_from is for the default preset: leave it out, or give --preset default")
 
@@ -214,7 +219,7 @@ MAY_CHANGE = frozenset(
 learning rate's cosine."""
 
 
-_ADDED = {"unet.attention_context": "input"}
+_ADDED = {"unet.attention_context": "input", "slab.optimiser": "adamw"}
 """Settings of the paper preset that earlier runs do not name, and what they were."""
 
 

@@ -26,6 +26,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, generate_batch, place
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.muon import MuonAdamW
 from primdiffusion.training.recorder import Interrupt, Recorder, StepMetrics, StepTimer
 from primdiffusion.training.run_folder import PICTURES, append_metrics
 from primdiffusion.training.state import AcceleratedState, NotFiniteError, agreed
@@ -100,7 +101,7 @@ def train_phase(
         OSError: the disk is full; the last saved state remains.
     """
     phase, path = trainee.phases[name], state_path(config, name)
-    state = AcceleratedState(trainee.network(name).requires_grad_(True), phase, config.seed, accelerator)
+    state = PhaseState(trainee.network(name).requires_grad_(True), phase, config.seed, accelerator)
     if path.exists():
         state.load(path)
     recorder = PhaseRecorder(config, trainee, name, state, tracker) if accelerator.is_main_process else None
@@ -124,6 +125,17 @@ def train_phase(
     accelerator.wait_for_everyone()
     trainee.put(name, state.average)
     return state
+
+
+class PhaseState(AcceleratedState):
+    """State of a phase, with the optimiser of its settings."""
+
+    config: PhaseConfig
+
+    def _optimiser(self) -> torch.optim.Optimizer:
+        if self.config.optimiser == "muon":
+            return MuonAdamW(self.network, self.config.learning_rate, self.config.weight_decay)
+        return super()._optimiser()
 
 
 def step(config: PhaseRun, trainee: Trainee, name: str, state: AcceleratedState) -> StepMetrics:

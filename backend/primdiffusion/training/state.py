@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from primdiffusion import tensor_file
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.machine import best_device
+from primdiffusion.training.muon import BETAS
 
 PATIENCE = datetime.timedelta(hours=3)
 """How long processes wait for the main process, which alone evaluates, renders and prepares data."""
@@ -49,9 +50,7 @@ class TrainingState:
     def __init__(self, network: nn.Module, config: OptimiserConfig, seed: int):
         self.network, self.config = network, config
         self.average = copy.deepcopy(network).eval().requires_grad_(False)
-        self.optimiser = torch.optim.AdamW(
-            self._groups(), lr=config.learning_rate, weight_decay=config.weight_decay, betas=(0.9, 0.99)
-        )
+        self.optimiser = self._optimiser()
         self.generator = torch.Generator().manual_seed(seed)
         self.step, self.seconds = 0, 0.0
         self.place: dict[str, str] = {}
@@ -60,6 +59,11 @@ class TrainingState:
     def _groups(self) -> list[dict[str, object]]:
         """Parameter groups, each with its factor on the configured learning rate."""
         return [{"params": list(self.network.parameters()), "factor": 1.0}]
+
+    def _optimiser(self) -> torch.optim.Optimizer:
+        return torch.optim.AdamW(
+            self._groups(), lr=self.config.learning_rate, weight_decay=self.config.weight_decay, betas=BETAS
+        )
 
     def update(self, loss: Tensor) -> float:
         """Take one optimiser step and update the average; returns the gradient norm.

@@ -1,0 +1,69 @@
+"""Muon for hidden layers beside AdamW for the others."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from primdiffusion.training.config import PhaseConfig
+from primdiffusion.training.phase import PhaseState
+from primdiffusion.training.state import accelerator_of
+from torch import nn
+
+
+class Net(nn.Module):
+    """A convolution between two ends."""
+
+    def __init__(self):
+        super().__init__()
+        self.inner, self.hidden, self.outer = nn.Conv2d(2, 6, 1), nn.Conv2d(6, 6, 3, padding=1), nn.Conv2d(6, 1, 1)
+
+    def forward(self, x):
+        return self.outer(torch.tanh(self.hidden(self.inner(x))))
+
+
+def started(memory_format=torch.channels_last, **settings):
+    torch.manual_seed(3)
+    phase = PhaseConfig(steps=50, batch=4, weight_decay=0.0, optimiser="muon", **settings)
+    return PhaseState(Net().to(memory_format=memory_format), phase, 0, accelerator_of())
+
+
+def advance(state, steps):
+    for _ in range(steps):
+        x = torch.randn(4, 2, 5, 5, generator=state.generator)
+        state.update((state.network(x) - x.sum(1, keepdim=True)).square().mean())
+
+
+@pytest.mark.parametrize("memory_format", [torch.channels_last, torch.contiguous_format])
+def test_the_first_update_of_a_hidden_layer_is_orthogonal_and_of_adamws_size(memory_format):
+    state = started(memory_format, learning_rate=1e-2)
+    before = state.network.hidden.weight.detach().clone()
+    advance(state, 1)
+    change = (state.network.hidden.weight.detach() - before).flatten(1) / 1e-4  # after a warm-up of one in 100 steps
+    singular = torch.linalg.svdvals(change)
+    assert singular.max() / singular.min() < 2.0  # Newton and Schulz come near 1, not to it
+    assert change.square().mean().sqrt() == pytest.approx(3 * 0.2 * 54**0.5 / 54**0.5, rel=0.2)
+
+
+def test_the_loss_falls():
+    state = started(learning_rate=5e-2)
+    x = torch.randn(64, 2, 5, 5, generator=torch.Generator().manual_seed(1))
+
+    def loss():
+        with torch.no_grad():
+            return (state.network(x) - x.sum(1, keepdim=True)).square().mean()
+
+    first = loss()
+    advance(state, 50)
+    assert loss() < 0.5 * first
+
+
+def test_a_saved_state_goes_on_bit_for_bit(tmp_path):
+    whole, part = started(), started()
+    advance(whole, 9)
+    advance(part, 4)
+    part.save(tmp_path / "state")
+    resumed = started()
+    resumed.load(tmp_path / "state")
+    advance(resumed, 5)
+    for a, b in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
+        assert torch.equal(a, b)
