@@ -152,7 +152,19 @@ def dense_steps(length: int, steps: int, power: float = 2.2) -> list[int]:
     return chain
 
 
-CHAINS = {"trailing": trailing_steps, "dense": dense_steps, "released": released_steps}
+def early_steps(length: int, steps: int, last: int = 100) -> list[int]:
+    """Evenly spaced descending t from T-1 to `last`, from which the last step goes to the clean sample at once.
+
+    What is undecided there becomes its mean instead of a draw. A network that has not learned the finest detail draws
+    it as coloured specks; its mean is smooth. With so many steps that they do not fit above `last`, the chain ends
+    lower.
+    """
+    _check_steps(length, steps)
+    lowest = min(last, length - steps)
+    return [round(length - 1 - i * (length - 1 - lowest) / max(1, steps - 1)) for i in range(steps)]
+
+
+CHAINS = {"trailing": trailing_steps, "dense": dense_steps, "early": early_steps, "released": released_steps}
 """Timesteps that a sampler visits, by their name in checkpoints."""
 
 

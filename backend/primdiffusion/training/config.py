@@ -143,9 +143,9 @@ class TrainingConfig(RunSettings):
     schedule: Literal["linear", "sqrt_linear", "fine_linear"] | None = None
     """Noise schedule over 1000 steps: linear (the paper's; for the paper preset), fine_linear (the same with less noise
     at the start; for the default preset) or sqrt_linear (the released code's)."""
-    chain: Literal["trailing", "dense"] | None = None
-    """Timesteps in sampling: trailing (evenly spaced; for the paper preset) or dense (denser at low noise; for the
-    default preset)."""
+    chain: Literal["trailing", "dense", "early"] | None = None
+    """Timesteps in sampling: trailing (evenly spaced; for the paper preset), dense (denser at low noise) or early (down
+    to t = 100, from which the mean is taken; for the default preset)."""
     start_from: Path | None = None
     """Checkpoint of the default preset to go on from in a new run: its codec, closed form, attributes and sizes of
     networks are kept, and the networks start with its weights."""
@@ -174,7 +174,7 @@ class TrainingConfig(RunSettings):
 
     def __post_init__(self) -> None:
         """Fill in the defaults of the preset; raise ValueError for values out of range."""
-        usual = {"default": ("fine_linear", "dense"), "paper": ("linear", "trailing")}[self.preset]
+        usual = {"default": ("fine_linear", "early"), "paper": ("linear", "trailing")}[self.preset]
         for name, value in zip(("schedule", "chain"), usual, strict=True):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)

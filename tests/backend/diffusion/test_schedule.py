@@ -8,6 +8,7 @@ from primdiffusion.diffusion.schedule import (
     CLEAN,
     Schedule,
     dense_steps,
+    early_steps,
     fine_linear,
     leading_steps,
     linear,
@@ -83,6 +84,17 @@ def test_dense_steps_fall_from_the_end_and_lie_closer_the_lower(steps):
         assert gaps[0] > 10 * gaps[-1]
 
 
+@pytest.mark.parametrize("steps", [1, 2, 7, 30, 100, 950, 1000])
+def test_early_steps_are_evenly_spaced_from_the_end_to_a_level_of_noise(steps):
+    chain = early_steps(1000, steps)
+    assert len(chain) == steps
+    assert chain[0] == 999
+    gaps = -np.diff(chain)
+    assert (gaps > 0).all()
+    assert steps == 1 or gaps.max() - gaps.min() <= 1
+    assert chain[-1] == {1: 999, 950: 50, 1000: 0}.get(steps, 100)
+
+
 def test_the_fine_schedule_ends_as_the_paper_s_and_begins_with_less_noise():
     fine, paper = fine_linear(), linear()
     assert fine.noise(0) < 0.2 * paper.noise(0)
@@ -96,6 +108,8 @@ def test_impossible_numbers_of_steps_are_rejected(steps):
         trailing_steps(1000, steps)
     with pytest.raises(ValueError, match=str(steps)):
         dense_steps(1000, steps)
+    with pytest.raises(ValueError, match=str(steps)):
+        early_steps(1000, steps)
 
 
 def test_steps_forward_and_noise_of_a_clean_sample_are_rejected():
