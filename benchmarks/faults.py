@@ -50,6 +50,7 @@ def main() -> None:
     if "fuzz" in arguments.parts:
         began = time.monotonic()
         figures |= tool("tests.fuzz", "--inputs", str(arguments.fuzz_inputs))
+        figures |= tool("tests.fuzz", "--verdicts")
         figures["fuzz_seconds"] = round(time.monotonic() - began, 1)
     if "chaos" in arguments.parts:
         began = time.monotonic()

@@ -60,6 +60,7 @@ def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
     try:
         with np.errstate(over="ignore"):  # infinite numbers are rejected below
             theta = _numbers(pose)
+        reject_matrices(theta)
         theta = body_theta(_frame(_a_row_a_pose(theta), frame))
         move = _frame(_numbers(translation), frame)[:3].copy()
         if len(move) < 3:
@@ -84,6 +85,12 @@ def _numbers(values: Any) -> NDArray[np.float32]:
 
 def _first(content: dict[str, Any], keys: tuple[str, ...], default: Any) -> Any:
     return next((content[key] for key in keys if key in content), default)
+
+
+def reject_matrices(values: NDArray) -> None:
+    """Raise ValueError for rotation matrices [F, n, 3, 3], whose numbers would be taken for those of axis-angle."""
+    if values.ndim == 4:
+        raise ValueError("rotation matrices instead of axis-angle numbers")
 
 
 def body_theta(values: NDArray) -> NDArray:

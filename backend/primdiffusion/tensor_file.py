@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
 import math
 from collections.abc import Callable, Mapping
@@ -10,21 +12,27 @@ from typing import Any, TypeVar
 
 import safetensors.torch
 import torch
-from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import open_regular
+from primdiffusion.formats.regular_files import map_privately, open_regular
+from primdiffusion.formats.tensor_layout import (
+    LENGTH_BYTES,
+    StoredTensor,
+    TensorLayout,
+    TensorLayoutError,
+    check_limits,
+    read_layout,
+)
 
 LARGEST_FILE = 16 * 2**30
-LARGEST_HEADER = 4 * 2**20
-"""Of names, shapes and metadata, bytes: it takes many times as much in memory."""
-MOST_DIMENSIONS = 8
-_KINDS = ("F64", "F32", "F16", "BF16", "I64", "I32", "I16", "I8", "U8", "BOOL")
-_LENGTH = 8
-"""Bytes of the header's length, and what the header is padded to a multiple of."""
+_KINDS = {
+    "F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64,
+    "I32": torch.int32, "I16": torch.int16, "I8": torch.int8, "U8": torch.uint8, "BOOL": torch.bool,
+}  # fmt: skip
+"""torch's types of the dtypes in `formats.tensor_layout`."""
 _MAKERS = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
 _ROOM, _SMALL = 2, 100_000
 """Layers with weight normalisation make their weights twice; networks count and place with small tensors."""
@@ -42,51 +50,76 @@ def read(path: Path, limit: int = LARGEST_FILE) -> tuple[dict[str, Tensor], dict
     FileNotFoundError and other OSErrors.
     """
     file = opened(path, limit)
-    try:
-        tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  no mapping
-    except (SafetensorError, RuntimeError) as error:
-        raise TensorFileError(str(error)[:120]) from error
-    for name, values in tensors.items():
-        if not ((values >= -LARGEST_NUMBER) & (values <= LARGEST_NUMBER)).all():
-            raise TensorFileError(f"{name!r:.60} holds NaN or infinite values, or numbers above {LARGEST_NUMBER:g}")
-    return tensors, file.metadata() or {}
+    return file.finite_tensors(), file.metadata
 
 
 def read_metadata(path: Path, limit: int = LARGEST_FILE) -> dict[str, str]:
     """Return the metadata without reading tensors. Raises as `read`."""
-    header = _header(path, limit)
-    metadata = header.get("__metadata__") or {}
-    if not isinstance(metadata, dict) or not all(isinstance(text, str) for text in metadata.values()):
-        raise TensorFileError("its metadata are no texts")
-    return metadata
-
-
-def opened(path: Path, limit: int = LARGEST_FILE) -> Any:
-    """Open a file for reading parts of its tensors (safetensors' `safe_open`). Raises as `read`."""
-    for name, about in _header(path, limit).items():
-        if name == "__metadata__":
-            continue
-        kind, shape = (about.get("dtype"), about.get("shape")) if isinstance(about, dict) else (None, None)
-        if kind not in _KINDS or not isinstance(shape, list) or len(shape) > MOST_DIMENSIONS:
-            raise TensorFileError(f"{name!r:.40} is {kind!s:.20} of a shape or type that no tensor here has")
-    try:
-        return safe_open(path, framework="pt")
-    except (SafetensorError, MemoryError) as error:
-        raise TensorFileError(str(error)[:120]) from error
-
-
-def _header(path: Path, limit: int) -> dict[str, Any]:
     with open_regular(path, limit) as file:
-        length = int.from_bytes(file.read(_LENGTH), "little")
-        if not 2 <= length <= LARGEST_HEADER:
-            raise TensorFileError(f"its header is not one of 2 bytes to {LARGEST_HEADER // 2**20} MB")
-        text = file.read(length)
-    if len(text) < length:
-        raise TensorFileError("its header is cut short")
-    header = parse_json(text)
-    if not isinstance(header, dict):
-        raise TensorFileError("its header is no object of JSON")
-    return header
+        return _layout(file).metadata
+
+
+def opened(path: Path, limit: int = LARGEST_FILE) -> TensorFile:
+    """Open a file for reading parts of its tensors. Raises as `read`."""
+    with open_regular(path, limit) as file:
+        return TensorFile(file)
+
+
+class TensorFile:
+    """A safetensors file that is mapped into memory; tensors are views of it, and writing to them leaves it as it is.
+
+    Everything is read from the file that was opened, also after another one has taken its name.
+    """
+
+    def __init__(self, file: io.BufferedReader | io.BytesIO) -> None:
+        """Check the header of an open file and map it; the file may be closed. Raises TensorFileError, OSError."""
+        self._layout = _layout(file)
+        self._bytes = map_privately(file)
+        if len(self._bytes) < self._layout.size:
+            raise TensorFileError("it was cut short while it was read")
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """The metadata, empty without any."""
+        return self._layout.metadata
+
+    @property
+    def tensors(self) -> Mapping[str, StoredTensor]:
+        """Type, shape and place of each tensor."""
+        return self._layout.tensors
+
+    def tensor(self, name: str) -> Tensor:
+        """A tensor of the file, of any values. Raises KeyError."""
+        stored = self._layout.tensors[name]
+        kind, size = _KINDS[stored.dtype], stored.end - stored.begin
+        if size == 0:
+            return torch.empty(stored.shape, dtype=kind)
+        begin = self._layout.data_start + stored.begin
+        values = torch.frombuffer(self._bytes, dtype=torch.uint8, count=size, offset=begin)
+        if begin % kind.itemsize:
+            values = values.clone()  # kernels may rely on addresses that are multiples of the size
+        return values.view(kind).reshape(stored.shape)
+
+    def finite_tensors(self) -> dict[str, Tensor]:
+        """All tensors. Raises TensorFileError for numbers that are not finite or above LARGEST_NUMBER."""
+        tensors = {name: self.tensor(name) for name in self._layout.tensors}
+        for name, values in tensors.items():
+            if not ((values >= -LARGEST_NUMBER) & (values <= LARGEST_NUMBER)).all():
+                raise TensorFileError(f"{name!r:.60} holds NaN or infinite values, or numbers above {LARGEST_NUMBER:g}")
+        return tensors
+
+    def sha256(self) -> str:
+        """SHA-256 of the whole file, hexadecimal."""
+        return hashlib.sha256(self._bytes).hexdigest()
+
+
+def _layout(file: io.BufferedReader | io.BytesIO) -> TensorLayout:
+    try:
+        layout = read_layout(file)
+        check_limits(layout)
+    except TensorLayoutError as error:
+        raise TensorFileError(str(error)) from error
+    return layout
 
 
 def save(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> bytes:
@@ -95,13 +128,13 @@ def save(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = Non
     Raises ValueError for tensors that share memory or are not contiguous.
     """
     content = safetensors.torch.save(dict(tensors))
-    end = _LENGTH + int.from_bytes(content[:_LENGTH], "little")
-    entries = parse_json(content[_LENGTH:end].decode())
+    end = LENGTH_BYTES + int.from_bytes(content[:LENGTH_BYTES], "little")
+    entries = parse_json(content[LENGTH_BYTES:end].decode())
     header = {"__metadata__": dict(sorted(metadata.items()))} if metadata else {}
     header |= dict(sorted(entries.items(), key=lambda entry: entry[1]["data_offsets"]))
     text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
-    text += b" " * (-len(text) % _LENGTH)
-    return len(text).to_bytes(_LENGTH, "little") + text + content[end:]
+    text += b" " * (-len(text) % LENGTH_BYTES)
+    return len(text).to_bytes(LENGTH_BYTES, "little") + text + content[end:]
 
 
 def load_network(build: Callable[[], Network], tensors: Mapping[str, Tensor]) -> Network:

@@ -1,8 +1,4 @@
-"""What a checkpoint can be asked for, read from its file without torch.
-
-A safetensors file begins with the length of its header (8 bytes, little-endian) and the header itself: JSON, in which
-`__metadata__` holds strings. The backend writes its vocabulary into one of them.
-"""
+"""What a checkpoint can be asked for, read from its file without torch: the backend writes it into the metadata."""
 
 from __future__ import annotations
 
@@ -11,9 +7,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..formats.json_files import parse_json
-from ..formats.regular_files import open_regular
+from ..formats.regular_files import TooLargeError, open_regular
+from ..formats.tensor_layout import check_limits, read_layout
 
-_LARGEST_FILE, _LONGEST_HEADER = 16 << 30, 4 << 20
+_LARGEST_FILE = 16 << 30
 """Bytes, as in the backend's `tensor_file`."""
 _LARGEST_NUMBER = 1e9
 
@@ -33,15 +30,17 @@ def read_vocabulary(path: Path) -> Vocabulary:
 
     Raises OSError for a file that cannot be read and ValueError for one that is no checkpoint.
     """
-    with open_regular(path, _LARGEST_FILE) as file:
-        length = int.from_bytes(file.read(8), "little")
-        header = file.read(length) if length <= _LONGEST_HEADER else b""
     try:
-        tree = parse_json(parse_json(header)["__metadata__"]["architecture"]).get("vocabulary") or {}
+        with open_regular(path, _LARGEST_FILE) as file:
+            layout = read_layout(file)
+        check_limits(layout)
+        tree = parse_json(layout.metadata["architecture"]).get("vocabulary") or {}
         categories = {name: tuple(map(str, values)) for name, values in tree.get("categories", {}).items()}
         scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree.get("scalars", {}).items()}
         if not all(abs(mean) <= _LARGEST_NUMBER and 0 < std <= _LARGEST_NUMBER for mean, std in scalars.values()):
             raise ValueError("a mean or standard deviation that no quantity has")
+    except TooLargeError:
+        raise
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ValueError(f"{path} is damaged or no checkpoint of a diffusion model: choose another file") from error
     return Vocabulary(categories, scalars)

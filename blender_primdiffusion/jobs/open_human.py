@@ -16,7 +16,7 @@ from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.json_files import parse_json
 from ..places import body_data
 from ..scene.human import LARGEST_BETA, NPZ_FILE, PERSON_FILE
-from ..scene.human_file import payload_in, read_tensors, with_motion, write_tensors
+from ..scene.human_file import HumanTensors, payload_in, read_tensors, with_motion, write_tensors
 from ..scene.human_npz import FORMAT_VERSION
 from ..scene.shape import ShapeModel
 
@@ -34,7 +34,7 @@ def opened(source: Path, folder: Path) -> dict[str, Any] | None:
         return None
     if "body" in human.metadata:
         return None
-    arrays = rest_arrays(source)
+    arrays = arrays_in(human, source.name)
     npz, person = folder / NPZ_FILE, folder / PERSON_FILE
     np.savez(npz, **arrays)
     write_tensors(person, with_motion(human, None))
@@ -46,16 +46,20 @@ def rest_arrays(source: Path) -> dict[str, Any]:
 
     Raises ValueError for a damaged file or a newer one, OSError.
     """
-    human = read_tensors(source)
-    payload, (model, body) = payload_in(human, source.name), default_body()
+    return arrays_in(read_tensors(source), source.name)
+
+
+def arrays_in(human: HumanTensors, name: str) -> dict[str, Any]:
+    """As `rest_arrays`, of a file of this name that was read."""
+    payload, (model, body) = payload_in(human, name), default_body()
     if len(payload.density) != len(model.face):
-        raise ValueError(f"{source.name!r} holds {len(payload.density)} primitives instead of {len(model.face)}")
+        raise ValueError(f"{name!r} holds {len(payload.density)} primitives instead of {len(model.face)}")
     if np.abs(payload.betas).max() > LARGEST_BETA:
-        raise ValueError(f"{source.name!r} is damaged (betas above {LARGEST_BETA}); generate the human again")
+        raise ValueError(f"{name!r} is damaged (betas above {LARGEST_BETA}); generate the human again")
     try:
         parse_json(provenance := human.metadata["provenance"])
     except (KeyError, ValueError) as error:
-        raise ValueError(f"{source.name!r} is damaged (its provenance is no JSON); generate the human again") from error
+        raise ValueError(f"{name!r} is damaged (its provenance is no JSON); generate the human again") from error
     rest = model.rest(payload.betas)
     return {
         "format_version": np.int64(FORMAT_VERSION),

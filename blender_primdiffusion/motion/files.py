@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..formats.arrays import ArrayFileError, array_names, read_arrays, read_npy
 from ..formats.json_files import read_json
 from ..formats.regular_files import TooLargeError
+from ..formats.rotations import first_improper, improper_text
 from ..formats.whole_files import replacing
 from .adjust import axis_direction, axis_name, find_up, turn_y_up
 from .bvh import BvhError, read_bvh
@@ -168,10 +169,12 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
         given = _matrices(_given(arrays, _POSES), path)
         rotations, joints = _rotations(given, path), given.shape[1]
     else:
-        given = _matrices(rest, path)
+        given = _matrices(rest, path, joints_before=1)
         body, joints = _rotations(given, path, joints_before=1), given.shape[1] + 1
         root = _first(arrays, _ROOT)
         if root is not None:
+            if root.ndim == 3 and root.shape[1:] == (3, 3):
+                root = root[:, None]  # a matrix a frame
             first = _matrices(root, path)[:, 0]
             if len(first) not in (1, len(body)):
                 raise MotionFileError(f"{path}: {len(first)} frames of global_orient but {len(body)} of body_pose")
@@ -235,13 +238,16 @@ def _rotations(given: NDArray, path: Path, joints_before: int = 0) -> NDArray[np
     return rotations
 
 
-def _matrices(values: NDArray, path: Path) -> NDArray[np.float64]:
+def _matrices(values: NDArray, path: Path, joints_before: int = 0) -> NDArray[np.float64]:
     """Rotation matrices [F, n, 3, 3] of axis-angle numbers [3 n], [F, 3 n], [F, n, 3], or of matrices [F, n, 3, 3]."""
     values = np.asarray(values, np.float64)
-    if values.ndim in (3, 4) and values.shape[-2:] == (3, 3) and not (values.ndim == 3 and _is_axis_angle(values)):
+    if values.ndim in (3, 4) and values.shape[-2:] == (3, 3):
         given = values if values.ndim == 4 else values[None]
-        if np.abs(given @ np.swapaxes(given, -1, -2) - np.eye(3)).max(initial=0) > 1e-2:
-            raise MotionFileError(f"{path} holds matrices that are no rotations: export the poses again")
+        improper = first_improper(given)
+        if improper is not None:
+            raise MotionFileError(
+                f"{path} holds {improper_text(improper[0], improper[1] + joints_before)}; export the poses again"
+            )
         return nearest(given)
     if values.ndim == 1:
         values = values[None]
@@ -252,11 +258,6 @@ def _matrices(values: NDArray, path: Path) -> NDArray[np.float64]:
             f"{path} holds poses of shape {values.shape}: needed are 72 axis-angle numbers a frame (24 joints x 3)"
         )
     return from_axis_angle(values.reshape(len(values), -1, 3))
-
-
-def _is_axis_angle(values: NDArray) -> bool:
-    """Whether [n, 3, 3] is n frames of 3 joints rather than n matrices."""
-    return bool(np.abs(values @ np.swapaxes(values, -1, -2) - np.eye(3)).max(initial=0) > 0.5)
 
 
 def _first(arrays: Mapping[str, NDArray], keys: Iterable[str]) -> NDArray | None:

@@ -1,13 +1,14 @@
 """.human files: a human as the backend saves it (safetensors), with its current shape and its motion.
 
-The backend reads them as it reads its own files; the motion is stored under additional names (`motion.*`). Safetensors
-files are eight bytes of length, a JSON header, then plain arrays, so numpy is enough to read and write them.
+The backend reads them as it reads its own files; the motion is stored under additional names (`motion.*`). Both find
+tensors in a file by `formats.tensor_layout`; numpy is enough to read and write them.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import io
 import json
 from pathlib import Path
 
@@ -18,12 +19,12 @@ from ..formats import compact_human
 from ..formats.arrays import all_finite, check_shapes
 from ..formats.json_files import parse_json
 from ..formats.regular_files import read_regular
+from ..formats.rotations import first_improper, improper_text
+from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, check_limits, read_layout
 from ..formats.whole_files import written_whole
 from .human import BETA_COUNT, LARGEST_PERSON
 
-_LARGEST_HEADER = 1 << 20
 _METADATA = "__metadata__"
-_DTYPES = {"F64": "<f8", "F32": "<f4", "F16": "<f2", "I64": "<i8", "I32": "<i4", "U8": "|u1", "BF16": "<u2"}
 _MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
 _EIGHT_BIT = ("rgb", "density")
 """Arrays that compact files hold in eight bits."""
@@ -54,33 +55,22 @@ class HumanTensors:
     """The content of a .human file."""
 
     metadata: dict[str, str]
-    arrays: dict[str, tuple[str, tuple[int, ...], bytes]]
-    """Safetensors' dtype, shape and bytes by name."""
+    arrays: dict[str, tuple[str, tuple[int, ...], bytes | memoryview]]
+    """Safetensors' dtype, shape and bytes by name; those of a file that was read are views of its content."""
 
 
 def read_tensors(path: Path) -> HumanTensors:
     """Read a .human file. Raises ValueError for a file of another kind or a damaged one, OSError."""
     data = read_regular(path, LARGEST_PERSON)
-    length = int.from_bytes(data[:8], "little")
     try:
-        if not 2 <= length <= min(_LARGEST_HEADER, len(data) - 8):
-            raise ValueError("it has no header")
-        header = parse_json(data[8 : 8 + length])
-        metadata = header.pop(_METADATA, {})
-        arrays = {}
-        for name, about in header.items():
-            begin, end = about["data_offsets"]
-            if type(begin) is not int or type(end) is not int or not 0 <= begin <= end:
-                raise ValueError(f"{name!r:.40} has no place in it")
-            raw = data[8 + length + begin : 8 + length + end]
-            if len(raw) != end - begin:
-                raise ValueError("it is truncated")
-            arrays[name] = (str(about["dtype"]), tuple(about["shape"]), raw)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        layout = read_layout(io.BytesIO(data))
+        check_limits(layout)
+    except ValueError as error:
         raise ValueError(f"{path.name!r} contains no human ({error!s:.120}); {_REMEDY}") from error
-    if not isinstance(metadata, dict) or metadata.get("format") != "primdiffusion.human":
+    if layout.metadata.get("format") != "primdiffusion.human":
         raise ValueError(f"{path.name!r} contains no human but something else; {_REMEDY}")
-    return HumanTensors(metadata, arrays)
+    arrays = {name: (one.dtype, one.shape, layout.raw(data, name)) for name, one in layout.tensors.items()}
+    return HumanTensors(layout.metadata, arrays)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -144,8 +134,16 @@ def payload_in(human: HumanTensors, name: str) -> HumanPayload:
 @functools.lru_cache(maxsize=64)
 def read_sizes(version: FileVersion) -> HumanPayload:
     """As `read_payload`, without colours and densities (empty arrays); cached."""
-    nothing = np.empty(0, np.float32)
-    return dataclasses.replace(read_payload(version.path), rgb=nothing, density=nothing)
+    payload, nothing = read_payload(version.path), np.empty(0, np.float32)
+    extents = payload.rest_half_extent
+    return dataclasses.replace(
+        payload,
+        rgb=nothing,
+        density=nothing,
+        delta_scale=payload.delta_scale.copy(),  # views would keep the whole file in memory
+        betas=payload.betas.copy(),
+        rest_half_extent=None if extents is None else extents.copy(),
+    )
 
 
 def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> HumanTensors:
@@ -216,6 +214,10 @@ def motion_in(human: HumanTensors, name: str) -> HumanMotion | None:
             raise ValueError(f"the motion in {name!r} is damaged; {_REMEDY}")
     if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
         raise ValueError(f"the motion in {name!r} has frames out of order; {_REMEDY}")
+    improper = first_improper(arrays[1])
+    if improper is not None:
+        frame = f"{arrays[0][improper[0]]:g}"
+        raise ValueError(f"the motion in {name!r} holds {improper_text(frame, improper[1])}; {_REMEDY}")
     return HumanMotion(*arrays, fps)
 
 
@@ -223,23 +225,24 @@ def write_tensors(path: Path, human: HumanTensors) -> None:
     """Write a .human file, which appears whole or not at all. Raises OSError."""
     header: dict[str, object] = {_METADATA: human.metadata}
     offset = 0
-    sizes = {name: np.dtype(_DTYPES.get(dtype, "u1")).itemsize for name, (dtype, _, _) in human.arrays.items()}
+    sizes = {name: np.dtype(DTYPES.get(dtype, "u1")).itemsize for name, (dtype, _, _) in human.arrays.items()}
     ordered = sorted(human.arrays, key=lambda name: (-sizes[name], name))  # widest first, so that all are aligned
     for name in ordered:
         dtype, shape, raw = human.arrays[name]
         header[name] = {"dtype": dtype, "shape": list(shape), "data_offsets": [offset, offset + len(raw)]}
         offset += len(raw)
     text = json.dumps(header, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 8)
+    text += b" " * (-len(text) % LENGTH_BYTES)
     with written_whole(path) as unfinished, unfinished.open("wb") as file:
-        file.write(len(text).to_bytes(8, "little") + text)
+        file.write(len(text).to_bytes(LENGTH_BYTES, "little") + text)
         for name in ordered:
             file.write(human.arrays[name][2])
 
 
-def _stored(array: NDArray[np.float32]) -> tuple[str, tuple[int, ...], bytes]:
+def _stored(array: NDArray[np.float32]) -> tuple[str, tuple[int, ...], bytes | memoryview]:
     return "F32", array.shape, np.ascontiguousarray(array, "<f4").tobytes()
 
 
-def _loaded(dtype: str, shape: tuple[int, ...], raw: bytes) -> NDArray:
-    return np.frombuffer(raw, _DTYPES[dtype]).reshape(shape)
+def _loaded(dtype: str, shape: tuple[int, ...], raw: bytes | memoryview) -> NDArray:
+    """An array as a view of its bytes."""
+    return np.frombuffer(raw, DTYPES[dtype]).reshape(shape)

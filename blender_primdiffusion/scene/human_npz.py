@@ -19,6 +19,7 @@ from ..formats.arrays import ArrayFileError, all_finite, array_names, check_shap
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.json_files import parse_json
 from ..formats.removing import remove_file
+from ..formats.rotations import first_improper
 from .body_file import body_file_name, saved_body_file
 from .cycles import max_overlap
 from .shape import FIELDS, OPTIONAL_FIELDS, ShapeModel, faulty_field
@@ -158,12 +159,11 @@ def _checked_values(human: HumanFile, path: Path) -> HumanFile:
     for name in _SHAPES:
         if not all_finite(getattr(human, name)):
             raise HumanNpzError(f"the field {name!r} of {path.name!r} holds NaN or infinite values; {_REMEDY}")
-    gram = np.swapaxes(human.rotation, -1, -2) @ human.rotation
     faults = {
         "faces": human.faces.min() < 0 or human.faces.max() >= len(human.vertices),
         "half_extent": human.half_extent.min() <= 0,
         "density": human.density.min() < 0,
-        "rotation": np.abs(gram - np.eye(3)).max() > 1e-3 or np.linalg.det(human.rotation).min() < 0,
+        "rotation": first_improper(human.rotation[None]) is not None,
         "skin_weights": not _rows_are_weights(human.skin_weights),
         "primitive_weights": not _rows_are_weights(human.primitive_weights),
     }

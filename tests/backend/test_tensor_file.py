@@ -10,9 +10,9 @@ import pytest
 import safetensors.torch
 import torch
 from primdiffusion.formats.regular_files import TooLargeError
+from primdiffusion.formats.tensor_layout import LARGEST_HEADER
 from primdiffusion.tensor_file import (
     LARGEST_FILE,
-    LARGEST_HEADER,
     RoomFor,
     TensorFileError,
     load_network,
@@ -28,8 +28,7 @@ TENSORS = {"b": torch.arange(6.0).reshape(2, 3), "a": torch.ones(3, dtype=torch.
 METADATA = {name: f"{name} ä" for name in ["the", "quick", "brown", "fox", "jumps", "over", "a", "lazy", "dog"]}
 CODE = """
 import hashlib, torch
-from primdiffusion.formats.regular_files import TooLargeError
-from primdiffusion.tensor_file import LARGEST_FILE, LARGEST_HEADER, TensorFileError, opened, read, read_metadata, save
+from primdiffusion.tensor_file import save
 print(hashlib.sha256(save({"x": torch.ones(3), "y": torch.ones(2)}, {str(n): str(n) for n in range(20)})).hexdigest())
 """
 

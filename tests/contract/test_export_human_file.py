@@ -81,6 +81,14 @@ def test_a_damaged_motion_is_rejected_with_a_sentence(saved, damage):
         motion_in(human, "b.human")
 
 
+@pytest.mark.parametrize("change", [np.diag([1, 1, 1.002]), np.diag([1, 1, -1]), np.zeros((3, 3))])
+def test_a_motion_with_a_matrix_that_is_not_a_rotation_is_rejected_by_frame_and_joint(saved, change):
+    motion = walk()
+    motion.rotations[2, 4] = change
+    with pytest.raises(ValueError, match=r"'b\.human' holds a matrix for joint left_knee in frame 2 that is not a rot"):
+        motion_in(with_motion(read_tensors(saved), motion), "b.human")
+
+
 @pytest.mark.parametrize("data", [b"", b"\xff" * 40, b"\x02\0\0\0\0\0\0\0[]", b"\x02\0\0\0\0\0\0\0{}"])
 def test_what_is_no_person_is_rejected_with_a_sentence(tmp_path, data):
     path = tmp_path / "x.human"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.capture import poses
-from primdiffusion.pose_file import read_pose
+from primdiffusion.pose_file import InvalidPoseError, read_pose
 
 from blender_primdiffusion.motion import files
 
@@ -51,6 +51,15 @@ def test_both_programs_read_the_same_motion(tmp_path, name):
     ours, theirs = poses.read_motion(path), files.read_motion(path)
     assert np.allclose(ours.joint_rotation.numpy(), theirs.rotations, atol=1e-5)
     assert np.allclose(ours.translation.numpy(), theirs.translations, atol=1e-5)
+
+
+def test_matrices_are_not_taken_for_axis_angle_numbers(tmp_path):
+    np.savez(tmp_path / "a.npz", poses=np.tile(np.eye(3), (FRAMES, 24, 1, 1)))
+    assert np.allclose(files.read_motion(tmp_path / "a.npz").rotations, np.eye(3))
+    with pytest.raises(poses.MotionFileError, match="matrices"):
+        poses.read_motion(tmp_path / "a.npz")
+    with pytest.raises(InvalidPoseError, match="axis-angle"):
+        read_pose(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("name", ["amass_smplh_without_a_rate.npz", "no_hands.npz", "amass_smpl.npz"])

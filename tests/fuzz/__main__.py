@@ -8,6 +8,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from fuzz.run import FINDINGS, run
+from fuzz.verdicts import compare
 
 
 def main() -> None:
@@ -16,7 +17,12 @@ def main() -> None:
     parser.add_argument("--inputs", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", default="", help="part of the name of a kind of input")
+    parser.add_argument("--verdicts", action="store_true", help="only compare readers of safetensors files")
     arguments = parser.parse_args()
+    if arguments.verdicts:
+        figures = compare()
+        print(json.dumps(figures))
+        sys.exit(figures["reader_verdicts_differ"] > 0)
     report = run(arguments.seed, arguments.inputs, minutes=arguments.minutes, only=arguments.only)
     print(json.dumps(report.figures()))
     if report.findings:

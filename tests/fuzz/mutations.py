@@ -6,6 +6,7 @@ import io
 import json
 import math
 import struct
+import warnings
 import zipfile
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -237,8 +238,16 @@ def torch_pickle(content: bytes, rng: Generator) -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(content)) as file, zipfile.ZipFile(out, "w") as changed:
         for info in file.infolist():
-            is_pickle = info.filename.endswith("data.pkl")
-            changed.writestr(info.filename, pick(rng, PICKLES) if is_pickle else file.read(info))
+            is_pickle, whole = info.filename.endswith("data.pkl"), file.read(info)
+            if is_pickle and rng.random() < 0.3:  # two pickles, of which one is whole
+                name = pick(rng, (info.filename, info.filename.upper(), info.filename.replace("/", "\\")))
+                pickles = [(info.filename, whole), (name, pick(rng, PICKLES))]
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # of a name that is there twice
+                    for one, content_of_one in pickles[:: pick(rng, (1, -1))]:
+                        changed.writestr(one, content_of_one)
+                continue
+            changed.writestr(info.filename, pick(rng, PICKLES) if is_pickle else whole)
     return out.getvalue()
 
 

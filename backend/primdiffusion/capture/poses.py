@@ -14,7 +14,7 @@ from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.formats.arrays import ArrayFileError, all_finite, read_npy, read_numbers
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-from primdiffusion.pose_file import body_theta
+from primdiffusion.pose_file import body_theta, reject_matrices
 
 POSES, ROOT, REST = ("poses", "pose", "theta", "fullpose"), ("global_orient", "root_orient"), ("body_pose", "pose_body")
 TRANSLATIONS = ("trans", "transl", "translation")
@@ -158,6 +158,7 @@ def _rows(rest: NDArray | None, root: NDArray | None, poses: NDArray | None) -> 
 
 def _frames(values: NDArray) -> NDArray[np.float64]:
     values = np.asarray(values, np.float64)
+    reject_matrices(values)
     values = values[None] if values.ndim == 1 or (values.ndim == 2 and values.shape[1] == 3) else values
     return values.reshape(len(values), -1)
 

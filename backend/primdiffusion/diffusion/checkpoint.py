@@ -89,20 +89,23 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict
     Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
     format or version, or holds values that are not finite.
     """
-    tensors, metadata = read_tensors(path, (FORMAT,))
+    tensors, metadata, digest = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
         architecture, card = parse_json(metadata["architecture"]), parse_json(metadata["card"])
         if not 0 < architecture["full_density"] <= LARGEST_NUMBER:
             raise RuntimeError(f"a full density of {architecture['full_density']!r:.20}")
-        return tensors, architecture, {**card, "sha256": file_hash(path)}
+        return tensors, architecture, {**card, "sha256": digest}
 
 
-def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, str]]:
-    """Return tensors in float32 and metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
-    metadata = read_metadata(path, formats)
+def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, str], str]:
+    """Return tensors in float32, metadata and SHA-256 of a checkpoint or encoder; errors as in `read_checkpoint`."""
+    _check_there(path)
     with _damage_named(path):
-        tensors, _ = tensor_file.read(path)
-    return {key: value.float() for key, value in tensors.items()}, metadata
+        file = tensor_file.opened(path)
+    _check_format(path, file.metadata, formats)
+    with _damage_named(path):
+        tensors = file.finite_tensors()
+    return {key: value.float() for key, value in tensors.items()}, file.metadata, file.sha256()
 
 
 @contextlib.contextmanager
@@ -254,12 +257,21 @@ def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
 
 def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
     """Return the metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
+    _check_there(path)
+    with _damage_named(path):
+        metadata = tensor_file.read_metadata(path)
+    _check_format(path, metadata, formats)
+    return metadata
+
+
+def _check_there(path: Path) -> None:
     if not path.is_file():
         raise FileNotFoundError(
             f"there is no checkpoint at {path}: give the path of a .safetensors file, or reinstall the package"
         )
-    with _damage_named(path):
-        metadata = tensor_file.read_metadata(path)
+
+
+def _check_format(path: Path, metadata: Mapping[str, str], formats: Sequence[str]) -> None:
     if metadata.get("format") not in formats:
         raise CheckpointError(
             f"{path} is a safetensors file of format {metadata.get('format')!r:.40}, not "
@@ -270,7 +282,6 @@ def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
         raise CheckpointError(
             f"{path} has format version {version!s:.20}, this program reads {readable}: use the matching release"
         )
-    return metadata
 
 
 @contextlib.contextmanager

@@ -157,7 +157,7 @@ def load_encoder(path: Path | str | None = None, device: torch.device | str = "c
     path = default_encoder() if path is None else Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no encoder at {path}: give the path of a .safetensors file")
-    tensors, metadata = read_tensors(path, (ENCODER_FORMAT,))
+    tensors, metadata, _ = read_tensors(path, (ENCODER_FORMAT,))
     with mismatches_named(path, ValueError):
         config = config_from_json(parse_json(metadata["config"]))
         anchors = {f"stand.{name}": value for name, value in under(tensors, "stand.").items()}

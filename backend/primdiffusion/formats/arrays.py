@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
+import dataclasses
 import io
 import math
 import struct
@@ -28,6 +30,8 @@ LARGEST_NUMBER = 1e9
 LARGEST_FILE = 2**31
 _LARGEST_DIRECTORY = 4 * 2**20
 """Of a zip archive's list of names, bytes; also of a single read."""
+_LOCAL_HEADER = struct.Struct("<26xHH")
+"""A member's header in a zip archive; its last fields are the lengths of the name and of an extra field behind it."""
 _LONGEST_HEADER = 10_000
 """Of an array, bytes, as in numpy."""
 _CHUNK = 2**20
@@ -136,7 +140,8 @@ def map_npy(path: str | Path) -> NDArray:
         stream.seek(0)
         shape, fortran, dtype = _header(stream, size, str(path))
         order = "F" if fortran else "C"
-        return np.memmap(path, dtype, "r", stream.tell(), shape, order)  # type: ignore[call-overload]
+        # of the open file, whose header was checked: another one may have taken its name
+        return np.memmap(stream, dtype, "r", stream.tell(), shape, order)  # type: ignore[call-overload]
 
 
 def read_pickled_bytes(path: str | Path, name: str) -> bytes:
@@ -151,19 +156,39 @@ def read_pickled_bytes(path: str | Path, name: str) -> bytes:
             return b"".join(iter(lambda: stream.read(_CHUNK), b""))
 
 
-def read_stored_member(path: str | Path, ending: str, limit: int, largest_file: int) -> bytes:
-    """Return the first member whose name ends so, of an archive without compression, as torch.save writes it.
+@dataclasses.dataclass(frozen=True)
+class StoredMember:
+    """A member of an archive without compression."""
 
-    Raises as `read_arrays`.
+    begin: int
+    """Offset of its first byte in the file."""
+    size: int
+    """Bytes."""
+    checksum: int
+    """CRC-32 of its bytes, as the archive states it."""
+
+
+def stored_members(file: BinaryIO, path: str | Path) -> dict[str, StoredMember]:
+    """Return the members of an archive without compression, as torch.save writes it, from the open file at `path`.
+
+    Names that differ in upper and lower case, or in slashes and backslashes, count as equal: torch's own reader does
+    not tell them apart. Raises ArrayFileError, also where two names are equal.
     """
-    with _archive(path, largest_file) as archive:
-        if any(one.compress_type != zipfile.ZIP_STORED for one in archive.infolist()):
-            raise ArrayFileError(f"{path} is compressed, which torch.save never does: save it again")
-        member = next((one for one in archive.infolist() if one.filename.endswith(ending)), None)
-        if member is None or member.file_size > limit or member.flag_bits & 1:
-            raise ArrayFileError(f"{path} holds no {ending} of at most {limit / 2**20:.0f} MB: save it again")
-        with archive.open(member) as stream:
-            return b"".join(iter(lambda: stream.read(_CHUNK), b""))
+    with _archive_in(file, path) as archive:
+        members: dict[str, StoredMember] = {}
+        end = file.seek(0, io.SEEK_END)
+        for info in archive.infolist():
+            if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
+                raise ArrayFileError(f"{path} is compressed, which torch.save never does: save it again")
+            archive.open(info).close()  # compares its two headers; encrypted members are errors
+            file.seek(info.header_offset)
+            name_bytes, extra_bytes = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
+            begin = info.header_offset + _LOCAL_HEADER.size + name_bytes + extra_bytes
+            if begin + info.file_size > end:
+                raise ArrayFileError(f"{path}: {info.filename!r:.60} is cut short: copy or export it again")
+            members[info.filename] = StoredMember(begin, info.file_size, info.CRC)
+        _check_names(path, [name.replace("\\", "/").lower() for name in archive.namelist()])
+        return members
 
 
 def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
@@ -202,15 +227,28 @@ class _Reads:
 
 
 @contextlib.contextmanager
-def _archive(path: str | Path, limit: int = LARGEST_FILE) -> Iterator[zipfile.ZipFile]:
-    with open_regular(path, limit) as file:
-        try:
-            with zipfile.ZipFile(_Reads(file)) as archive:  # type: ignore[arg-type]
-                yield archive
-        except ArrayFileError:
-            raise
-        except _UNREADABLE as e:
-            raise ArrayFileError(f"{path} is not a whole .npz file ({str(e)[:100]}): copy or export it again") from e
+def _archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
+    with open_regular(path, LARGEST_FILE) as file, _archive_in(file, path) as archive:
+        yield archive
+
+
+@contextlib.contextmanager
+def _archive_in(file: BinaryIO, path: str | Path) -> Iterator[zipfile.ZipFile]:
+    try:
+        with zipfile.ZipFile(_Reads(file)) as archive:  # type: ignore[arg-type]
+            _check_names(path, [name.removesuffix(".npy") for name in archive.namelist()])
+            yield archive
+    except ArrayFileError:
+        raise
+    except _UNREADABLE as e:
+        raise ArrayFileError(f"{path} is not a whole .npz file ({str(e)[:100]}): copy or export it again") from e
+
+
+def _check_names(path: str | Path, names: Sequence[str]) -> None:
+    """Check that names differ: of two members of one name, readers choose different ones."""
+    if len(set(names)) < len(names):
+        twice = next(name for name, count in collections.Counter(names).items() if count > 1)
+        raise ArrayFileError(f"{path} holds {twice!r:.60} twice: save it again")
 
 
 @contextlib.contextmanager

@@ -42,6 +42,74 @@ def parse_message(text: str | bytes) -> Any:
     return _checked(_parsed(text), finite=False)
 
 
+class Pairs(list[tuple[str, Any]]):
+    """A JSON object as the names and values in its text, in which a name may occur twice."""
+
+
+def parse_pairs(text: bytes, deepest: int) -> Any:
+    """Parse JSON as strictly as serde_json, the parser of the safetensors library; objects become `Pairs`.
+
+    Unlike Python's parser it rejects NaN and infinite numbers, floats that overflow, halves of surrogate pairs, and
+    values nested more than `deepest` levels. Integers outside 64 bits and -0 are floats. Of the limits of this module
+    none applies: the caller limits the length of the text. Raises JsonError.
+    """
+    try:
+        decoded = text.decode("utf-8")
+        tree = json.loads(
+            decoded, object_pairs_hook=Pairs, parse_int=_integer, parse_float=_finite, parse_constant=_constant
+        )
+    except UnicodeDecodeError as e:
+        raise JsonError(f"it is not UTF-8 text: byte {e.start}") from e
+    except RecursionError as e:
+        raise JsonError(f"it is nested more than {deepest} deep") from e
+    except ValueError as e:
+        raise JsonError(str(e)[:120]) from e
+    _check_pairs(tree, deepest, escapes="\\u" in decoded)
+    return tree
+
+
+def _integer(digits: str) -> int | float:
+    if len(digits) > 20 or digits == "-0":
+        return _finite(digits)
+    number = int(digits)
+    return number if -(2**63) <= number < 2**64 else float(number)
+
+
+def _finite(digits: str) -> float:
+    number = float(digits)
+    if not math.isfinite(number):
+        raise ValueError("a number is out of range")
+    return number
+
+
+def _constant(name: str) -> float:
+    raise ValueError(f"{name} is not a number of JSON")
+
+
+def _check_pairs(tree: Any, deepest: int, *, escapes: bool) -> None:
+    """Check the depth of a tree of `parse_pairs`, and its strings if the text contains `escapes`."""
+    level = [tree]
+    for depth in range(deepest + 2):
+        if escapes:  # without escapes, decoding has already rejected halves of pairs
+            _check_strings(level)
+        level = [value for value in level if isinstance(value, list)]
+        if not level:
+            return
+        if depth == deepest:
+            break
+        level = [entry[1] if isinstance(container, Pairs) else entry for container in level for entry in container]
+    raise JsonError(f"it is nested more than {deepest} deep")
+
+
+def _check_strings(values: list[Any]) -> None:
+    names = [pair[0] for value in values if isinstance(value, Pairs) for pair in value]
+    for text in (*names, *(value for value in values if isinstance(value, str))):
+        try:
+            text.encode("utf-8")
+        except UnicodeEncodeError as e:
+            raise JsonError(f"the text {text!r:.40} contains half of a surrogate pair") from e
+
+
 def _parsed(text: str | bytes) -> Any:
     if not isinstance(text, str | bytes):
         raise JsonError(f"it is no text but {type(text).__name__}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import mmap
 import os
 import re
 import stat
@@ -43,17 +44,39 @@ def open_regular(path: str | Path, limit: int) -> io.BufferedReader | io.BytesIO
 
     A file that states no size is read as empty: those of /proc may be endless.
     """
-    size = check_regular(path).st_size
+    size = check_regular(path).st_size  # before it is opened: to open a device may already do something
     check_size(path, size, limit)
-    return open(path, "rb") if size else io.BytesIO()
+    if not size:
+        return io.BytesIO()
+    file = open(path, "rb")  # noqa: SIM115  the caller closes it
+    try:
+        opened = os.fstat(file.fileno())  # another file may have taken its name in between
+        if not stat.S_ISREG(opened.st_mode):
+            raise PermissionError(errno.EPERM, "this is not a regular file", str(path))
+        check_size(path, opened.st_size, limit)
+    except BaseException:
+        file.close()
+        raise
+    return file
+
+
+def map_privately(file: io.BufferedReader | io.BytesIO) -> mmap.mmap | bytearray:
+    """Map an open file into memory, so that what is written there stays in memory; closing the file does no harm.
+
+    Raises OSError, also for lack of memory, and ValueError for a file that is empty now.
+    """
+    if isinstance(file, io.BytesIO):
+        return bytearray(file.getvalue())
+    return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
 
 
 def read_regular(path: str | Path, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes. Raises as `open_regular`."""
     with open_regular(path, limit) as file:
-        data = file.read(limit + 1)  # some files grow
-    check_size(path, len(data), limit)
-    return data
+        size = file.seek(0, io.SEEK_END)  # some files grow
+        check_size(path, size, limit)
+        file.seek(0)
+        return file.read(size)  # not up to the limit, for which Python would take memory
 
 
 def check_size(path: str | Path, size: int, limit: int) -> None:

@@ -100,7 +100,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
 
 def _load(path: Path) -> object:
     try:
-        return torch_file.load(path, mapped=True)
+        return torch_file.load(path)
     except TooLargeError:
         raise
     except torch_file.PICKLE_ERRORS as error:

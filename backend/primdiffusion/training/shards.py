@@ -11,7 +11,9 @@ have to be unpacked whole. Shards hold the same bytes as the files they are made
 from __future__ import annotations
 
 import bisect
+import contextlib
 import hashlib
+import io
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,9 +28,10 @@ from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import TooLargeError, is_plain_path, open_regular
+from primdiffusion.formats.regular_files import is_plain_path, open_regular
 from primdiffusion.formats.whole_files import staged, write_atomically, written_whole
 from primdiffusion.primitives.primitives import K, S
+from primdiffusion.tensor_file import TensorFile
 from primdiffusion.training.stored_people import PersonDataset, PersonFolder, PersonVariants, attributes_of
 
 INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1
@@ -97,7 +100,11 @@ def _write_shard(path: Path, people: Sequence[PersonVariants]) -> None:
 def digest_of(path: Path) -> str:
     """SHA-256 of a regular file, hexadecimal. Raises OSError and TooLargeError."""
     with open_regular(path, LARGEST_SHARD) as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+        return _digest(file)
+
+
+def _digest(file: io.BufferedReader | io.BytesIO) -> str:
+    return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def damaged_shards(folder: Path) -> list[str]:
@@ -131,7 +138,7 @@ class PackedPeople:
             raise ShardError(f"{folder / INDEX} is damaged ({error!s:.100}): pack the humans again") from error
         if len(self.names) < 2:
             raise FileNotFoundError(f"{folder / INDEX} lists {len(self.names)} humans: training needs two or more")
-        self._open: dict[int, Any] = {}
+        self._open: dict[int, TensorFile] = {}
 
     def known(self, index: int) -> tuple[Attributes, ...]:
         """Return the attributes of each colouring of a person. Raises as `person`."""
@@ -158,25 +165,33 @@ class PackedPeople:
 
     def check(self, shard: int) -> None:
         """Check a shard against its SHA-256. Raises ShardError, FileNotFoundError."""
+        with self._checked(shard):
+            pass
+
+    @contextlib.contextmanager
+    def _checked(self, shard: int) -> Iterator[io.BufferedReader | io.BytesIO]:
+        """A shard, open, after a check against its SHA-256, so that what was checked is read. Raises as `check`."""
         path = self.paths[shard]
         if not path.is_file():
             raise FileNotFoundError(f"there is no {path}, which {INDEX} names: pack the humans again")
-        if digest_of(path) != self._digests[shard]:
-            raise ShardError(f"{path} is damaged: its SHA-256 differs from {INDEX}: pack the humans again")
+        with open_regular(path, LARGEST_SHARD) as file:
+            if _digest(file) != self._digests[shard]:
+                raise ShardError(f"{path} is damaged: its SHA-256 differs from {INDEX}: pack the humans again")
+            yield file
 
-    def _check_content(self, number: int, file: Any) -> None:
+    def _check_content(self, number: int, file: TensorFile) -> None:
         people = range(self._firsts[number], self._firsts[number + 1])
         rows = sum(self.variants[index] for index in people)
         wanted = {"voxels": [rows, K, S, S, S, 4], "betas": [len(people), BETAS], "delta_scale": [rows, K, 3]}
         for name, shape in wanted.items():
-            if name == "delta_scale" and name not in file.keys():  # noqa: SIM118 - safe_open is no mapping
+            if name == "delta_scale" and name not in file.tensors:
                 continue
-            if name not in file.keys():  # noqa: SIM118
+            if name not in file.tensors:
                 raise ValueError(f"{name!r} is missing")
-            part = file.get_slice(name)
-            if part.get_shape() != shape or part.get_dtype() not in _KINDS[name]:
-                raise ValueError(f"{name!r} is {part.get_dtype()} {part.get_shape()}, not {shape}")
-            if name != "voxels" and not (part[:].float().abs() <= LARGEST_NUMBER).all():
+            stored = file.tensors[name]
+            if list(stored.shape) != shape or stored.dtype not in _KINDS[name]:
+                raise ValueError(f"{name!r} is {stored.dtype} {list(stored.shape)}, not {shape}")
+            if name != "voxels" and not (file.tensor(name).float().abs() <= LARGEST_NUMBER).all():
                 raise ValueError(f"{name!r} holds impossible numbers")
 
     def _rows(self, index: int) -> tuple[int, int, slice]:
@@ -187,23 +202,23 @@ class PackedPeople:
         return shard, index - first, slice(start, start + self.variants[index])
 
     def _scale(self, shard: int, rows: slice) -> Tensor:
-        if "delta_scale" in self._shard(shard).keys():  # noqa: SIM118 - safe_open is no mapping
+        if "delta_scale" in self._shard(shard).tensors:
             return self._slice(shard, "delta_scale")[rows].float()
         return torch.ones(rows.stop - rows.start, K, 3)
 
-    def _slice(self, shard: int, name: str) -> Any:
-        return self._shard(shard).get_slice(name)
+    def _slice(self, shard: int, name: str) -> Tensor:
+        return self._shard(shard).tensor(name)
 
-    def _shard(self, number: int) -> Any:
+    def _shard(self, number: int) -> TensorFile:
         if number not in self._open:
-            self.check(number)
-            try:
-                file = tensor_file.opened(self.paths[number], LARGEST_SHARD)
-                self._check_content(number, file)
-            except TooLargeError:
-                raise
-            except ValueError as error:
-                raise ShardError(f"{self.paths[number]} is no shard ({error!s:.100}): pack the humans again") from error
+            with self._checked(number) as opened:
+                try:
+                    file = TensorFile(opened)
+                    self._check_content(number, file)
+                except ValueError as error:
+                    raise ShardError(
+                        f"{self.paths[number]} is no shard ({error!s:.100}): pack the humans again"
+                    ) from error
             self._open[number] = file
         return self._open[number]
 

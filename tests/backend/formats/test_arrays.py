@@ -10,6 +10,7 @@ import zipfile
 
 import numpy as np
 import pytest
+from primdiffusion.formats import arrays, regular_files
 from primdiffusion.formats.arrays import (
     ArrayFileError,
     all_finite,
@@ -206,3 +207,53 @@ def test_headers_of_python_2_are_read_without_a_warning(tmp_path, recwarn):
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
     assert read_npy(tmp_path / "a.npy").shape == (1,)
     assert not recwarn
+
+
+@pytest.mark.parametrize("names", [("pose.npy", "pose.npy"), ("pose.npy", "pose"), ("pose", "trans.npy", "pose.npy")])
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_two_arrays_of_one_name_are_rejected(tmp_path, names):
+    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
+        for name in names:
+            archive.writestr(name, npy())
+    for read in (read_arrays, array_names, lambda path: array_shape(path, "pose")):
+        with pytest.raises(ArrayFileError, match="holds 'pose' twice"):
+            read(tmp_path / "a.npz")
+
+
+def test_a_mapped_array_is_that_of_the_file_whose_header_was_checked(tmp_path, monkeypatch):
+    path, other = tmp_path / "a.npy", tmp_path / "b.npy"
+    np.save(path, np.arange(100))
+    np.save(other, np.zeros(100, np.int64))
+    header = arrays._header
+
+    def checked_then_replaced(*given):
+        os.replace(other, path)
+        return header(*given)
+
+    monkeypatch.setattr(arrays, "_header", checked_then_replaced)
+    assert np.array_equal(map_npy(path), np.arange(100))
+
+
+def test_what_is_no_longer_a_regular_file_when_it_is_opened_is_not_read(tmp_path, monkeypatch):
+    path = tmp_path / "a.npz"
+    np.savez(path, pose=np.zeros(3))
+    status = os.stat(path)
+    path.unlink()
+    os.mkfifo(path)
+    keep_open = os.open(path, os.O_RDWR)  # or open waits for a writer
+    monkeypatch.setattr(regular_files, "check_regular", lambda _: status)
+    try:
+        with pytest.raises(PermissionError, match="not a regular file"):
+            read_arrays(path, ["pose"])
+    finally:
+        os.close(keep_open)
+
+
+def test_what_grows_beyond_the_limit_before_it_is_opened_is_not_read(tmp_path, monkeypatch):
+    path = tmp_path / "a"
+    path.write_bytes(bytes(10))
+    status = os.stat(path)
+    path.write_bytes(bytes(30))
+    monkeypatch.setattr(regular_files, "check_regular", lambda _: status)
+    with pytest.raises(regular_files.TooLargeError):
+        regular_files.read_regular(path, 20)

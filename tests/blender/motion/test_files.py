@@ -86,6 +86,35 @@ def test_a_pose_npz_is_read_as_it_stands(tmp_path):
     np.testing.assert_array_equal(motion.translations, MOVE)
 
 
+@pytest.mark.parametrize("ending", ["npy", "npz", "json"])
+@pytest.mark.parametrize(
+    ("change", "is_read"),
+    [
+        (np.eye(3), True),
+        (np.diag([1, 1, 1.0004]), True),
+        (np.diag([1, 1, 1.001]), False),
+        (np.array([[1, 2e-3, 0], [0, 1, 0], [0, 0, 1]]), False),
+        (np.diag([1, 1, -1.0]), False),
+        (np.zeros((3, 3)), False),
+    ],
+)
+def test_a_matrix_is_a_rotation_within_a_thousandth_or_a_sentence(tmp_path, ending, change, is_read):
+    matrices = from_axis_angle(THETA)
+    matrices[1, 4] = matrices[1, 4] @ change
+    path = tmp_path / f"p.{ending}"
+    if ending == "json":
+        path.write_text(json.dumps({"pose": matrices.tolist()}), encoding="utf-8")
+    elif ending == "npy":
+        np.save(path, matrices)
+    else:
+        np.savez(path, global_orient=matrices[:, 0], body_pose=matrices[:, 1:])
+    if is_read:
+        np.testing.assert_allclose(read_motion(path).rotations, from_axis_angle(THETA), atol=1e-3)
+    else:
+        with pytest.raises(MotionFileError, match=rf"p\.{ending} .*joint left_knee in frame 1 that is not a rotation"):
+            read_motion(path)
+
+
 def test_rotation_matrices_are_read(tmp_path):
     matrices = from_axis_angle(THETA)
     np.savez(tmp_path / "p.npz", global_orient=matrices[:, :1], body_pose=matrices[:, 1:])
@@ -148,7 +177,7 @@ def test_one_translation_serves_all_frames(tmp_path):
         ({"poses": np.zeros((3, 72)), "trans": np.zeros((4, 3))}, "translations of shape"),
         ({"poses": np.array([{"a": 1}], object)}, "pickled Python objects"),
         ({"body_pose": np.zeros((3, 69)), "global_orient": np.zeros((2, 3))}, "2 frames of global_orient but 3"),
-        ({"body_pose": np.ones((3, 23, 3, 3))}, "no rotations"),
+        ({"body_pose": np.ones((3, 23, 3, 3))}, "joint left_hip in frame 0 that is not a rotation"),
         ({"marker_data": np.zeros((3, 72))}, "it holds 'marker_data' and needs 'poses'"),
     ],
 )
