@@ -24,6 +24,7 @@ from primdiffusion import __version__
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
 from primdiffusion.diffusion.conditioning import Attributes
+from primdiffusion.diffusion.fixed_threads import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.formats import requests
@@ -83,8 +84,8 @@ def generate(
 ) -> Human:
     """A new human, on the CPU, determined by model, seed, steps, sampler, attributes and guidance.
 
-    On one device, with one version of torch and number of threads, every bit is the same; otherwise, and in a batch,
-    values differ by rounding (below 1e-5 of their range on CPUs).
+    On one kind of processor, with one version of torch, every bit is the same on any number of cores and threads
+    (`diffusion.fixed_threads`); otherwise, and in a batch, values differ by rounding (about 1e-5 of their range).
 
     `attributes` condition the sample on attributes in `model.vocabulary`; empty means unconditional, as in the paper.
     `on_step` is called after each step; raise an exception from it to cancel.
@@ -123,6 +124,7 @@ def generate_batch(
     ]
 
 
+@on_fixed_threads
 def people_of(
     model: DiffusionModel,
     x0: Float[Tensor, "b c h w"],

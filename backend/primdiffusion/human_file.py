@@ -27,6 +27,7 @@ import torch
 from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyModel
+from primdiffusion.diffusion.fixed_threads import GRID_THREADS, fixed_threads
 from primdiffusion.formats import compact_human
 from primdiffusion.formats.arrays import write_stored
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -233,6 +234,7 @@ def _reject(name: str, value: Any, wanted: str) -> NoReturn:
     raise ValueError(f"{name!r} of its provenance is {value!r:.60}, not {wanted}: generate the human again")
 
 
+@fixed_threads(GRID_THREADS)
 def export_for_blender(path: str | Path, human: Human) -> None:
     """Write `human.npz`: the human in the T pose, with skinning to 24 joints.
 

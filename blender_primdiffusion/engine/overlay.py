@@ -61,8 +61,8 @@ _STICK_PX, _JOINT_PX = 2.2, 2.2
 class ShownHuman:
     """A human whom a 3D view shows."""
 
-    obj: bpy.types.Object
-    """The armature, or the object that instances it; valid until the scene changes."""
+    object_uid: int
+    """Of the armature, or of the object that instances it; a reference would not outlive undo."""
     pose: PosedHuman
     placed: tuple[GpuPayload, Boxes]
 
@@ -211,7 +211,8 @@ class Overlay:
         hit = context.scene.ray_cast(context.evaluated_depsgraph_get(), origin, ray.normalized(), distance=ray.length)
         if hit[0] and not context.space_data.shading.show_xray:
             return None
-        return min(reading.humans.values(), key=lambda human: _distance(human.placed[1], point)).obj
+        nearest = min(reading.humans.values(), key=lambda human: _distance(human.placed[1], point))
+        return next((obj for obj in context.view_layer.objects if obj.session_uid == nearest.object_uid), None)
 
     def reading(self, context: bpy.types.Context) -> SceneReading:
         """What the space shows."""
@@ -247,7 +248,7 @@ class Overlay:
             except (ValueError, OSError) as error:
                 self.error = str(error)
                 continue
-            humans[key] = ShownHuman(obj, pose, placed)
+            humans[key] = ShownHuman(obj.session_uid, pose, placed)
             if not known and number < len(candidates) and time.monotonic() > end:
                 complete = False
                 break

@@ -34,7 +34,7 @@ def volumes_are_empty() -> bool:
     known = _recall()
     if known is None and _running is None:
         _running = _start()
-        bpy.app.timers.register(_follow, first_interval=_TICK_S)
+        bpy.app.timers.register(_follow, first_interval=_TICK_S, persistent=True)
     return bool(known)
 
 

@@ -122,7 +122,9 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
 
     bl_idname = "primdiffusion.take_result"
     bl_label = "Take Result"
-    bl_options = {"INTERNAL"}  # not UNDO: the step has the job's own name, and none is made on failure
+    bl_options = {
+        "INTERNAL"
+    }  # not UNDO: the step has the job's own name, and a failure that changed nothing makes none
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -131,23 +133,32 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """Failures are shown by the panel, or reported by the operator that waits."""
-        undo = queue.current.job.undo
-        if undo:
-            _leave_edit_mode(context)
+        job, before = queue.current.job, _data_blocks()
+        left_edit_mode = bool(job.undo) and _leave_edit_mode(context)
         outcome = queue.finish(context)
-        if outcome.error is not None:
+        went_well = outcome.error is None
+        if went_well and job.undo:
+            bpy.ops.ed.undo_push(message=job.undo)
+            keep_writing()
+        elif left_edit_mode or _data_blocks() != before:  # by a failure or an exporter; see `in_the_way`
+            bpy.ops.ed.undo_push(message=job.undo or job.label)
+        if not went_well:
             print(f"PrimDiffusion: {outcome.sentence}")
             return {"CANCELLED"}
-        if undo:
-            bpy.ops.ed.undo_push(message=undo)
-            keep_writing()
         return {"FINISHED"}
 
 
-def _leave_edit_mode(context: bpy.types.Context) -> None:
-    """Undo steps made in an edit mode hold only the edited object, not the new human."""
-    if context.mode.startswith(("EDIT", "PARTICLE")):
+def _data_blocks() -> set[int]:
+    """All data-blocks of the file: undo crashes on those that come or go outside its steps."""
+    return {block.session_uid for block in bpy.data.user_map()}
+
+
+def _leave_edit_mode(context: bpy.types.Context) -> bool:
+    """Undo steps made in an edit mode hold only the edited object, not the new human. Whether there was one."""
+    in_edit_mode = context.mode.startswith(("EDIT", "PARTICLE"))
+    if in_edit_mode:
         bpy.ops.object.mode_set(mode="OBJECT")
+    return in_edit_mode
 
 
 TICK_S = 0.1

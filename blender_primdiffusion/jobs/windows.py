@@ -3,24 +3,60 @@
 from __future__ import annotations
 
 import contextlib
+import math
+import time
 from collections.abc import Iterator
 
 import bpy
+from bpy.app.handlers import persistent
 from mathutils import Matrix, Vector
 
 _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
 """Options of modal operators that block the scene or the mouse; others (screencasts) may run for ever."""
 
+_JOBS = {"RENDER": "the render", "OBJECT_BAKE": "the bake"}
+"""Blender's jobs that read the scene in a thread of their own, and their names in panels."""
+UNDO_REST_S = 0.5
+"""Steps of undo and redo follow each other faster than this while a key is held or pressed again and again."""
+_last_undo = -math.inf
+
 
 def in_the_way() -> str:
-    """What a result has to wait for, as shown in panels; empty for nothing."""
-    if bpy.app.is_job_running("RENDER"):
-        return "the render"
+    """What a timer has to wait for before it changes data, as shown in panels; empty for nothing.
+
+    Undo reads only those data-blocks that differ between two of its steps, and keeps the others as they are now. What
+    a timer changes between two steps then refers to data that the next step removes, and Blender (5.2.2) crashes. So a
+    timer waits until undo and redo have rested, and what it changes becomes an undo step (`take_result`).
+
+    Files are loaded and saved within one event, during which no timer runs.
+    """
+    for job, name in _JOBS.items():
+        if bpy.app.is_job_running(job):
+            return name
+    if time.monotonic() - _last_undo < UNDO_REST_S:
+        return "undo"
     windows = bpy.context.window_manager.windows
     for modal in (modal for window in windows for modal in window.modal_operators):
         if _IN_THE_WAY & modal.bl_options:
             return modal.name
     return ""
+
+
+@persistent
+def note_undo(*_: object) -> None:
+    """Handler of undo_post and redo_post: further steps may follow."""
+    global _last_undo
+    _last_undo = time.monotonic()
+
+
+@persistent
+def forget_undo(*_: object) -> None:
+    """Handler of load_pre: another file has its own steps."""
+    global _last_undo
+    _last_undo = -math.inf
+
+
+HANDLERS = (("undo_post", note_undo), ("redo_post", note_undo), ("load_pre", forget_undo))
 
 
 @contextlib.contextmanager

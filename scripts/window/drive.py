@@ -1,8 +1,8 @@
 """Runs inside Blender's window: installs the zip, then plays the scenes of `scenes.py` from a timer, step by step.
 
 A scene is a generator. It yields seconds to wait, the name of a screenshot to take, or an input:
-{"point": [x, y], "click": True}, {"point": [x, y], "drag": [dx, dy]} or {"key": "Escape"}; or figures to be written
-to a file: {"figures": {name: value}}.
+{"point": [x, y], "click": True}, {"point": [x, y], "drag": [dx, dy]} or {"key": "Escape", "times": 1}; or figures to
+be written to a file: {"figures": {name: value}}.
 """
 
 from __future__ import annotations
@@ -26,8 +26,10 @@ def play() -> Iterator[float]:
     """Play all scenes; yields seconds to wait between steps."""
     import scenes
     from setting_up import set_up_real
+    from undo_scenes import undo_and_timers
 
-    asked_for = {"set_up_real": set_up_real} if "set_up_real" in SCENES else {}
+    on_request = {"set_up_real": set_up_real, "undo_and_timers": undo_and_timers}
+    asked_for = {name: scene for name, scene in on_request.items() if name in SCENES}
     yield 2.0
     install()
     yield 0.5

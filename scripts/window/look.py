@@ -97,7 +97,8 @@ def do(request: dict, out: Path, display: str) -> None:
         time.sleep(0.3)
         subprocess.run([*hand, "mouseup", "1"], check=True, env=environment)
     if "key" in request:
-        subprocess.run([*hand, "key", request["key"]], check=True, env=environment)
+        times = ["--delay", "2", "--repeat", str(request.get("times", 1)), "--repeat-delay", "2"]
+        subprocess.run([*hand, "key", *times, request["key"]], check=True, env=environment)
 
 
 def main() -> int:

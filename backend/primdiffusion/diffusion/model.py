@@ -15,6 +15,12 @@ from torch import Tensor, nn
 from primdiffusion.diffusion.codec import CellCodec, Codec
 from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.fixed_threads import (
+    GRID_THREADS,
+    SLAB_THREADS,
+    each_with_fixed_threads,
+    fixed_threads,
+)
 from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule, trailing_steps
 from primdiffusion.formats import requests
@@ -90,6 +96,11 @@ class DiffusionModel:
     def device(self) -> torch.device:
         """Device of the denoiser's parameters."""
         return next(iter(self.denoiser.state_dict().values())).device
+
+    @property
+    def threads(self) -> int:
+        """Threads that sampling uses on a CPU, whatever its number of cores (`fixed_threads`)."""
+        return GRID_THREADS if isinstance(self.codec, CellCodec) else SLAB_THREADS
 
     def to(self, device: torch.device | str) -> DiffusionModel:
         """The same model on another device; moves the networks in place."""
@@ -186,8 +197,8 @@ def sample(
 ) -> Iterator[SamplerStep]:
     """Generate a person for each seed, yielding every step; the last step's x0 is the result (default: 30 DDIM steps).
 
-    The same batch of seeds gives the same bits on one device with one version of torch and number of threads. A seed's
-    noise is the same in any batch and on any device, so the person is the same up to rounding. To cancel, stop
+    The same batch of seeds gives the same bits on one kind of device with one version of torch, on any number of cores.
+    A seed's noise is the same in any batch and on any device, so the person is the same up to rounding. To cancel, stop
     iterating. ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside
     1 ... T.
     """
@@ -197,12 +208,14 @@ def sample(
         raise ValueError("no seeds were given: give one for each human")
     chain = model.chain(model.schedule.length, steps)
     generators = [seeded(seed) for seed in seeds]
-    start = model.start(generators, chain[0], condition)
+    with fixed_threads(model.threads):
+        start = model.start(generators, chain[0], condition)
 
     def denoise(x: Tensor, t: int) -> Tensor:
         return model.denoise(x, t, condition, guidance)
 
-    return SAMPLERS[sampler](denoise, model.schedule, start, chain, generators)
+    steps_taken = SAMPLERS[sampler](denoise, model.schedule, start, chain, generators)
+    return each_with_fixed_threads(steps_taken, model.threads)
 
 
 def seeded(seed: int) -> torch.Generator:

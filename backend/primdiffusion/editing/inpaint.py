@@ -13,6 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from primdiffusion.diffusion.fixed_threads import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddpm_step, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
@@ -132,6 +133,7 @@ MASKED_SAMPLERS: Mapping[requests.Masking, MaskedSampler] = {"repaint": repaint,
 """Samplers of a region by name."""
 
 
+@on_fixed_threads
 def inpaint(
     model: DiffusionModel,
     human: Human,
@@ -171,6 +173,7 @@ def inpaint(
     return with_edit(human, edit, combined(region, decoded(model, x0), human.payload))
 
 
+@on_fixed_threads
 def harmonise(
     model: DiffusionModel,
     human: Human,

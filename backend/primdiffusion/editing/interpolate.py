@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from primdiffusion.diffusion.fixed_threads import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddim
 from primdiffusion.diffusion.schedule import Schedule
@@ -30,6 +31,7 @@ from primdiffusion.human import Human, made_by
 from primdiffusion.primitives.primitives import Payload
 
 
+@on_fixed_threads
 def interpolate(
     model: DiffusionModel,
     a: Human,

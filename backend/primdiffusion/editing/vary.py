@@ -7,6 +7,7 @@ from types import MappingProxyType
 
 import torch
 
+from primdiffusion.diffusion.fixed_threads import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.editing.edit import (
@@ -49,6 +50,7 @@ def vary(
     return vary_batch(model, human, amount, [seed], steps, on_step, attributes, guidance)[0]
 
 
+@on_fixed_threads
 def vary_batch(
     model: DiffusionModel,
     human: Human,

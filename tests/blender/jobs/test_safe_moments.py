@@ -1,0 +1,200 @@
+"""Timers change data at safe moments alone, and never outside an undo step."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from types import SimpleNamespace
+
+import bpy
+import pytest
+from jobs_driven import drive, error_of
+
+from blender_primdiffusion.jobs import cycles_check, late_volumes, windows
+from blender_primdiffusion.jobs.follow import follow
+from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.scene.human import humans
+
+
+def until_ready() -> None:
+    """Until the child's result is there, and built but for the step into the scene."""
+    end = time.monotonic() + 60
+    while not queue.ready:
+        assert time.monotonic() < end
+        queue.tick()
+        time.sleep(0.01)
+
+
+def steps(*names: str) -> None:
+    """An undo step for each name, which adds an object of that name."""
+    for name in names:
+        bpy.context.scene.collection.objects.link(bpy.data.objects.new(name, None))
+        bpy.ops.ed.undo_push(message=name)
+
+
+def names() -> set[str]:
+    return {obj.name for obj in bpy.data.objects if obj.type == "EMPTY"}
+
+
+@pytest.fixture
+def resting_at_once(monkeypatch):
+    monkeypatch.setattr(windows, "UNDO_REST_S", 0.0)
+
+
+def test_a_result_waits_until_undo_and_redo_have_rested(addon, monkeypatch):
+    steps("before", "one", "two")
+    queue.add(addon, GenerateJob(11, 1))
+    until_ready()
+    monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
+    for step in (bpy.ops.ed.undo, bpy.ops.ed.undo, bpy.ops.ed.redo):
+        step()
+        for _ in range(5):
+            assert follow() is not None
+        assert windows.in_the_way() == "undo"
+        assert not humans(bpy.context.scene)
+    monkeypatch.setattr(windows, "UNDO_REST_S", 0.0)
+    drive()
+    assert len(humans(bpy.context.scene)) == 1
+    assert names() == {"before", "one"}
+
+
+@pytest.mark.parametrize("pressed", ["undo undo", "undo redo", "undo undo redo"])
+def test_results_between_undo_and_redo_are_steps_of_their_own(addon, resting_at_once, pressed):
+    steps("before")
+    rounds = 5
+    for count in range(1, rounds + 1):
+        steps(*(f"{count} {name}" for name in ("one", "two", "three")))
+        for step in pressed.split():
+            getattr(bpy.ops.ed, step)()
+        queue.add(addon, GenerateJob(10 + count, 1))
+        drive()
+        left = names()
+        for step, people in (("undo", count - 1), ("redo", count)):
+            getattr(bpy.ops.ed, step)()
+            assert len(humans(bpy.context.scene)) == people
+            assert names() == left
+    for _ in range(2):  # to the first step and back to the last
+        while len(names()) > 1:
+            bpy.ops.ed.undo()
+        assert not humans(bpy.context.scene)
+        while len(humans(bpy.context.scene)) < rounds:
+            bpy.ops.ed.redo()
+        assert names() == left
+
+
+@pytest.mark.parametrize(("job", "shown"), [("RENDER", "the render"), ("OBJECT_BAKE", "the bake")])
+def test_nothing_is_changed_while_blender_reads_the_scene_in_a_thread(addon, monkeypatch, job, shown):
+    queue.add(addon, GenerateJob(11, 1))
+    until_ready()
+    app = SimpleNamespace(is_job_running=lambda kind: kind == job)
+    monkeypatch.setattr(windows, "bpy", SimpleNamespace(app=app, context=bpy.context))
+    assert windows.in_the_way() == shown
+    for _ in range(5):
+        assert follow() is not None
+    assert late_volumes.late_volumes.tick() == late_volumes.BLOCKED_S
+    assert not humans(bpy.context.scene)
+    monkeypatch.undo()
+    drive()
+    assert len(humans(bpy.context.scene)) == 1
+
+
+def test_nothing_is_changed_within_a_modal_operator(addon, monkeypatch):
+    queue.add(addon, GenerateJob(11, 1))
+    until_ready()
+    modals = [
+        SimpleNamespace(name="Screencast Keys", bl_options={"REGISTER"}),
+        SimpleNamespace(name="Move", bl_options={"UNDO", "BLOCKING"}),
+    ]
+    manager = SimpleNamespace(windows=[SimpleNamespace(modal_operators=modals)])
+    context = SimpleNamespace(window_manager=manager)
+    app = SimpleNamespace(is_job_running=lambda _kind: False)
+    with monkeypatch.context() as held:
+        held.setattr(windows, "bpy", SimpleNamespace(app=app, context=context))
+        assert windows.in_the_way() == "Move"
+        modals.pop()
+        assert windows.in_the_way() == ""
+    drive()
+    assert len(humans(bpy.context.scene)) == 1
+
+
+def test_another_file_does_not_wait_for_the_undo_of_the_last_one(addon, monkeypatch):
+    monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
+    steps("one", "two")
+    bpy.ops.ed.undo()
+    assert windows.in_the_way() == "undo"
+    bpy.ops.wm.read_homefile(use_empty=True)
+    assert windows.in_the_way() == ""
+
+
+def test_what_a_failure_leaves_is_an_undo_step(addon, resting_at_once, monkeypatch):
+    def fail(*_given):
+        bpy.data.meshes.new("left behind").use_fake_user = True
+        raise ValueError("the disk is full")
+
+    monkeypatch.setattr(GenerateJob, "finish", fail)
+    steps("before", "one")
+    queue.add(addon, GenerateJob(11, 1))
+    drive()
+    assert "disk is full" in error_of("generate")
+    assert "left behind" in bpy.data.meshes
+    bpy.ops.ed.undo()
+    assert "left behind" not in bpy.data.meshes
+    assert names() == {"before", "one"}
+
+
+def test_a_failure_that_changed_nothing_makes_no_step(addon, resting_at_once, monkeypatch):
+    def fail(*_given):
+        raise ValueError("the disk is full")
+
+    monkeypatch.setattr(GenerateJob, "finish", fail)
+    steps("before", "one")
+    queue.add(addon, GenerateJob(11, 1))
+    drive()
+    bpy.ops.ed.undo()
+    assert names() == {"before"}
+
+
+def test_a_failure_that_left_edit_mode_can_be_undone(addon, resting_at_once, monkeypatch):
+    def fail(*_given):
+        raise ValueError("the disk is full")
+
+    monkeypatch.setattr(GenerateJob, "finish", fail)
+    bpy.ops.mesh.primitive_cube_add()
+    bpy.ops.ed.undo_push(message="Add Cube")
+    bpy.ops.object.mode_set(mode="EDIT")
+    bpy.ops.ed.undo_push(message="Edit Mode")
+    queue.add(addon, GenerateJob(11, 1))
+    drive()
+    assert bpy.context.mode == "OBJECT"
+    bpy.ops.ed.undo()
+    assert bpy.context.mode == "EDIT_MESH"
+    bpy.ops.ed.redo()
+    assert bpy.context.mode == "OBJECT"
+
+
+def test_a_job_without_a_step_that_leaves_data_makes_one(addon, resting_at_once, monkeypatch):
+    def finish(*_given) -> str:
+        bpy.data.images.new("baked by an exporter", 1, 1).use_fake_user = True
+        return "Exported"
+
+    monkeypatch.setattr(GenerateJob, "undo", "")
+    monkeypatch.setattr(GenerateJob, "finish", finish)
+    steps("before")
+    queue.add(addon, GenerateJob(11, 1))
+    drive()
+    bpy.ops.ed.undo()
+    assert "baked by an exporter" not in bpy.data.images
+    assert names() == {"before"}
+
+
+def test_the_check_of_cycles_is_followed_after_another_file_is_loaded(addon, monkeypatch):
+    process = subprocess.Popen(["sleep", "60"], stdout=subprocess.PIPE, text=True)
+    monkeypatch.setattr(cycles_check, "_recall", lambda: None)
+    monkeypatch.setattr(cycles_check, "_start", lambda: process)
+    try:
+        assert not cycles_check.volumes_are_empty()
+        bpy.ops.wm.read_homefile(use_empty=True)
+        assert bpy.app.timers.is_registered(cycles_check._follow)
+    finally:
+        cycles_check.unregister()
