@@ -6,7 +6,10 @@ Runs `python -m tests.fuzz` and `python -m tests.chaos` (about an hour in all), 
 one seed is generated on 1, 2 and 4 threads, alone and in a batch of 8: the largest difference of any number of the
 human, relative to the range of its kind. Two processes write the same seed: their files must have the same bytes.
 
-With --parts some of the three are measured anew, and the file's other figures are kept.
+Small files that claim much (`tests/fuzz/small_inputs.py`) are read one by one: `small_input_peak_mb` is the largest
+peak of memory, `small_input_seconds` the longest time.
+
+With --parts some of the four are measured anew, and the file's other figures are kept.
 """
 
 from __future__ import annotations
@@ -31,7 +34,7 @@ SEED = 7
 THREADS = (1, 2, 4)
 BATCHES = (1, 8)
 PERSON = "person.human.safetensors"
-PARTS = ("seed", "fuzz", "chaos")
+PARTS = ("seed", "small", "fuzz", "chaos")
 Figure = float | int | bool | str | None
 
 
@@ -47,6 +50,8 @@ def main() -> None:
     if "seed" in arguments.parts:
         figures["threads_person_error_max"] = person_error(arguments.steps)
         figures["same_seed_bytes_equal"] = same_bytes(arguments.steps)
+    if "small" in arguments.parts:
+        figures |= tool("tests.fuzz", "--small")
     if "fuzz" in arguments.parts:
         began = time.monotonic()
         figures |= tool("tests.fuzz", "--inputs", str(arguments.fuzz_inputs))

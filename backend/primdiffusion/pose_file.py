@@ -59,10 +59,10 @@ def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
         translation = _first(content, TRANSLATION_KEYS, translation)
     try:
         with np.errstate(over="ignore"):  # infinite numbers are rejected below
-            theta = _numbers(pose)
-        reject_matrices(theta)
-        theta = body_theta(_frame(_a_row_a_pose(theta), frame))
-        move = _frame(_numbers(translation), frame)[:3].copy()
+            theta = np.asarray(pose)
+            reject_matrices(theta)
+            theta = body_theta(_numbers(_frame(_a_row_a_pose(theta), frame)))
+            move = _numbers(_frame(np.asarray(translation), frame)[:3])
         if len(move) < 3:
             raise ValueError(f"{len(move)} numbers instead of 3")
     except (TypeError, ValueError, IndexError, OverflowError) as e:

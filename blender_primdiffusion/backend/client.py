@@ -11,7 +11,6 @@ import contextlib
 import dataclasses
 import itertools
 import json
-import os
 import subprocess
 import time
 from collections.abc import Iterator, Mapping
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from .child_streams import LOG_LINES, LONGEST_LINE, Input, Output
+from .child_variables import COMPUTING, passed_on
 from .messages import MessageError, fault_of, parsed
 
 PROGRAM = "primdiffusion"
@@ -85,18 +85,17 @@ def is_program(path: Path) -> bool:
 
 
 def child_environment(module_path: Path | None, cache_dir: Path | None, extra: Mapping[str, str]) -> dict[str, str]:
-    """The environment of a backend process: this one's, without what would lead its Python astray.
+    """The environment of a backend process: the variables that `child_variables` passes on, ours, and `extra`.
 
     `module_path` is the folder that holds the package `primdiffusion` (`bundled` in the zip); it goes before
     anything installed. `cache_dir` takes byte code and compiled kernels, so that the extension's folder stays as it is.
     """
-    environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONHOME", "PYTHONSTARTUP")}
+    environment = passed_on(COMPUTING)
     environment.update(PYTHONSAFEPATH="1")  # never import from the current folder
     environment.update(PYTHONUTF8="1", PYTHONUNBUFFERED="1", PYTHONFAULTHANDLER="1")
     if module_path is not None:
         environment["PYTHONPATH"] = str(module_path)
     if cache_dir is not None:
-        environment.pop("PYTHONDONTWRITEBYTECODE", None)  # torch would be recompiled at every start
         environment.update(PYTHONPYCACHEPREFIX=str(cache_dir / "bytecode"), NUMBA_CACHE_DIR=str(cache_dir / "numba"))
     environment.update(extra)
     return environment

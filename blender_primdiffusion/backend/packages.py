@@ -16,6 +16,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..formats.regular_files import read_regular
+from .child_variables import NETWORK, passed_on
 
 CUDA_DRIVER = 580
 """The oldest NVIDIA driver that torch's CUDA 13 builds run on."""
@@ -218,8 +219,7 @@ class SetUpFailed(RuntimeError):
 
 def clean_environment(temporary: Path, pip_cache: Path) -> dict[str, str]:
     """For pip and venv: nothing of a user's Python set-up, pip's own settings (mirror, proxy, certificate) stay."""
-    unwanted = ("PYTHON", "VIRTUAL_ENV", "__PYVENV", "CONDA", "PIP_TARGET", "PIP_PREFIX")
-    environment = {name: value for name, value in os.environ.items() if not name.startswith(unwanted)}
+    environment = passed_on(NETWORK)
     environment.update(PIP_USER="0", PIP_CACHE_DIR=str(pip_cache), PYTHONUTF8="1", PYTHONUNBUFFERED="1")
     environment.update(TMPDIR=str(temporary), TEMP=str(temporary), TMP=str(temporary))
     return environment

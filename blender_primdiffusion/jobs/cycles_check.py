@@ -79,7 +79,8 @@ def _follow() -> float | None:
 
 def _start() -> subprocess.Popen[str]:
     command = [bpy.app.binary_path, "-b", "--factory-startup", "--python", str(PROGRAM)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    environment = passed_on(COMPUTING, BLENDER)
+    return subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
 
 
 def _result(printed: str) -> bool:

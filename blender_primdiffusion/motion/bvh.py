@@ -24,7 +24,11 @@ MOST_JOINTS = 1000
 LONGEST_NUMBER = 40
 """Characters with the space around it: what is much longer than all numbers that are announced holds others."""
 MOST_ROTATIONS = 5_000_000
-"""Joints times frames: 24 joints for an hour at 60 frames/s, 65 joints for 20 minutes."""
+"""Joints times frames: 24 joints for an hour at 60 frames/s, 65 joints for 20 minutes. Files of fewer joints than SMPL
+count as SMPL's."""
+UNBACKED_ROTATIONS = 1_000_000
+"""Joints times frames that a file may have however small it is; beyond, one for each byte. Three angles with the space
+around them take at least six, but joints need not have angles."""
 LONGEST_FRAME_TIME, SHORTEST_FRAME_TIME = 10.0, 1e-4
 """Seconds."""
 _CHANNELS = {f"{axis}{kind}": (kind, "XYZ".index(axis)) for axis in "XYZ" for kind in ("position", "rotation")}
@@ -184,8 +188,9 @@ def _parse_motion(text: str, columns: int, joints: int) -> tuple[NDArray[np.floa
     frames, frame_time = int(found[1]), float(found[2])
     if not columns:
         raise ValueError("no joint has channels")
-    if frames * joints > MOST_ROTATIONS:
-        raise ValueError(f"{frames} frames of {joints} joints are more than {MOST_ROTATIONS} rotations, cut the motion")
+    rotations, most = frames * max(joints, len(JOINT_NAMES)), min(MOST_ROTATIONS, max(UNBACKED_ROTATIONS, len(text)))
+    if rotations > most:
+        raise ValueError(f"{frames} frames of {joints} joints are more than {most} rotations, cut the motion")
     if not (frame_time <= 0 or SHORTEST_FRAME_TIME <= frame_time <= LONGEST_FRAME_TIME):
         raise ValueError(f"a frame time of {frame_time:g} s")
     if len(text) - found.end() > LONGEST_NUMBER * frames * columns + LONGEST_HIERARCHY:

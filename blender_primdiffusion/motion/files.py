@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, array_names, read_arrays, read_npy
 from ..formats.json_files import read_json
+from ..formats.motion_size import MotionTooLongError, check_motion_size
 from ..formats.regular_files import TooLargeError
 from ..formats.rotations import first_improper, improper_text
 from ..formats.whole_files import replacing
@@ -157,6 +158,10 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
             raise MotionFileError(f"{path}: {key!r} holds {array.dtype} instead of numbers")
         if array.size == 0:
             raise MotionFileError(f"{path}: {key!r} holds no frame; export the motion again")
+        try:
+            check_motion_size(path, array.size)
+        except MotionTooLongError as e:
+            raise MotionFileError(str(e)) from e
         if not np.isfinite(array).all():
             raise MotionFileError(f"{path}: {key!r} holds NaN or infinite numbers; export the motion again")
         if array.size > MOST_NUMBERS or np.abs(array.astype(np.float64)).max() > LARGEST_NUMBER:

@@ -7,10 +7,23 @@ from numpy.typing import NDArray
 
 from ..scene.convention import matrix_to_quaternion
 
+_BLOCK = 100_000
+"""Rotations made at once: each step below takes as much memory as its result."""
+
 
 def from_axis_angle(vector: NDArray) -> NDArray[np.float64]:
     """Rotations [..., 3, 3] of axis-angle vectors [..., 3] (Rodrigues)."""
     vector = np.asarray(vector, np.float64)
+    if vector.size <= 3 * _BLOCK:
+        return _rodrigues(vector)
+    flat = vector.reshape(-1, 3)
+    rotation = np.empty((len(flat), 3, 3))
+    for first in range(0, len(flat), _BLOCK):
+        rotation[first : first + _BLOCK] = _rodrigues(flat[first : first + _BLOCK])
+    return rotation.reshape(*vector.shape[:-1], 3, 3)
+
+
+def _rodrigues(vector: NDArray) -> NDArray[np.float64]:
     angle = np.linalg.norm(vector, axis=-1)[..., None, None]
     cross = _cross(vector)
     # sin(x)/x and (1 - cos(x))/x^2 by sinc, which is right at 0
@@ -37,9 +50,13 @@ def from_quaternion(quaternion: NDArray) -> NDArray[np.float64]:
 def about_axis(axis: int, angle: NDArray | float) -> NDArray[np.float64]:
     """Rotations [..., 3, 3] by angles [...] about the axis x, y or z (0, 1, 2)."""
     angle = np.asarray(angle, np.float64)
-    vector = np.zeros((*angle.shape, 3))
-    vector[..., axis] = angle
-    return from_axis_angle(vector)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    rotation = np.zeros((*angle.shape, 3, 3))
+    rotation[..., axis, axis] = 1.0
+    rotation[..., first, first] = rotation[..., second, second] = cosine
+    rotation[..., second, first], rotation[..., first, second] = sine, -sine
+    return rotation
 
 
 def between(start: NDArray, end: NDArray) -> NDArray[np.float64]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import os
 import subprocess
 import sys
 import tempfile
@@ -15,6 +14,7 @@ from pathlib import Path
 import bpy
 
 from ..backend.child_streams import Output
+from ..backend.child_variables import BLENDER, COMPUTING, passed_on
 from ..backend.messages import MessageError, captures_message
 from ..console import CANCELLED, DONE
 from ..formats.removing import remove_folder
@@ -77,7 +77,7 @@ class CaptureSession:
                 stdin=subprocess.PIPE,
                 stdout=self._output.target,
                 stderr=self._errors.target,
-                env={**os.environ, "TMPDIR": folder, "TEMP": folder, "TMP": folder},
+                env={**passed_on(COMPUTING, BLENDER), "TMPDIR": folder, "TEMP": folder, "TMP": folder},
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
         except OSError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Generator
 from pathlib import Path
@@ -9,7 +10,17 @@ from pathlib import Path
 import pytest
 
 from blender_primdiffusion import places
+from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import BackendPython
+
+ORDERS = ("FAKE_", "EXPORT_")
+"""Beginnings of the variables that tell a fake child what to do; the extension itself passes none of them on."""
+
+
+def fake_client(python: Path, module_path: Path | None, *, cache_dir: Path | None = None) -> BackendClient:
+    """A client whose child gets the variables of ORDERS that are set at this time."""
+    orders = {name: value for name, value in os.environ.items() if name.startswith(ORDERS)}
+    return BackendClient(python, module_path, orders, cache_dir=cache_dir)
 
 
 def use_this_python(patch: pytest.MonkeyPatch, backend: Path | None = None) -> None:
@@ -23,3 +34,4 @@ def use_this_python(patch: pytest.MonkeyPatch, backend: Path | None = None) -> N
     patch.setattr("blender_primdiffusion.backend.environment.search", search)
     if backend:
         patch.setattr(places, "backend_module_path", lambda: backend)
+        patch.setattr(places, "BackendClient", fake_client)

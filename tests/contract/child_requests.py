@@ -6,6 +6,8 @@ import sys
 from collections.abc import Generator
 from pathlib import Path
 
+from waiting import BACKEND
+
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.requests import Backend, ChildRequest
 
@@ -17,7 +19,7 @@ def this_pythons_backend(**settings) -> Backend:
 
     def make_client() -> Generator[None, None, BackendClient]:
         yield
-        return BackendClient(Path(sys.executable), **settings)
+        return BackendClient(Path(sys.executable), BACKEND, **settings)
 
     return Backend(make_client)
 

@@ -53,7 +53,7 @@ def tick(request: ChildRequest, until, timeout_s: float = 90.0) -> None:
 @pytest.fixture
 def backend(tmp_path):
     (tmp_path / "sitecustomize.py").write_text(LONG_STEPS)
-    backend = this_pythons_backend(env={"PYTHONPATH": str(tmp_path)})
+    backend = this_pythons_backend(env={"PYTHONPATH": f"{tmp_path}{os.pathsep}{BACKEND}"})
     yield backend
     backend.shutdown()
 

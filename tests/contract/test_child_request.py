@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from child_requests import generate_request, this_pythons_backend
 from conversation import BUSY_STEPS
+from waiting import BACKEND
 
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import BackendNotFound, ImportTimedOut
@@ -68,7 +69,7 @@ def test_a_child_that_was_being_started_when_all_was_shut_down_is_ended_too(chec
     def slowly():
         for _ in range(3):
             yield
-        clients.append(BackendClient(PYTHON))
+        clients.append(BackendClient(PYTHON, BACKEND))
         return clients[0]
 
     backend = Backend(slowly)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from conversation import BUSY_STEPS
-from waiting import PYTHON, wait_for
+from waiting import BACKEND, PYTHON, wait_for
 
 from blender_primdiffusion.backend.child_streams import LONGEST_LINE
 from blender_primdiffusion.backend.client import (
@@ -29,7 +29,7 @@ def sampling(event) -> bool:
 
 @pytest.fixture
 def client():
-    client = BackendClient(PYTHON)
+    client = BackendClient(PYTHON, BACKEND)
     client.start()
     yield client
     client.kill()
@@ -280,9 +280,11 @@ def test_the_environment_leads_the_childs_python_nowhere_else(monkeypatch, tmp_p
     monkeypatch.setenv("PYTHONHOME", "/blender/python")
     monkeypatch.setenv("PYTHONPATH", "/blender/scripts")
     monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    monkeypatch.setenv("LD_PRELOAD", "/blender/library.so")
     environment = child_environment(tmp_path, tmp_path / "cache", {"EXTRA": "1"})
     assert "PYTHONHOME" not in environment
     assert "PYTHONDONTWRITEBYTECODE" not in environment
+    assert "LD_PRELOAD" not in environment
     assert environment["PYTHONPATH"] == str(tmp_path)
     assert Path(environment["NUMBA_CACHE_DIR"]).is_relative_to(tmp_path / "cache")
     assert Path(environment["PYTHONPYCACHEPREFIX"]).is_relative_to(tmp_path / "cache")
@@ -292,7 +294,7 @@ def test_the_environment_leads_the_childs_python_nowhere_else(monkeypatch, tmp_p
 def test_a_module_in_the_current_folder_is_not_taken_for_the_backends(monkeypatch, tmp_path):
     (tmp_path / "primdiffusion.py").write_text("raise SystemExit(7)")
     monkeypatch.chdir(tmp_path)
-    client = BackendClient(PYTHON)
+    client = BackendClient(PYTHON, BACKEND)
     client.start()
     wait_for(client, lambda e: isinstance(e, Response))
     client.kill()

@@ -7,6 +7,8 @@ from pathlib import Path
 from blender_primdiffusion.backend.client import BackendClient
 
 PYTHON = Path(sys.executable)
+BACKEND = Path(__file__).resolve().parents[2] / "backend"
+"""The checkout's own: a child sees no PYTHONPATH of the tests."""
 
 
 def wait_for(client: BackendClient, wanted, timeout_s: float = 60, into: list | None = None):

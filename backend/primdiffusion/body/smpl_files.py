@@ -18,6 +18,9 @@ from primdiffusion.formats.arrays import ArrayFileError, all_finite, array_names
 from primdiffusion.formats.regular_files import read_regular
 
 LARGEST_OBJ = 32 * 2**20
+MOST_FACES, MOST_NUMBERS = 100_000, 32_000_000
+"""Faces of a body, and numbers in one of its arrays: five and two times SMPL-X's. They become larger types, and a body
+without texture coordinates is unwrapped in a time that grows with its faces."""
 LARGEST_BODY_M = 1000.0
 """The automatic unwrap of larger ones takes minutes."""
 SHAPE_COMPONENTS = 10
@@ -112,6 +115,8 @@ class _ArrayFile:
         if not right:
             wanted = " x ".join(map(str, shape))
             raise self.wrong(name, f"has shape {' x '.join(map(str, array.shape))} where {wanted} is needed")
+        if array.size > MOST_NUMBERS:
+            raise self.wrong(name, f"holds {array.size} numbers, more than {MOST_NUMBERS}")
         if array.dtype.kind not in "biuf":
             raise self.wrong(name, f"holds {array.dtype} where numbers are needed")
         return array
@@ -125,6 +130,8 @@ class _ArrayFile:
 
     def whole(self, name: str, shape: tuple[int | str, ...], limit: int) -> np.ndarray:
         array = self.shaped(name, shape)
+        if len(array) > MOST_FACES:
+            raise self.wrong(name, f"has {len(array)} rows, more than {MOST_FACES}")
         number = np.array(array, np.int64)
         if not np.array_equal(number, array) or number.min() < 0 or number.max() >= limit:
             raise self.wrong(name, f"holds numbers that are not whole and from 0 to {limit - 1}")

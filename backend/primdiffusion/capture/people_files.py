@@ -21,7 +21,7 @@ from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import JsonError, parse_json
 from primdiffusion.formats.regular_files import read_regular
-from primdiffusion.geometry.pictures import MOST_PIXELS, opened_picture
+from primdiffusion.geometry.pictures import MOST_PIXELS, decoded, decoded_bytes, opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 
@@ -32,7 +32,11 @@ WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 LARGEST_GLB = 256 * 2**20
 MOST_PARTS, MOST_CORNERS, MOST_TEXELS = 100, 20_000_000, 2 * MOST_PIXELS
-"""Of a human: nodes may share meshes, and materials pictures, so that small files name gigabytes."""
+"""Limits of a human."""
+UNBACKED_CORNERS = 1_000_000
+"""Corners and coordinates that a human may have however small its file is; beyond, one for each byte. Primitives may
+share accessors, so that small files name gigabytes, while an ordinary file has two bytes for an index and four for a
+coordinate."""
 LARGEST_UV = 1e4
 """Repeats of a texture."""
 
@@ -49,6 +53,8 @@ class Glb:
     content: dict[str, Any]
     """The JSON chunk."""
     binary: bytes
+    size: int
+    """Bytes of the file."""
 
     def array(self, accessor: int) -> NDArray:
         """Values of an accessor, [count] or [count, width]; normalised integers as float32 in [0, 1].
@@ -84,15 +90,28 @@ class Glb:
             GlbError: it does not exist, is not embedded, or cannot be decoded.
         """
         try:
-            view = self.content["bufferViews"][self.content["images"][image]["bufferView"]]
-            first = int(view.get("byteOffset", 0))
-            data = self.binary[first : first + int(view["byteLength"])]
-            with opened_picture(io.BytesIO(data)) as picture:
-                return np.asarray(picture.convert("RGBA"))
+            with opened_picture(io.BytesIO(self._image_bytes(image))) as picture:
+                return decoded(picture, "RGBA")
         except (LookupError, TypeError, ValueError, OSError, OverflowError) as e:
-            raise GlbError(
-                f"{self.path}: image {image} cannot be read ({e!s:.160}): pack PNG or JPEG into the file"
-            ) from e
+            raise self._unreadable_image(image, e) from e
+
+    def picture_texels(self, image: int) -> int:
+        """Number of an embedded image's pixels, from its header alone. Raises as `picture`."""
+        try:
+            with opened_picture(io.BytesIO(self._image_bytes(image))) as picture:
+                return picture.width * picture.height
+        except (LookupError, TypeError, ValueError, OSError, OverflowError) as e:
+            raise self._unreadable_image(image, e) from e
+
+    def _image_bytes(self, image: int) -> bytes:
+        view = self.content["bufferViews"][self.content["images"][image]["bufferView"]]
+        first = int(view.get("byteOffset", 0))
+        return self.binary[first : first + int(view["byteLength"])]
+
+    def _unreadable_image(self, image: int, reason: Exception) -> GlbError:
+        return GlbError(
+            f"{self.path}: image {image!s:.20} cannot be read ({reason!s:.160}): pack PNG or JPEG into the file"
+        )
 
 
 def read_glb(path: str | Path) -> Glb:
@@ -120,7 +139,7 @@ def read_glb(path: str | Path) -> Glb:
         raise GlbError(f"{path} is not a complete .glb file ({e!s:.160}): write it again") from e
     if not isinstance(content, dict):
         raise GlbError(f"{path} contains no glTF object: write it again")
-    return Glb(path, content, chunks.get(BINARY_CHUNK, b""))
+    return Glb(path, content, chunks.get(BINARY_CHUNK, b""), len(data))
 
 
 SUBJECT_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
@@ -196,8 +215,9 @@ def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
 
 
 def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
-    nodes, parts, corners, texels = glb.content["nodes"], [], 0, 0
-    textures: dict[int | None, UInt8[np.ndarray, "H W 4"]] = {}
+    nodes, parts, corners = glb.content["nodes"], [], 0
+    most_corners = min(MOST_CORNERS, UNBACKED_CORNERS + glb.size)
+    textures = _Textures(glb)
     for node in nodes:
         if "mesh" not in node:
             continue
@@ -206,16 +226,12 @@ def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
         joints = _joints(glb, node["skin"])
         for number, primitive in enumerate(glb.content["meshes"][node["mesh"]]["primitives"]):
             name = str(node.get("name", f"part {len(parts)}")) + (f" {number}" if number else "")
-            material = primitive.get("material")
-            if material not in textures:
-                textures[material] = _texture(glb, material)
-                texels += textures[material].size // 4
-            parts.append(_part(glb, name, primitive, joints, textures[material]))
+            parts.append(_part(glb, name, primitive, joints, textures.of_material(primitive.get("material"))))
             corners += parts[-1].faces.size + parts[-1].vertices.size
-            if len(parts) > MOST_PARTS or corners > MOST_CORNERS or texels > MOST_TEXELS:
+            if len(parts) > MOST_PARTS or corners > most_corners:
                 raise GlbError(
-                    f"{glb.path} has more than {MOST_PARTS} parts, {MOST_CORNERS} corners or {MOST_TEXELS} texels: "
-                    "make a simpler human"
+                    f"{glb.path} has more than {MOST_PARTS} parts, or than the {most_corners} corners that a file of "
+                    "its size may have: make a simpler human"
                 )
     if not parts:
         raise GlbError(f"{glb.path} contains no mesh: make the human again")
@@ -262,24 +278,69 @@ def _part(
     )
 
 
-def _texture(glb: Glb, number: int | None) -> UInt8[np.ndarray, "H W 4"]:
-    """Base colour times factor; opaque unless the material uses alpha."""
+@dataclasses.dataclass(frozen=True)
+class _Surface:
+    """What determines a material's texture: materials of equal surfaces share one array."""
+
+    image: int | None
+    """None for a plain colour."""
+    factor: tuple[float, ...]
+    """On linear red, green, blue and alpha."""
+    alpha_scale: float | None
+    """Factor on alpha, at which the cutoff is one half, as the rasteriser tests; None for opaque materials."""
+
+
+class _Textures:
+    """The textures of a file, each decoded once, and only as many as a file of its size may have."""
+
+    def __init__(self, glb: Glb) -> None:
+        self._glb = glb
+        self._most_texels = min(MOST_TEXELS, decoded_bytes(glb.size) // 4)
+        self._texels = 0
+        self._decoded: dict[_Surface, UInt8[np.ndarray, "H W 4"]] = {}
+
+    def of_material(self, number: int | None) -> UInt8[np.ndarray, "H W 4"]:
+        """Base colour times factor; opaque unless the material uses alpha. Raises GlbError."""
+        surface = _surface(self._glb, number)
+        if surface not in self._decoded:
+            self._texels += 1 if surface.image is None else self._glb.picture_texels(surface.image)
+            if self._texels > self._most_texels:
+                raise GlbError(
+                    f"{self._glb.path} has textures of more than the {self._most_texels} texels that a file of its "
+                    "size may have: make a simpler human"
+                )
+            self._decoded[surface] = _texture(self._glb, surface)
+        return self._decoded[surface]
+
+
+def _surface(glb: Glb, number: int | None) -> _Surface:
     material = {} if number is None else glb.content["materials"][number]
-    surface = material.get("pbrMetallicRoughness", {})
-    picture = np.full((1, 1, 4), 255, np.uint8)
-    if "baseColorTexture" in surface:
-        picture = glb.picture(glb.content["textures"][surface["baseColorTexture"]["index"]]["source"]).copy()
-    factor = np.asarray(surface.get("baseColorFactor", (1, 1, 1, 1)), np.float64)
-    if not (factor[:3] == 1).all():
-        linear = decode_srgb(np.arange(256)[:, None] / 255.0) * factor[:3]
-        table = np.round(encode_srgb(np.clip(linear, 0, 1)) * 255).astype(np.uint8)
-        for channel in range(3):
-            picture[..., channel] = table[picture[..., channel], channel]
+    about = material.get("pbrMetallicRoughness", {})
+    image = None
+    if "baseColorTexture" in about:
+        image = int(glb.content["textures"][about["baseColorTexture"]["index"]]["source"])
+    red, green, blue, alpha = map(float, about.get("baseColorFactor", (1, 1, 1, 1)))
     if material.get("alphaMode", "OPAQUE") == "OPAQUE":
+        return _Surface(image, (red, green, blue), None)
+    cutoff = float(material.get("alphaCutoff", 0.5)) if material["alphaMode"] == "MASK" else 0.5
+    return _Surface(image, (red, green, blue), alpha * 0.5 / max(cutoff, 1e-3))
+
+
+def _texture(glb: Glb, surface: _Surface) -> UInt8[np.ndarray, "H W 4"]:
+    picture = np.full((1, 1, 4), 255, np.uint8) if surface.image is None else glb.picture(surface.image)
+    if surface.factor != (1, 1, 1):
+        linear = decode_srgb(np.arange(256)[:, None] / 255.0) * np.array(surface.factor)
+        _replace(picture, np.round(encode_srgb(np.clip(linear, 0, 1)) * 255).astype(np.uint8))
+    if surface.alpha_scale is None:
         picture[..., 3] = 255
     else:
-        # Scale alpha so that the cutoff is one half, as the rasteriser tests.
-        cutoff = float(material.get("alphaCutoff", 0.5)) if material["alphaMode"] == "MASK" else 0.5
-        scaled = np.arange(256) * (factor[3] * 0.5 / max(cutoff, 1e-3))
-        picture[..., 3] = np.round(np.clip(scaled, 0, 255)).astype(np.uint8)[picture[..., 3]]
+        scaled = np.arange(256) * surface.alpha_scale
+        _replace(picture[..., 3:], np.round(np.clip(scaled, 0, 255)).astype(np.uint8)[:, None])
     return picture
+
+
+def _replace(values: UInt8[np.ndarray, "H W n"], table: UInt8[np.ndarray, "256 c"]) -> None:
+    """Replace the first values of each texel by the table's, in place and a row at a time."""
+    for row in values:
+        for channel in range(table.shape[1]):
+            row[:, channel] = table[row[:, channel], channel]

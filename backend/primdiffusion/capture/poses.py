@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.formats.arrays import ArrayFileError, all_finite, read_npy, read_numbers
 from primdiffusion.formats.json_files import read_json
+from primdiffusion.formats.motion_size import MotionTooLongError, check_motion_size
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.pose_file import body_theta, reject_matrices
 
@@ -23,6 +24,8 @@ CLEARLY_UP = 0.6
 """Smallest mean cosine between the pelvis' up and an axis for which that axis is up."""
 MOST_CANDIDATES = 2000
 """Frames to choose from; longer motions are subsampled evenly."""
+FRAMES_AT_ONCE = 4096
+"""Frames whose rotations are made at once: in float64 that takes several times their memory."""
 BUILT_IN = Path(__file__).parent / "data" / "poses.json"
 """The extension's poses, 72 axis-angle values by name; made by scripts/bake_poses."""
 
@@ -49,6 +52,10 @@ def read_motion(path: str | Path) -> BodyPose:
     if not path.is_file():
         raise FileNotFoundError(f"the pose file {path} does not exist: check the path")
     content = read_numbers(path, (), KEYS) if path.suffix == ".npz" else _read_plain(path)
+    try:
+        check_motion_size(path, max((values.size for values in content.values()), default=0))
+    except MotionTooLongError as e:
+        raise MotionFileError(str(e)) from e
     turns = _turns(path, content)
     move = np.asarray(_first(content, TRANSLATIONS, np.zeros(3)), np.float64)
     if move.size not in (3, 3 * len(turns)) or not all_finite(move):
@@ -111,8 +118,9 @@ def _spread(rotation: Float[torch.Tensor, "F J 3 3"], count: int, seed: int) -> 
 
 
 def _as_pose(turns: NDArray, translation: NDArray) -> BodyPose:
-    rotation = axis_angle_to_matrix(torch.from_numpy(turns.reshape(-1, J, 3)))
-    return BodyPose(rotation.float(), torch.from_numpy(np.array(translation, np.float32)))
+    blocks = torch.from_numpy(turns.reshape(-1, J, 3)).split(FRAMES_AT_ONCE)
+    rotation = torch.cat([axis_angle_to_matrix(block).float() for block in blocks])
+    return BodyPose(rotation, torch.from_numpy(np.array(translation, np.float32)))
 
 
 def _read_plain(path: Path) -> dict[str, NDArray]:

@@ -22,7 +22,7 @@ from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.pictures import opened_picture
+from primdiffusion.geometry.pictures import decoded, opened_picture, strips
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 
@@ -253,14 +253,14 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
         CaptureFileError: it is damaged or has another size.
     """
     try:
-        with opened_picture(path) as picture:
+        with opened_picture(path, bytes_each=_BYTES_OF_A_PIXEL.get(kind, 4)) as picture:
             size = picture.size
             if size == (width, height) and kind == "depth":
                 if len(picture.getbands()) != 1:
                     raise ValueError(f"it has {len(picture.getbands())} channels instead of one")
-                return np.asarray(picture).astype(np.uint16)
+                return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
             if size == (width, height):
-                return np.array(picture.convert("RGB" if kind in ("img", "normal") else "L"))
+                return decoded(picture, "RGB" if kind in ("img", "normal") else "L")
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
@@ -304,7 +304,7 @@ def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
         pictures = sorted((folder / kind / f"camera{camera:04d}").glob(f"[0-9]*{capture_layout.ENDINGS[kind]}"))
         for path in pictures[:1]:
             try:
-                with opened_picture(path) as picture:
+                with opened_picture(path, bytes_each=1) as picture:
                     return picture.size
             except (OSError, ValueError) as e:
                 raise CaptureFileError(f"{path} is not a complete image ({e!s:.160}): render it again") from e
@@ -316,15 +316,23 @@ def _no_mask(view: View) -> Tensor:
 
 
 def _depth(steps: np.ndarray) -> np.ndarray:
-    return steps.astype(np.float32) * np.float32(DEPTH_UNIT)
+    metres = steps.astype(np.float32)
+    metres *= np.float32(DEPTH_UNIT)
+    return metres
 
 
 def _normal(values: np.ndarray) -> np.ndarray:
-    return np.where(values.any(-1, keepdims=True), values.astype(np.float32) / 127.5 - 1, 0).astype(np.float32)
+    normals = np.zeros(values.shape, np.float32)
+    for row, bytes_of_row in zip(normals, values, strict=True):  # whole pictures would take three copies
+        covered = bytes_of_row.any(-1)
+        row[covered] = bytes_of_row[covered].astype(np.float32) / 127.5 - 1
+    return normals
 
 
 def _as_stored(values: np.ndarray) -> np.ndarray:
     return values
 
 
+_BYTES_OF_A_PIXEL = {"img": 4, "mask": 1, "depth": 4, "normal": 12, "part": 1}
+"""Of a view in memory."""
 _KINDS = {"img": _as_stored, "mask": _as_stored, "depth": _depth, "normal": _normal, "part": _as_stored}

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, UInt8
+from PIL import Image
 from torch import Tensor
 from torch.nn import functional
 
@@ -19,7 +20,7 @@ from primdiffusion.formats.arrays import read_npy
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.pictures import PictureError, opened_picture
+from primdiffusion.geometry.pictures import PictureError, opened_picture, strips
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
 from primdiffusion.people.person import Person
@@ -42,6 +43,8 @@ FAR_OUTSIDE = 100
 """Widths of the picture that no joint is away from its corner."""
 WHITE_DISTANCE = 6
 """Pictures without alpha: a pixel whose channels are all within this of white (255) is background."""
+STRIP_PIXELS = 2**17
+"""Pixels that are resized at once."""
 SUPERSAMPLE = 2
 """Samples along a pixel's side in renders of meshes."""
 SUFFIXES, FORMATS = (".png", ".jpg", ".jpeg", ".webp"), ("PNG", "JPEG", "WEBP")
@@ -151,37 +154,53 @@ def folder_shots(folder: Path) -> Iterator[Shot]:
     if not isinstance(truth, dict):
         raise ValueError(f"{folder / JOINTS_FILE} is not an object of picture names: see docs/design/evaluation.md")
     for path in paths:
-        rgba = _read_picture(path)
-        size = rgba.shape[0]
-        rgb, alpha = rgba[..., :3], rgba[..., 3:]
-        rgb = _to_side(rgb * alpha + (1 - alpha), antialias=True)
-        if bool((alpha < 1).any()):
-            mask = _to_side(alpha, antialias=True)[..., 0] >= 0.5
-        else:
-            mask = (rgb * 255 < 255 - WHITE_DISTANCE).any(-1)
+        shrunk, size, has_alpha = _read_picture(path)
+        rgb = shrunk[..., :3]
+        mask = shrunk[..., 3] >= 0.5 if has_alpha else (rgb * 255 < 255 - WHITE_DISTANCE).any(-1)
         joints, head_size = _joints(truth.get(path.name), size, folder / JOINTS_FILE, path.name)
         depth = _depth(folder / DEPTH_FOLDER / f"{path.stem}.npy", size)
         yield Shot(path.name, (rgb * 255).round().to(torch.uint8), mask, joints, head_size, depth)
 
 
-def _read_picture(path: Path) -> Float[Tensor, "h w 4"]:
+def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], int, bool]:
+    """Colour over white and alpha, resized to SIDE; the picture's own side; whether any of it is transparent."""
     try:
         with opened_picture(path, FORMATS) as picture:
             width, height = picture.size
-            array = np.asarray(picture.convert("RGBA"), np.float32)
+            if width == height:
+                shrunk, has_alpha = _over_white(picture)
+                return shrunk, width, has_alpha
     except (PictureError, OSError) as error:
         raise ValueError(f"{path} is not a readable picture ({error!s:.160}): write it again or remove it") from error
-    if width != height:
-        raise ValueError(f"{path} has {width} x {height} pixels: pad it with white to a square")
-    return torch.from_numpy(array) / 255
+    raise ValueError(f"{path} has {width} x {height} pixels: pad it with white to a square")
 
 
-def _to_side(values: Float[Tensor, "h w c"], antialias: bool) -> Float[Tensor, "s s c"]:
-    if values.shape[:2] == (SIDE, SIDE):
+def _over_white(picture: Image.Image) -> tuple[Float[Tensor, "s s 4"], bool]:
+    """Colour over white and alpha, resized to SIDE; whether any of it is transparent.
+
+    The bicubic filter with antialiasing is separable: strips of rows are shrunk in width, and what they give in height.
+    A whole picture in float32 would take gigabytes.
+    """
+    narrow, has_alpha = [], False
+    for _, strip in strips(picture, STRIP_PIXELS):
+        rgba = np.asarray(strip.convert("RGBA"))
+        has_alpha = has_alpha or int(rgba[..., 3].min()) < 255
+        values = torch.from_numpy(rgba.astype(np.float32)) / 255
+        values[..., :3] = values[..., :3] * values[..., 3:] + (1 - values[..., 3:])
+        narrow.append(_resized(values, (len(values), SIDE)))
+    return _resized(torch.cat(narrow), (SIDE, SIDE)).clamp(0, 1), has_alpha
+
+
+def _resized(values: Float[Tensor, "h w c"], size: tuple[int, int]) -> Float[Tensor, "h2 w2 c"]:
+    if values.shape[:2] == size:
         return values
-    mode = "bicubic" if antialias else "nearest"
-    moved = functional.interpolate(values.movedim(-1, 0)[None], (SIDE, SIDE), mode=mode, antialias=antialias)
-    return moved[0].movedim(0, -1).clamp(0, 1) if antialias else moved[0].movedim(0, -1)
+    return functional.interpolate(values.movedim(-1, 0)[None], size, mode="bicubic", antialias=True)[0].movedim(0, -1)
+
+
+def _nearest(values: Float[Tensor, "h w"]) -> Float[Tensor, "s s"]:
+    if values.shape == (SIDE, SIDE):
+        return values
+    return functional.interpolate(values[None, None], (SIDE, SIDE), mode="nearest")[0, 0]
 
 
 def _joints(given: Any, size: int, source: Path, name: str) -> tuple[Tensor | None, float | None]:
@@ -209,4 +228,4 @@ def _depth(path: Path, size: int) -> Float[Tensor, "s s"] | None:
     if depth.shape != (size, size):
         raise ValueError(f"{path} has shape {tuple(depth.shape)}, its picture {size} x {size} pixels: give one size")
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.inf)
-    return _to_side(depth[..., None], antialias=False)[..., 0]
+    return _nearest(depth)

@@ -25,7 +25,7 @@ LARGEST_BYTES = 512 * 2**20
 """Largest size of what one call reads: small files can claim petabytes. An hour of motion at 60 frames/s takes 285
 MB."""
 MOST_REPEATED, LARGEST_RATIO = 64 * 2**20, 200
-"""Bytes from which on an array may not be larger than this many times its compressed size: arrays of zeros are."""
+"""Bytes from which on what one call reads may not be larger than this many times its compressed size: zeros are."""
 LARGEST_NUMBER = 1e9
 LARGEST_FILE = 2**31
 _LARGEST_DIRECTORY = 4 * 2**20
@@ -76,14 +76,15 @@ def read_arrays(path: str | Path, required: Sequence[str] = (), optional: Sequen
         ArrayFileError: the file is damaged, lacks an array, or one is pickled or larger than `LARGEST_BYTES`.
         OSError: it cannot be opened; FileNotFoundError if it does not exist.
     """
-    arrays, total = {}, 0
+    arrays, total, packed = {}, 0, 0
     with _archive(path) as archive:
         for name in (*required, *optional):
             if name in optional and _member(archive, name) is None:
                 continue
             member = _needed(archive, path, name)
-            total += member.file_size
+            total, packed = total + member.file_size, packed + member.compress_size
             _check_size(total, f"{path}: {name!r}")
+            _check_ratio(total, packed, f"{path}: {name!r}")
             with archive.open(member) as stream:
                 arrays[name] = _read(stream, member.file_size, f"{path}: {name!r}")
     return arrays
@@ -271,9 +272,13 @@ def _needed(archive: zipfile.ZipFile, path: str | Path, name: str) -> zipfile.Zi
         raise ArrayFileError(f"{path}: {name!r} is encrypted, which is not supported: save it without a password")
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack without a limit
         raise ArrayFileError(f"{path}: {name!r} is compressed in another way than numpy's: save it with numpy.savez")
-    if member.file_size > max(MOST_REPEATED, LARGEST_RATIO * member.compress_size):
-        raise ArrayFileError(f"{path}: {name!r} unpacks to {member.file_size / 2**20:.0f} MB of the same: cut it")
+    _check_ratio(member.file_size, member.compress_size, f"{path}: {name!r}")
     return member
+
+
+def _check_ratio(size: int, packed: int, what: str) -> None:
+    if size > max(MOST_REPEATED, LARGEST_RATIO * packed):
+        raise ArrayFileError(f"{what} unpacks to {size / 2**20:.0f} MB of the same: cut it")
 
 
 def _check_size(size: int, what: str) -> None:

@@ -30,10 +30,6 @@ _TEMPORARY = re.compile(rf"\.(?P<stem>.*)\.{_WRITER.pattern}\.partial(?P<suffix>
 _REPLACED = "replaced"
 
 
-class FolderInUseError(ValueError):
-    """Another process works in the folder; the message names it."""
-
-
 def writer() -> str:
     """This process, and a random part: for names of temporary files."""
     return f"{_space()}-{os.getpid()}-{secrets.token_hex(4)}"
@@ -153,7 +149,7 @@ def staged_together(folders: Sequence[str | Path], last: str = "") -> Iterator[l
     asides: list[Path] = []
     try:
         for target in targets:
-            made += _make(target)
+            made += create_folders(target)
             remove_abandoned(target)
             asides.append(temporary_name(target / "files"))
             asides[-1].mkdir()
@@ -168,36 +164,7 @@ def staged_together(folders: Sequence[str | Path], last: str = "") -> Iterator[l
     finally:
         for aside in asides:
             remove_folder(aside, aside.parent)
-        _unmake(made)
-
-
-@contextlib.contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
-    """Hold a folder, created if need be, for one process at a time. Raises FolderInUseError, OSError.
-
-    The system lets go of it when the process ends, however it ends. Windows, and disks that know no such locks, hold
-    nothing. A created folder that is still empty in the end is removed.
-    """
-    made = _make(folder)
-    try:
-        if os.name == "nt":
-            yield
-            return
-        import fcntl  # not on Windows
-
-        descriptor = os.open(folder, os.O_RDONLY)
-        try:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as e:
-                raise FolderInUseError(f"another process works in {folder}: wait for it, or give another folder") from e
-            except OSError:  # a disk without locks
-                pass
-            yield
-        finally:
-            os.close(descriptor)
-    finally:
-        _unmake(made)
+        remove_empty(made)
 
 
 def publish(moves: Sequence[tuple[Path, Path]], last: str = "") -> None:
@@ -248,7 +215,7 @@ def _keep(target: Path, old: Path) -> None:
         shutil.copy2(target, old)
 
 
-def _make(folder: Path) -> list[Path]:
+def create_folders(folder: Path) -> list[Path]:
     """Create `folder` and its missing parents; return the created ones, innermost first."""
     missing = []
     while not folder.exists():
@@ -259,7 +226,7 @@ def _make(folder: Path) -> list[Path]:
     return missing
 
 
-def _unmake(created: Sequence[Path]) -> None:
+def remove_empty(created: Sequence[Path]) -> None:
     """Remove the created folders, unless they are in use."""
     for path in created:
         with contextlib.suppress(OSError):

@@ -1,8 +1,15 @@
-"""Decode untrusted picture files of a limited size."""
+"""Decode untrusted picture files in limited memory.
+
+A picture of one colour compresses to a thousandth, so that a small file may claim as much as a scan's texture of
+8192 x 8192 pixels, which is a large file. Hence two limits, both checked before pixels are decoded: MOST_PIXELS for
+all, and for what a decoded picture takes, UNBACKED_BYTES or LARGEST_RATIO times the size of its file.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import io
+import os
 import struct
 import warnings
 import zlib
@@ -10,12 +17,25 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+from jaxtyping import UInt8
 from PIL import Image
 
-from primdiffusion.formats.regular_files import check_regular
+from primdiffusion.formats.regular_files import check_regular, open_regular
 
 MOST_PIXELS = 8192 * 8192
-"""Of a picture: small files can claim gigabytes."""
+"""Most pixels of a picture: what scans have."""
+UNBACKED_BYTES = 160 * 2**20
+"""Bytes that a decoded picture may take however small its file is: colour of 6,400 x 6,400 pixels, grey of any size."""
+LARGEST_RATIO = 160
+"""Decoded bytes for each byte of the file beyond that. A scan's texture of 8192 x 8192 then needs a file of 1.7 MB; as
+JPEG it has 1.0 MB if all of it has one colour."""
+MOST_SCANS = 64
+"""Scans of a JPEG, each of which passes over all of its pixels; progressive files have about ten."""
+STRIP_PIXELS = 2**20
+"""Pixels that are converted at once."""
+LARGEST_FILE = 512 * 2**20
+"""Bytes of a picture file."""
 _UNREADABLE = (
     SyntaxError, ValueError, TypeError, LookupError, EOFError, OverflowError, RuntimeError, MemoryError, struct.error,
     zlib.error, Image.DecompressionBombError, Image.DecompressionBombWarning,
@@ -27,25 +47,76 @@ class PictureError(ValueError):
 
 
 @contextlib.contextmanager
-def opened_picture(source: Path | BinaryIO, formats: tuple[str, ...] = ("PNG", "JPEG")) -> Iterator[Image.Image]:
+def opened_picture(
+    source: Path | BinaryIO, formats: tuple[str, ...] = ("PNG", "JPEG"), bytes_each: int = 4
+) -> Iterator[Image.Image]:
     """Open a picture of one of Pillow's `formats`; errors of decoding it in the block are PictureErrors too.
+
+    `bytes_each` is the number of bytes that the block makes of a pixel, by which large pictures of small files are
+    rejected before anything is decoded.
 
     Raises PictureError, and OSError for a file that cannot be opened.
     """
-    if isinstance(source, Path):
-        check_regular(source)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limit below is smaller
-            with Image.open(source, formats=formats) as picture:
-                if picture.width * picture.height > MOST_PIXELS:
-                    raise PictureError(f"{picture.width} x {picture.height} pixels, more than {MOST_PIXELS}")
-                yield picture
-    except PictureError:
-        raise
-    except OSError as e:
-        if e.errno is not None:
+    with contextlib.ExitStack() as stack:
+        if isinstance(source, Path):
+            check_regular(source)
+        try:
+            file = stack.enter_context(open_regular(source, LARGEST_FILE)) if isinstance(source, Path) else source
+            size = file.seek(0, os.SEEK_END)
+            file.seek(0)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # the limits below are smaller
+                with Image.open(file, formats=formats) as picture:
+                    check_pixels(picture.width, picture.height, size, bytes_each)
+                    if picture.format == "JPEG":
+                        _check_scans(file)
+                    yield picture
+        except PictureError:
             raise
-        raise PictureError(str(e)[:120]) from e
-    except _UNREADABLE as e:
-        raise PictureError(str(e)[:120]) from e
+        except OSError as e:
+            if e.errno is not None:
+                raise
+            raise PictureError(str(e)[:120]) from e
+        except _UNREADABLE as e:
+            raise PictureError(str(e)[:120]) from e
+
+
+def check_pixels(width: int, height: int, file_size: int, bytes_each: int) -> None:
+    """Raise PictureError for more pixels than MOST_PIXELS, or than a file of this size may have (see the module)."""
+    if width * height > MOST_PIXELS:
+        raise PictureError(f"{width} x {height} pixels, more than {MOST_PIXELS}")
+    if width * height * bytes_each > decoded_bytes(file_size):
+        raise PictureError(f"{width} x {height} pixels in a file of only {file_size} bytes")
+
+
+def decoded_bytes(file_size: int) -> int:
+    """The most bytes that what is decoded from a file of this size may take."""
+    return max(UNBACKED_BYTES, LARGEST_RATIO * file_size)
+
+
+def decoded(picture: Image.Image, mode: str) -> UInt8[np.ndarray, "H W *channels"]:
+    """Decode a picture to Pillow's `mode` ("RGBA", "RGB", "L"), in strips: the result is the only other copy."""
+    bands = len(Image.new(mode, (1, 1)).getbands())
+    pixels = np.empty((picture.height, picture.width, bands), np.uint8)
+    for top, strip in strips(picture):
+        pixels[top : top + strip.height] = np.asarray(strip.convert(mode)).reshape(strip.height, strip.width, bands)
+    return pixels if bands > 1 else pixels[..., 0]
+
+
+def strips(picture: Image.Image, pixels: int | None = None) -> Iterator[tuple[int, Image.Image]]:
+    """Yield the picture in strips of whole rows of about `pixels`, each with the number of its first row."""
+    rows = max(1, (pixels or STRIP_PIXELS) // max(picture.width, 1))
+    for top in range(0, picture.height, rows):
+        yield top, picture.crop((0, top, picture.width, min(top + rows, picture.height)))
+
+
+def _check_scans(file: BinaryIO | io.BufferedReader | io.BytesIO) -> None:
+    """Count the markers that begin scans, which no compressed data contain."""
+    place, scans, last = file.tell(), 0, b""
+    file.seek(0)
+    while chunk := file.read(2**20):
+        scans += (last + chunk).count(b"\xff\xda")
+        last = chunk[-1:]
+    file.seek(place)
+    if scans > MOST_SCANS:
+        raise PictureError(f"{scans} scans, more than {MOST_SCANS}")

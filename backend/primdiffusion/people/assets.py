@@ -22,7 +22,7 @@ from jaxtyping import UInt8
 from PIL import Image
 
 from primdiffusion.formats.regular_files import open_regular, read_regular, real_path
-from primdiffusion.geometry.pictures import PictureError, opened_picture
+from primdiffusion.geometry.pictures import PictureError, decoded, opened_picture, strips
 from primdiffusion.people.mhclo import ObjMesh, Proxy, read_pair
 
 ENVIRONMENT_VARIABLE = "PRIMDIFFUSION_ASSETS"
@@ -136,16 +136,22 @@ def _picture_path(root: Path, name: str) -> Path | None:
 def _decoded(path: Path, size: int) -> UInt8[np.ndarray, "H W 4"]:
     """Decode and shrink an image; shrinking weights colour by alpha, so that edges keep their colour."""
     try:
-        with opened_picture(path) as file:
-            picture = file.convert("RGBA")
+        with opened_picture(path) as picture:
+            array = decoded(picture, "RGBA") if picture.width <= size else _shrunk(picture, size)
     except (OSError, PictureError) as error:
         raise DamagedPictureError(f"{path} cannot be decoded ({error!s:.160}): fetch it again") from error
-    if picture.width > size:
-        box = (size, round(picture.height * size / picture.width))
-        picture = picture.convert("RGBa").resize(box, Image.Resampling.BOX).convert("RGBA")
-    array = np.array(picture)
     array.setflags(write=False)
     return array
+
+
+def _shrunk(picture: Image.Image, width: int) -> UInt8[np.ndarray, "H W 4"]:
+    """Shrink to a width, strip by strip: Pillow filters rows, rounds, and then columns, so the result is the same."""
+    narrow = Image.new("RGBa", (width, picture.height))
+    for top, strip in strips(picture):
+        premultiplied = strip.convert("RGBA").convert("RGBa")
+        narrow.paste(premultiplied.resize((width, strip.height), Image.Resampling.BOX), (0, top))
+    size = (width, max(1, round(picture.height * width / picture.width)))
+    return np.array(narrow.resize(size, Image.Resampling.BOX).convert("RGBA"))
 
 
 UNKNOWN = "unknown"

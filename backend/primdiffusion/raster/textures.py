@@ -66,12 +66,13 @@ class TexturePyramid:
 def gather_textures(mesh: TexturedMesh) -> Textures:
     """The textures of a mesh, one after the other. Raises UnusableMesh if one is empty."""
     _check_textures(mesh)
-    flat = [np.ascontiguousarray(part.texture).reshape(-1, 4) for part in mesh.parts]
+    textures, which = _distinct(mesh)
+    flat = [np.ascontiguousarray(texture).reshape(-1, 4) for texture in textures]
     return Textures(
         rgba=np.concatenate(flat),
-        start=np.cumsum([0] + [len(texels) for texels in flat])[:-1].astype(np.int64),
-        size=np.array([part.texture.shape[:2] for part in mesh.parts], np.int32),
-        cut_out=np.array([bool((texels[:, 3] < ALPHA_TEST).any()) for texels in flat]),
+        start=np.cumsum([0] + [len(texels) for texels in flat])[:-1].astype(np.int64)[which],
+        size=np.array([texture.shape[:2] for texture in textures], np.int32)[which],
+        cut_out=np.array([bool(texels[:, 3].min() < ALPHA_TEST) for texels in flat])[which],
     )
 
 
@@ -81,23 +82,38 @@ def texture_pyramid(mesh: TexturedMesh) -> TexturePyramid:
     Raises UnusableMesh if a texture is empty.
     """
     _check_textures(mesh)
-    flat: list[np.ndarray] = []
-    start = np.zeros((len(mesh.parts), LEVELS), np.int64)
-    size = np.ones((len(mesh.parts), LEVELS, 2), np.int32)
-    last = np.zeros(len(mesh.parts), np.int32)
+    textures, which = _distinct(mesh)
+    sizes = [_level_sizes(*texture.shape[:2]) for texture in textures]
+    rgba = np.empty((sum(rows * columns for levels in sizes for rows, columns in levels), 4), np.uint8)
+    start = np.zeros((len(textures), LEVELS), np.int64)
+    size = np.ones((len(textures), LEVELS, 2), np.int32)
     texels = 0
-    for number, part in enumerate(mesh.parts):
-        level = np.ascontiguousarray(part.texture)
-        for depth in range(LEVELS):
-            start[number, depth], size[number, depth] = texels, level.shape[:2]
-            flat.append(level.reshape(-1, 4))
-            texels += len(flat[-1])
-            last[number] = depth
-            if min(level.shape[:2]) < 2:
-                break
-            level = _halved(level, LINEAR_OF_BYTE, BYTE_OF_LINEAR)
-    cut_out = np.array([bool((part.texture[..., 3] < 255).any()) for part in mesh.parts])
-    return TexturePyramid(np.concatenate(flat), start, size, last, cut_out)
+    for number, texture in enumerate(textures):
+        level = np.ascontiguousarray(texture)
+        for depth, (rows, columns) in enumerate(sizes[number]):
+            if depth:
+                level = _halved(level, LINEAR_OF_BYTE, BYTE_OF_LINEAR)
+            start[number, depth], size[number, depth] = texels, (rows, columns)
+            rgba[texels : texels + rows * columns] = level.reshape(-1, 4)
+            texels += rows * columns
+    last = np.array([len(levels) - 1 for levels in sizes], np.int32)
+    cut_out = np.array([bool(texture[..., 3].min() < 255) for texture in textures])
+    return TexturePyramid(rgba, start[which], size[which], last[which], cut_out[which])
+
+
+def _distinct(mesh: TexturedMesh) -> tuple[list[UInt8[np.ndarray, "H W 4"]], Int64[np.ndarray, "P"]]:
+    """The textures, those that parts share once, and the number of each part's texture among them."""
+    textures = {id(part.texture): part.texture for part in mesh.parts}
+    numbers = {identity: number for number, identity in enumerate(textures)}
+    return list(textures.values()), np.array([numbers[id(part.texture)] for part in mesh.parts], np.int64)
+
+
+def _level_sizes(rows: int, columns: int) -> list[tuple[int, int]]:
+    """Rows and columns of a texture and of its halvings."""
+    sizes = [(rows, columns)]
+    while len(sizes) < LEVELS and min(sizes[-1]) >= 2:
+        sizes.append((sizes[-1][0] // 2, sizes[-1][1] // 2))
+    return sizes
 
 
 def mip_levels(texture: UInt8[np.ndarray, "H W 4"], count: int) -> list[Float32[np.ndarray, "h w 4"]]:

@@ -25,8 +25,9 @@ import torch
 from primdiffusion import __version__
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import read_regular
-from primdiffusion.formats.whole_files import alone_in, remove_abandoned, write_atomically
+from primdiffusion.formats.whole_files import remove_abandoned, write_atomically
 from primdiffusion.training.config import RunConfig, check_resumable, to_json
+from primdiffusion.training.folder_lock import lock_folder
 
 log = logging.getLogger(__name__)
 
@@ -43,7 +44,7 @@ def alone(work: Callable[[Config], Made]) -> Callable[[Config], Made]:
     @functools.wraps(work)
     def held(config: Config) -> Made:
         is_first = os.environ.get("RANK", "0") == "0"
-        with alone_in(config.run) if is_first else contextlib.nullcontext():
+        with lock_folder(config.run) if is_first else contextlib.nullcontext():
             return work(config)
 
     return held

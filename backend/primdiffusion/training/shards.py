@@ -11,6 +11,7 @@ have to be unpacked whole. Shards hold the same bytes as the files they are made
 from __future__ import annotations
 
 import bisect
+import collections
 import contextlib
 import hashlib
 import io
@@ -127,11 +128,12 @@ class PackedPeople:
         index = _read_index(self._index)
         try:
             self.full_density = float(index["full_density"])
+            _check_distinct([str(shard["file"]) for shard in index["shards"]])
             self.paths = [folder / _plain_name(shard["file"]) for shard in index["shards"]]
             self._digests = [str(shard["sha256"]) for shard in index["shards"]]
             people = [person for shard in index["shards"] for person in shard["people"]]
             self.names: Sequence[str] = [str(person["name"]) for person in people]
-            self.variants: Sequence[int] = [int(person["variants"]) for person in people]
+            self.variants: Sequence[int] = [_count(person["variants"]) for person in people]
             self._stored: Sequence[Mapping[str, Any]] = [dict(person["attributes"]) for person in people]
             self._firsts = [0, *itertools.accumulate(len(shard["people"]) for shard in index["shards"])]
         except (KeyError, TypeError, ValueError) as error:
@@ -221,6 +223,19 @@ class PackedPeople:
                     ) from error
             self._open[number] = file
         return self._open[number]
+
+
+def _check_distinct(names: Sequence[str]) -> None:
+    """Raise ValueError for a shard that is listed twice: each listing would read its gigabytes again."""
+    if len(set(names)) < len(names):
+        twice = next(name for name, count in collections.Counter(names).items() if count > 1)
+        raise ValueError(f"it lists the shard {twice!r:.60} more than once")
+
+
+def _count(variants: Any) -> int:
+    if type(variants) is not int or variants < 1:
+        raise ValueError(f"a human has {variants!r:.20} colourings")
+    return variants
 
 
 def _plain_name(name: Any) -> str:

@@ -100,7 +100,7 @@ def read_person(path: Path) -> PersonVariants:
         arrays = read_arrays(path, (*_ABOUT, "voxels"), ("delta_scale",))
         outline = _outline_of(arrays, arrays["voxels"].shape)
         voxels = torch.from_numpy(arrays["voxels"])
-        scale = torch.from_numpy(arrays["delta_scale"]).float() if "delta_scale" in arrays else None
+        scale = torch.from_numpy(arrays["delta_scale"]) if "delta_scale" in arrays else None
     except _DAMAGED as error:
         raise ValueError(_NO_PERSON.format(path=path, error=str(error).removeprefix(f"{path}: ")[:150])) from error
     if voxels.dtype != torch.uint8 or tuple(voxels.shape[1:]) != _VOXELS:
@@ -108,7 +108,9 @@ def read_person(path: Path) -> PersonVariants:
             f"{path} holds voxels {voxels.dtype} {tuple(voxels.shape)}; uint8 [n, {K}, {S}, {S}, {S}, 4] is needed"
         )
     scale = torch.ones(len(voxels), K, 3) if scale is None else scale
-    if tuple(scale.shape) != (len(voxels), K, 3) or not (torch.isfinite(scale) & (scale > 0)).all():
+    fits = tuple(scale.shape) == (len(voxels), K, 3)  # before it becomes larger as float32
+    scale = scale.float() if fits else scale
+    if not fits or not (torch.isfinite(scale) & (scale > 0)).all():
         raise ValueError(f"{path} holds delta_scale {tuple(scale.shape)}; positive [{len(voxels)}, {K}, 3] is needed")
     return PersonVariants(voxels, scale, outline.betas, outline.known(), outline.full_density)
 

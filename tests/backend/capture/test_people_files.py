@@ -55,3 +55,26 @@ def test_a_small_file_cannot_name_endless_parts(person):
     write(path, tree, binary)
     with pytest.raises(GlbError, match="more than 100 parts"):
         read_person(path)
+
+
+def test_materials_of_one_surface_share_a_texture_and_others_have_their_own(person):
+    path, tree, binary = person
+    surface = tree["materials"][0]["pbrMetallicRoughness"]
+    tinted = {**surface, "baseColorFactor": [0.5, 1, 1, 1]}
+    tree["materials"] = [{"pbrMetallicRoughness": about} for about in (surface, surface, tinted)]
+    primitive = tree["meshes"][0]["primitives"][0]
+    tree["meshes"][0]["primitives"] = [{**primitive, "material": number} for number in range(3)]
+    write(path, tree, binary)
+    first, second, third = (part.texture for part in read_person(path).mesh.parts[:3])
+    assert first is second
+    assert (third[..., 0] < first[..., 0]).all()
+    assert (third[..., 1:] == first[..., 1:]).all()
+
+
+def test_textures_that_a_file_of_its_size_cannot_have_are_not_decoded(person, monkeypatch):
+    path, _, _ = person
+    monkeypatch.setattr("primdiffusion.capture.people_files.decoded_bytes", lambda _size: 4)
+    monkeypatch.setattr("primdiffusion.capture.people_files.Glb.picture", lambda *_: pytest.fail("decoded"))
+    monkeypatch.setattr("primdiffusion.capture.people_files.Glb.picture_texels", lambda *_: 2)
+    with pytest.raises(GlbError, match="more than the 1 texels that a file of its size may have"):
+        read_person(path)

@@ -7,6 +7,7 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.capture.poses import choose_poses
+from primdiffusion.evaluation import shots
 from primdiffusion.evaluation.shots import JOINTS, SIDE, body_camera, folder_shots, human_shots, mesh_shots
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import generate, pose_body
@@ -25,8 +26,8 @@ def human():
 @pytest.fixture(scope="module")
 def shot(human):
     """The left side of a human, which has views at 0, 90, 180 and 270 degrees."""
-    shots = human_shots(human, choose_poses([], 1, 0), 4, "person", MarchSettings(step=0.02), torch.device("cpu"))
-    return [next(shots), next(shots)][1]
+    drawn = human_shots(human, choose_poses([], 1, 0), 4, "person", MarchSettings(step=0.02), torch.device("cpu"))
+    return [next(drawn), next(drawn)][1]
 
 
 def test_a_camera_holds_the_body_from_every_side(human):
@@ -111,3 +112,15 @@ def test_meshes_are_drawn_around_their_joints():
     assert shot.mask[row, column].all()
     side = [JOINTS.index(f"{side}_shoulder") for side in ("left", "right")]
     assert shot.joints[side[0], 0] > shot.joints[side[1], 0] + 20  # seen from the front
+
+
+@pytest.mark.parametrize("mode", ["RGB", "RGBA"])
+def test_pictures_resized_in_strips_are_those_resized_whole(tmp_path, monkeypatch, mode):
+    noise = np.random.default_rng(0).integers(0, 256, (701, 701, 4), dtype=np.uint8)
+    Image.fromarray(noise).convert(mode).save(tmp_path / "a.png")
+    monkeypatch.setattr(shots, "STRIP_PIXELS", 10**9)
+    whole = next(folder_shots(tmp_path))
+    monkeypatch.setattr(shots, "STRIP_PIXELS", 7000)
+    in_strips = next(folder_shots(tmp_path))
+    assert int((whole.rgb.int() - in_strips.rgb.int()).abs().max()) <= 1
+    assert bool((whole.mask == in_strips.mask).float().mean() > 0.9999)

@@ -5,14 +5,12 @@ import errno
 import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from primdiffusion.formats import whole_files
 from primdiffusion.formats.whole_files import (
     ABANDONED_AFTER_S,
-    alone_in,
     has_ended,
     is_abandoned,
     publish,
@@ -217,19 +215,3 @@ def test_folders_and_devices_are_not_replaced(tmp_path):
         with pytest.raises(PermissionError, match="not a regular file"), written_whole(place):
             pass
     assert [entry.name for entry in tmp_path.iterdir()] == ["pipe"]
-
-
-def test_a_folder_is_held_by_one_process_and_let_go_at_its_end(tmp_path):
-    program = "import sys, primdiffusion.formats.whole_files as w\nwith w.alone_in(w.Path(sys.argv[1])):\n    input()"
-    line = [sys.executable, "-c", program, str(tmp_path / "run")]
-    with alone_in(tmp_path / "run"):
-        refused = subprocess.run(line, input="\n", capture_output=True, text=True, check=False)
-        assert "another process works in" in refused.stderr
-    assert not (tmp_path / "run").exists()
-    with subprocess.Popen(line, stdin=subprocess.PIPE) as other:
-        while not (tmp_path / "run").exists():
-            time.sleep(0.01)
-        other.kill()
-    with alone_in(tmp_path / "run"):
-        (tmp_path / "run" / "a").touch()
-    assert (tmp_path / "run" / "a").exists()

@@ -3,9 +3,10 @@
 import struct
 import zlib
 
+import numpy as np
 import pytest
 from PIL import Image
-from primdiffusion.geometry.pictures import PictureError, opened_picture
+from primdiffusion.geometry.pictures import PictureError, check_pixels, decoded, opened_picture
 
 
 def png(width: int, height: int, data: bytes = b"") -> bytes:
@@ -35,3 +36,48 @@ def test_a_picture_is_opened(tmp_path):
     Image.new("RGB", (3, 2)).save(tmp_path / "a.png")
     with opened_picture(tmp_path / "a.png") as picture:
         assert picture.size == (3, 2)
+
+
+def test_a_large_picture_in_a_small_file_is_rejected_by_its_header_and_a_large_file_may_have_it(tmp_path):
+    small = 100_000
+    check_pixels(6400, 6400, small, 4)
+    check_pixels(8192, 8192, small, 1)
+    check_pixels(8192, 8192, 2_000_000, 4)  # the texture of a scan
+    with pytest.raises(PictureError, match="in a file of only 100000 bytes"):
+        check_pixels(8192, 8192, small, 4)
+    path = tmp_path / "a.png"
+    path.write_bytes(png(8000, 8000, b"no zlib"))  # would be another error if it were decoded
+    with pytest.raises(PictureError, match="8000 x 8000 pixels in a file of only"), opened_picture(path):
+        pass
+
+
+@pytest.mark.parametrize("mode", ["1", "L", "LA", "P", "RGB", "RGBA", "I;16"])
+@pytest.mark.parametrize("wanted", ["RGBA", "RGB", "L"])
+def test_pictures_decoded_in_strips_are_pillows(tmp_path, monkeypatch, mode, wanted):
+    if mode == "I;16" and wanted != "L":
+        pytest.skip("Pillow does not convert these")
+    rng = np.random.default_rng(0)
+    colour = Image.fromarray(rng.integers(0, 256, (23, 17, 4), dtype=np.uint8), "RGBA")
+    if mode == "I;16":
+        picture = Image.fromarray(rng.integers(0, 256, (23, 17), dtype=np.uint16))
+    else:
+        picture = colour if mode == "RGBA" else colour.convert("RGB").convert(mode)
+    picture.save(tmp_path / "a.png")
+    monkeypatch.setattr("primdiffusion.geometry.pictures.STRIP_PIXELS", 60)
+    with opened_picture(tmp_path / "a.png") as opened:
+        result = decoded(opened, wanted)
+    assert result.dtype == np.uint8
+    assert np.array_equal(result, np.asarray(Image.open(tmp_path / "a.png").convert(wanted)))
+
+
+def test_a_jpeg_of_many_scans_is_rejected_and_a_progressive_one_is_read(tmp_path):
+    path = tmp_path / "a.jpg"
+    noise = np.random.default_rng(0).integers(0, 256, (64, 64, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(path, progressive=True)
+    with opened_picture(path) as picture:
+        assert decoded(picture, "RGB").shape == (64, 64, 3)
+    content = path.read_bytes()
+    last = content.rindex(b"\xff\xda")
+    path.write_bytes(content[:-2] + content[last:-2] * 70 + content[-2:])
+    with pytest.raises(PictureError, match="scans, more than"), opened_picture(path):
+        pass

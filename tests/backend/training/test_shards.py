@@ -208,3 +208,27 @@ def test_a_shard_with_the_right_checksum_and_other_tensors_is_rejected(copied, n
     (copied / INDEX).write_text(json.dumps(index))
     with pytest.raises(ShardError, match="shard_0000"):
         PackedPeople(copied).person(0)
+
+
+def test_a_shard_that_is_listed_twice_is_rejected(tmp_path):
+    index = _changed_index(tmp_path, lambda shards: shards.append(shards[0]))
+    with pytest.raises(ShardError, match=r"lists the shard 'shard_0000\.safetensors' more than once"):
+        PackedPeople(index.parent)
+
+
+@pytest.mark.parametrize("variants", [0, -3, 1.5, "1", True])
+def test_a_number_of_colourings_that_is_none_is_rejected(tmp_path, variants):
+    index = _changed_index(tmp_path, lambda shards: shards[0]["people"][0].update(variants=variants))
+    with pytest.raises(ShardError, match="colourings"):
+        PackedPeople(index.parent)
+
+
+def _changed_index(folder: pathlib.Path, change) -> pathlib.Path:
+    write_people(folder / "people", 2, variants=1)
+    for _ in pack_people(folder / "people", folder / "packed", people_each=1):
+        pass
+    path = folder / "packed" / INDEX
+    content = json.loads(path.read_text(encoding="utf-8"))
+    change(content["shards"])
+    path.write_text(json.dumps(content), encoding="utf-8")
+    return path

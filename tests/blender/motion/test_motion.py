@@ -40,6 +40,15 @@ def test_rotations_are_scipys():
     np.testing.assert_allclose(from_quaternion(twin.as_quat()[:, [3, 0, 1, 2]] * 3), twin.as_matrix(), atol=1e-12)
 
 
+def test_a_rotation_about_an_axis_is_that_of_the_axis_angle_also_of_many():
+    angles = np.linspace(-7, 7, 150_001)
+    for axis in range(3):
+        vectors = np.zeros((len(angles), 3))
+        vectors[:, axis] = angles
+        np.testing.assert_allclose(about_axis(axis, angles), from_axis_angle(vectors), atol=1e-14)
+        np.testing.assert_array_equal(from_axis_angle(vectors)[-9:], from_axis_angle(vectors[-9:]))
+
+
 def test_axis_angles_come_back_at_no_turn_and_at_half_a_turn():
     vectors = np.array([[0, 0, 0], [1e-9, 0, 0], [0, 1e-5, 0], [np.pi - 1e-7, 0, 0]])
     np.testing.assert_allclose(to_axis_angle(from_axis_angle(vectors)), vectors, atol=1e-8)

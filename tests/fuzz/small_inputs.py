@@ -1,0 +1,541 @@
+"""Small files that claim much: each is read in a process of its own, whose peak of memory and time are measured.
+
+`measure` starts one process, `python -m fuzz.small_inputs NAME ...`, which loads the readers' modules and forks for
+each input: a fork has what is loaded, and its peak begins anew.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import resource
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from fuzz.run import FOLDERS, ROOT, _memory_mb
+from fuzz.target import said
+
+SMALL_BYTES = 1_000_000
+"""Size below which an input must stay within `MOST_MEMORY_MB`."""
+PROTECTION = 6 * 2**30
+"""Bytes of data that a measured process may have: a reader without a limit must not take the machine down."""
+WAIT_S = 300.0
+COLOUR, GREY = 2, 0
+"""PNG's colour types."""
+
+
+@dataclasses.dataclass(frozen=True)
+class SmallInput:
+    """An input below `SMALL_BYTES` that claims gigabytes or minutes."""
+
+    make: Callable[[Path], Path]
+    """Writes it into a folder, without much memory of its own, and returns the path that `read` gets."""
+    read: Callable[[Path], object]
+    warm: Callable[[Path], Path]
+    """Writes an ordinary file of the same kind: reading it first loads modules, the body and compiled kernels."""
+    kind: str
+    """What is tested together."""
+    is_read: bool = False
+    """Whether the input must be readable; otherwise it may also be rejected in one sentence."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Measured:
+    """What reading one input took."""
+
+    bytes: int
+    """Size of the input."""
+    peak_mb: float
+    """Growth of the process's resident memory at its peak, MB; 0 on other systems than Linux."""
+    seconds: float
+    sentence: str
+    """The error that the reader gave; empty if the input was read."""
+    is_user_error: bool
+    """Whether it was read, or rejected in a sentence; False for an error that would be shown with a traceback."""
+
+
+def measure(names: Sequence[str]) -> dict[str, Measured]:
+    """Read inputs, each in a process of its own. Raises subprocess.SubprocessError if one ends or hangs."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*FOLDERS, ROOT / "backend")))}
+    command = [sys.executable, "-m", "fuzz.small_inputs", *names]
+    wait_s = WAIT_S * (1 + len(names))
+    done = subprocess.run(command, env=environment, stdout=subprocess.PIPE, timeout=wait_s, check=True)
+    lines = [json.loads(line) for line in done.stdout.splitlines() if line.startswith(b"{")]
+    return {line.pop("name"): Measured(**line) for line in lines}
+
+
+def figures() -> dict[str, float]:
+    """The largest peak and the longest time of all inputs, as benchmarks/faults.py records them."""
+    measured = measure(list(INPUTS)).values()
+    return {
+        "small_inputs": len(measured),
+        "small_input_peak_mb": round(max(one.peak_mb for one in measured), 1),
+        "small_input_seconds": round(max(one.seconds for one in measured), 2),
+    }
+
+
+def main(names: Sequence[str]) -> None:
+    """Measure inputs and print a line of JSON for each. Raises ChildProcessError for a fork that ends otherwise."""
+    import torch
+
+    torch.set_num_threads(1)  # a fork has none of the other threads
+    loaded = set()
+    for name in names:
+        chosen = INPUTS[name]
+        with tempfile.TemporaryDirectory(prefix="primdiffusion_small_") as temporary:
+            warm, small = Path(temporary, "warm"), Path(temporary, "small")
+            warm.mkdir()
+            small.mkdir()
+            if (chosen.read, chosen.warm) not in loaded:
+                chosen.read(chosen.warm(warm))
+                loaded.add((chosen.read, chosen.warm))
+            fork = os.fork()
+            if fork == 0:
+                _measure_here(name, small)
+                os._exit(0)
+            if os.waitpid(fork, 0)[1]:
+                raise ChildProcessError(f"{name}: the process that read it was ended")
+
+
+def _measure_here(name: str, folder: Path) -> None:
+    path = INPUTS[name].make(folder)
+    resource.setrlimit(resource.RLIMIT_DATA, (PROTECTION, PROTECTION))
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+    before, began = _memory_mb("VmRSS"), time.perf_counter()
+    error: BaseException | None = None
+    try:
+        INPUTS[name].read(path)
+    except Exception as caught:
+        error = caught
+    seconds, grown = time.perf_counter() - began, _memory_mb("VmHWM") - before
+    sentence = "" if error is None else said(error)
+    shown = f"{type(error).__name__}: {error}" if sentence is None else sentence
+    about = Measured(
+        bytes=path.stat().st_size,
+        peak_mb=round(grown, 1),
+        seconds=round(seconds, 2),
+        sentence=shown.replace(f"{folder}{os.sep}", ""),
+        is_user_error=sentence is not None,
+    )
+    print(json.dumps({"name": name, **dataclasses.asdict(about)}), flush=True)
+
+
+# --- files that are made in little memory
+
+
+def png(width: int, height: int, colour: int = COLOUR, bits: int = 8) -> bytes:
+    """A black PNG of any size."""
+    row = b"\0" * (1 + width * (3 if colour == COLOUR else 1) * bits // 8)
+    packer = zlib.compressobj(9)
+    data = b"".join([*(packer.compress(row) for _ in range(height)), packer.flush()])
+    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
+    chunks = ((b"IHDR", header), (b"IDAT", data), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
+    )
+
+
+def many_scans(side: int, scans: int) -> bytes:
+    """A progressive JPEG whose last scan is repeated."""
+    import io
+
+    from PIL import Image
+
+    file = io.BytesIO()
+    Image.new("L", (side, side)).save(file, "JPEG", progressive=True, quality=50)
+    data = file.getvalue()
+    last = data.rindex(b"\xff\xda")
+    return data[:-2] + data[last:-2] * scans + data[-2:]
+
+
+def zeros(path: Path, arrays: Mapping[str, tuple[str, tuple[int, ...]]], **small: object) -> Path:
+    """A deflated .npz with zeros of these types and shapes, and `small` arrays."""
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
+        for name, (kind, shape) in arrays.items():
+            header = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": shape}
+            left = int(np.prod(shape)) * np.dtype(kind).itemsize
+            with archive.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array_header_1_0(member, header)
+                while left:
+                    left -= member.write(bytes(min(left, 2**20)))
+        for name, values in small.items():
+            with archive.open(f"{name}.npy", "w") as member:
+                np.lib.format.write_array(member, np.asarray(values))
+    return path
+
+
+# --- pictures
+
+
+def small_picture(folder: Path) -> Path:
+    (folder / "a.png").write_bytes(png(64, 64))
+    return folder / "a.png"
+
+
+def picture(width: int, height: int, colour: int = COLOUR, bits: int = 8) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        (folder / "a.png").write_bytes(png(width, height, colour, bits))
+        return folder / "a.png"
+
+    return make
+
+
+def scanned_picture(folder: Path) -> Path:
+    (folder / "a.jpg").write_bytes(many_scans(4096, 2000))
+    return folder / "a.jpg"
+
+
+def read_asset(path: Path) -> object:
+    from primdiffusion.people.assets import _decoded
+
+    return _decoded(path, 1024)
+
+
+def read_shots(path: Path) -> object:
+    from primdiffusion.evaluation.shots import folder_shots
+
+    return list(folder_shots(path.parent))
+
+
+def read_capture(kind: str) -> Callable[[Path], object]:
+    def read(path: Path) -> object:
+        from PIL import Image
+        from primdiffusion.capture.reader import _KINDS, read_picture
+
+        Image.MAX_IMAGE_PIXELS = None
+        with Image.open(path) as opened:
+            width, height = opened.size
+        return _KINDS[kind](read_picture(path, kind, width, height))
+
+    return read
+
+
+# --- meshes
+
+
+def small_glb(folder: Path) -> Path:
+    from capture_scenes import save_person
+
+    return save_person(folder / "person.glb")
+
+
+def glb(side: int, materials: int, nodes: int = 1, tinted: bool = False, alpha: bool = False) -> Callable[[Path], Path]:
+    """A human of `nodes` copies of `materials` parts, whose materials share one picture."""
+
+    def make(folder: Path) -> Path:
+        path = small_glb(folder)
+        content = path.read_bytes()
+        length = int.from_bytes(content[12:16], "little")
+        tree, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+        picture = png(side, side)
+        tree["images"] = [{"bufferView": len(tree["bufferViews"]), "mimeType": "image/png"}]
+        tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(picture)})
+        tree["textures"] = [{"source": 0}]
+        surface = {"baseColorTexture": {"index": 0}}
+        tree["materials"] = [
+            {
+                "pbrMetallicRoughness": {**surface, "baseColorFactor": [1 - 0.01 * number * tinted, 1, 1, 1]},
+                "alphaMode": "BLEND" if alpha else "OPAQUE",
+            }
+            for number in range(materials)
+        ]
+        primitive = tree["meshes"][0]["primitives"][0]
+        tree["meshes"] = [{"primitives": [{**primitive, "material": number} for number in range(materials)]}]
+        joints = [node for node in tree["nodes"] if "mesh" not in node]
+        tree["nodes"] = [*joints, *({"name": f"part {n}", "mesh": 0, "skin": 0} for n in range(nodes))]
+        return write_glb(path, tree, binary + picture)
+
+    return make
+
+
+def many_corners(folder: Path) -> Path:
+    """A human of 100 parts with the same faces, a byte a corner."""
+    path = small_glb(folder)
+    content = path.read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    tree, binary = json.loads(content[20 : 20 + length]), content[28 + length :]
+    corners = 900_000
+    tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": corners})
+    view = len(tree["bufferViews"]) - 1
+    tree["accessors"].append({"bufferView": view, "componentType": 5121, "count": corners, "type": "SCALAR"})
+    primitive = {**tree["meshes"][0]["primitives"][0], "indices": len(tree["accessors"]) - 1}
+    tree["meshes"] = [{"primitives": [primitive] * 100}]
+    joints = [node for node in tree["nodes"] if "mesh" not in node]
+    tree["nodes"] = [*joints, {"name": "part", "mesh": 0, "skin": 0}]
+    return write_glb(path, tree, binary + bytes(corners))
+
+
+def write_glb(path: Path, tree: object, binary: bytes) -> Path:
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    binary += b"\0" * (-len(binary) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+    return path
+
+
+def read_glb(path: Path) -> object:
+    from primdiffusion.capture.people_files import read_person
+    from primdiffusion.raster.textures import texture_pyramid
+
+    mesh = read_person(path).mesh
+    return mesh, texture_pyramid(mesh)
+
+
+# --- poses and motion
+
+
+def motion(*arrays: tuple[str, str, tuple[int, ...]]) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        return zeros(folder / "a.npz", {name: (kind, shape) for name, kind, shape in arrays})
+
+    return make
+
+
+def matrices(frames: int) -> Callable[[Path], Path]:
+    """Rotation matrices, all the identity, in the smallest type."""
+
+    def make(folder: Path) -> Path:
+        np.savez_compressed(folder / "a.npz", pose=np.broadcast_to(np.eye(3, dtype=np.int8), (frames, 24, 3, 3)))
+        return folder / "a.npz"
+
+    return make
+
+
+def small_motion(folder: Path) -> Path:
+    return motion(("poses", "f4", (4, 72)))(folder)
+
+
+def read_motion(path: Path) -> object:
+    from blender_primdiffusion.motion.files import read_motion
+
+    return read_motion(path)
+
+
+def read_poses(path: Path) -> object:
+    from primdiffusion.capture.poses import read_motion
+
+    return read_motion(path)
+
+
+def read_pose(path: Path) -> object:
+    from primdiffusion.pose_file import read_pose
+
+    return read_pose(path)
+
+
+def bvh(frames: int, extra: int = 0) -> Callable[[Path], Path]:
+    """A motion of which the root alone turns about one axis, two characters a frame; with `extra` joints."""
+
+    def make(folder: Path) -> Path:
+        from bvh_files import motion_of, write_bvh
+        from primdiffusion.formats.joints import JOINT_NAMES
+
+        from blender_primdiffusion.motion.skeleton import REST_JOINTS
+
+        path = write_bvh(folder / "a.bvh", REST_JOINTS, *motion_of(), {name: name for name in JOINT_NAMES})
+        head = path.read_text().split("MOTION")[0]
+        lines = ["CHANNELS 0" if "CHANNELS" in line else line for line in head.splitlines()]
+        first = lines.index("CHANNELS 0")
+        lines[first] = "CHANNELS 1 Xrotation"
+        lines[first + 1 : first + 1] = ["JOINT extra { OFFSET 0 0 0 CHANNELS 0 }"] * extra
+        lines += ["MOTION", f"Frames: {frames}", "Frame Time: 0.01", "0 " * frames]
+        path.write_text("\n".join(lines))
+        return path
+
+    return make
+
+
+# --- training data
+
+
+def small_shards(folder: Path) -> Path:
+    from fuzz.data_targets import make_packed
+
+    return make_packed(folder)
+
+
+def repeated_shard(folder: Path) -> Path:
+    """An index that lists one shard a thousand times."""
+    path = small_shards(folder)
+    index = json.loads(path.read_text(encoding="utf-8"))
+    index["shards"] = index["shards"][:1] * 1000
+    path.write_text(json.dumps(index), encoding="utf-8")
+    return path
+
+
+def negative_variants(folder: Path) -> Path:
+    """A shard with a billion colourings of one human, which another takes away again."""
+    import torch
+    from primdiffusion.training.shards import digest_of
+    from safetensors.torch import load_file, save_file
+
+    path = small_shards(folder)
+    index = json.loads(path.read_text(encoding="utf-8"))
+    first = index["shards"][0]
+    first["people"] = [{**first["people"][0], "variants": 10**9}, {**first["people"][0], "variants": 1 - 10**9}]
+    path.write_text(json.dumps(index), encoding="utf-8")
+    shard = path.with_name(first["file"])
+    tensors = load_file(shard)
+    save_file({**tensors, "betas": torch.zeros(2, 10)}, shard)
+    first["sha256"] = digest_of(shard)
+    path.write_text(json.dumps(index), encoding="utf-8")
+    return path
+
+
+def read_shards(path: Path) -> object:
+    from primdiffusion.training.shards import PackedPeople
+
+    people = PackedPeople(path.parent)
+    return [people.known(number) for number in range(len(people.names))]
+
+
+def payload(count: int, scales: int) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        arrays = {"voxels": ("u1", (count, 1024, 8, 8, 8, 4))}
+        if scales:
+            arrays["delta_scale"] = ("f2", (scales, 1024, 3))
+        small = {"betas": np.zeros(10), "attributes": np.array("{}"), "full_density": np.array(100.0)}
+        return zeros(folder / "person_000000.npz", arrays, **small)
+
+    return make
+
+
+def read_payload(path: Path) -> object:
+    from primdiffusion.training.stored_people import read_person
+
+    return read_person(path)
+
+
+# --- bodies
+
+
+def small_body(folder: Path) -> Path:
+    from fuzz.targets import make_smpl_npz
+
+    return make_smpl_npz(folder)
+
+
+def small_pickle(folder: Path) -> Path:
+    from fuzz.targets import make_smpl_pickle
+
+    return make_smpl_pickle(folder)
+
+
+def many_faces(folder: Path) -> Path:
+    """A body whose faces are all the same, millions of them."""
+    path = small_body(folder)
+    with np.load(path) as archive:
+        kept = {name: archive[name] for name in archive.files if name not in ("f", "vt", "ft")}
+    return zeros(path, {"f": ("i1", (20_000_000, 3))}, **kept)
+
+
+def shared_lists(folder: Path) -> Path:
+    """A pickle whose arrays are lists of lists of one list, ten million numbers in a few kilobytes."""
+    import pickle
+
+    row, block = [0.5] * 3, [[0.5] * 100] * 3
+    content = {name: [block] * 30_000 for name in ("shapedirs", "posedirs", "weights", "J_regressor")}
+    content |= {"v_template": [row] * 30_000, "f": [[0, 1, 2]] * 100_000}
+    (folder / "body.pkl").write_bytes(pickle.dumps(content, 2))
+    return folder / "body.pkl"
+
+
+def read_body(path: Path) -> object:
+    from primdiffusion.body.smpl_files import load_body
+
+    return load_body(path)
+
+
+def small_human(folder: Path) -> Path:
+    from fuzz.targets import make_synthetic_npz
+
+    return make_synthetic_npz(folder)
+
+
+def many_boxes(folder: Path) -> Path:
+    """A human for Blender whose arrays have as many zeros as they may."""
+    path = small_human(folder)
+    with np.load(path) as archive:
+        kept = {name: archive[name] for name in archive.files}
+    count = len(kept["position"])
+    large = {
+        name: (array.dtype.str, (100_000, *array.shape[1:]))
+        for name, array in kept.items()
+        if array.ndim and len(array) == count
+    }
+    return zeros(path, large, **{name: array for name, array in kept.items() if name not in large})
+
+
+def read_human(path: Path) -> object:
+    from blender_primdiffusion.scene.human_npz import read_human
+
+    return read_human(path)
+
+
+_WHOLE = 63 * 2**20
+_QUARTER = [("poses", "f4", (55_000, 72)), ("trans", "f4", (55_000, 3))]
+"""Fifteen minutes of AMASS."""
+_SEVEN = [
+    (name, "f4", (_WHOLE // 288, 72))
+    for name in ("poses", "pose", "theta", "fullpose", "global_orient", "trans", "transl")
+]
+INPUTS: dict[str, SmallInput] = {
+    "glb of 64 materials": SmallInput(glb(1400, 64), read_glb, small_glb, "meshes", is_read=True),
+    "glb of 64 tinted materials": SmallInput(glb(1400, 64, tinted=True), read_glb, small_glb, "meshes"),
+    "glb of 100 parts": SmallInput(glb(4096, 1, nodes=100), read_glb, small_glb, "meshes", is_read=True),
+    "glb of a huge picture": SmallInput(glb(8192, 2, tinted=True), read_glb, small_glb, "meshes"),
+    "glb of a large picture": SmallInput(glb(6400, 1), read_glb, small_glb, "meshes"),
+    "glb of many corners": SmallInput(many_corners, read_glb, small_glb, "meshes"),
+    "asset": SmallInput(picture(8192, 8192), read_asset, small_picture, "pictures"),
+    "asset just below the limit": SmallInput(picture(6470, 6470), read_asset, small_picture, "pictures"),
+    "asset of many scans": SmallInput(scanned_picture, read_asset, small_picture, "pictures"),
+    "shot": SmallInput(picture(8192, 8192), read_shots, small_picture, "pictures"),
+    "shot just below the limit": SmallInput(picture(6470, 6470), read_shots, small_picture, "pictures"),
+    "captured image": SmallInput(picture(8192, 8192), read_capture("img"), small_picture, "pictures"),
+    "captured normal": SmallInput(picture(3700, 3700), read_capture("normal"), small_picture, "pictures", is_read=True),
+    "captured normal, huge": SmallInput(picture(7000, 7000), read_capture("normal"), small_picture, "pictures"),
+    "captured mask": SmallInput(
+        picture(8192, 8192, GREY), read_capture("mask"), small_picture, "pictures", is_read=True
+    ),
+    "captured depth": SmallInput(
+        picture(6470, 6470, GREY, 16), read_capture("depth"), picture(64, 64, GREY, 16), "pictures", is_read=True
+    ),
+    "motion": SmallInput(motion(("poses", "f4", (_WHOLE // 288, 72))), read_motion, small_motion, "motion"),
+    "motion of bytes": SmallInput(motion(("poses", "i1", (_WHOLE // 72, 72))), read_motion, small_motion, "motion"),
+    "motion just below the limit": SmallInput(motion(*_QUARTER), read_motion, small_motion, "motion", is_read=True),
+    "motion of matrices": SmallInput(matrices(_WHOLE // 216), read_motion, small_motion, "motion"),
+    "motion of matrices just below the limit": SmallInput(
+        matrices(18_000), read_motion, small_motion, "motion", is_read=True
+    ),
+    "motion of seven arrays": SmallInput(motion(*_SEVEN), read_motion, small_motion, "motion"),
+    "poses": SmallInput(motion(("poses", "f4", (_WHOLE // 288, 72))), read_poses, small_motion, "motion"),
+    "poses just below the limit": SmallInput(motion(*_QUARTER), read_poses, small_motion, "motion", is_read=True),
+    "poses of bytes": SmallInput(motion(("poses", "i1", (_WHOLE // 72, 72))), read_poses, small_motion, "motion"),
+    "pose of bytes": SmallInput(
+        motion(("poses", "i1", (_WHOLE // 72, 72))), read_pose, small_motion, "motion", is_read=True
+    ),
+    "bvh of many frames": SmallInput(bvh(480_000), read_motion, bvh(4), "motion"),
+    "bvh of many joints": SmallInput(bvh(5000, extra=900), read_motion, bvh(4), "motion"),
+    "bvh just below the limit": SmallInput(bvh(34_000), read_motion, bvh(4), "motion", is_read=True),
+    "repeated shard": SmallInput(repeated_shard, read_shards, small_shards, "people"),
+    "negative colourings": SmallInput(negative_variants, read_shards, small_shards, "people"),
+    "payload": SmallInput(payload(30, 0), read_payload, payload(1, 0), "people", is_read=True),
+    "payload of scales": SmallInput(payload(1, 10_000), read_payload, payload(1, 0), "people"),
+    "body of many faces": SmallInput(many_faces, read_body, small_body, "people"),
+    "body of shared lists": SmallInput(shared_lists, read_body, small_pickle, "people"),
+    "human of many boxes": SmallInput(many_boxes, read_human, small_human, "people"),
+}  # fmt: skip
+
+if __name__ == "__main__":
+    main(sys.argv[1:])
