@@ -94,10 +94,12 @@ def set_up_folder() -> environment.SetUpFolder:
 
 
 def preference(name: str) -> str:
-    """A path from the add-on's preferences, absolute; empty when unset or when the add-on is not enabled."""
+    """A path from the add-on's preferences, as it is; empty when unset or when the add-on is not enabled.
+
+    It may be relative, to whatever .blend is open: `environment.candidates` and `queue.chosen_checkpoint` reject it.
+    """
     addon = bpy.context.preferences.addons.get(EXTENSION)
-    value = getattr(addon.preferences, name, "") if addon is not None else ""
-    return bpy.path.abspath(value) if value else ""
+    return str(getattr(addon.preferences, name, "")).strip() if addon is not None else ""
 
 
 def new_backend(python: str) -> Backend:

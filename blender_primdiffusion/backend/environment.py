@@ -12,6 +12,7 @@ from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 
 from ..formats.json_files import parse_json
+from ..formats.regular_files import is_local_path
 from .child_streams import Output
 from .client import PROGRAM, child_environment, is_program
 
@@ -37,6 +38,11 @@ NOT_INSTALLED = (
     "or its Python in the extension's preferences"
 )
 """Where the extension brings none."""
+NOT_ABSOLUTE = (
+    "the extension's preferences name {} by {!r}, which depends on the file that is open: choose it again, by its "
+    "whole path on this computer (without Relative Path in the file browser)"
+)
+"""For paths of preferences: a stranger's folder must not supply what they name."""
 tried: dict[Path, bool] = {}
 """Interpreters that were tried since Blender was started, and whether they imported torch and the backend."""
 
@@ -122,9 +128,12 @@ def candidates(
     `installed` by the user, the running one (with `own_python`).
 
     An explicit wish (preferences or variable) that fails is an error and not a reason to look further. An environment
-    of the extension's own that is not finished is passed over.
+    of the extension's own that is not finished is passed over. Raises BackendNotFound where the preferences name a path
+    that is not absolute, or on another server.
     """
     if preference and str(preference).strip():
+        if not is_local_path(str(preference)):
+            raise BackendNotFound(NOT_ABSOLUTE.format("a Python", str(preference)[:200]))
         yield "the extension's preferences", Path(preference)
         return
     if os.environ.get(VARIABLE):

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..scene.body_file import BODY_FILE, body_file
+from ..scene.blend_values import stored_numbers
+from ..scene.body_file import body_file
 from ..scene.convention import transforms_to_backend
-from ..scene.human import BETAS, MARK, person_file
+from ..scene.human import BETA_COUNT, BETAS, MARK, person_file
 from .solids import scene_solids, stored, visible_instances
 
 SMALLEST_SCALE = 1e-4
@@ -174,17 +175,16 @@ def pose_of(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collec
         transforms_to_backend(posed @ np.linalg.inv(rest)),
         _betas(armature, owner.name),
         (matrix @ posed[0])[:3, 3],
-        body_file(owner) if BODY_FILE in owner else None,
+        body_file(owner),
     )
 
 
 def _betas(armature: bpy.types.Object, name: str) -> list[float] | None:
     if BETAS not in armature:
         return None
-    try:
-        return [float(value) for value in armature[BETAS]]
-    except (TypeError, ValueError) as error:
+    betas = stored_numbers(armature, BETAS, BETA_COUNT)
+    if betas is None:
         raise ValueError(
-            f"the custom property {BETAS!r} on the armature of {name!r} is {armature[BETAS]!r}; "
-            "make it a list of ten numbers, or delete it"
-        ) from error
+            f"the custom property {BETAS!r} on the armature of {name!r} is no list of {BETA_COUNT} numbers: delete it"
+        )
+    return betas

@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from ..formats.json_files import parse_json
 from ..formats.regular_files import check_regular
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import builtin_poses, current_pose
@@ -21,8 +20,9 @@ from ..motion.rotation import from_axis_angle, to_axis_angle
 from ..motion.skeleton import REST_JOINTS, joint_positions
 from ..places import own_folder
 from ..scene.armature import build_armature, keyframe_poses
+from ..scene.blend_values import as_shown
 from ..scene.convention import points_to_blender
-from ..scene.human import MARK, armature_of, person_file
+from ..scene.human import armature_of, person_file, provenance_of
 from .queue import Job
 from .target import HumanTarget
 
@@ -43,15 +43,13 @@ def mark(asset: bpy.types.ID, description: str, tags: Iterable[str], picture: ND
 
 def asset_description(person: bpy.types.Collection) -> tuple[str, list[str]]:
     """Description and tags of a human: its seed and attributes."""
-    try:
-        made = parse_json(person[MARK])
-    except (ValueError, TypeError):
-        made = {}
-    asked = made.get("attributes") or {}
-    said = ", ".join(f"{name} {value}" for name, value in asked.items())
-    seed = f"seed {made['seed']}" if "seed" in made else "no seed"
+    made = provenance_of(person)
+    asked = made.get("attributes")
+    asked = asked if isinstance(asked, dict) else {}
+    said = ", ".join(f"{as_shown(name)} {as_shown(value)}" for name, value in asked.items())
+    seed = f"seed {as_shown(made['seed'])}" if "seed" in made else "no seed"
     description = f"Generated human, {seed}" + (f", {said}" if said else "")
-    return description, [HUMAN_TAG, *(str(value) for value in asked.values() if isinstance(value, str))]
+    return description, [HUMAN_TAG, *(as_shown(value) for value in asked.values() if isinstance(value, str))]
 
 
 def pose_action(armature: bpy.types.Object, rotations: NDArray, translation: NDArray, name: str) -> bpy.types.Action:

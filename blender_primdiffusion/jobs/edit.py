@@ -11,11 +11,11 @@ import bpy
 import numpy as np
 
 from ..backend.requests import sentence
-from ..formats.json_files import parse_json
 from ..scene.attachment import in_viewport
+from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import Replaced, edit_destination, replace_person, restore_destination, restore_volumes
-from ..scene.human import MARK, person_file
+from ..scene.human import person_file, provenance_of
 from ..scene.human_npz import Destination, read_human, write_now
 from ..scene.volumes import free_unused_grids
 from .follow import building
@@ -174,11 +174,12 @@ class RegenerateJob(Job):
     def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
         """Raises ValueError where another checkpoint has generated another human."""
         person, human = self.target.found(), Path(result["human"])
-        made, before = read_human(human).meta, parse_json(person[MARK])
+        made, before = read_human(human).meta, provenance_of(person)
         for name in ("checkpoint_sha256", "checkpoint"):
             if name in before and made.get(name) != before[name]:
+                other = as_shown(before.get("checkpoint"))
                 raise ValueError(
-                    f"{person.name!r} was made by the checkpoint {before.get('checkpoint')!r}, and this one is "
+                    f"{person.name!r} was made by the checkpoint {other!r}, and this one is "
                     f"{made.get('checkpoint')!r}: choose that one in the preferences, "
                     "otherwise the result would be another human"
                 )
@@ -189,7 +190,7 @@ class RegenerateJob(Job):
 
 def made_from_seed(person: bpy.types.Collection) -> dict[str, Any]:
     """The provenance of a human that its seed reproduces. Raises ValueError for others."""
-    made = parse_json(person[MARK])
+    made = provenance_of(person)
     if made.get("edits"):
         raise ValueError(
             f"{person.name!r} was edited after they were generated, so no seed reproduces them: restore their files"

@@ -17,7 +17,7 @@ from ..formats.whole_files import written_whole
 from ..motion.skeleton import unchain
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
-from ..scene.body_file import BODY_FILE, shape_model_of
+from ..scene.body_file import shape_model_of, stored_body_name
 from ..scene.convention import points_to_backend
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import armature_of, person_file
@@ -85,7 +85,7 @@ class ProxyJob(Job):
         """The proxy as an object, in no collection, with the current shape of the body."""
         made = np.array(result["betas"], np.float64)
         proxy = build_proxy(person, read_proxy(Path(result["proxy"])), Path(result["texture"]), made)
-        if BODY_FILE in person:
+        if stored_body_name(person) is not None:
             follow_shape(person, proxy, betas_of(person))
         return proxy
 
@@ -190,7 +190,7 @@ def write_human(
     human = read_tensors(person_file(person))
     if has_custom_shape(person):
         betas, growth = betas_of(person), None
-        if BODY_FILE in person:  # humans of earlier versions have none, and boxes of fixed size
+        if stored_body_name(person) is not None:  # humans of earlier versions have none, and boxes of fixed size
             growth = shape_model_of(person).growth(generated_betas(person), betas)
         human = reshaped(human, betas, growth)
     motion = None if frames is None else _motion(context, person, frames)

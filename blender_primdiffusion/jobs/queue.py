@@ -15,7 +15,9 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import bpy
 
 from ..backend.client import Died, Silent
+from ..backend.environment import NOT_ABSOLUTE
 from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError
+from ..formats.regular_files import is_local_path
 from ..formats.removing import remove_folder
 from ..places import new_backend, preference
 from ..scene.attachment import volumes_may_wait
@@ -84,8 +86,14 @@ class Job(abc.ABC):
 
 
 def chosen_checkpoint(name: str) -> str:
-    """The file of the preference `checkpoint` or `encoder`; empty for the bundled one."""
-    return preference(name)
+    """The file of the preference `checkpoint` or `encoder`; empty for the bundled one.
+
+    Raises ValueError for a path that depends on the open .blend or the working directory.
+    """
+    chosen = preference(name)
+    if chosen and not is_local_path(chosen):
+        raise ValueError(NOT_ABSOLUTE.format(f"a {name}", chosen[:200]))
+    return chosen
 
 
 CANCELLED = "Cancelled"

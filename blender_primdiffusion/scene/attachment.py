@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bpy
 
+from .blend_values import stored_choice, stored_flag
 from .human import check_editable
 
 ATTACHMENT = "primdiffusion_attachment"
@@ -19,8 +20,7 @@ VOLUMES_IN_VIEWPORT = False
 
 def attachment_of(collection: bpy.types.Collection) -> str:
     """The human's mode."""
-    mode = str(collection.get(ATTACHMENT, MODES[0]))
-    return mode if mode in MODES else MODES[0]
+    return stored_choice(collection, ATTACHMENT, MODES)
 
 
 def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
@@ -65,7 +65,7 @@ def _show(collection: bpy.types.Collection, parts: dict[str, bpy.types.Collectio
 
 def in_viewport(collection: bpy.types.Collection) -> bool:
     """Whether viewports show the human's volumes; renders do in any case."""
-    return bool(collection.get(IN_VIEWPORT, True))
+    return stored_flag(collection, IN_VIEWPORT, True)
 
 
 def volumes_may_wait(collection: bpy.types.Collection | None = None) -> bool:
@@ -87,5 +87,4 @@ def show_in_viewport(collection: bpy.types.Collection, shown: bool) -> None:
 
 def attachment_before_merge(collection: bpy.types.Collection) -> str:
     """The mode to return to when the merged volume is removed."""
-    mode = str(collection.get(_BEFORE, MODES[0]))
-    return mode if mode in MODES[:2] else MODES[0]
+    return stored_choice(collection, _BEFORE, MODES[:2])

@@ -13,33 +13,44 @@ import bpy
 import numpy as np
 
 from ..formats.arrays import check_shapes, read_arrays
+from ..formats.regular_files import exists_in_its_folder
 from ..formats.removing import remove_file
 from ..formats.whole_files import replacing
+from .blend_values import stored_name
 from .human import VolumeWriteError, folders_of
 from .shape import FIELDS, INTEGERS, OPTIONAL_FIELDS, ShapeModel, faulty_field
 
 BODY_FILE = "primdiffusion_body_file"
 """Custom property of a human's collection: the name of its body's file."""
 BODY_NPZ = re.compile(r"body_[0-9a-f]{12}\.npz")
+"""Names that BODY_FILE may hold; the hash is of the content."""
 _SMALL, _SMALL_LIMIT = np.uint16, 2**16
 """Integers in files, where they fit: bodies have fewer vertices and faces."""
 
 
 def shape_model_of(collection: bpy.types.Collection) -> ShapeModel:
     """The model by which the human's body follows its shape. Raises ValueError or FileNotFoundError."""
-    if BODY_FILE not in collection:
+    path = body_file(collection)
+    if path is None:
         raise ValueError(
             f"the human {collection.name!r} was made by an earlier version and cannot be reshaped: generate the "
             "human again, or vary it"
         )
-    return read_body_file(body_file(collection))
+    return read_body_file(path)
 
 
-def body_file(collection: bpy.types.Collection) -> Path:
-    """The file of the human's body, or where it should be; the collection must have a BODY_FILE."""
-    name = str(collection[BODY_FILE])
+def stored_body_name(collection: bpy.types.Collection) -> str | None:
+    """The name of the body's file; None for a human of an earlier version, whose collection does not name one."""
+    return stored_name(collection, BODY_FILE, BODY_NPZ)
+
+
+def body_file(collection: bpy.types.Collection) -> Path | None:
+    """The file of the human's body, or where it should be; None where `stored_body_name` is."""
+    name = stored_body_name(collection)
+    if name is None:
+        return None
     paths = [folder / name for near in folders_of(collection) for folder in (near.parent, near)]
-    return next((path for path in paths if path.is_file()), paths[0])
+    return next((path for path in paths if exists_in_its_folder(path)), paths[0])
 
 
 def body_file_name(model: ShapeModel) -> str:
@@ -84,7 +95,7 @@ def saved_body(collection: bpy.types.Collection, model: ShapeModel | None, folde
 
 def body_files() -> set[str]:
     """Names of the body files that humans of this .blend use, linked ones included."""
-    return {str(collection[BODY_FILE]) for collection in bpy.data.collections if BODY_FILE in collection}
+    return {name for collection in bpy.data.collections if (name := stored_body_name(collection)) is not None}
 
 
 @functools.lru_cache(maxsize=4)
@@ -93,7 +104,7 @@ def read_body_file(path: Path) -> ShapeModel:
 
     Raises FileNotFoundError, or ValueError for a damaged file.
     """
-    if not path.is_file():
+    if not exists_in_its_folder(path):
         raise FileNotFoundError(
             f"the body's file is missing: {str(path)!r}; put it back beside the humans' folders, or generate the "
             "human again"

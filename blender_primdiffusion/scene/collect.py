@@ -7,21 +7,25 @@ were appended, or whose .blend was saved elsewhere under another name, stay wher
 from __future__ import annotations
 
 import dataclasses
-import re
-from collections.abc import Iterable
+import itertools
+import os
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import bpy
 from bpy.app.handlers import persistent
 
-from ..formats.regular_files import real_path
-from ..formats.removing import remove_file
-from .body_file import BODY_FILE, BODY_NPZ, body_files
+from ..formats.regular_files import exists_in_its_folder, real_path
+from ..formats.removing import OutsideFolderError, check_inside, remove_file
+from .blend_values import as_shown, stored_folder
+from .body_file import BODY_FILE, BODY_NPZ, body_file, body_files, stored_body_name
 from .human import (
     HOME,
     MARK,
     MERGED_VDB,
     PERSON,
+    PERSON_FILE,
+    PERSON_FILES,
     PRIMITIVE_VDB,
     TEMPORARY,
     UNWRITTEN_NPZ,
@@ -37,8 +41,7 @@ from .human import (
     volume_path,
 )
 
-_PERSON_FILES = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
-_OURS = (PRIMITIVE_VDB, _PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
+_OURS = (PRIMITIVE_VDB, PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,7 +63,7 @@ def collect_temporary_volumes(blend_path: str) -> Collected:
     undo. In a .blend never saved, paths become absolute: Blender makes them relative when it first writes it. Raises
     VolumeWriteError when the folder beside the .blend cannot be written.
     """
-    return _collect(blend_path, [volume for volume in _local() if _temporary(volume_path(volume))])
+    return _collect(blend_path, {volume: path for volume, path in _local().items() if _temporary(path)})
 
 
 def collect_files() -> Collected:
@@ -72,13 +75,13 @@ def collect_files() -> Collected:
     if not bpy.data.filepath:
         raise ValueError("this file was never saved: save it first, which collects the files of its humans too")
     home = humans_folder()
-    away = [volume for volume in _local() if not _inside(volume_path(volume), home)]
+    away = {volume: path for volume, path in _local().items() if not _inside(path, home)}
     present = _present(away)
-    gone = [volume for volume in away if volume not in present]
+    gone = [path for volume, path in away.items() if volume not in present]
     if gone:
         raise FileNotFoundError(
-            f"{len(gone)} volumes have lost their files, {str(volume_path(gone[0]))!r} among them: press Find Missing "
-            "Volumes in the panel Human first"
+            f"{len(gone)} volumes have lost their files, {str(gone[0])!r} among them: press Find Missing Volumes in "
+            "the panel Human first"
         )
     return _collect(bpy.data.filepath, away)
 
@@ -88,7 +91,7 @@ def store_folders() -> None:
     for person in bpy.data.collections:
         if MARK in person and person.library is None:
             home = folders_of(person)[0]
-            if home.is_dir() and person.get(HOME) != str(home):
+            if os.path.isdir(home) and stored_folder(person, HOME) != home:
                 person[HOME] = str(home)
 
 
@@ -97,6 +100,8 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
     """Handler of save_pre. After a failure, which is printed, the .blend is saved pointing to the temporary files."""
     if not blend_path:  # the start-up file
         return
+    for fault in ignored_values():
+        print(f"PrimDiffusion: {fault}")
     try:
         collect_temporary_volumes(blend_path)
     except OSError as error:
@@ -106,6 +111,32 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
     store_folders()
 
 
+def ignored_values() -> list[str]:
+    """Names and paths of files that this .blend stores with its humans and that no file of a human can have, each in a
+    sentence. They count as missing."""
+    found = []
+    for person in bpy.data.collections:
+        if MARK not in person or person.library is not None:
+            continue
+        valid = {
+            PERSON: person_file_name(person) != PERSON_FILE or person.get(PERSON) == PERSON_FILE,
+            BODY_FILE: stored_body_name(person) is not None,
+            HOME: stored_folder(person, HOME) is not None,
+        }
+        found += [
+            f"the custom property {name!r} of {as_shown(person.name)!r} is ignored: it does not name what it should"
+            for name, is_valid in valid.items()
+            if name in person and not is_valid
+        ]
+        volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME" and obj.data.filepath}
+        if strange := sorted(volume.name for volume in volumes if volume_path(volume) is None):
+            found.append(
+                f"{len(strange)} volumes of {as_shown(person.name)!r} are ignored, {as_shown(strange[0])!r} among "
+                "them: their paths name no volumes of a human"
+            )
+    return found
+
+
 def unused(folder: Path) -> list[Path]:
     """Files in `folder`, of earlier states of humans, that nothing in the current .blend points to.
 
@@ -113,7 +144,7 @@ def unused(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         return []
-    used = {real_path(path) for volume in bpy.data.volumes if volume.filepath for path in sequence_files(volume)}
+    used = {real_path(path) for volume in bpy.data.volumes for path in sequence_files(volume)}
     in_use = _person_files() | body_files()
     later = {path.parent for path in used if not path.is_file()}
     found = []
@@ -130,26 +161,26 @@ def _person_files() -> set[str]:
     return {person_file_name(collection) for collection in bpy.data.collections if MARK in collection}
 
 
-def _local() -> list[bpy.types.Volume]:
-    """Volumes of humans in this .blend that are not linked."""
+def _local() -> dict[bpy.types.Volume, Path]:
+    """Volumes of humans in this .blend that are not linked, and their paths."""
     shown = {
         obj.data: None
         for person in bpy.data.collections
         if MARK in person
         for obj in person.all_objects
-        if obj.type == "VOLUME" and obj.data.filepath
+        if obj.type == "VOLUME" and obj.data.library is None
     }
-    return [volume for volume in shown if volume.library is None]
+    paths = {volume: volume_path(volume) for volume in shown}
+    return {volume: path for volume, path in paths.items() if path is not None}
 
 
-def _collect(blend_path: str, away: Iterable[bpy.types.Volume]) -> Collected:
+def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path]) -> Collected:
     target = humans_folder(blend_path)
     sources = _present(away)
-    moved = {volume: target / path.parent.name / path.name for volume, path in sources.items()}
-    copies = {path: moved[volume].parent / path.name for volume in moved for path in sequence_files(volume)}
-    copies = {source: copy for source, copy in copies.items() if source.is_file()}
-    for folder in {path.parent for path in sources.values()}:
-        copies |= {path: target / folder.name / path.name for path in unwritten_in(folder)}
+    files = _files_by_folder(sources)
+    homes = {folder: _home(folder, paths, target) for folder, paths in files.items()}
+    moved = {volume: homes[path.parent] / path.name for volume, path in sources.items()}
+    copies = {path: homes[folder] / path.name for folder, paths in files.items() for path in paths}
     names = {}
     for person in bpy.data.collections:
         if MARK in person and person.library is None:
@@ -157,10 +188,9 @@ def _collect(blend_path: str, away: Iterable[bpy.types.Volume]) -> Collected:
     made: list[Path] = []
     try:
         for source, destination in copies.items():
-            there = destination.is_file() and destination.stat().st_size == source.stat().st_size
-            if not there and copy_file(source, destination):  # names of volumes and bodies identify the content
+            if not _there(source, destination) and copy_file(source, destination, target):
                 made.append(destination)
-    except OSError as error:
+    except (OSError, OutsideFolderError) as error:
         for path in made:
             remove_file(path, path.parent)
         raise VolumeWriteError(
@@ -186,25 +216,57 @@ def _of_person(
     if volume not in moved:
         return {}
     home, copies = moved[volume].parent, {}
-    file = next((path for path in (folder / person_file_name(person) for folder in near) if path.is_file()), None)
+    name = person_file_name(person)
+    file = next((path for path in (folder / name for folder in near) if exists_in_its_folder(path)), None)
     if file is not None and file.parent != home:
         name = available_name(file, home, file.name)
         copies[file] = home / name
         if name != person_file_name(person):
             names[person] = name
-    body = str(person.get(BODY_FILE, ""))
-    paths = [parent / body for folder in near for parent in (folder.parent, folder)] if body else []
-    found = next((path for path in paths if path.is_file()), None)
-    if found is not None:
-        copies[found] = target / body
+    body = body_file(person)
+    if body is not None and exists_in_its_folder(body):
+        copies[body] = target / body.name
     return copies
 
 
-def _present(volumes: Iterable[bpy.types.Volume]) -> dict[bpy.types.Volume, Path]:
-    """The paths of those volumes whose file exists or will be written."""
-    paths = {volume: volume_path(volume) for volume in volumes}
+def _files_by_folder(sources: Mapping[bpy.types.Volume, Path]) -> dict[Path, list[Path]]:
+    """The files of volumes, and those that volumes are written from, by their folder."""
+    found: dict[Path, dict[Path, None]] = {path.parent: {} for path in sources.values()}
+    for volume, path in sources.items():
+        found[path.parent] |= {file: None for file in sequence_files(volume) if exists_in_its_folder(file)}
+    for folder, files in found.items():
+        files |= dict.fromkeys(unwritten_in(folder))
+    return {folder: list(files) for folder, files in found.items()}
+
+
+def _home(folder: Path, files: Iterable[Path], target: Path) -> Path:
+    """Where in `target` the files of `folder` go: a folder of the same name, with a number where other files have the
+    names or it leads out of `target`."""
+    files, name = list(files), folder.name or "human"
+    numbered = (target / f"{name}_{number}" for number in itertools.count(2))
+    return next(home for home in itertools.chain([target / name], numbered) if _is_free(home, files, target))
+
+
+def _is_free(home: Path, files: Iterable[Path], target: Path) -> bool:
+    try:
+        check_inside(home / "file", target)
+    except OutsideFolderError:
+        return False
+    taken = os.path.lexists(home) and not os.path.isdir(home)
+    return not taken and all(_there(path, home / path.name) or not os.path.lexists(home / path.name) for path in files)
+
+
+def _there(source: Path, destination: Path) -> bool:
+    """Whether a copy is there already: names of volumes and bodies identify the content."""
+    if not exists_in_its_folder(destination) or PERSON_FILES.fullmatch(destination.name):
+        return False
+    return destination.stat().st_size == source.stat().st_size
+
+
+def _present(paths: Mapping[bpy.types.Volume, Path]) -> dict[bpy.types.Volume, Path]:
+    """Those volumes whose file exists or will be written."""
     later = {folder for folder in {path.parent for path in paths.values()} if unwritten_in(folder)}
-    return {volume: path for volume, path in paths.items() if path.parent in later or path.is_file()}
+    return {volume: path for volume, path in paths.items() if path.parent in later or exists_in_its_folder(path)}
 
 
 def _temporary(path: Path) -> bool:

@@ -9,8 +9,8 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from ..formats.json_files import parse_json
-from .human import MARK, armature_of, humans, volumes_of
+from .blend_values import stored_text
+from .human import MARK, armature_of, humans, provenance_of, volumes_of
 from .shape import betas_of, has_custom_shape
 
 _SENSOR_MM = 36.0
@@ -149,7 +149,7 @@ def overlap_warning(collection: bpy.types.Collection) -> str | None:
 
     try:
         most = current_overlap(collection)
-    except (ValueError, KeyError, TypeError):  # changed by hand
+    except ValueError:  # changed by hand
         return None
     if most <= CYCLES_LIMIT:
         return None
@@ -169,12 +169,14 @@ def current_overlap(collection: bpy.types.Collection) -> int:
 
     The number stored with the human where it has the shape of its file, or where volumes are hidden (when attached to
     the surface or merged) or missing. For other shapes it is counted once, in some 50 ms, from what Blender has
-    evaluated. Raises ValueError, KeyError or TypeError where the collection's provenance was changed by hand.
+    evaluated. Raises ValueError where the collection's provenance was changed by hand.
     """
-    stored = int(parse_json(collection[MARK])["most_overlapping"])
+    stored = provenance_of(collection).get("most_overlapping")
+    if not isinstance(stored, int):
+        raise ValueError(f"the custom property {MARK!r} of {collection.name!r} was changed by hand")
     if not has_custom_shape(collection):
         return stored
-    key = (collection.session_uid, collection[MARK], tuple(betas_of(collection)))
+    key = (collection.session_uid, stored_text(collection, MARK) or "", tuple(betas_of(collection)))
     if key not in _counted:
         volumes = [obj for objects in volumes_of(collection).values() for obj in objects]
         if not volumes or not all(obj.visible_get() for obj in volumes):  # else Blender would read all files

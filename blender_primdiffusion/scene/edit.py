@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.regular_files import real_path
+from ..formats.regular_files import exists_in_its_folder, real_path
 from .attachment import volumes_may_wait
 from .body_file import saved_body
 from .human import (
@@ -124,14 +124,16 @@ def restore_volumes(collection: bpy.types.Collection, written: WrittenHuman, per
     """
     shown = [obj for objects in volumes_of(collection).values() for obj in objects]
     made = {real_path(path) for path in written.made}
-    lost = _without_files(collection) | {obj for obj in shown if real_path(volume_path(obj.data)) in made}
+    written_again = {obj for obj in shown if (path := volume_path(obj.data)) is not None and real_path(path) in made}
+    lost = _without_files(collection) | written_again
     with written.entering(lambda: home_of(collection)):
         return _restore(collection, written, lost, person)
 
 
 def _without_files(collection: bpy.types.Collection) -> set[bpy.types.Object]:
     shown = volumes_of(collection)
-    return {obj for objects in shown.values() for obj in objects if not volume_path(obj.data).is_file()}
+    paths = {obj: volume_path(obj.data) for objects in shown.values() for obj in objects}
+    return {obj for obj, path in paths.items() if path is None or not exists_in_its_folder(path)}
 
 
 def _restore(collection: bpy.types.Collection, written: WrittenHuman, lost: set[bpy.types.Object], person: Path) -> int:

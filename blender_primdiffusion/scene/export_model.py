@@ -6,6 +6,7 @@ That scene holds nothing else, so the user's selection, modes and visibility sta
 from __future__ import annotations
 
 import dataclasses
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,7 +16,7 @@ import bpy
 
 from ..formats.joints import JOINT_NAMES
 from ..formats.removing import remove_folder
-from .human import copy_file
+from ..formats.whole_files import replacing
 
 
 @dataclasses.dataclass(frozen=True)
@@ -190,4 +191,5 @@ def _publish(folder: Path, path: Path) -> None:
     for source in sorted(folder.rglob("*"), key=lambda source: source == folder / path.name):
         if source.is_dir():
             continue
-        copy_file(source, path.parent / source.relative_to(folder))
+        with replacing(path.parent / source.relative_to(folder)) as unfinished:
+            shutil.copyfile(source, unfinished)

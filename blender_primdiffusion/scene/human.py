@@ -5,6 +5,7 @@ Panels import this file when Blender starts, so it needs no numpy.
 
 from __future__ import annotations
 
+import errno
 import filecmp
 import hashlib
 import os
@@ -12,11 +13,14 @@ import re
 import shutil
 from collections import defaultdict
 from pathlib import Path
+from typing import Any
 
 import bpy
 
-from ..formats.regular_files import read_regular, real_path
+from ..formats.regular_files import check_regular, exists_in_its_folder, read_regular, real_path
+from ..formats.removing import OutsideFolderError, check_inside
 from ..formats.whole_files import written_whole
+from .blend_values import file_path, stored_name, stored_record
 
 LARGEST_PERSON = 256 << 20
 """Bytes of a human of the backend."""
@@ -32,9 +36,11 @@ as it does the paths of the volumes."""
 HOME = "primdiffusion_folder"
 """Custom property of a human's collection: the absolute folder of its files when the .blend was last saved. Paths of
 volumes are relative to the .blend, which may be moved alone, or opened as a copy in a temporary folder."""
-PRIMITIVE_VDB = re.compile(r"prim_(\d{4,})_[0-9a-f]{12}\.vdb")
+PERSON_FILES = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
+"""Names that PERSON may hold; the hash is of the content."""
+PRIMITIVE_VDB = re.compile(r"prim_([0-9]{4,6})_[0-9a-f]{12}\.vdb")
 """File names of the volumes of primitives; the hash is of the content."""
-MERGED_VDB = re.compile(r"merged_[0-9a-f]{12}(_\d{4,})?\.vdb")
+MERGED_VDB = re.compile(r"merged_[0-9a-f]{12}(_[0-9]{4,6})?\.vdb")
 """File names of merged volumes; those of a sequence end in the frame, counted from 1."""
 
 
@@ -71,14 +77,18 @@ def stored_path(path: Path) -> str:
         return str(path)
 
 
-def volume_path(volume: bpy.types.Volume) -> Path:
-    """The absolute path of a volume's file."""
-    return Path(bpy.path.abspath(volume.filepath, library=volume.library))
+def volume_path(volume: bpy.types.Volume) -> Path | None:
+    """The absolute path of a human's volume; None where it has no name of such a file, or `file_path` rejects it."""
+    path = file_path(volume.filepath, volume.library)
+    named = path is not None and (PRIMITIVE_VDB.fullmatch(path.name) or MERGED_VDB.fullmatch(path.name))
+    return path if named else None
 
 
 def sequence_files(volume: bpy.types.Volume) -> list[Path]:
-    """All files of a volume: those of a merged sequence, else the only one."""
+    """All files of a human's volume: those of a merged sequence, else the only one; none without a `volume_path`."""
     path = volume_path(volume)
+    if path is None:
+        return []
     match = MERGED_VDB.fullmatch(path.name)
     if match is None or match[1] is None:
         return [path]
@@ -88,9 +98,10 @@ def sequence_files(volume: bpy.types.Volume) -> list[Path]:
 def unwritten_in(folder: Path) -> list[Path]:
     """Files in a folder from which volumes are still to be written there; none where the folder cannot be read."""
     try:
-        return sorted(folder / name for name in os.listdir(folder) if UNWRITTEN_NPZ.fullmatch(name))
+        found = sorted(folder / name for name in os.listdir(folder) if UNWRITTEN_NPZ.fullmatch(name))
     except OSError:
         return []
+    return [path for path in found if exists_in_its_folder(path)]
 
 
 def folder_of(collection: bpy.types.Collection) -> Path:
@@ -101,11 +112,16 @@ def folder_of(collection: bpy.types.Collection) -> Path:
 def folders_of(collection: bpy.types.Collection) -> list[Path]:
     """Where a human's files may be: beside the volumes wherever these are, else `folder_of`.
 
-    Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere.
+    Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere. A merged volume may be
+    in another folder than those of the primitives, which have the files beside them.
     """
-    volume = next((obj.data for obj in collection.all_objects if obj.type == "VOLUME"), None)
-    current = [volume_path(volume).parent] if volume is not None and volume.filepath else []
-    return [*current, folder_of(collection)]
+    merged: list[Path] = []
+    for obj in collection.all_objects:
+        if obj.type == "VOLUME" and (path := volume_path(obj.data)) is not None:
+            if PRIMITIVE_VDB.fullmatch(path.name):
+                return [path.parent, folder_of(collection)]
+            merged.append(path.parent)
+    return [*merged[:1], folder_of(collection)]
 
 
 def home_of(collection: bpy.types.Collection) -> Path:
@@ -115,23 +131,24 @@ def home_of(collection: bpy.types.Collection) -> Path:
     gets all files, so that they are never in two places.
     """
     folders = folders_of(collection)
-    home = next((folder for folder in folders if (folder / person_file_name(collection)).is_file()), folders[0])
+    name = person_file_name(collection)
+    home = next((folder for folder in folders if exists_in_its_folder(folder / name)), folders[0])
     for own in (humans_folder(), humans_folder("")):
-        if real_path(home).is_relative_to(real_path(own)):
+        if real_path(home).parent.is_relative_to(real_path(own)):  # bodies are in the parent
             return home
     return folder_of(collection)
 
 
 def person_file_name(collection: bpy.types.Collection) -> str:
     """The name of `person_file`, which each edit changes."""
-    return str(collection.get(PERSON, PERSON_FILE))
+    return stored_name(collection, PERSON, PERSON_FILES) or PERSON_FILE
 
 
 def person_file(collection: bpy.types.Collection) -> Path:
     """The backend's file of a human. Raises MissingPersonFile."""
     name, folders = person_file_name(collection), folders_of(collection)
     for folder in folders:
-        if (folder / name).is_file():
+        if exists_in_its_folder(folder / name):
             return folder / name
     raise MissingPersonFile(
         f"the file of the human {collection.name!r} is missing: {str(folders[0] / name)!r}; put it back beside "
@@ -148,18 +165,41 @@ def available_name(person: Path, folder: Path, name: str) -> str:
     """The name for a copy of the backend's file in `folder`: `name`, unless another human's file has it, which undo
     may need."""
     taken = folder / name
-    if not taken.is_file() or filecmp.cmp(person, taken, shallow=False):
+    if not os.path.lexists(taken) or _same_file(person, taken):
         return name
     return content_name(person)
 
 
-def copy_file(source: Path, destination: Path) -> bool:
-    """Copy a file, which appears whole or not at all; returns whether it is new. Raises OSError."""
-    new = not destination.exists()
+def _same_file(one: Path, other: Path) -> bool:
+    return exists_in_its_folder(other) and filecmp.cmp(one, other, shallow=False)
+
+
+def is_there(source: Path, destination: Path) -> bool:
+    """Whether `destination` is a copy of `source` already. Raises FileExistsError where it is another file."""
+    if not os.path.lexists(destination):
+        return False
+    if not _same_file(source, destination):
+        message = "another file of this name is there and is not replaced: move it away"
+        raise FileExistsError(errno.EEXIST, message, str(destination))
+    return True
+
+
+def copy_file(source: Path, destination: Path, folder: Path) -> bool:
+    """Copy a file of a human to `destination` in `folder`, where it appears whole or not at all; whether it is new.
+
+    Nothing is replaced. Raises FileExistsError where the name is taken by another content, OutsideFolderError where
+    `destination` lies outside of `folder` or `source` is a link out of its own folder, and OSError.
+    """
+    check_inside(destination, folder)
+    check_regular(source)
+    if not exists_in_its_folder(source):
+        raise OutsideFolderError(f"{source} is a link out of its folder and is not copied: remove it")
+    if is_there(source, destination):
+        return False
     destination.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(destination) as unfinished:
         shutil.copyfile(source, unfinished)
-    return new
+    return True
 
 
 MARK = "primdiffusion_human"
@@ -172,6 +212,14 @@ BETA_COUNT = 10
 """Numbers in a shape."""
 LARGEST_BETA = 5.0
 """Beyond this, bodies of linear shape models fall apart."""
+
+
+def provenance_of(collection: bpy.types.Collection) -> dict[str, Any]:
+    """How a human was made: seed, steps, attributes, edits and so on; empty where the .blend holds none.
+
+    The fields are the .blend's, of any type; `generated_betas` checks the shape.
+    """
+    return stored_record(collection, MARK)
 
 
 def armature_of(collection: bpy.types.Collection) -> bpy.types.Object:
@@ -191,7 +239,8 @@ def volumes_of(collection: bpy.types.Collection) -> dict[int, list[bpy.types.Obj
     """The human's volume objects by primitive, which the file name gives whatever the object is called now."""
     found = defaultdict(list)
     for obj in collection.all_objects:
-        if obj.type == "VOLUME" and (match := PRIMITIVE_VDB.fullmatch(volume_path(obj.data).name)):
+        path = volume_path(obj.data) if obj.type == "VOLUME" else None
+        if path is not None and (match := PRIMITIVE_VDB.fullmatch(path.name)):
             found[int(match[1])].append(obj)
     return dict(found)
 

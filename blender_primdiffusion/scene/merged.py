@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
-from ..formats.json_files import parse_json
-from ..formats.removing import remove_file
-from .human import VolumeWriteError, armature_of, copy_file, folders_of, person_file_name, stored_path
+from ..formats.removing import OutsideFolderError, remove_file
+from .blend_values import stored_record
+from .human import VolumeWriteError, armature_of, copy_file, home_of, person_file_name, stored_path
 from .material import person_material
 from .volumes import write_vdb
 
@@ -101,8 +101,8 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
     try:
         for source, target in zip(files, targets, strict=True):
             if target in new:
-                copy_file(source, target)
-    except OSError as error:
+                copy_file(source, target, folder.parent)
+    except (OSError, OutsideFolderError) as error:
         for path in new:
             if path.is_file():
                 remove_file(path, folder)
@@ -136,9 +136,12 @@ def merged_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
 
 
 def merged_state(merged: bpy.types.Object) -> MergedState:
-    """What a merged object shows."""
-    saved = parse_json(merged[MARK])
-    return MergedState(**{**saved, "poses": tuple(saved["poses"])})
+    """What a merged object shows. Raises ValueError where the .blend does not hold that."""
+    saved = stored_record(merged, MARK)
+    poses, voxel, start = (saved.get(name) for name in ("poses", "voxel", "start"))
+    if not (isinstance(poses, list) and poses and isinstance(voxel, int | float) and isinstance(start, int)):
+        raise ValueError(f"the custom property {MARK!r} of {merged.name!r} was changed by hand: merge again")
+    return MergedState(tuple(map(str, poses)), float(voxel), start)
 
 
 def remove_merged(collection: bpy.types.Collection) -> None:
@@ -149,8 +152,8 @@ def remove_merged(collection: bpy.types.Collection) -> None:
 
 
 def merged_folder(collection: bpy.types.Collection) -> Path:
-    """Where merged files go: beside the human's volumes."""
-    return folders_of(collection)[0]
+    """Where merged files go: beside the human's volumes, if these are in a folder of this .blend."""
+    return home_of(collection)
 
 
 def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequence[float] | None) -> str:

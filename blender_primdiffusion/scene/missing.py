@@ -15,8 +15,9 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..formats.regular_files import real_path
-from .body_file import BODY_FILE
+from ..formats.regular_files import exists_in_its_folder, real_path
+from .blend_values import as_shown, stored_folder
+from .body_file import stored_body_name
 from .human import (
     HOME,
     MARK,
@@ -26,6 +27,7 @@ from .human import (
     copy_file,
     folder_of,
     folders_of,
+    home_of,
     humans_folder,
     person_file_name,
     stored_path,
@@ -35,6 +37,8 @@ from .human import (
 from .human_file import read_tensors
 from .shape import generated_betas
 
+_LONGEST_SEQUENCE = 100_000
+"""Frames of a merged volume whose files are looked for."""
 _DEEPEST = 6
 _MOST_FOLDERS = 20_000
 _SAME_BETAS = 1e-4
@@ -51,7 +55,7 @@ class Listing:
         if folder not in self._names:
             try:
                 with os.scandir(folder) as entries:  # a pipe named like a volume would hang Blender
-                    self._names[folder] = frozenset(entry.name for entry in entries if os.path.isfile(entry))
+                    self._names[folder] = frozenset(entry.name for entry in entries if _is_file(entry))
             except OSError:
                 self._names[folder] = frozenset()
         return self._names[folder]
@@ -89,7 +93,7 @@ class MissingFiles:
     def linked(self) -> str:
         """Path of the .blend that the human is linked from; empty for this one."""
         holder = next((v for v in (*self.volumes, *self.merged, self.person) if v.library is not None), None)
-        return holder.library.filepath if holder is not None else ""
+        return as_shown(holder.library.filepath or holder.library.name) if holder is not None else ""
 
     def summary(self) -> str:
         """For messages, for instance: 12 volumes of 'Human'."""
@@ -109,7 +113,7 @@ def missing_files() -> list[MissingFiles]:
             continue
         single, several = _without_files(person, listing)
         near = folders_of(person)
-        name, body = person_file_name(person), str(person.get(BODY_FILE, ""))
+        name, body = person_file_name(person), stored_body_name(person) or ""
         has_person = any(folder / name in listing for folder in near)
         has_body = not body or any(path / body in listing for folder in near for path in (folder.parent, folder))
         if single or several or not (has_person and has_body):
@@ -124,10 +128,10 @@ def find_files(lost: Sequence[MissingFiles], directory: Path | None = None) -> d
     Looks beside the .blend, in the folders of its humans when it was last saved, in the folders of other humans, and
     then in `directory` and below. Raises NotADirectoryError where that is no folder.
     """
-    if directory is not None and not directory.is_dir():
+    if directory is not None and not os.path.isdir(directory):
         raise NotADirectoryError(f"there is no folder {str(directory)!r}: choose the one that the volumes are in")
     wanted = {
-        *(path.name for one in lost for volume in one.volumes for path in (volume_path(volume),)),
+        *(_name(volume) for one in lost for volume in one.volumes),
         *(name for one in lost for volume in one.merged for name in _sequence_names(volume)),
         *(one.body_file for one in lost),
         *(one.person_file for one in lost if one.person_file != PERSON_FILE),
@@ -139,9 +143,9 @@ def find_person(lost: MissingFiles, directory: Path | None = None) -> Path | Non
     """Where the backend's file of a human is now; None where it is not found. Does not raise."""
     if not lost.person_file:
         near = [folder / person_file_name(lost.person) for folder in folders_of(lost.person)]
-        return next((path for path in near if path.is_file()), None)
+        return next((path for path in near if exists_in_its_folder(path)), None)
     listing = Listing()
-    own = {volume_path(obj.data).name for obj in lost.person.all_objects if obj.type == "VOLUME"}
+    own = {_name(obj.data) for obj in lost.person.all_objects if obj.type == "VOLUME"}
     for folder in _search_folders(directory):
         if lost.person_file not in listing.names(folder):
             continue
@@ -156,13 +160,13 @@ def repair(lost: Sequence[MissingFiles], found: dict[str, Path]) -> int:
     repaired = 0
     for one in lost:
         for volume in one.volumes:
-            path = found.get(volume_path(volume).name)
+            path = found.get(_name(volume))
             if path is not None and volume.library is None:
                 volume.filepath = stored_path(path)
                 repaired += 1
         for volume in one.merged:
-            path = found.get(volume_path(volume).name)
-            complete = path is not None and all((path.parent / name).is_file() for name in _sequence_names(volume))
+            path = found.get(_name(volume))
+            complete = path is not None and {*_sequence_names(volume)} <= Listing().names(path.parent)
             if complete and volume.library is None:
                 volume.filepath = stored_path(path)
                 repaired += 1
@@ -170,21 +174,21 @@ def repair(lost: Sequence[MissingFiles], found: dict[str, Path]) -> int:
 
 
 def copy_back(lost: Sequence[MissingFiles], found: dict[str, Path], directory: Path | None = None) -> int:
-    """Copy the backend's and the body's files that were found to where the human's volumes are now; returns how many.
+    """Copy the backend's and the body's files that were found to the human's folder; returns how many.
 
-    Call `repair` first. Raises OSError.
+    Call `repair` first. Raises OSError, and ValueError where that folder lies behind a link or what was found is one.
     """
     copied = 0
     for one in lost:
-        home = folders_of(one.person)[0]
-        if one.linked or not home.is_dir():
+        if one.linked or not os.path.isdir(folders_of(one.person)[0]):
             continue
-        if one.person_file and not (home / one.person_file).is_file():
+        home = home_of(one.person)
+        if one.person_file and not os.path.lexists(home / one.person_file):
             source = find_person(one, directory)
-            copied += source is not None and copy_file(source, home / one.person_file)
+            copied += source is not None and copy_file(source, home / one.person_file, home.parent)
         paths = [home.parent / one.body_file, home / one.body_file]
-        if one.body_file in found and not any(path.is_file() for path in paths):
-            copied += copy_file(found[one.body_file], paths[0])
+        if one.body_file in found and not any(exists_in_its_folder(path) for path in paths):
+            copied += copy_file(found[one.body_file], paths[0], home.parent)
     return copied
 
 
@@ -195,6 +199,8 @@ def _without_files(
     later = {folder for folder in folders_of(person)[:1] if unwritten_in(folder)}
     for volume in {obj.data: None for obj in person.all_objects if obj.type == "VOLUME"}:
         path = volume_path(volume)
+        if path is None:
+            continue
         if PRIMITIVE_VDB.fullmatch(path.name) and path not in listing:
             single += [] if path.parent in later else [volume]
         elif MERGED_VDB.fullmatch(path.name) and not {*_sequence_names(volume)} <= listing.names(path.parent):
@@ -202,14 +208,25 @@ def _without_files(
     return single, several
 
 
+def _is_file(entry: os.DirEntry[str]) -> bool:
+    return exists_in_its_folder(Path(entry.path)) if entry.is_symlink() else os.path.isfile(entry)
+
+
+def _name(volume: bpy.types.Volume) -> str:
+    """The name of a volume's file; empty where it has none."""
+    path = volume_path(volume)
+    return path.name if path is not None else ""
+
+
 def _sequence_names(volume: bpy.types.Volume) -> list[str]:
     """Names of all files of a merged volume, missing or not."""
-    name = volume_path(volume).name
+    name = _name(volume)
     match = MERGED_VDB.fullmatch(name)
     if match is None or match[1] is None or not volume.is_sequence:
         return [name]
     width = len(match[1]) - 1
-    return [name.replace(match[1], f"_{number:0{width}d}") for number in range(1, volume.frame_duration + 1)]
+    last = min(volume.frame_duration, _LONGEST_SEQUENCE)
+    return [name.replace(match[1], f"_{number:0{width}d}") for number in range(1, last + 1)]
 
 
 def _search_folders(directory: Path | None) -> Iterator[Path]:
@@ -226,9 +243,9 @@ def _search_folders(directory: Path | None) -> Iterator[Path]:
 def _likely_folders() -> Iterator[Path]:
     humans = [person for person in bpy.data.collections if MARK in person]
     yield from (folder_of(person) for person in humans)
-    homes = [Path(str(person[HOME])) for person in humans if person.get(HOME)]
+    homes = [home for person in humans if (home := stored_folder(person, HOME)) is not None]
     yield from homes
-    shown = {volume_path(volume).parent for volume in bpy.data.volumes if volume.filepath}
+    shown = {path.parent for volume in bpy.data.volumes if (path := volume_path(volume)) is not None}
     yield from sorted(shown)
     roots = [humans_folder(), *(folder.parent for folder in (*homes, *sorted(shown)))]
     blend = Path(bpy.data.filepath)

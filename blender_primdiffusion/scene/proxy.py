@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
-from ..formats.json_files import parse_json
+from .blend_values import as_numbers, stored_record
 from .body_file import shape_model_of
 from .build import build_body_mesh
 from .convention import points_to_blender
-from .human import BODY_MARK, armature_of, own_data, person_file_name
+from .human import BETA_COUNT, BODY_MARK, armature_of, own_data, person_file_name
 from .shape import SAME_BETAS, ShapeModel
 
 PROXY_MARK = "primdiffusion_proxy"
@@ -98,22 +98,20 @@ def proxy_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
 
 def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas: NDArray | None) -> bool:
     """Whether the human was edited since, or has a shape that the proxy could not follow."""
-    made_of, now = parse_json(proxy[PROXY_MARK]), _origin(collection, betas)
-    same_shape = (made_of["betas"] is None) == (now["betas"] is None) and (
-        now["betas"] is None or np.allclose(made_of["betas"], now["betas"], atol=1e-4)
-    )
-    return made_of["file"] != now["file"] or not same_shape
+    shown = shown_betas(proxy)
+    same_shape = shown is None if betas is None else shown is not None and np.allclose(shown, betas, atol=1e-4)
+    return stored_record(proxy, PROXY_MARK).get("file") != person_file_name(collection) or not same_shape
 
 
 def shown_betas(proxy: bpy.types.Object) -> NDArray[np.float64] | None:
     """The shape [10] that a proxy shows; None where it is unknown."""
-    betas = parse_json(proxy[PROXY_MARK])["betas"]
+    betas = as_numbers(stored_record(proxy, PROXY_MARK).get("betas"), BETA_COUNT)
     return None if betas is None else np.array(betas, np.float64)
 
 
 def show_betas(proxy: bpy.types.Object, betas: NDArray) -> None:
     """Store with a proxy that it shows another shape [10]."""
-    proxy[PROXY_MARK] = json.dumps({**parse_json(proxy[PROXY_MARK]), "betas": _rounded(betas)})
+    proxy[PROXY_MARK] = json.dumps({**stored_record(proxy, PROXY_MARK), "betas": _rounded(betas)})
 
 
 def show_textures_in_solid() -> None:

@@ -68,7 +68,7 @@ def apply_rest(collection: bpy.types.Collection, rest: Rest, betas: NDArray, gro
     armature[BETAS] = betas.tolist()
     position, quaternion = points_to_blender(rest.position), matrix_to_quaternion(frames_to_blender(rest.rotation))
     for k, objects in volumes_of(collection).items():
-        for obj in objects:
+        for obj in objects if k < len(growth) else ():  # the number is the file name's
             obj.location, obj.rotation_quaternion, obj.scale = position[k], quaternion[k], growth[k]
     scale_surface(collection, growth)
     armature.update_tag()
@@ -82,7 +82,7 @@ def apply_rest(collection: bpy.types.Collection, rest: Rest, betas: NDArray, gro
 def apply_growth(collection: bpy.types.Collection, growth: NDArray) -> None:
     """Scale volumes by `growth` [K, 3], however they are attached."""
     for k, objects in volumes_of(collection).items():
-        for obj in objects:
+        for obj in objects if k < len(growth) else ():
             obj.scale = growth[k]
     scale_surface(collection, growth)
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite
-from ..formats.json_files import parse_json
-from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, armature_of
+from .blend_values import as_numbers, stored_numbers
+from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, armature_of, provenance_of
 
 _TINY = 1e-12
 """Smallest divisor when normalising, as in the backend."""
@@ -255,17 +255,15 @@ def _unit(vectors: NDArray) -> NDArray[np.float64]:
 def betas_of(collection: bpy.types.Collection) -> NDArray[np.float64]:
     """The human's shape [10] as the engine draws it now. Raises ValueError where it is no list of ten numbers."""
     armature = armature_of(collection)
-    given = armature[BETAS] if BETAS in armature else generated_betas(collection)
-    try:
-        betas = np.array(list(given), np.float64)
-    except (TypeError, ValueError):
-        betas = np.empty(0)
-    if betas.shape != (BETA_COUNT,) or not np.isfinite(betas).all():
+    if BETAS not in armature:
+        return generated_betas(collection)
+    betas = stored_numbers(armature, BETAS, BETA_COUNT)
+    if betas is None:
         raise ValueError(
             f"the custom property {BETAS!r} on the armature of {collection.name!r} is no list of {BETA_COUNT} numbers: "
             "delete it"
         )
-    return betas
+    return np.array(betas)
 
 
 def generated_betas(collection: bpy.types.Collection) -> NDArray[np.float64]:
@@ -273,16 +271,13 @@ def generated_betas(collection: bpy.types.Collection) -> NDArray[np.float64]:
 
     Raises ValueError where the collection's provenance is damaged.
     """
-    try:
-        betas = np.array(parse_json(collection[MARK])["betas"], np.float64)
-    except (ValueError, KeyError, TypeError):
-        betas = np.empty(0)
-    if betas.shape != (BETA_COUNT,):
+    betas = as_numbers(provenance_of(collection).get("betas"), BETA_COUNT)
+    if betas is None:
         raise ValueError(
             f"the custom property {MARK!r} of {collection.name!r} was changed by hand and holds no shape: undo that, "
             "or generate the human again"
         )
-    return betas
+    return np.array(betas)
 
 
 def has_custom_shape(collection: bpy.types.Collection) -> bool:

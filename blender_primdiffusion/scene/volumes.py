@@ -17,9 +17,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.removing import remove_folder
+from ..formats.regular_files import exists_in_its_folder
+from ..formats.removing import OutsideFolderError, check_inside, remove_folder
 from ..formats.whole_files import publish, remove_abandoned, temporary_name
-from .human import VolumeWriteError, folders_of, unwritten_in, volume_path
+from .human import UNWRITTEN_NPZ, VolumeWriteError, folders_of, is_there, unwritten_in, volume_path
 
 VOXELS = 8
 """Voxels along a side of a primitive."""
@@ -138,13 +139,18 @@ class Staging:
                 raise write_error(self._folder, error) from error
 
     def copy(self, files: Mapping[str, Path]) -> None:
-        """Add copies of `files` under the names given. Raises VolumeWriteError."""
+        """Add copies of `files` under the names given. Raises VolumeWriteError, also where another file has a name."""
         try:
             for name, path in files.items():
-                shutil.copyfile(path, self._hidden / name)
+                if not (self._is_unwritten(name) or is_there(path, self._folder / name)):
+                    shutil.copyfile(path, self._hidden / name)
                 self.names.append(name)
         except OSError as error:
             raise write_error(self._folder, error) from error
+
+    def _is_unwritten(self, name: str) -> bool:
+        """Whether the file that volumes are written from is there: its name tells which, whatever else is in it."""
+        return bool(UNWRITTEN_NPZ.fullmatch(name)) and exists_in_its_folder(self._folder / name)
 
 
 @contextmanager
@@ -152,15 +158,16 @@ def staged(folder: Path) -> Iterator[Staging]:
     """Stage new files of `folder`, which move into it when the block ends well.
 
     When the block or a move fails, neither the files nor folders made for them remain. Raises VolumeWriteError when
-    the folder cannot be written or the disk is full.
+    the folder cannot be written, is a link out of the folder that it is in, or the disk is full.
     """
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     try:
+        check_inside(folder / "volumes", folder.parent)
         folder.mkdir(parents=True, exist_ok=True)
         remove_abandoned(folder)
         hidden = temporary_name(folder / "volumes")
         hidden.mkdir()
-    except OSError as error:
+    except (OSError, OutsideFolderError) as error:
         remove_empty(folder, existing)
         raise write_error(folder, error) from error
     try:
@@ -283,7 +290,7 @@ def person_memory(collection: bpy.types.Collection) -> Memory:
     if unwritten_in(folders_of(collection)[0]):
         return Memory(0, 0)
     paths = {volume_path(obj.data) for obj in collection.all_objects if obj.type == "VOLUME"}
-    return _memory_of(tuple(sorted(paths)))
+    return _memory_of(tuple(sorted(path for path in paths if path is not None)))
 
 
 @functools.lru_cache(maxsize=64)
@@ -291,7 +298,7 @@ def _memory_of(paths: Sequence[Path]) -> Memory:
     vdb = openvdb()
     files = grids = 0
     for path in paths:
-        if not path.is_file():
+        if not exists_in_its_folder(path):
             continue
         files += path.stat().st_size
         try:

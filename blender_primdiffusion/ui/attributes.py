@@ -10,6 +10,7 @@ from pathlib import Path
 import bpy
 
 from ..backend.vocabulary import Vocabulary, read_vocabulary
+from ..formats.regular_files import is_local_path
 from ..places import backend_module_path, preference
 from .translations import CONTEXT
 
@@ -33,6 +34,8 @@ def known() -> Vocabulary:
 
     chosen, bundled = preference("checkpoint"), backend_module_path()
     if chosen:
+        if not is_local_path(chosen):
+            return Vocabulary()
         path = Path(chosen)
     elif bundled is not None:
         path = bundled / _DEFAULT_CHECKPOINT

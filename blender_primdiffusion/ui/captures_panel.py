@@ -13,6 +13,7 @@ from bpy.app.translations import pgettext_iface
 from mathutils import Vector
 
 from ..jobs.follow import Reporting, redraw
+from ..scene.blend_values import setting_path
 from .captures_session import Busy, captures
 from .captures_settings import words_of
 from .drawing import CAPTURES, SidebarPanel, draw_lines, property_columns
@@ -140,7 +141,7 @@ class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
         from ..capture.options import parse
         from ..formats.capture_repair import repair, verify
 
-        out = bpy.path.abspath(self.out or context.scene.primdiffusion_captures.out)
+        out = bpy.path.abspath(self.out) or setting_path(context.scene.primdiffusion_captures.out, "Captures")
         if not out:
             raise ValueError("choose the folder of captures first")
         words = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import bpy
 
 from ..formats.requests import LAYOUTS, PASSES
+from ..scene.blend_values import setting_path
 from .translations import CONTEXT
 
 if TYPE_CHECKING:
@@ -174,9 +175,10 @@ def words_of(
 ) -> list[str]:
     """The command `capture` in words (`capture.options`); a file of cameras, where needed, goes to `folder`.
 
-    `people` and `out` go before the panel's. Raises ValueError where something is missing.
+    `people` and `out` go before the panel's. Raises ValueError where something is missing or a path is impossible.
     """
-    people, out = bpy.path.abspath(people or asked.people), bpy.path.abspath(out or asked.out)
+    people = bpy.path.abspath(people) or setting_path(asked.people, "People")
+    out = bpy.path.abspath(out) or setting_path(asked.out, "Captures")
     if not people or not out:
         raise ValueError(f"choose a folder {'of people' if not people else 'for the captures'} first")
     words = ["--people", people, "--out", out, "--seed", str(asked.seed)]
@@ -184,9 +186,13 @@ def words_of(
     words += ["--poses", str(asked.pose_count), "--size", str(asked.width), str(asked.height)]
     words += ["--samples", str(asked.samples), "--light", asked.light, "--device", asked.device]
     words += ["--background", asked.background]
-    for name, path in (("--body", asked.body), ("--pose-files", asked.poses)):
-        words += [name, bpy.path.abspath(path)] if path else []
-    words += ["--hdri", bpy.path.abspath(asked.hdri)] if asked.light == "hdri" and asked.hdri else []
+    hdri = asked.hdri if asked.light == "hdri" else ""
+    for name, label, path in (
+        ("--body", "Body", asked.body),
+        ("--pose-files", "Poses", asked.poses),
+        ("--hdri", "HDRI", hdri),
+    ):
+        words += [name, setting_path(path, label)] if path else []
     words += ["--denoise"] if asked.denoise else []
     words += ["--released-reference"] if asked.released_reference else []
     words += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]

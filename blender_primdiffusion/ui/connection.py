@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..backend.environment import NOT_INSTALLED, candidates, own_python_has_backend
+from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, own_python_has_backend
 from ..backend.requests import sentence
 from ..places import EXTENSION, installed_backend, missing_packages, preference
 from .drawing import draw_lines
@@ -19,7 +19,10 @@ def found() -> tuple[bool, str]:
     if lacking := missing_packages():
         return False, sentence(lacking)
     own = own_python_has_backend()
-    named = next(candidates(preference("backend_python"), None, installed_backend(), own_python=own), None)
+    try:
+        named = next(candidates(preference("backend_python"), None, installed_backend(), own_python=own), None)
+    except BackendNotFound as error:
+        return False, sentence(error)
     return (False, sentence(NOT_INSTALLED)) if named is None else (True, f"Uses {named[1]}, named by {named[0]}")
 
 

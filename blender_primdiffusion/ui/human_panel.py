@@ -31,8 +31,12 @@ class _Find:
     )
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..scene.missing import copy_back, find_files, missing_files, repair  # needs numpy
+        # needs numpy
+        from ..scene.collect import ignored_values
+        from ..scene.missing import copy_back, find_files, missing_files, repair
 
+        for fault in ignored_values():
+            self.report({"WARNING"}, sentence(fault))
         directory = Path(bpy.path.abspath(self.directory)) if self.directory else None
         try:
             lost = missing_files()
@@ -42,7 +46,7 @@ class _Find:
             if repaired:
                 bpy.ops.ed.undo_push(message="Find Missing Volumes")
             restored, left = self._restore(context, directory)
-        except OSError as error:
+        except (OSError, ValueError) as error:
             self.report({"ERROR"}, in_words(error))
             return {"CANCELLED"}
         finally:
@@ -128,9 +132,11 @@ class PRIMDIFFUSION_OT_collect_files(Reporting, bpy.types.Operator):
     bl_options = {"UNDO"}
 
     def act(self, _context: bpy.types.Context) -> set[str]:
-        from ..scene.collect import collect_files  # needs numpy
+        from ..scene.collect import collect_files, ignored_values  # needs numpy
 
         done = collect_files()
+        for fault in ignored_values():
+            self.report({"WARNING"}, sentence(fault))
         look()
         where = humans_folder().name
         if done.volumes:

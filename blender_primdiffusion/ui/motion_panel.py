@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 
 import bpy
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
-from ..formats.json_files import parse_json
 from ..jobs.follow import Reporting
 from ..scene.actions import action_curves, end_repeat, loops, repeat
+from ..scene.blend_values import as_shown, stored_record
 from .drawing import HUMAN, SidebarPanel, draw_lines, property_columns
 from .export_operators import destination
 from .on_person import FACTS, OnArmature, WhereTo, scene_fps, target_armature
 from .translations import CONTEXT
 
+_MOST_FACTS = 20
 _BUILT_IN = [
     ("WALK", "Walk", "An easy walk straight ahead; the feet do not slide"),
     ("IDLE", "Idle", "Standing, breathing, the weight going from leg to leg"),
@@ -215,8 +217,5 @@ class PRIMDIFFUSION_MT_actions(bpy.types.Menu):
 
 def facts_of(action: bpy.types.Action) -> dict[str, str]:
     """What was found when the motion was imported; nothing for actions of other origin."""
-    try:
-        found = parse_json(action.get(FACTS, "{}"))
-    except (ValueError, TypeError):
-        return {}
-    return {str(k): str(v) for k, v in found.items()} if isinstance(found, dict) else {}
+    found = itertools.islice(stored_record(action, FACTS).items(), _MOST_FACTS)
+    return {as_shown(name): as_shown(value) for name, value in found}

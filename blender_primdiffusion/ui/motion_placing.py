@@ -19,8 +19,9 @@ from ..motion.rotation import nearest
 from ..motion.skeleton import unchain
 from ..scene.actions import last_key, push_to_strip
 from ..scene.armature import append_poses, keyframe_poses, rest_rotations
+from ..scene.blend_values import stored_numbers
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
-from ..scene.human import BETAS
+from ..scene.human import BETA_COUNT, BETAS
 from .on_person import FACTS, scene_fps
 
 
@@ -127,7 +128,7 @@ def sample_motion(
     world = BLENDER_FROM_BACKEND.T @ world @ BLENDER_FROM_BACKEND
     places = points_to_backend(bones[:, 0, :3, 3]) - pelvis
     motion = Motion(unchain(world), places, scene_fps(context.scene), armature.name)
-    return motion, np.asarray(list(armature.get(BETAS, np.zeros(10))), np.float64), pelvis
+    return motion, np.array(stored_numbers(armature, BETAS, BETA_COUNT) or [0.0] * BETA_COUNT), pelvis
 
 
 @contextmanager

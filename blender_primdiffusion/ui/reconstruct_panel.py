@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import bpy
 
 from ..formats.requests import CAPTURE_VIEWS
 from ..jobs.follow import Reporting, submit
+from ..scene.blend_values import setting_path
 from .drawing import CAPTURES, SidebarPanel, draw_job, property_columns
 
 _CAMERAS_FILE = "cameras.json"
@@ -29,8 +31,12 @@ def subjects_in(folder: Path) -> list[str]:
 
 
 def _search(self: PRIMDIFFUSION_PG_reconstruct, _context: bpy.types.Context, typed: str) -> Iterator[str]:
-    if self.capture:
-        names = subjects_in(Path(bpy.path.abspath(self.capture)))
+    try:
+        folder = setting_path(self.capture, "Captures")
+    except ValueError:  # the operator reports it
+        return
+    if folder:
+        names = subjects_in(Path(folder))
         yield from (name for name in names if typed.lower() in name.lower())
 
 
@@ -86,11 +92,11 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
         from ..jobs.generate import ReconstructJob  # needs numpy
 
         asked = context.scene.primdiffusion_reconstruct
-        folder = bpy.path.abspath(self.directory or asked.capture)
+        folder = bpy.path.abspath(self.directory) or setting_path(asked.capture, "Captures")
         subject = self.subject or ("" if self.directory else asked.subject)  # the panel's belongs to its own folder
         if not folder:
             raise ValueError("choose the folder of captures first")
-        if not Path(folder).is_dir():
+        if not os.path.isdir(folder):
             raise FileNotFoundError(f"there is no folder {folder!r:.200}: choose one of captures")
         frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
         return submit(self, context, ReconstructJob(folder, subject, frame, views))

@@ -9,9 +9,9 @@ import bpy
 from bpy.app.translations import pgettext_iface
 
 from ..backend.requests import sentence
-from ..formats.json_files import parse_json
 from ..jobs.target import named_person, selected_person
-from ..scene.human import BETA_COUNT, BETAS, MARK, armature_of, humans
+from ..scene.blend_values import as_shown
+from ..scene.human import BETA_COUNT, BETAS, armature_of, humans, provenance_of
 from .drawing import HUMAN, SidebarPanel, draw_lines, property_columns
 from .on_person import SKIP, OnPerson
 from .translations import CONTEXT
@@ -135,6 +135,8 @@ class PRIMDIFFUSION_OT_copy_shape(_Shape, bpy.types.Operator):
 
 _SHOWN = ("seed", "steps", "sampler", "guidance", "checkpoint", "version")
 """Fields of the provenance, in this order."""
+_MOST_LINES = 60
+"""Lines of Details about the provenance."""
 _ANIMATED = "The shape is animated: the exact engine draws it in each frame; bones and volumes keep one shape"
 
 
@@ -221,19 +223,22 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     from ..scene.cycles import current_overlap
     from ..scene.volumes import person_memory
 
-    provenance = parse_json(person[MARK])
-    lines = [(name.capitalize(), f"{provenance[name]}") for name in _SHOWN if provenance.get(name) not in (None, "")]
-    lines += [(name.capitalize(), f"{value}") for name, value in (provenance.get("attributes") or {}).items()]
-    for edit in provenance.get("edits", ()):
-        rest = ", ".join(
-            f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)
-        )
-        lines.append((f"Edit: {edit['edit']}", rest))
+    provenance = provenance_of(person)
+    attributes, edits = provenance.get("attributes"), provenance.get("edits")
+    shown = {name: provenance[name] for name in _SHOWN if provenance.get(name) not in (None, "")}
+    lines = [(name.capitalize(), as_shown(value)) for name, value in shown.items()]
+    if isinstance(attributes, dict):
+        lines += [(as_shown(name.capitalize()), as_shown(value)) for name, value in attributes.items()]
+    for edit in edits if isinstance(edits, list) else ():
+        if isinstance(edit, dict):
+            rest = [f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)]
+            lines.append((f"Edit: {as_shown(edit.get('edit', '?'))}", as_shown(", ".join(rest))))
+    del lines[_MOST_LINES:]
     volumes = [obj for obj in person.all_objects if obj.type == "VOLUME"]
     memory = person_memory(person)
     try:
         most = str(current_overlap(person))
-    except (ValueError, KeyError, TypeError):  # changed by hand
+    except ValueError:  # changed by hand
         most = "?"
     lines.append(("Volumes", f"{len(volumes)}, up to {most} overlap"))
     lines.append(("Memory once drawn", f"{memory.grids / 1e6:.0f} MB"))

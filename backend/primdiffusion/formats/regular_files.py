@@ -88,3 +88,15 @@ def check_size(path: str | Path, size: int, limit: int) -> None:
 def is_plain_path(path: str) -> bool:
     """Return whether a path named in a file may be looked up: no server, device, URL or control character."""
     return 0 < len(path) <= 4096 and path.isprintable() and not _REMOTE.match(path)
+
+
+def is_local_path(path: str) -> bool:
+    """Return whether a path may be looked up (`is_plain_path`) and is the same in every working directory."""
+    return is_plain_path(path) and os.path.isabs(path)
+
+
+def exists_in_its_folder(path: Path) -> bool:
+    """Return whether `path` is a regular file, and if it is a link, one to a file in its own folder. Does not raise."""
+    if not os.path.isfile(path):
+        return False
+    return not os.path.islink(path) or real_path(path).is_relative_to(real_path(path.parent))

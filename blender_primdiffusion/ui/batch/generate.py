@@ -18,7 +18,8 @@ from ...capture.report import Report
 from ...console import Stop, duration
 from ...formats.regular_files import real_path
 from ...formats.removing import check_unlinked
-from ...places import missing_packages, preference
+from ...jobs.queue import chosen_checkpoint
+from ...places import missing_packages
 from ...scene.human import NPZ_FILE, PERSON_FILE
 from ..attributes import Attributes, parsed
 from .running import Clock, NoBackend, Say, Stopped, ask, backend_of, begun, publish, reason, run, staging
@@ -70,7 +71,7 @@ def person_name(seed: int) -> str:
 
 def _params(options: argparse.Namespace, attributes: Attributes) -> dict[str, object]:
     """Parameters of the child's method that all humans share."""
-    checkpoint = real_path(options.checkpoint) if options.checkpoint is not None else preference("checkpoint")
+    checkpoint = real_path(options.checkpoint) if options.checkpoint is not None else chosen_checkpoint("checkpoint")
     return {
         "steps": options.steps,
         "sampler": options.sampler,

@@ -21,7 +21,7 @@ from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
-from ...formats.regular_files import real_path
+from ...formats.regular_files import exists_in_its_folder, real_path
 from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
 from ...jobs import cycles_check
@@ -278,7 +278,8 @@ class _Drawing:
 def _check_volumes(scene: bpy.types.Scene) -> None:
     write_all_unwritten()
     volumes = {obj.data for person in humans(scene) for obj in person.all_objects if obj.type == "VOLUME"}
-    missing = [path for path in (volume_path(volume) for volume in volumes if volume.filepath) if not path.is_file()]
+    paths = [path for path in map(volume_path, volumes) if path is not None]
+    missing = [path for path in paths if not exists_in_its_folder(path)]
     if missing:
         raise FileNotFoundError(
             f"{len(missing)} of {len(volumes)} volumes have lost their files, {missing[0]} among them: put the folder "

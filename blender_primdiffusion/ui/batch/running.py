@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -53,7 +54,7 @@ class Stopped(Exception):
 @contextmanager
 def backend_of(python: Path | None) -> Iterator[Backend]:
     """A child on this Python, or the preferences'; started at first use, ended with the block."""
-    backend = new_backend(str(python) if python is not None else preference("backend_python"))
+    backend = new_backend(preference("backend_python") if python is None else absolute(python))
     try:
         yield backend
     finally:
@@ -68,9 +69,9 @@ def python_for_engine(python: Path | None) -> Iterator[None]:
         return
     addon = bpy.context.preferences.addons.get(EXTENSION)
     before, variable = (addon.preferences.backend_python if addon else ""), os.environ.get(VARIABLE)
-    os.environ[VARIABLE] = str(python)
+    os.environ[VARIABLE] = absolute(python)
     if addon is not None:
-        addon.preferences.backend_python = str(python)
+        addon.preferences.backend_python = absolute(python)
     try:
         yield
     finally:
@@ -80,6 +81,11 @@ def python_for_engine(python: Path | None) -> Iterator[None]:
             del os.environ[VARIABLE]
         else:
             os.environ[VARIABLE] = variable
+
+
+def absolute(program: Path) -> str:
+    """The absolute path of a program on the command line, which may be relative or one on the PATH."""
+    return os.path.abspath(shutil.which(program) or program)
 
 
 def check_backend(python: Path | None) -> None:

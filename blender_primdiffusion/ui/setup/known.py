@@ -11,10 +11,11 @@ from typing import Any, Literal
 
 import bpy
 
-from ...backend.environment import VARIABLE, tried
+from ...backend.environment import NOT_ABSOLUTE, VARIABLE, tried
 from ...backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
 from ...backend.requests import sentence
 from ...backend.setup import state_of
+from ...formats.regular_files import is_local_path
 from ...places import EXTENSION, missing_packages, preference, set_up_folder
 
 LOCKS = Path(__file__).resolve().parents[2] / "requirements"
@@ -43,6 +44,8 @@ def known() -> Known:
     if lacking := missing_packages():
         return Known("lacking", False, sentence(lacking))
     if named := preference("backend_python"):
+        if not is_local_path(named):
+            return Known("named", False, sentence(NOT_ABSOLUTE.format("a Python", named[:200])))
         return Known("named", True, f"Uses {named}", works=tried.get(Path(named)))
     if named := os.environ.get(VARIABLE):
         line = f"Uses {named}, named by the environment variable {VARIABLE}"

@@ -278,7 +278,7 @@ class PRIMDIFFUSION_OT_test_backend(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         now = known.known()
         if not now.usable:
-            remedy = "" if now.state == "lacking" else ": press Set Up Backend first, or name a Python"
+            remedy = "" if now.state in {"lacking", "named"} else ": press Set Up Backend first, or name a Python"
             self.report({"ERROR"}, f"{now.line}{remedy}")
             return {"CANCELLED"}
         return _begin(self, testing, replaces=False)

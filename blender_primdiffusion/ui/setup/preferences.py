@@ -31,7 +31,7 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
     draw_lines(box, now.line, "ERROR", width)
     if now.state == "lacking":
         return False
-    if not draw_cost(box, width):
+    if now.state == "named" or not draw_cost(box, width):
         props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
         props.module = EXTENSION
     elif now.state == "broken":

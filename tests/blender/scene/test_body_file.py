@@ -14,7 +14,7 @@ from blender_primdiffusion.scene import build, collect
 from blender_primdiffusion.scene.body_file import body_file_name, read_body_file, saved_body_file, shape_model_of
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
-from blender_primdiffusion.scene.human import copy_file, folder_of, humans, remove_human
+from blender_primdiffusion.scene.human import copy_file, folder_of, humans, remove_human, volume_path
 from blender_primdiffusion.scene.human_npz import HumanNpzError, read_human
 from blender_primdiffusion.scene.shape import FIELDS
 
@@ -144,7 +144,7 @@ def test_a_link_in_place_of_the_bodys_file_loses_nothing_outside(tmp_path, there
 
 
 @pytest.mark.parametrize("full", [True, False])
-def test_links_where_a_save_puts_files_lose_nothing_outside(addon, tmp_path, monkeypatch, full):
+def test_links_where_a_save_puts_files_stay_and_lose_nothing_outside(addon, tmp_path, monkeypatch, full):
     bpy.ops.wm.read_factory_settings(use_empty=True)  # a file that was never saved
     person = build_human(bpy.context, synthetic_shape.write(tmp_path / "human.npz"))
     (tmp_path / "outside").mkdir()
@@ -153,18 +153,20 @@ def test_links_where_a_save_puts_files_lose_nothing_outside(addon, tmp_path, mon
     source = folder_of(person)
     target = tmp_path / "new_humans" / source.name
     target.mkdir(parents=True)
-    links = [target.parent / body_file(person).name, *(target / path.name for path in source.glob("*.vdb"))]
+    links = [target / path.name for path in source.glob("*.vdb")]
     for link in links:
         link.symlink_to(mine)
     copied = []
 
-    def copy_some(one, destination):
+    def copy_some(one, destination, folder):
         copied.append(destination)
         if full and len(copied) == len(links):
             raise OSError(errno.ENOSPC, "no space left")
-        return copy_file(one, destination)
+        return copy_file(one, destination, folder)
 
     monkeypatch.setattr(collect, "copy_file", copy_some)
     collect_before_saving(str(tmp_path / "new.blend"))
-    assert set(copied) == set(links)
+    assert {path.parent.name for path in copied if path.suffix == ".vdb"} == {f"{source.name}_2"}
+    assert all(link.is_symlink() for link in links)
+    assert all(volume_path(volume).parent.name == source.name + "_2" * (not full) for volume in bpy.data.volumes)
     assert [path.read_text() for path in mine.parent.iterdir()] == ["mine"]

@@ -72,7 +72,7 @@ def test_nothing_is_written_through_a_link_with_a_temporary_name(tmp_path):
     (tmp_path / "mine").write_text("mine")
     for name in (".a.part", ".source.part", "sit.part", ".a.human.part"):
         (tmp_path / name).symlink_to("mine")
-    copy_file(tmp_path / "source", tmp_path / "a")
+    copy_file(tmp_path / "source", tmp_path / "a", tmp_path)
     put(tmp_path / "source", tmp_path / "b")
     write_tensors(tmp_path / "a.human", HumanTensors({}, {}))
     save_pose(tmp_path, "sit", np.zeros((24, 3)), np.zeros(3))

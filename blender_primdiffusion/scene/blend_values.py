@@ -1,0 +1,136 @@
+"""Read what a .blend holds as a stranger's: custom properties, and paths of volumes and of scene settings.
+
+Anyone can write anything into a .blend. A value of another type, form or size than the extension stores counts as
+missing, so that neither drawing nor saving raises, and no name or path leads out of its folder. Nothing else in the
+extension reads these values (`tests/blender/scene/test_blend_values.py`). Needs no numpy: panels import this file.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path, PureWindowsPath
+from typing import Any, cast
+
+import bpy
+
+from ..formats.json_files import JsonError, parse_json
+from ..formats.regular_files import is_local_path, is_plain_path, real_path
+
+LONGEST_TEXT = 4 << 20
+"""Characters of a text; the longest is the state of a merged sequence, 20 characters a frame."""
+LARGEST_NUMBER = 1e6
+_LONGEST_PART = 255
+"""Bytes of a name in a path: file systems take no more, and `stat` raises OSError."""
+_LONGEST_SHOWN = 120
+"""Characters of a value in a panel or a message."""
+
+
+def stored_text(holder: bpy.types.bpy_struct, name: str) -> str | None:
+    """A custom property that is text of at most LONGEST_TEXT characters; None for any other."""
+    value = holder.get(name)
+    return value if isinstance(value, str) and len(value) <= LONGEST_TEXT else None
+
+
+def stored_name(holder: bpy.types.bpy_struct, name: str, pattern: re.Pattern[str]) -> str | None:
+    """A custom property that is a file name of this pattern; None for any other."""
+    text = stored_text(holder, name)
+    return text if text is not None and pattern.fullmatch(text) else None
+
+
+def stored_folder(holder: bpy.types.bpy_struct, name: str) -> Path | None:
+    """A custom property that is the absolute path of a folder, which need not exist; None for any other."""
+    text = stored_text(holder, name)
+    return _folder(text, bpy.data.filepath) if text else None
+
+
+def stored_record(holder: bpy.types.bpy_struct, name: str) -> dict[str, Any]:
+    """A custom property that is a JSON object; empty for any other."""
+    text = stored_text(holder, name)
+    try:
+        record = {} if text is None else parse_json(text)
+    except JsonError:
+        return {}
+    return record if isinstance(record, dict) else {}
+
+
+def stored_numbers(holder: bpy.types.bpy_struct, name: str, count: int) -> list[float] | None:
+    """A custom property that is `count` numbers; None for any other."""
+    return as_numbers(holder.get(name), count)
+
+
+def stored_flag(holder: bpy.types.bpy_struct, name: str, default: bool) -> bool:
+    """A custom property that is true or false; `default` for any other."""
+    value = holder.get(name)
+    return bool(value) if isinstance(value, bool | int) else default
+
+
+def stored_choice(holder: bpy.types.bpy_struct, name: str, choices: Sequence[str]) -> str:
+    """A custom property that is one of `choices`; the first of them for any other."""
+    text = stored_text(holder, name)
+    return text if text is not None and text in choices else choices[0]
+
+
+def as_numbers(values: object, count: int) -> list[float] | None:
+    """A list, tuple or array of `count` numbers up to LARGEST_NUMBER as floats; None for anything else."""
+    is_array = isinstance(values, list | tuple) or hasattr(values, "typecode")  # Blender's arrays
+    numbers: list[Any] = list(cast(Sequence[Any], values)[: count + 1]) if is_array else []
+    if len(numbers) != count or not all(map(_is_number, numbers)):
+        return None
+    return [float(number) for number in numbers]
+
+
+def as_shown(value: object) -> str:
+    """A value for a panel or a message: one short line, in which unprintable characters are question marks."""
+    if isinstance(value, dict | list):
+        return "..."
+    text = value[: _LONGEST_SHOWN + 1] if isinstance(value, str) else f"{value}"
+    printable = "".join(letter if letter.isprintable() else "?" for letter in text)
+    return printable if len(printable) <= _LONGEST_SHOWN else f"{printable[:_LONGEST_SHOWN]}..."
+
+
+def file_path(stored: str, library: bpy.types.Library | None) -> Path | None:
+    """The absolute path of a file that a data-block of this .blend, or of `library`, names; None where it is empty,
+    relative to a .blend that was never saved, on another server, a device or longer than file systems take."""
+    folder, name = os.path.split(bpy.path.abspath(stored, library=library))
+    inside = _folder(folder, bpy.data.filepath) if folder else None
+    return None if inside is None or not _is_name(name) else inside / name
+
+
+def setting_path(stored: str, label: str) -> str:
+    """A scene's setting that is a path, absolute; empty where it is not set.
+
+    Raises ValueError for what `file_path` rejects. `label`: what the panel calls the setting.
+    """
+    if not stored:
+        return ""
+    path = bpy.path.abspath(stored)
+    if _folder(path.rstrip("/\\") or path, bpy.data.filepath) is None:
+        raise ValueError(
+            f"{label} is {as_shown(stored)!r}, which is not the whole path of a file or folder on this computer: "
+            "choose it again"
+        )
+    return path
+
+
+@functools.lru_cache(maxsize=256)
+def _folder(path: str, blend: str) -> Path | None:
+    """A folder named in a .blend, without `..`; None for one that must not be looked up. `blend`: the open .blend."""
+    shared = PureWindowsPath(path).drive.lower()
+    near = os.name == "nt" and shared.startswith("\\\\") and shared == PureWindowsPath(blend).drive.lower()
+    if not (is_local_path(path) or (near and is_plain_path(path[2:]))):
+        return None
+    folder = Path(path)
+    if not all(_is_name(part) for part in folder.parts[1:] if part != ".."):
+        return None
+    return real_path(folder) if ".." in folder.parts else folder
+
+
+def _is_number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= LARGEST_NUMBER  # not NaN
+
+
+def _is_name(part: str) -> bool:
+    return part not in ("", ".", "..") and part.isprintable() and len(os.fsencode(part)) <= _LONGEST_PART
