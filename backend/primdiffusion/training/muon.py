@@ -36,9 +36,7 @@ class MuonAdamW(torch.optim.Optimizer):
             lr=learning_rate, weight_decay=weight_decay, adjust_lr_fn="match_rms_adamw",
         )  # fmt: skip
         self._adamw = torch.optim.AdamW(others, lr=learning_rate, weight_decay=weight_decay, betas=BETAS)
-        super().__init__(
-            [{"params": own, "factor": FACTOR}, {"params": others, "factor": 1.0}], {"lr": learning_rate}
-        )
+        super().__init__([{"params": own, "factor": FACTOR}, {"params": others, "factor": 1.0}], {"lr": learning_rate})
 
     @torch.no_grad()
     def step(self, closure: Any = None) -> None:
