@@ -111,7 +111,10 @@ class CellTrainee:
         self.train, self.held = prepared.train.to(device), prepared.held.to(device)
         self.vocabulary, self.full_density = prepared.vocabulary, prepared.full_density
         schedule = SCHEDULES[str(config.schedule)]()
-        sizes = config.model if base is None else base.denoiser.config
+        sizes = config.model
+        if base is not None:
+            assert isinstance(base.denoiser, PersonDenoiser)  # as `load_base` has checked
+            sizes = base.denoiser.config
 
         def build() -> PersonDenoiser:
             return PersonDenoiser(sizes, prepared.prior, schedule)
