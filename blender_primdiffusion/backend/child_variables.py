@@ -72,12 +72,12 @@ NETWORK: Table = {
     "NO_PROXY": "hosts that are reached directly",
     "SSL_CERT_FILE": "certificates of a company's network",
     "SSL_CERT_DIR": "the same",
-    "REQUESTS_CA_BUNDLE": "the same, for pip",
-    "CURL_CA_BUNDLE": "the same, which pip reads next",
-    "PIP_*": "pip's mirror, certificate and time limits; what would install elsewhere is in NEVER",
+    "REQUESTS_CA_BUNDLE": "the same, for the installer",
+    "CURL_CA_BUNDLE": "the same, looked up next",
+    "PIP_*": "the installer's mirror, certificate and time limits; what would install elsewhere is in NEVER",
     "NETRC": "the mirror's password, which a settings file may hold",
 }
-"""For pip alone, which is the only program that uses the network."""
+"""For set-up alone: no other program uses the network."""
 BLENDER: Table = {
     "BLENDER_*": "folders of Blender's settings and scripts",
     "CYCLES_*": "Cycles' devices and kernels",

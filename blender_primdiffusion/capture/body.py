@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, all_finite, read_arrays
+from ..formats.arrays import MOST_BODY_VALUES, ArrayFileError, all_finite, read_arrays
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..motion.skeleton import chain, joint_positions
 from ..places import body_data
@@ -105,7 +105,7 @@ def read_body(path: Path | None = None) -> Body:
     if not source.is_file():
         raise BodyError(f"there is no body model {source}: check the path")
     try:
-        arrays = read_arrays(source, optional=_KEYS)
+        arrays = read_arrays(source, optional=_KEYS, most_values=MOST_BODY_VALUES)
     except ArrayFileError as e:
         raise BodyError(f"{e}; a body model is an .npz of plain arrays in SMPL's form") from e
     _check(source, arrays)

@@ -12,7 +12,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..formats.arrays import check_shapes, read_arrays
+from ..formats.arrays import MOST_BODY_VALUES, check_shapes, read_arrays
 from ..formats.regular_files import exists_in_its_folder
 from ..formats.removing import remove_file
 from ..formats.whole_files import replacing
@@ -110,7 +110,7 @@ def read_body_file(path: Path) -> ShapeModel:
             "human again"
         )
     try:
-        arrays = read_arrays(path, tuple(FIELDS), tuple(OPTIONAL_FIELDS))
+        arrays = read_arrays(path, tuple(FIELDS), tuple(OPTIONAL_FIELDS), most_values=MOST_BODY_VALUES)
         shapes = FIELDS | {name: shape for name, shape in OPTIONAL_FIELDS.items() if name in arrays}
         check_shapes(path, arrays, shapes, {})
         model = ShapeModel.from_arrays(arrays)

@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, all_finite, array_names, check_shapes, read_arrays
+from ..formats.arrays import MOST_BODY_VALUES, ArrayFileError, all_finite, array_names, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.json_files import parse_json
 from ..formats.removing import remove_file
@@ -97,7 +97,7 @@ def read_human(path: str | Path) -> HumanFile:
 
 def _read(path: Path) -> HumanFile:
     try:
-        arrays = read_arrays(path, array_names(path))
+        arrays = read_arrays(path, array_names(path), most_values=MOST_BODY_VALUES)
     except (ArrayFileError, OSError) as error:
         raise HumanNpzError(f"{path.name!r} is damaged or no human file ({error!s:.200}); {_REMEDY}") from error
     version = int(_scalar(arrays, "format_version", path))

@@ -3,11 +3,13 @@ the child neither hears the cancel nor beats."""
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 
 import pytest
 from child_requests import generate_request, this_pythons_backend
+from waiting import BACKEND
 
 from blender_primdiffusion.backend.requests import ChildRequest
 

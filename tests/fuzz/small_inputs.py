@@ -158,14 +158,18 @@ def many_scans(side: int, scans: int) -> bytes:
     return data[:-2] + data[last:-2] * scans + data[-2:]
 
 
-def zeros(path: Path, arrays: Mapping[str, tuple[str, tuple[int, ...]]], **small: object) -> Path:
-    """A deflated .npz with zeros of these types and shapes, and `small` arrays."""
+def zeros(path: Path, arrays: Mapping[str, tuple[str, tuple[int, ...]]], *, noise: int = 0, **small: object) -> Path:
+    """A deflated .npz with zeros of these types and shapes, and `small` arrays.
+
+    The first `noise` bytes of each are ones and zeros that do not compress, so that the file is large enough for more.
+    """
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
         for name, (kind, shape) in arrays.items():
             header = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": shape}
             left = int(np.prod(shape)) * np.dtype(kind).itemsize
             with archive.open(f"{name}.npy", "w") as member:
                 np.lib.format.write_array_header_1_0(member, header)
+                left -= member.write(np.random.default_rng(0).integers(0, 2, min(noise, left), np.uint8).tobytes())
                 while left:
                     left -= member.write(bytes(min(left, 2**20)))
         for name, values in small.items():
@@ -295,9 +299,9 @@ def read_glb(path: Path) -> object:
 # --- poses and motion
 
 
-def motion(*arrays: tuple[str, str, tuple[int, ...]]) -> Callable[[Path], Path]:
+def motion(*arrays: tuple[str, str, tuple[int, ...]], noise: int = 0) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
-        return zeros(folder / "a.npz", {name: (kind, shape) for name, kind, shape in arrays})
+        return zeros(folder / "a.npz", {name: (kind, shape) for name, kind, shape in arrays}, noise=noise)
 
     return make
 
@@ -332,6 +336,24 @@ def read_pose(path: Path) -> object:
     from primdiffusion.pose_file import read_pose
 
     return read_pose(path)
+
+
+def captured_poses(frames: int) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        from primdiffusion.formats.capture_layout import SMPL_FOLDER, SMPL_PLAIN_FILE
+
+        shapes = {"global_orient": (frames, 3), "body_pose": (frames, 69), "transl": (frames, 3)}
+        (folder / SMPL_FOLDER).mkdir()
+        arrays = {name: ("i1", shape) for name, shape in shapes.items()}
+        return zeros(folder / SMPL_FOLDER / SMPL_PLAIN_FILE, arrays, betas=[0.0] * 10)
+
+    return make
+
+
+def read_captured_poses(path: Path) -> object:
+    from primdiffusion.capture.smpl_parameters import read_smpl
+
+    return read_smpl(path.parents[1])
 
 
 def bvh(frames: int, extra: int = 0) -> Callable[[Path], Path]:
@@ -463,18 +485,30 @@ def small_human(folder: Path) -> Path:
     return make_synthetic_npz(folder)
 
 
-def many_boxes(folder: Path) -> Path:
-    """A human for Blender whose arrays have as many zeros as they may."""
+def many_boxes(kind: str, boxes: int, noise: int = 0) -> Callable[[Path], Path]:
+    return lambda folder: _many_boxes(folder, kind, boxes, noise)
+
+
+def _many_boxes(folder: Path, kind: str, boxes: int, noise: int) -> Path:
+    """A human for Blender of so many boxes, whose numbers are zero."""
     path = small_human(folder)
     with np.load(path) as archive:
         kept = {name: archive[name] for name in archive.files}
     count = len(kept["position"])
     large = {
-        name: (array.dtype.str, (100_000, *array.shape[1:]))
-        for name, array in kept.items()
-        if array.ndim and len(array) == count
+        name: (kind, (boxes, *array.shape[1:])) for name, array in kept.items() if array.ndim and len(array) == count
     }
-    return zeros(path, large, **{name: array for name, array in kept.items() if name not in large})
+    return zeros(path, large, noise=noise, **{name: array for name, array in kept.items() if name not in large})
+
+
+def weights(count: int, noise: int = 0) -> Callable[[Path], Path]:
+    return lambda folder: zeros(folder / "a.npz", {"weights": ("i1", (count,))}, noise=noise)
+
+
+def read_weights(path: Path) -> object:
+    from primdiffusion.editing.regions import read_weights
+
+    return read_weights(path)
 
 
 def read_human(path: Path) -> object:
@@ -486,6 +520,7 @@ def read_human(path: Path) -> object:
 _WHOLE = 63 * 2**20
 _QUARTER = [("poses", "f4", (55_000, 72)), ("trans", "f4", (55_000, 3))]
 """Fifteen minutes of AMASS."""
+_NOISY = [("poses", "i1", (1_800_000, 72))]
 _SEVEN = [
     (name, "f4", (_WHOLE // 288, 72))
     for name in ("poses", "pose", "theta", "fullpose", "global_orient", "trans", "transl")
@@ -522,6 +557,15 @@ INPUTS: dict[str, SmallInput] = {
     "poses": SmallInput(motion(("poses", "f4", (_WHOLE // 288, 72))), read_poses, small_motion, "motion"),
     "poses just below the limit": SmallInput(motion(*_QUARTER), read_poses, small_motion, "motion", is_read=True),
     "poses of bytes": SmallInput(motion(("poses", "i1", (_WHOLE // 72, 72))), read_poses, small_motion, "motion"),
+    "poses of bytes and noise": SmallInput(motion(*_NOISY, noise=4_000_000), read_poses, small_motion, "motion"),
+    "motion of bytes and noise": SmallInput(motion(*_NOISY, noise=4_000_000), read_motion, small_motion, "motion"),
+    "pose of bytes and noise": SmallInput(
+        motion(*_NOISY, noise=4_000_000), read_pose, small_motion, "motion", is_read=True
+    ),
+    "captured poses": SmallInput(
+        captured_poses(55_000), read_captured_poses, captured_poses(2), "motion", is_read=True
+    ),
+    "captured poses of bytes": SmallInput(captured_poses(850_000), read_captured_poses, captured_poses(2), "motion"),
     "pose of bytes": SmallInput(
         motion(("poses", "i1", (_WHOLE // 72, 72))), read_pose, small_motion, "motion", is_read=True
     ),
@@ -534,7 +578,10 @@ INPUTS: dict[str, SmallInput] = {
     "payload of scales": SmallInput(payload(1, 10_000), read_payload, payload(1, 0), "people"),
     "body of many faces": SmallInput(many_faces, read_body, small_body, "people"),
     "body of shared lists": SmallInput(shared_lists, read_body, small_pickle, "people"),
-    "human of many boxes": SmallInput(many_boxes, read_human, small_human, "people"),
+    "human of many boxes": SmallInput(many_boxes("f4", 100_000), read_human, small_human, "people"),
+    "human of bytes": SmallInput(many_boxes("i1", 15_000), read_human, small_human, "people"),
+    "human of bytes and noise": SmallInput(many_boxes("i1", 50_000, 700_000), read_human, small_human, "people"),
+    "weights of bytes and noise": SmallInput(weights(150_000_000, 4_000_000), read_weights, weights(100), "people"),
 }  # fmt: skip
 
 if __name__ == "__main__":

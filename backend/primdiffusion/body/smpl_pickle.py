@@ -20,7 +20,9 @@ from primdiffusion.formats.regular_files import read_regular
 LARGEST_PICKLE = 512 * 2**20
 """SMPL with 300 shape components takes 250 MB."""
 MOST_NUMBERS = 10_000_000
-"""In lists, and in sparse matrices as they become dense; the regressor of SMPL's joints has 165,360."""
+"""In sparse matrices as they become dense; the regressor of SMPL's joints has 165,360."""
+MOST_LISTED = 2_000_000
+"""Numbers in lists, each of which is visited; SMPL's arrays are not lists."""
 MAX_NESTING = 8
 """Limit on nested chumpy selections; body models nest less."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
@@ -206,8 +208,8 @@ def _check_count(value: object) -> None:
     for _ in range(MAX_NESTING + 1):
         lists = [entry for entry in level if isinstance(entry, list | tuple)]
         count += sum(map(len, lists))
-        if count > MOST_NUMBERS:
-            raise ValueError(f"a list holds more than {MOST_NUMBERS} numbers")
+        if count > MOST_LISTED:
+            raise ValueError(f"a list holds more than {MOST_LISTED} numbers")
         level = [entry for inner in lists for entry in inner]
         if not level:
             return

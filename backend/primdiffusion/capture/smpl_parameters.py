@@ -13,6 +13,7 @@ from primdiffusion.body.model import BodyPose, J
 from primdiffusion.body.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
 from primdiffusion.formats.arrays import ArrayFileError, all_finite, read_numbers, read_pickled_bytes
 from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
+from primdiffusion.formats.motion_size import MotionTooLongError, check_motion_size
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
 
@@ -65,6 +66,10 @@ def _read_pickled(path: Path) -> dict[str, np.ndarray]:
 
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
+    try:
+        check_motion_size(path, max(values.size for values in arrays.values()))
+    except MotionTooLongError as e:
+        raise ArrayFileError(str(e)) from e
     frames = len(arrays["global_orient"])
     shapes = {"global_orient": (frames, 3), "body_pose": (frames, 3 * (J - 1)), "transl": (frames, 3)}
     for name, shape in shapes.items():

@@ -31,6 +31,8 @@ COLLAR_HEIGHT, COLLAR_SLOPE = 0.007, -0.42
 """The plane y = height + slope * z, metres from the neck's joint: shirt below, skin above."""
 NAPE_DEPTH, HAIRLINE_SLOPE = -0.052, 1.4
 """The plane z = depth + slope * y, metres from the head's joint: hair lies behind it."""
+MOST_WEIGHTS = 1_000_000
+"""Vertices with painted weights; bodies have about ten thousand."""
 CUFF = 0.02
 """End of long sleeves, metres from the wrist's joint towards the hand."""
 
@@ -70,7 +72,7 @@ DISJOINT = ("face", "hair", "neck", "torso", "hips", *SIDED_PARTS)
 
 def read_weights(path: str | Path) -> Float[Tensor, "v"]:
     """Read painted weights. Raises FileNotFoundError, and ValueError for a file without usable weights."""
-    weights = read_numbers(path, ("weights",))["weights"]
+    weights = read_numbers(path, ("weights",), most_values=MOST_WEIGHTS)["weights"]
     if weights.ndim != 1:
         raise ValueError(f"weights in {path} are {weights.dtype} {weights.shape}: give one number for each vertex")
     return torch.from_numpy(weights.astype(np.float32))

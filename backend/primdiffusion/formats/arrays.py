@@ -26,6 +26,8 @@ LARGEST_BYTES = 512 * 2**20
 MB."""
 MOST_REPEATED, LARGEST_RATIO = 64 * 2**20, 200
 """Bytes from which on what one call reads may not be larger than this many times its compressed size: zeros are."""
+MOST_BODY_VALUES = 32_000_000
+"""Numbers that a file of a body, or of a human on one, may hold: SMPL-X's with all components has 28 million."""
 LARGEST_NUMBER = 1e9
 LARGEST_FILE = 2**31
 _LARGEST_DIRECTORY = 4 * 2**20
@@ -67,16 +69,19 @@ def array_shape(path: str | Path, name: str) -> tuple[int, ...]:
             return _header(stream, member.file_size, what)[0]
 
 
-def read_arrays(path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, NDArray]:
+def read_arrays(
+    path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = (), *, most_values: int | None = None
+) -> dict[str, NDArray]:
     """Read the arrays `required` of an .npz, and those of `optional` that it contains; others are not unpacked.
 
-    Nothing is extracted to disk, so paths in names do no harm.
+    Nothing is extracted to disk, so paths in names do no harm. `most_values` is for callers that convert them to larger
+    types: the values of all arrays together.
 
     Raises:
         ArrayFileError: the file is damaged, lacks an array, or one is pickled or larger than `LARGEST_BYTES`.
         OSError: it cannot be opened; FileNotFoundError if it does not exist.
     """
-    arrays, total, packed = {}, 0, 0
+    arrays, total, packed, values = {}, 0, 0, 0
     with _archive(path) as archive:
         for name in (*required, *optional):
             if name in optional and _member(archive, name) is None:
@@ -85,14 +90,21 @@ def read_arrays(path: str | Path, required: Sequence[str] = (), optional: Sequen
             total, packed = total + member.file_size, packed + member.compress_size
             _check_size(total, f"{path}: {name!r}")
             _check_ratio(total, packed, f"{path}: {name!r}")
+            if most_values is not None:
+                with archive.open(member) as stream:
+                    values += math.prod(_header(stream, member.file_size, f"{path}: {name!r}")[0])
+                if values > most_values:
+                    raise ArrayFileError(f"{path}: {name!r} makes it {values} values, more than {most_values}: cut it")
             with archive.open(member) as stream:
                 arrays[name] = _read(stream, member.file_size, f"{path}: {name!r}")
     return arrays
 
 
-def read_numbers(path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, NDArray]:
+def read_numbers(
+    path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = (), *, most_values: int | None = None
+) -> dict[str, NDArray]:
     """As `read_arrays`; also raises ArrayFileError for arrays that are not finite numbers."""
-    arrays = read_arrays(path, required, optional)
+    arrays = read_arrays(path, required, optional, most_values=most_values)
     for name, values in arrays.items():
         if values.dtype.kind not in "biuf":
             raise ArrayFileError(f"{path}: {name!r} holds {values.dtype}, not numbers: save it as numbers")
