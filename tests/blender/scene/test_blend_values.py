@@ -175,7 +175,7 @@ def test_a_name_of_another_pattern_counts_as_missing(holder, name):
 
 
 @pytest.mark.parametrize(
-    "path", ["", "x", "../x", "//", r"\\host\share\x", "https://host/x", "a\0b", "/a\n/b", "/" + "x" * 256, "/a" * 3000]
+    "path", ["", "x", "../x", "//", r"\\host\share\x", "https://host/x", "/a\0b", "/" + "x" * 256, "/a" * 3000]
 )  # fmt: skip
 def test_a_folder_that_is_not_absolute_or_on_a_server_counts_as_missing(holder, path):
     holder[HOME] = path
@@ -192,6 +192,14 @@ def test_a_path_with_two_dots_leads_where_the_links_on_the_way_do(saved_scene, t
     (tmp_path / "near").symlink_to(tmp_path / "far" / "away")
     assert file_path(f"{tmp_path}/near/../x.vdb", None) == Path(os.path.realpath(tmp_path)) / "far" / "x.vdb"
     assert file_path("//x.vdb", None) == tmp_path / "x.vdb"
+
+
+def test_folders_of_users_have_any_name(holder, tmp_path):
+    for name in ("写真\u3000年", "a\u00a0b", "a\u200db", "\udcff", "x y'\"%"):
+        folder = tmp_path / name / "Anna"
+        assert file_path(f"{folder}/x.vdb", None) == folder / "x.vdb"
+        holder[HOME] = str(folder)
+        assert stored_folder(holder, HOME) == folder
 
 
 @pytest.mark.parametrize("stored", ["captures", "../x", r"\\host\share", "https://host/x", "/" + "x" * 300, "a\nb"])
