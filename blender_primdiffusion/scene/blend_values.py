@@ -17,7 +17,7 @@ from typing import Any, cast
 import bpy
 
 from ..formats.json_files import JsonError, parse_json
-from ..formats.regular_files import is_local_path, is_plain_path, real_path
+from ..formats.regular_files import is_local_path, real_path
 
 LONGEST_TEXT = 4 << 20
 """Characters of a text; the longest is the state of a merged sequence, 20 characters a frame."""
@@ -117,10 +117,10 @@ def setting_path(stored: str, label: str) -> str:
 
 @functools.lru_cache(maxsize=256)
 def _folder(path: str, blend: str) -> Path | None:
-    """A folder named in a .blend, without `..`; None for one that must not be looked up. `blend`: the open .blend."""
-    shared = PureWindowsPath(path).drive.lower()
-    near = os.name == "nt" and shared.startswith("\\\\") and shared == PureWindowsPath(blend).drive.lower()
-    if not (is_local_path(path) or (near and is_plain_path(path[2:]))):
+    """A folder that a .blend names, without `..`; None for one that must not be looked up. `blend`: the open file."""
+    share = PureWindowsPath(path).drive.lower() if os.name == "nt" else ""
+    is_near = share.startswith("\\\\") and share == PureWindowsPath(blend).drive.lower()  # where the user opened it
+    if not (is_local_path(path) or (is_near and "\0" not in path)):
         return None
     folder = Path(path)
     if not all(_is_name(part) for part in folder.parts[1:] if part != ".."):
@@ -133,4 +133,4 @@ def _is_number(value: object) -> bool:
 
 
 def _is_name(part: str) -> bool:
-    return part not in ("", ".", "..") and part.isprintable() and len(os.fsencode(part)) <= _LONGEST_PART
+    return part not in ("", ".", "..") and "\0" not in part and len(os.fsencode(part)) <= _LONGEST_PART

@@ -17,14 +17,13 @@ from bpy.app.handlers import persistent
 
 from ..formats.regular_files import exists_in_its_folder, real_path
 from ..formats.removing import OutsideFolderError, check_inside, remove_file
-from .blend_values import as_shown, stored_folder
+from .blend_values import as_shown, stored_folder, stored_name
 from .body_file import BODY_FILE, BODY_NPZ, body_file, body_files, stored_body_name
 from .human import (
     HOME,
     MARK,
     MERGED_VDB,
     PERSON,
-    PERSON_FILE,
     PERSON_FILES,
     PRIMITIVE_VDB,
     TEMPORARY,
@@ -119,7 +118,7 @@ def ignored_values() -> list[str]:
         if MARK not in person or person.library is not None:
             continue
         valid = {
-            PERSON: person_file_name(person) != PERSON_FILE or person.get(PERSON) == PERSON_FILE,
+            PERSON: stored_name(person, PERSON, PERSON_FILES) is not None,
             BODY_FILE: stored_body_name(person) is not None,
             HOME: stored_folder(person, HOME) is not None,
         }
@@ -131,8 +130,8 @@ def ignored_values() -> list[str]:
         volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME" and obj.data.filepath}
         if strange := sorted(volume.name for volume in volumes if volume_path(volume) is None):
             found.append(
-                f"{len(strange)} volumes of {as_shown(person.name)!r} are ignored, {as_shown(strange[0])!r} among "
-                "them: their paths name no volumes of a human"
+                f"the volume {as_shown(strange[0])!r} of {as_shown(person.name)!r}, one of {len(strange)}, is ignored: "
+                "its path is not one of a human's volume"
             )
     return found
 

@@ -52,6 +52,11 @@ class VolumeWriteError(OSError):
     """Files of a human could not be written; nothing was left behind."""
 
 
+def link_error(folder: Path) -> VolumeWriteError:
+    """For a folder of a human that leads out of the folder that it is in."""
+    return VolumeWriteError(f"{str(folder)!r} is a link to another folder: nothing is written there, remove the link")
+
+
 class MissingPersonFile(FileNotFoundError):
     """The backend's file of a human is not where it should be."""
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
 from ..formats.removing import OutsideFolderError, remove_file
 from .blend_values import stored_record
-from .human import VolumeWriteError, armature_of, copy_file, home_of, person_file_name, stored_path
+from .human import VolumeWriteError, armature_of, copy_file, home_of, link_error, person_file_name, stored_path
 from .material import person_material
 from .volumes import write_vdb
 
@@ -102,7 +102,9 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
         for source, target in zip(files, targets, strict=True):
             if target in new:
                 copy_file(source, target, folder.parent)
-    except (OSError, OutsideFolderError) as error:
+    except OutsideFolderError as error:
+        raise link_error(folder) from error
+    except OSError as error:
         for path in new:
             if path.is_file():
                 remove_file(path, folder)

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ..formats.regular_files import exists_in_its_folder
 from ..formats.removing import OutsideFolderError, check_inside, remove_folder
 from ..formats.whole_files import publish, remove_abandoned, temporary_name
-from .human import UNWRITTEN_NPZ, VolumeWriteError, folders_of, is_there, unwritten_in, volume_path
+from .human import UNWRITTEN_NPZ, VolumeWriteError, folders_of, is_there, link_error, unwritten_in, volume_path
 
 VOXELS = 8
 """Voxels along a side of a primitive."""
@@ -167,7 +167,9 @@ def staged(folder: Path) -> Iterator[Staging]:
         remove_abandoned(folder)
         hidden = temporary_name(folder / "volumes")
         hidden.mkdir()
-    except (OSError, OutsideFolderError) as error:
+    except OutsideFolderError as error:
+        raise link_error(folder) from error
+    except OSError as error:
         remove_empty(folder, existing)
         raise write_error(folder, error) from error
     try:

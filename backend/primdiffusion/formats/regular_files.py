@@ -12,6 +12,7 @@ from pathlib import Path
 
 _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 """Starts of UNC paths, Windows' devices and URLs."""
+_LONGEST_PATH = 4096
 
 
 class TooLargeError(ValueError):
@@ -87,12 +88,12 @@ def check_size(path: str | Path, size: int, limit: int) -> None:
 
 def is_plain_path(path: str) -> bool:
     """Return whether a path named in a file may be looked up: no server, device, URL or control character."""
-    return 0 < len(path) <= 4096 and path.isprintable() and not _REMOTE.match(path)
+    return 0 < len(path) <= _LONGEST_PATH and path.isprintable() and not _REMOTE.match(path)
 
 
 def is_local_path(path: str) -> bool:
-    """Return whether a path may be looked up (`is_plain_path`) and is the same in every working directory."""
-    return is_plain_path(path) and os.path.isabs(path)
+    """Return whether a path is absolute and of this computer: no server, device or URL. Folders may have any name."""
+    return 0 < len(path) <= _LONGEST_PATH and "\0" not in path and not _REMOTE.match(path) and os.path.isabs(path)
 
 
 def exists_in_its_folder(path: Path) -> bool:

@@ -1,0 +1,410 @@
+"""Every name and path that the extension reads from a .blend or the preferences, each with values of an attacker.
+
+`figures` tries all of them: it saves, loads, draws all panels and runs the operators on files, and counts what was
+changed outside of the folder beside the .blend. The tests try one property at a time.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import bpy
+import synthetic
+import synthetic_shape
+from exporting import write_person
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import sidebar
+
+from blender_primdiffusion.jobs import missing_files
+from blender_primdiffusion.places import EXTENSION
+from blender_primdiffusion.scene import attachment, merged, proxy, surface, unwritten
+from blender_primdiffusion.scene.body_file import BODY_FILE
+from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.edit import edit_destination, replace_person
+from blender_primdiffusion.scene.human import (
+    BETAS,
+    BODY_MARK,
+    HOME,
+    MARK,
+    PERSON,
+    armature_of,
+    body_of,
+    folder_of,
+    humans_folder,
+    volume_path,
+)
+from blender_primdiffusion.scene.human_npz import write_now
+from blender_primdiffusion.ui.on_person import FACTS
+
+COUNT = 3
+"""Volumes of the human."""
+SECRET = b"a user's file"
+HASH = "0123456789ab"
+LINK = {
+    PERSON: f"person_{HASH}.human.safetensors",
+    BODY_FILE: f"body_{HASH}.npz",
+    "volume.filepath": f"prim_0000_{HASH}.vdb",
+}
+"""Names that these may have, of links to a user's file and to a device."""
+LONGEST_SENTENCE = 400
+_LONGEST_LABEL, _LONGEST_PATH = 1000, 1024
+
+
+class Stage:
+    """The folders of one attempt.
+
+    `home/.bashrc` is the user's; `home/me/project/shot.blend` is the stranger's file, saved by the user;
+    `downloads/zip/blender_0/primdiffusion_humans/Anna` has the files of its human, which saving copies.
+    """
+
+    def __init__(self, root: Path):
+        self.root = root
+        self.users = root / "home" / ".bashrc"
+        self.project = root / "home" / "me" / "project"
+        self.blend = self.project / "shot.blend"
+        self.humans = self.project / "shot_humans"
+        self.source = root.with_name("source")
+        """Files of the human as the backend would write them."""
+        self.shipped = root / "downloads" / "zip" / "blender_0" / "primdiffusion_humans" / "Anna"
+
+    def before(self) -> dict[Path, bytes]:
+        """All files with their content; links with where they lead."""
+        files = [path for path in sorted(self.root.rglob("*")) if path.is_symlink() or path.is_file()]
+        return {path: os.readlink(path).encode() if path.is_symlink() else path.read_bytes() for path in files}
+
+    def changed_outside(self, before: dict[Path, bytes]) -> list[str]:
+        """Files outside of the folder beside the .blend that are new, gone or different; in it, those that were there
+        and are gone or different, and copies of the user's file."""
+        after, found = self.before(), []
+        for path in sorted({*before, *after}):
+            inside = path.is_relative_to(self.humans)
+            allowed = path.name.startswith("shot.blend") or (inside and path not in before)
+            if not allowed and before.get(path) != after.get(path):
+                found.append(f"{path.relative_to(self.root)} changed")
+            if inside and path not in before and SECRET in after.get(path, b""):
+                found.append(f"{path.relative_to(self.root)} is a copy of the user's file")
+        return found
+
+
+def build(stage: Stage) -> None:
+    """Make the stage's folders: a human with all that can be stored with one, whose files are the stranger's."""
+    stage.project.mkdir(parents=True)
+    stage.shipped.parent.mkdir(parents=True)
+    stage.users.write_bytes(SECRET)
+    (stage.root / "downloads" / ".bashrc").write_bytes(b"the stranger's")
+    first = stage.source
+    first.mkdir()
+    (first / "grid.vdb").write_bytes(b"merged")
+    npz = synthetic_shape.write(first / "human.npz", COUNT)
+    write_person(first / "person.human.safetensors", synthetic.arrays(COUNT)["betas"])
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.save_as_mainfile(filepath=str(stage.blend))
+    person = build_human(bpy.context, npz, "Anna", [first / "person.human.safetensors"])
+    attachment.set_attachment(person, "SURFACE")
+    armature = armature_of(person)
+    bpy.context.view_layer.objects.active = armature
+    armature.animation_data_create().action = bpy.data.actions.new("Walk")
+    mesh = bpy.data.objects.new("Anna_proxy", body_of(person).data.copy())
+    mesh[proxy.PROXY_MARK] = json.dumps({"file": "person.human.safetensors", "betas": [0.0] * 10})
+    person.objects.link(mesh)
+    whole = bpy.data.objects.new("Anna_merged", bpy.data.volumes.new("Anna_merged"))
+    whole[merged.MARK] = json.dumps({"poses": ["0"], "voxel": 0.01, "start": 0})
+    whole.data.filepath = str(stage.shipped / f"merged_{HASH}.vdb")
+    person.objects.link(whole)
+    shutil.move(folder_of(person), stage.shipped)
+    body = next(humans_folder().glob("body_*.npz"))
+    shutil.move(body, stage.shipped.parent / body.name)
+    (stage.shipped / f"merged_{HASH}.vdb").write_bytes(b"merged")
+    for name in LINK.values():
+        (stage.shipped / name).symlink_to(os.path.relpath(stage.users, stage.shipped))
+        (stage.shipped / name.replace(HASH, "f" * 12)).symlink_to("/dev/zero")
+    for volume in bpy.data.volumes:  # relative, so that copies of the stage hold together
+        volume.filepath = bpy.path.relpath(str(stage.shipped / volume_path(volume).name))
+    bpy.app.handlers.save_pre.remove(missing_files.collect_before_saving)  # the stranger has no extension
+    try:
+        bpy.ops.wm.save_mainfile()
+    finally:
+        bpy.app.handlers.save_pre.append(missing_files.collect_before_saving)
+    shutil.copy(stage.blend, stage.blend.with_name("other.blend"))
+    shutil.rmtree(stage.humans)
+
+
+def person() -> bpy.types.Collection:
+    return next(collection for collection in bpy.data.collections if MARK in collection)
+
+
+def _with(mark: str) -> Callable[[], bpy.types.Object]:
+    return lambda: next(obj for obj in person().all_objects if mark in obj)
+
+
+HOLDERS: dict[str, Callable[[], Any]] = {
+    **dict.fromkeys((MARK, PERSON, HOME, BODY_FILE, attachment.ATTACHMENT, attachment._BEFORE), person),
+    attachment.IN_VIEWPORT: person,
+    BETAS: lambda: armature_of(person()),
+    BODY_MARK: lambda: body_of(person()),
+    proxy.PROXY_MARK: _with(proxy.PROXY_MARK),
+    merged.MARK: _with(merged.MARK),
+    surface.MARK: _with(surface.MARK),
+    FACTS: lambda: bpy.data.actions["Walk"],
+}
+"""What holds each custom property."""
+SETTINGS = {
+    "primdiffusion_captures": ("people", "out", "body", "poses", "hdri"),
+    "primdiffusion_reconstruct": ("capture",),
+}
+"""Paths among the scene's settings."""
+TEXTS = {"primdiffusion_reconstruct": ("subject",)}
+"""Names among the scene's settings that become part of a path."""
+PREFERENCES = ("backend_python", "checkpoint", "encoder")
+"""Paths in the preferences."""
+
+
+def _set_setting(group: str, name: str) -> Callable[[object], None]:
+    def put(value: object) -> None:
+        settings = getattr(bpy.context.scene, group)
+        if isinstance(value, str):
+            setattr(settings, name, value)
+            return
+        scene = bpy.context.scene  # as a .blend may store it, of another type than the property's
+        stored = scene.bl_system_properties_get(do_create=True) if hasattr(scene, "bl_system_properties_get") else scene
+        settings.property_unset(name)
+        if group not in stored:
+            stored[group] = {}
+        stored[group][name] = value
+
+    return put
+
+
+def _set_preference(name: str) -> Callable[[object], None]:
+    return lambda value: setattr(bpy.context.preferences.addons[EXTENSION].preferences, name, value)
+
+
+def _set_custom(name: str) -> Callable[[object], None]:
+    def put(value: object) -> None:
+        holder = HOLDERS[name]()
+        if name in holder:  # of another type
+            del holder[name]
+        holder[name] = value
+
+    return put
+
+
+def _set_volume(value: object) -> None:
+    next(iter(bpy.data.volumes)).filepath = value
+
+
+def _set_merged(value: object) -> None:
+    bpy.data.volumes["Anna_merged"].filepath = value
+
+
+def _set_library(value: object) -> None:
+    other = Path(bpy.data.filepath).with_name("other.blend")
+    with bpy.data.libraries.load(str(other), link=True) as (_, wanted):
+        wanted.collections = ["Anna"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    bpy.data.libraries[0].filepath = value
+
+
+def _set_name(value: object) -> None:
+    person().name = value
+
+
+PROPERTIES: dict[str, Callable[[object], None]] = {
+    **{name: _set_custom(name) for name in HOLDERS},
+    "volume.filepath": _set_volume,
+    "merged.filepath": _set_merged,
+    "library.filepath": _set_library,
+    "collection.name": _set_name,
+    **{f"{group}.{name}": _set_setting(group, name) for group, names in SETTINGS.items() for name in names},
+    **{f"{group}.{name}": _set_setting(group, name) for group, names in TEXTS.items() for name in names},
+    **{f"preferences.{name}": _set_preference(name) for name in PREFERENCES},
+}
+"""How each is set, as a stranger would."""
+TEXT_ONLY = {"volume.filepath", "merged.filepath", "library.filepath", "collection.name"} | {
+    f"preferences.{name}" for name in PREFERENCES
+}
+"""Blender itself stores these as text."""
+ODD_RECORD = {
+    "betas": "x", "edits": [1, {"edit": {}}, {"a\ud800": "\ud800"}], "attributes": [1], "seed": {"a": 1}, "steps": "\0",
+    "most_overlapping": "x", "file": 1, "poses": [], "voxel": "x", "start": None, "checkpoint": ["x"],
+}  # fmt: skip
+
+
+def values(name: str, stage: Stage) -> dict[str, object]:
+    """What is stored in a property, by what it is."""
+    link = LINK.get(name, "link")
+    linked = str(stage.shipped / link) if name == "volume.filepath" else link
+    texts = {
+        "up": "../../../.bashrc",
+        "up from the file": "//../../.bashrc",
+        "up to a folder": "..",
+        "up and a volume": f"//../prim_0000_{HASH}.vdb",
+        "volume in a parent": f"{stage.shipped}/../prim_0000_{HASH}.vdb",
+        "volume at the root": f"/prim_0000_{HASH}.vdb",
+        "absolute": str(stage.users),
+        "server": r"\\host\share\x",
+        "two slashes": "//x",
+        "address": "https://host/x.vdb",
+        "link": linked,
+        "link to a device": linked.replace(HASH, "f" * 12),
+        "device": "/dev/zero",
+        "empty": "",
+        "control characters": "a\n\x1b[2Jb",
+        "long": "x" * 2**20,
+        "long parts": "/".join(["", "p" * 300, "q" * 300, f"prim_0000_{HASH}.vdb"]),
+        "deep": "[" * 100_000,
+        "list": "[1, 2]",
+        "odd record": json.dumps(ODD_RECORD),
+        "long record": json.dumps({"seed": "x" * 2**20, "attributes": {f"n{k}": k for k in range(1000)}}),
+        "large numbers": json.dumps({"betas": [1e300] * 10, "most_overlapping": 1e18, "poses": [1] * 9, "voxel": 1}),
+    }
+    if name in TEXT_ONLY:
+        return dict(texts)
+    others = {"number": 7, "numbers": [0.5] * 3, "group": {"a": {"b": 1}}, "bytes": b"\xff\x00", "texts": ["a", "b"]}
+    return {**texts, **others}
+
+
+def panels_fault() -> str:
+    """Which panel cannot be drawn, or draws what Blender cannot show; empty when all can."""
+    for cls in [*sidebar.panels(), *_menus()]:
+        try:
+            if hasattr(cls, "poll") and not cls.poll(bpy.context):
+                continue
+            texts = sidebar.draw(cls, bpy.context).texts
+        except Exception as error:
+            return f"{cls.__name__} raises {error!r:.200}"
+        for text in texts:
+            if len(text) > _LONGEST_LABEL or any(0xD800 <= ord(letter) < 0xE000 for letter in text):
+                return f"{cls.__name__} shows {text!r:.80}"
+    return ""
+
+
+def _menus() -> list[type]:
+    return [cls for cls in bpy.types.Menu.__subclasses__() if cls.__name__.startswith("PRIMDIFFUSION_MT_")]
+
+
+OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
+    ("set_attachment", {"mode": "ARMATURE"}), ("reset_shape", {}), ("collect_files", {}), ("find_missing_volumes", {}),
+    ("human_from_captures", {}), ("verify_captures", {}), ("remove_proxy", {}), ("unmerge", {}),
+    ("remove_unused_files", {}),
+)  # fmt: skip
+"""Pressed one after the other; those that need the backend are what `edit_fault` does with its result."""
+
+
+def operators_fault() -> str:
+    """Which operator ends in more than a sentence; empty when none does."""
+    for name, properties in OPERATORS:
+        try:
+            getattr(bpy.ops.primdiffusion, name)(**properties)
+        except RuntimeError as error:
+            text = str(error).strip()
+            longest = max(map(len, text.splitlines()), default=0)
+            if "Traceback" in text or longest > LONGEST_SENTENCE + _LONGEST_PATH:
+                return f"{name}: {text[-800:]!r}"
+    return ""
+
+
+def edit_fault(stage: Stage, source: Path) -> str:
+    """What goes wrong when an edit's result and a merged volume enter the scene; empty when nothing does."""
+    try:
+        written = write_now(source / "human.npz", edit_destination(person()))
+        replace_person(person(), written, source / "person.human.safetensors")
+        merged.publish([source / "grid.vdb"], ["a"], merged.merged_folder(person()))
+        for path in unwritten.unwritten():
+            list(unwritten.write_unwritten(path))
+    except (ValueError, OSError):
+        return ""
+    except Exception as error:
+        return f"an edit raises {error!r:.300}"
+    return ""
+
+
+def saving_fault() -> str:
+    """What goes wrong when the file is saved and looked through; empty when nothing does."""
+    with contextlib.redirect_stderr(io.StringIO()) as errors:
+        try:
+            missing_files.collect_before_saving(bpy.data.filepath)
+            bpy.ops.wm.save_mainfile()
+            missing_files.look()
+        except Exception as error:
+            return f"saving raises {error!r:.300}"
+    return f"saving prints {errors.getvalue()[-800:]}" if "Traceback" in errors.getvalue() else ""
+
+
+def attempt(name: str, value: object, stage: Stage, source: Path) -> list[str]:
+    """What one value of one property does that it must not; `stage` is used up."""
+    bpy.ops.wm.open_mainfile(filepath=str(stage.blend))
+    settings = bpy.context.scene.primdiffusion_captures
+    settings.people = settings.out = ""
+    before = stage.before()
+    PROPERTIES[name](value)
+    faults = [
+        panels_fault(),
+        saving_fault(),
+        operators_fault(),
+        panels_fault(),
+        edit_fault(stage, source),
+        panels_fault(),
+    ]
+    faults.append(saving_fault())
+    return [*filter(None, faults), *stage.changed_outside(before)]
+
+
+def tried(name: str, pristine: Stage, folder: Path) -> Iterator[tuple[str, list[str]]]:
+    """Each value of a property, and what it did; in copies of `pristine` at `folder`, which is removed each time."""
+    for what in values(name, pristine):
+        shutil.rmtree(folder, ignore_errors=True)
+        shutil.copytree(pristine.root, folder, symlinks=True)
+        stage = Stage(folder)
+        yield what, attempt(name, values(name, stage)[what], stage, pristine.source)
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def in_preferences() -> Iterator[None]:
+    """The extension among the enabled ones, so that it has preferences."""
+    addons = bpy.context.preferences.addons
+    made = addons.get(EXTENSION) or addons.new()
+    made.module = EXTENSION
+    try:
+        yield
+    finally:
+        addons.remove(addons.get(EXTENSION))
+
+
+def figures() -> dict[str, int]:
+    """`blend_properties_tried`, and `files_written_outside`: changes that any of their values made outside of the
+    folder beside the .blend. Takes some minutes; for a process of its own, in which the extension is not registered."""
+    import pytest
+    from backend_python import use_this_python
+
+    import blender_primdiffusion
+
+    outside = 0
+    with tempfile.TemporaryDirectory() as root, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("FAKE_HUMAN", str(synthetic.write(Path(root) / "prepared.npz", COUNT)))
+        use_this_python(patch, Path(__file__).parent / "fake_backend")
+        bpy.ops.wm.read_factory_settings(use_empty=True)
+        blender_primdiffusion.register()
+        pristine = Stage(Path(root) / "pristine")
+        build(pristine)
+        with in_preferences():
+            for name in PROPERTIES:
+                for _, faults in tried(name, pristine, Path(root) / "case"):
+                    outside += sum("changed" in fault or "copy of the user's file" in fault for fault in faults)
+        blender_primdiffusion.unregister()
+    return {"blend_properties_tried": len(PROPERTIES), "files_written_outside": outside}
+
+
+if __name__ == "__main__":
+    print(json.dumps(figures()))

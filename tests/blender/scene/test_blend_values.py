@@ -1,0 +1,232 @@
+"""What a .blend holds is read by one module, and what it rejects is what no human has."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import json
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import bpy
+import pytest
+from blend_tampering import HOLDERS, PREFERENCES, SETTINGS
+from shown_words import classes
+
+import blender_primdiffusion
+from blender_primdiffusion.scene import blend_values
+from blender_primdiffusion.scene.blend_values import (
+    as_numbers,
+    as_shown,
+    file_path,
+    setting_path,
+    stored_choice,
+    stored_flag,
+    stored_folder,
+    stored_name,
+    stored_numbers,
+    stored_record,
+    stored_text,
+)
+from blender_primdiffusion.scene.human import HOME, PERSON, PERSON_FILES
+
+pytestmark = pytest.mark.any_blender
+ROOT = Path(blender_primdiffusion.__file__).parent
+READER = Path(blend_values.__file__)
+READERS = {name for name in vars(blend_values) if name.startswith("stored_")}
+PREFIX = "primdiffusion_"
+OF_SCANS = {"primdiffusion_part"}
+"""An attribute of meshes that captures make and render at once."""
+OPERATORS_OWN = {
+    "scene/blend_values.py",
+    "ui/assets_panel.py", "ui/captures_panel.py", "ui/captures_settings.py", "ui/export_operators.py",
+    "ui/human_panel.py", "ui/import_motion.py", "ui/reconstruct_panel.py", "ui/setup/operators.py",
+}  # fmt: skip
+"""Modules that resolve paths: besides the reader, those whose operators are given one by the user or a script."""
+ODD = [7, 0.5, [0.5] * 3, {"a": {"b": 1}}, b"\xff\x00", ["a", "b"], "x" * (blend_values.LONGEST_TEXT + 1)]
+BAD_NAMES = ["../../x", "..", ".", "", "/etc/passwd", r"\\host\share\x", "//x", "/dev/zero", "a" * 2**20, "person.txt"]
+
+
+@pytest.fixture
+def holder(empty_scene):
+    return bpy.data.collections.new("Anna")
+
+
+def read_by(node: ast.AST) -> tuple[ast.AST | None, str]:
+    """The expression for the name of what a node may read, and how: by a reader, with `in`, or otherwise."""
+    if isinstance(node, ast.Call) and len(node.args) > 1 and getattr(node.func, "id", "") in READERS:
+        return node.args[1], "reader"
+    if isinstance(node, ast.Call) and node.args and getattr(node.func, "attr", "") in ("get", "pop", "setdefault"):
+        return node.args[0], "otherwise"
+    if isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.In | ast.NotIn):
+        return node.left, "in"
+    if isinstance(node, ast.Subscript) and isinstance(node.ctx, ast.Load):
+        return node.slice, "otherwise"
+    return None, ""
+
+
+def uses(tree: ast.AST, module: ModuleType) -> Iterator[tuple[str, str]]:
+    """Custom properties of ours that a module reads, and how."""
+    for node in ast.walk(tree):
+        key, how = read_by(node)
+        name = key.value if isinstance(key, ast.Constant) else vars(module).get(getattr(key, "id", ""))
+        if isinstance(name, str) and name.startswith(PREFIX) and name not in OF_SCANS:
+            yield name, how
+
+
+def found_uses() -> Iterator[tuple[str, str, str]]:
+    """Of all modules: the file, the property, and how it is read."""
+    for path in sorted(ROOT.rglob("*.py")):
+        if path.name == "__main__.py" or "bundled" in path.parts or path == READER:
+            continue
+        dotted = ".".join(path.relative_to(ROOT.parent).with_suffix("").parts).removesuffix(".__init__")
+        module = importlib.import_module(dotted)
+        for name, how in uses(ast.parse(path.read_text(encoding="utf-8")), module):
+            yield path.relative_to(ROOT).as_posix(), name, how
+
+
+@pytest.mark.usefixtures("addon")
+def test_every_custom_property_is_read_by_the_reader_and_tried_by_the_tampering():
+    found = list(found_uses())
+    assert [(file, name) for file, name, how in found if how == "otherwise"] == []
+    assert {name for _, name, _ in found} == set(HOLDERS)
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["person[HOME]", "person.get(HOME)", "person.get(HOME, '')", "person['primdiffusion_folder']",
+     "str(person[HOME])", "person.get('primdiffusion_folder')", "person.pop(HOME)"],
+)  # fmt: skip
+def test_the_rule_sees_another_way_to_read(line):
+    from blender_primdiffusion.scene import human
+
+    assert (HOME, "otherwise") in set(uses(ast.parse(line), human))
+    assert (HOME, "reader") in set(uses(ast.parse("stored_folder(person, HOME)"), human))
+    assert not list(uses(ast.parse("person[HOME] = 'x'"), human))
+
+
+@pytest.mark.usefixtures("addon")
+def test_every_setting_and_preference_that_is_a_path_is_tried_by_the_tampering():
+    def paths(rna: bpy.types.Struct) -> tuple[str, ...]:
+        kinds = {prop.identifier: getattr(prop, "subtype", "") for prop in rna.properties}
+        return tuple(name for name, kind in kinds.items() if kind in ("FILE_PATH", "DIR_PATH"))
+
+    groups = {
+        prop.identifier: paths(prop.fixed_type)
+        for prop in bpy.types.Scene.bl_rna.properties
+        if prop.type == "POINTER" and prop.identifier.startswith("primdiffusion")
+    }
+    assert {group: names for group, names in groups.items() if names} == SETTINGS
+    (preferences,) = classes(bpy.types.AddonPreferences)
+    assert set(paths(preferences.bl_rna)) == set(PREFERENCES)
+
+
+def test_only_the_reader_and_operators_on_the_users_own_paths_resolve_paths():
+    calls = re.compile(r"path\.abspath\(")
+    found = {
+        path.relative_to(ROOT).as_posix()
+        for path in ROOT.rglob("*.py")
+        if calls.search(path.read_text(encoding="utf-8").replace("os.path.abspath(", ""))
+    }
+    assert found == OPERATORS_OWN
+
+
+@pytest.mark.parametrize("value", ODD, ids=lambda value: type(value).__name__)
+def test_a_value_of_another_type_counts_as_missing(holder, value):
+    for read, missing in (
+        (lambda: stored_text(holder, PERSON), None),
+        (lambda: stored_name(holder, PERSON, PERSON_FILES), None),
+        (lambda: stored_folder(holder, PERSON), None),
+        (lambda: stored_record(holder, PERSON), {}),
+        (lambda: stored_numbers(holder, PERSON, 10), None),
+        (lambda: stored_choice(holder, PERSON, ("A", "B")), "A"),
+    ):
+        holder[PERSON] = "a text"
+        del holder[PERSON]
+        assert read() == missing
+        holder[PERSON] = value
+        assert read() == missing
+    if not isinstance(value, int):
+        assert stored_flag(holder, PERSON, True) is True
+        assert stored_flag(holder, PERSON, False) is False
+
+
+def test_what_the_extension_stores_is_read(holder):
+    for value, read in (
+        ("person_0123456789ab.human.safetensors", lambda: stored_name(holder, PERSON, PERSON_FILES)),
+        ("B", lambda: stored_choice(holder, PERSON, ("A", "B"))),
+        (False, lambda: stored_flag(holder, PERSON, True)),
+        ([0.5] * 10, lambda: stored_numbers(holder, PERSON, 10)),
+    ):
+        holder.pop(PERSON, None)
+        holder[PERSON] = value
+        assert read() == value
+    holder[HOME] = json.dumps({"a": [1]})
+    assert stored_record(holder, HOME) == {"a": [1]}
+
+
+@pytest.mark.parametrize("name", BAD_NAMES, ids=lambda name: name[:20] or "empty")
+def test_a_name_of_another_pattern_counts_as_missing(holder, name):
+    holder[PERSON] = name
+    assert stored_name(holder, PERSON, PERSON_FILES) is None
+
+
+@pytest.mark.parametrize(
+    "path", ["", "x", "../x", "//", r"\\host\share\x", "https://host/x", "/a\0b", "/" + "x" * 256, "/a" * 3000]
+)  # fmt: skip
+def test_a_folder_that_is_not_absolute_or_on_a_server_counts_as_missing(holder, path):
+    holder[HOME] = path
+    assert stored_folder(holder, HOME) is None
+
+
+@pytest.mark.parametrize("path", ["", "//x.vdb", r"\\host\share\x.vdb", "x.vdb", "/tmp/..", "/tmp/" + "x" * 256])
+def test_a_volume_in_a_file_never_saved_has_no_path_relative_to_it(empty_scene, path):
+    assert file_path(path, None) is None
+
+
+def test_a_path_with_two_dots_leads_where_the_links_on_the_way_do(saved_scene, tmp_path):
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    (tmp_path / "near").symlink_to(tmp_path / "far" / "away")
+    assert file_path(f"{tmp_path}/near/../x.vdb", None) == Path(os.path.realpath(tmp_path)) / "far" / "x.vdb"
+    assert file_path("//x.vdb", None) == tmp_path / "x.vdb"
+
+
+def test_folders_of_users_have_any_name(holder, tmp_path):
+    for name in ("写真\u3000年", "a\u00a0b", "a\u200db", "\udcff", "x y'\"%"):
+        folder = tmp_path / name / "Anna"
+        assert file_path(f"{folder}/x.vdb", None) == folder / "x.vdb"
+        holder[HOME] = str(folder)
+        assert stored_folder(holder, HOME) == folder
+
+
+@pytest.mark.parametrize("stored", ["captures", "../x", r"\\host\share", "https://host/x", "/" + "x" * 300, "a\nb"])
+def test_a_setting_that_is_no_whole_path_is_named_in_one_sentence(saved_scene, stored):
+    with pytest.raises(ValueError, match=r"^Captures is .* not the whole path .*: choose it again$") as caught:
+        setting_path(stored, "Captures")
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_settings_may_be_relative_to_a_saved_file_or_absolute_or_empty(saved_scene, tmp_path):
+    assert setting_path("//captures", "Captures") == str(tmp_path / "captures")
+    assert setting_path(f"{tmp_path}/", "Captures") == f"{tmp_path}/"
+    assert setting_path("", "Captures") == ""
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with pytest.raises(ValueError, match="Captures is '//captures'"):
+        setting_path("//captures", "Captures")
+
+
+@pytest.mark.parametrize("values", [[float("nan")] * 2, [1e300, 0.0], [True, False], ["1", "2"], [1], "12", None, {}])
+def test_no_list_of_two_numbers(values):
+    assert as_numbers(values, 2) is None
+
+
+@pytest.mark.parametrize("value", ["x" * 10**6, "a\ud800\x1b[2J\n", {"a": 1}, [1], 10**400, None, 0.5])
+def test_what_is_shown_is_one_short_printable_line(value):
+    shown = as_shown(value)
+    assert shown.isprintable()
+    assert len(shown) <= 130
+    assert shown.encode()
