@@ -10,6 +10,7 @@ from pathlib import Path
 
 import bpy
 
+from ..backend.child_variables import BLENDER, COMPUTING, passed_on
 from ..formats.json_files import read_json
 from ..places import own_folder
 

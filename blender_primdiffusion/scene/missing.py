@@ -129,7 +129,7 @@ def find_files(lost: Sequence[MissingFiles], directory: Path | None = None) -> d
     then in `directory` and below. Raises NotADirectoryError where that is no folder.
     """
     if directory is not None and not os.path.isdir(directory):
-        raise NotADirectoryError(f"there is no folder {str(directory)!r}: choose the one that the volumes are in")
+        raise NotADirectoryError(f"there is no folder {str(directory)!r:.200}: choose the one that the volumes are in")
     wanted = {
         *(_name(volume) for one in lost for volume in one.volumes),
         *(name for one in lost for volume in one.merged for name in _sequence_names(volume)),

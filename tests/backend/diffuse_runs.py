@@ -16,7 +16,8 @@ from primdiffusion.training.diffuse import train
 from primdiffusion.training.run_folder import METRICS
 
 TINY_UNET = UNetConfig(width=32, multipliers=(1, 1, 1, 1, 1), blocks=1, heads=2)
-DEFAULT_FILES = {"config.json", "run.json", "metrics.jsonl", "pictures", "model.safetensors", "prepared.safetensors",
+DEFAULT_FILES = {".lock", "config.json", "run.json", "metrics.jsonl", "pictures", "model.safetensors",
+                 "prepared.safetensors",
                  "person.state.safetensors", "local.state.safetensors"}  # fmt: skip
 
 

@@ -24,7 +24,7 @@ from safetensors.torch import load_file
 from tiny_encoder import TINY
 
 FEW = {"steps": 6, "batch": 1, "views": 2, "targets": 1, "size": 16, "step": 0.02, "hold_scale": 2, "log_every": 1}
-WHOLE = {"config.json", "run.json", METRICS, MODEL, STATE, "pictures"}
+WHOLE = {".lock", "config.json", "run.json", METRICS, MODEL, STATE, "pictures"}
 """What lies in the folder of a run that was not torn."""
 
 

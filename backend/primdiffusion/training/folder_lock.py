@@ -8,6 +8,7 @@ from pathlib import Path
 
 from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 
+from primdiffusion.formats.removing import remove_file
 from primdiffusion.formats.whole_files import create_folders, remove_empty
 
 LOCK = ".lock"
@@ -58,4 +59,4 @@ def _acquired(folder: Path) -> BaseFileLock:
 def _remove_if_alone(path: Path) -> None:
     with contextlib.suppress(OSError):
         if list(path.parent.iterdir()) == [path]:
-            path.unlink()
+            remove_file(path, path.parent)
