@@ -185,6 +185,7 @@ def _betas(armature: bpy.types.Object, name: str) -> list[float] | None:
     betas = stored_numbers(armature, BETAS, BETA_COUNT)
     if betas is None:
         raise ValueError(
-            f"the custom property {BETAS!r} on the armature of {name!r} is no list of {BETA_COUNT} numbers: delete it"
+            f"the custom property {BETAS!r} on the armature of {name!r} is not a list of numbers: "
+            "make it a list of ten numbers, or delete it"
         )
     return betas

@@ -96,11 +96,13 @@ def main(names: Sequence[str]) -> None:
             warm, small = Path(temporary, "warm"), Path(temporary, "small")
             warm.mkdir()
             small.mkdir()
+            ordinary = chosen.warm(warm)
             if (chosen.read, chosen.warm) not in loaded:
-                chosen.read(chosen.warm(warm))
+                chosen.read(ordinary)
                 loaded.add((chosen.read, chosen.warm))
             fork = os.fork()
             if fork == 0:
+                chosen.read(ordinary)  # a fork maps libraries anew, as it uses them: their pages are not the input's
                 _measure_here(name, small)
                 os._exit(0)
             if os.waitpid(fork, 0)[1]:
