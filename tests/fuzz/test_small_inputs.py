@@ -10,6 +10,7 @@ from fuzz.run import LONGEST_SENTENCE, MOST_MEMORY_MB
 from fuzz.small_inputs import INPUTS, SMALL_BYTES, measure
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="peaks of memory are read from /proc")
 @pytest.mark.timeout(1800)
 @pytest.mark.parametrize("kind", sorted({one.kind for one in INPUTS.values()}))
