@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import bpy
@@ -11,6 +12,7 @@ from late_volumes_stage import COUNT, advance, check_complete, generated, on_dis
 import blender_primdiffusion
 from blender_primdiffusion.engine.overlay import overlay
 from blender_primdiffusion.jobs import late_volumes as module
+from blender_primdiffusion.jobs import windows
 from blender_primdiffusion.jobs.late_volumes import late_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene import unwritten
@@ -61,6 +63,7 @@ def test_hidden_volumes_cost_the_viewport_nothing_and_renders_have_them(person):
 
 def test_a_slice_is_as_long_as_the_drawing_before_it_within_limits(person, monkeypatch):
     given, now = [], [100.0]
+    monkeypatch.setattr(windows, "_last_undo", -math.inf)  # an undo of another test lies in this clock's future
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
     monkeypatch.setattr(late_volumes, "work", lambda seconds: given.append(round(seconds, 3)) or True)
     for drawing in (0.0, 0.07, 3.0):
