@@ -307,7 +307,7 @@ def test_betas_on_the_armature_change_the_shape(stage, backend):
     assert np.abs(render_png(stage.out) - before).max() > 50
     stage.armature["primdiffusion_betas"] = "tall"
     stage.armature.update_tag()
-    with pytest.raises(RuntimeError, match=r"primdiffusion_betas.*is no list of 10 numbers: delete it"):
+    with pytest.raises(RuntimeError, match=r"primdiffusion_betas.*make it a list of ten numbers"):
         render_png(stage.out)
 
 
