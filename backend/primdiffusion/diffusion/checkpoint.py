@@ -148,6 +148,11 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
     path = default_checkpoint() if path is None else Path(path)
     tensors, architecture, card = read_checkpoint(path)
     with mismatches_named(path):
+        if "detail" in architecture:
+            raise CheckpointError(
+                f"{path} has a detail decoder, which only the program up to commit fdffd56 reads: train a new "
+                "checkpoint, or use the default one"
+            )
         if architecture["kind"] == RELEASED:
             return _released_model(tensors, architecture, card, path.parent).to(device)
     with mismatches_named(path, ValueError, AttributeError):
@@ -164,8 +169,6 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
         prior = PersonPrior(**under(weights, "prior_"))
-        if "detail" in architecture:
-            raise RuntimeError("it has a detail decoder, which versions up to 0.1.0 read")
         codec = CellCodec(_linear_codec(under(tensors, "codec.")))
         shapes = ShapePrior(**under(tensors, "shapes."))
         check_parts(codec.codec, prior, shapes, vocabulary)

@@ -43,7 +43,7 @@ Model = TypeVar("Model", bound=ComputesOnThreads)
 def fixed_threads(count: int) -> Iterator[None]:
     """Let torch use `count` threads in the block, or in the decorated function; afterwards the caller's number again.
 
-    Applies to the calling thread, and to Python threads that first use torch meanwhile.
+    Applies to the calling thread, and to Python threads that first use torch within it.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(count)

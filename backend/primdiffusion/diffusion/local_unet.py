@@ -49,7 +49,7 @@ def step_features(t: Int[Tensor, "b"], features: int, longest: float = 10_000.0)
 class PersonNetworkConfig:
     """Size of the perceptron over person components."""
 
-    width: int = 640
+    width: int = 384
     """Features of the residual stream."""
     blocks: int = 4
     """Residual blocks."""
@@ -61,7 +61,7 @@ class PersonNetworkConfig:
 class LocalUNetConfig:
     """Size of the U-Net over the 32 x 32 grid."""
 
-    widths: tuple[int, ...] = (128, 192, 256)
+    widths: tuple[int, ...] = (192, 256, 320)
     """Channels at 32, 16 and 8 cells a side."""
     blocks: int = 1
     """Residual blocks of a level, down and up."""

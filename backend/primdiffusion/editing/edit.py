@@ -13,7 +13,7 @@ from torch import Tensor
 
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep
-from primdiffusion.diffusion.schedule import Schedule, trailing_steps
+from primdiffusion.diffusion.schedule import early_steps
 from primdiffusion.formats.requests import check_unit_interval
 from primdiffusion.human import Human
 from primdiffusion.primitives.body_setup import BodySetup
@@ -74,17 +74,18 @@ def conditional_denoiser(model: DiffusionModel, attributes: Mapping[str, str | f
     return denoise
 
 
-def edit_timesteps(schedule: Schedule, amount: float, steps: int) -> list[int]:
-    """Descending timesteps from T * amount^0.7 (T-1, pure noise, for amount 1) to 0; empty for amount 0.
+def edit_timesteps(model: DiffusionModel, amount: float, steps: int) -> list[int]:
+    """Descending timesteps from T * amount^0.7 (T-1, pure noise, for amount 1); empty for amount 0.
 
     Low noise levels hardly change the result: the power makes amounts look evenly spaced. There are `steps` timesteps,
-    spaced as in sampling, or fewer if there are fewer below the start. Raises ValueError for an amount outside 0 ... 1
-    and a number of steps outside 1 ... T.
+    evenly spaced, or fewer if there are fewer below the start. They end where the model's own chain of as many steps
+    ends, or lower for a start below that, so an edit draws no finer detail than sampling does. Raises ValueError for an
+    amount outside 0 ... 1 and a number of steps outside 1 ... T.
     """
     check_unit_interval("amount", amount)
-    trailing_steps(schedule.length, steps)
-    levels = round(amount**AMOUNT_POWER * schedule.length)
-    return trailing_steps(levels, min(steps, levels)) if levels else []
+    last = model.chain(model.schedule.length, steps)[-1]
+    levels = round(amount**AMOUNT_POWER * model.schedule.length)
+    return early_steps(levels, min(steps, levels), last) if levels else []
 
 
 def run_sampler(steps: Iterable[SamplerStep], on_step: OnStep | None) -> Float[Tensor, "b c h w"]:

@@ -193,7 +193,7 @@ def harmonise(
     region = check_region(region)
     generator = edit_generator(seed)
     model = match_density(model, human)
-    chain = edit_timesteps(model.schedule, amount, steps)
+    chain = edit_timesteps(model, amount, steps)
     payload = human.payload
     if chain:
         known, inside = encoded(model, human), model.cell_mask(region)

@@ -65,7 +65,7 @@ def vary_batch(
     generators = [edit_generator(seed) for seed in seeds]
     model = match_density(model, human)
     denoise = conditional_denoiser(model, attributes, guidance)
-    chain = edit_timesteps(model.schedule, amount, steps)
+    chain = edit_timesteps(model, amount, steps)
     payloads = [human.payload.to("cpu")] * len(seeds)
     if chain:
         x0 = encoded(model, human)

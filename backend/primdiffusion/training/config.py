@@ -21,9 +21,9 @@ Levels = Literal["uniform", "log_uniform", "log_normal"]
 class CodecConfig:
     """The frozen linear codec."""
 
-    channels: int = 256
+    channels: int = 320
     """Latent channels of a primitive."""
-    people: int = 160
+    people: int = 240
     """Randomly chosen samples (geometry and colours) to which the basis is fitted."""
 
 
@@ -153,9 +153,9 @@ class TrainingConfig(RunSettings):
     prior: PriorConfig = dataclasses.field(default_factory=PriorConfig)
     model: DenoiserConfig = dataclasses.field(default_factory=DenoiserConfig)
     person: PhaseConfig = dataclasses.field(
-        default_factory=lambda: PhaseConfig(steps=8000, batch=256, evaluate_every=1000, bfloat16=True)
+        default_factory=lambda: PhaseConfig(steps=700, batch=256, evaluate_every=350, bfloat16=True)
     )
-    """The default preset's network over person components, trained first."""
+    """The default preset's network over person components, trained first; with few humans more steps overfit."""
     local: PhaseConfig = dataclasses.field(
         default_factory=lambda: PhaseConfig(
             steps=38_000, batch=16, blend=0.2, weight_decay=0.0, levels="log_normal", bfloat16=True, optimiser="muon"

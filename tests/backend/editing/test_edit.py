@@ -9,7 +9,7 @@ import torch
 from diffusion_people import small_model
 from editing_people import anybody, slab_model
 from primdiffusion.diffusion.model import seeded
-from primdiffusion.diffusion.schedule import linear
+from primdiffusion.diffusion.schedule import dense_steps, early_steps, linear, trailing_steps
 from primdiffusion.editing.edit import edit_generator, edit_timesteps
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate, inversion_steps, inverted, slerp
@@ -110,11 +110,19 @@ def test_a_variant_keeps_the_body(human):
 
 
 def test_edits_go_down_from_the_level_of_their_amount():
-    schedule = linear()
-    assert edit_timesteps(schedule, 1.0, 4) == [999, 749, 499, 249]
-    assert edit_timesteps(schedule, 0.0, 4) == []
-    assert edit_timesteps(schedule, 0.5, 1) == [round(1000 * 0.5**0.7) - 1]
-    assert edit_timesteps(schedule, 0.0004, 30) == [3, 2, 1, 0]
+    model = dataclasses.replace(tiny_model(), schedule=linear(), chain=trailing_steps)
+    assert edit_timesteps(model, 1.0, 4) == [999, 749, 499, 249]
+    assert edit_timesteps(model, 0.0, 4) == []
+    assert edit_timesteps(model, 0.5, 1) == [round(1000 * 0.5**0.7) - 1]
+    assert edit_timesteps(model, 0.0004, 30) == [3, 2, 1, 0]
+
+
+@pytest.mark.parametrize("amount", [0.05, 0.25, 0.9])
+def test_edits_end_where_sampling_ends(amount):
+    model = dataclasses.replace(tiny_model(), schedule=linear(), chain=early_steps)
+    assert edit_timesteps(model, amount, 10)[-1] == min(100, round(1000 * amount**0.7) - 10)
+    dense = dataclasses.replace(model, chain=dense_steps)
+    assert edit_timesteps(dense, amount, 10)[-1] == dense_steps(1000, 10)[-1]
 
 
 @pytest.mark.parametrize(

@@ -44,6 +44,14 @@ def test_the_first_update_of_a_hidden_layer_is_orthogonal_and_of_adamws_size(mem
     assert change.square().mean().sqrt() == pytest.approx(3 * 0.2 * 54**0.5 / 54**0.5, rel=0.2)
 
 
+def test_only_hidden_kernels_have_a_momentum():
+    state = started()
+    advance(state, 1)
+    moments = {name: set(state.optimiser.state[parameter]) for name, parameter in state.network.named_parameters()}
+    assert [name for name, held in moments.items() if held == {"momentum_buffer"}] == ["hidden.weight"]
+    assert all({"exp_avg", "exp_avg_sq"} < held for name, held in moments.items() if name != "hidden.weight")
+
+
 def test_the_loss_falls():
     state = started(learning_rate=5e-2)
     x = torch.randn(64, 2, 5, 5, generator=torch.Generator().manual_seed(1))

@@ -4,6 +4,7 @@ import sys
 import types
 
 import pytest
+from accelerate import PartialState
 from diffuse_runs import make_small, rows, settings
 from primdiffusion.failures import MissingPackageError, describe
 from primdiffusion.training.config import check_resumable, to_json
@@ -61,6 +62,7 @@ def test_wandb_is_started_in_the_run_folder_and_steps_never_fall(people, tmp_pat
 
 
 def test_the_encoder_s_lines_are_sent_too(tmp_path, monkeypatch):
+    PartialState()  # as a run has, and as tests before this one may have: trackers log through it
     wandb = Wandb()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
     with tracking("wandb", tmp_path) as tracker:
