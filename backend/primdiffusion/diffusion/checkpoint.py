@@ -18,8 +18,9 @@ from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.consistency import check_parts
+from primdiffusion.diffusion.consistency import check_fine, check_parts
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.detail import DetailCodec, DetailConfig, DetailDecoder, FineCodec
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
 from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior
@@ -41,9 +42,9 @@ ENCODER_FORMAT = "primdiffusion-encoder"
 """Format of the files of `encoder.model`."""
 FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
-_HALVED = ("codec.mean", "codec.basis", "denoiser.")
+_HALVED = ("codec.mean", "codec.basis", "denoiser.", "fine.mean", "fine.basis", "detail.")
 _WHOLE = ("prior_variance", "prior_log_weight")
-_SECTIONS = ("held_out_rms_x0_error", "limits")
+_SECTIONS = ("held_out_rms_x0_error", "held_out_rms_detail_error", "limits")
 
 
 class CheckpointError(ValueError):
@@ -62,7 +63,13 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     architecture: dict[str, Any] = {"schedule": schedule, "chain": chain, "full_density": model.full_density}
     architecture |= {"vocabulary": model.vocabulary.to_json()}
     if isinstance(model.codec, CellCodec):
-        tensors |= _fields("codec", model.codec.codec)
+        codec = model.codec.codec
+        tensors |= _fields("codec", codec)
+        if isinstance(model.codec, DetailCodec):
+            fine, decoder = model.codec.fine, model.codec.decoder
+            tensors |= _fields("fine", fine.codec) | {"back": fine.back}
+            tensors |= {f"detail.{key}": value for key, value in decoder.state_dict().items()}
+            architecture["detail"] = dataclasses.asdict(decoder.config)
         tensors |= _fields("shapes", model.shapes)
         architecture |= {"kind": "person"}
     else:
@@ -148,11 +155,6 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
     path = default_checkpoint() if path is None else Path(path)
     tensors, architecture, card = read_checkpoint(path)
     with mismatches_named(path):
-        if "detail" in architecture:
-            raise CheckpointError(
-                f"{path} has a detail decoder, which only the program up to commit fdffd56 reads: train a new "
-                "checkpoint, or use the default one"
-            )
         if architecture["kind"] == RELEASED:
             return _released_model(tensors, architecture, card, path.parent).to(device)
     with mismatches_named(path, ValueError, AttributeError):
@@ -169,7 +171,7 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
         prior = PersonPrior(**under(weights, "prior_"))
-        codec = CellCodec(_linear_codec(under(tensors, "codec.")))
+        codec = _cell_codec(tensors, architecture.get("detail"))
         shapes = ShapePrior(**under(tensors, "shapes."))
         check_parts(codec.codec, prior, shapes, vocabulary)
         denoiser = tensor_file.load_network(lambda: PersonDenoiser(denoiser_config(config), prior, schedule), weights)
@@ -177,6 +179,21 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
     chain = CHAINS[architecture.get("chain", "trailing")]
     density = float(architecture["full_density"])
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
+
+
+def _cell_codec(tensors: Mapping[str, Tensor], detail: Mapping[str, Any] | None) -> CellCodec:
+    """The codec of latents, with its detail decoder if the checkpoint has one."""
+    codec = _linear_codec(under(tensors, "codec."))
+    if detail is None:
+        return CellCodec(codec)
+    fine = FineCodec(_linear_codec(under(tensors, "fine.")), tensors["back"])
+    check_fine(fine, codec)
+    config = DetailConfig(**{**detail, "widths": tuple(detail["widths"])})
+    decoder = tensor_file.load_network(
+        lambda: DetailDecoder(codec.channels, fine.codec.channels, config), under(tensors, "detail.")
+    )
+    decoder.eval().requires_grad_(False)
+    return DetailCodec(codec, fine, decoder)
 
 
 def _linear_codec(tensors: Mapping[str, Tensor]) -> LinearCodec:
@@ -334,6 +351,7 @@ def model_card(card: Mapping[str, Any]) -> str:
             "",
             *_attribute_section(card.get("attributes", {})),
             *_error_section(card.get("held_out_rms_x0_error")),
+            *_detail_section(card.get("held_out_rms_detail_error")),
             "## Limits",
             "",
             *(f"- {limit}" for limit in card.get("limits", ())),
@@ -363,6 +381,21 @@ def _error_table(errors: Mapping[str, Mapping[str, float]]) -> list[str]:
     levels = list(next(iter(errors.values())))
     rows = [f"| {name} | " + " | ".join(f"{by[level]:.4f}" for level in levels) + " |" for name, by in errors.items()]
     return ["| t | " + " | ".join(levels) + " |", "|---" * (len(levels) + 1) + "|", *rows]
+
+
+def _detail_section(errors: Mapping[str, Mapping[str, float]] | None) -> list[str]:
+    """Lines of the section on the detail decoder; empty for a model without."""
+    if errors is None:
+        return []
+    return [
+        "## Held-out error of the detail decoder",
+        "",
+        "Root mean square error of the finer codec's latents, from clean latents (0) and from the denoiser's guesses",
+        "at steps t. `linear`: least squares of each cell; `decoder`: this checkpoint.",
+        "",
+        *_error_table(errors),
+        "",
+    ]
 
 
 def _attribute_section(attributes: Mapping[str, Any]) -> list[str]:

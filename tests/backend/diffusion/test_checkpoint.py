@@ -57,15 +57,6 @@ def test_the_steps_that_a_model_is_sampled_in_are_part_of_it(path):
     assert load_checkpoint(path).chain is trailing_steps
 
 
-def test_a_checkpoint_with_a_detail_decoder_is_rejected_with_what_reads_it(path):
-    def with_detail(metadata):
-        return metadata | {"architecture": json.dumps(json.loads(metadata["architecture"]) | {"detail": {}})}
-
-    rewrite(path, change_metadata=with_detail)
-    with pytest.raises(CheckpointError, match=r"detail decoder, which only the program up to commit \w+ reads"):
-        load_checkpoint(path)
-
-
 def test_a_codec_of_before_weights_is_read_as_it_was(path):
     rewrite(path, lambda t: {k: v for k, v in t.items() if k not in ("codec.weight", "codec.dead_zone")})
     codec = load_checkpoint(path).codec.codec
