@@ -161,7 +161,8 @@ def encoded(
         conditions += [vocabulary.encode(attributes) for attributes in person.attributes]
         betas.append(person.betas)
     geometry = torch.arange(len(paths)).repeat_interleave(torch.tensor([len(one) for one in latents]))
-    return LatentSet(torch.cat(latents), geometry, torch.stack(betas), torch.stack(conditions))
+    detailed = torch.tensor(len(conditions))
+    return LatentSet(torch.cat(latents), geometry, torch.stack(betas), torch.stack(conditions), detailed)
 
 
 def objective_of(

@@ -25,7 +25,7 @@ from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
-from primdiffusion.training.stored_people import PersonDataset
+from primdiffusion.training.stored_people import PersonDataset, one_density
 
 PREPARED = "prepared.safetensors"
 
@@ -49,25 +49,30 @@ def prepare(
     train: Sequence[int],
     held: Sequence[int],
     base: DiffusionModel | None = None,
+    more: PersonDataset | None = None,
 ) -> Prepared:
     """Return codec, latents, prior and shape prior of a run; loaded from the run folder if they are saved there.
 
-    With a `base` (`load_base`) all but the latents are those of that model.
+    With a `base` (`load_base`) all but the latents are those of that model. `more` are blurred people to train on.
 
     Raises ValueError for a person's file, or prepared ones, that are damaged, and for people of another full density
-    than those of `base`; OSError.
+    than the others or those of `base`; OSError.
     """
     path = config.run / PREPARED
     if path.exists():
         return _load_prepared(path)
+    one_density([each.full_density for each in (people, more, base) if each is not None])
     if base is not None:
-        prepared = _prepared_with(base, people, train, held)
+        prepared = _prepared_with(base, people, train, held, more)
         _save_prepared(path, prepared)
         return prepared
     generator = torch.Generator().manual_seed(config.seed)
-    vocabulary = vocabulary_of(each for index in train for each in people.known(index))
+    known = [each for index in train for each in people.known(index)]
+    if more is not None:
+        known += [each for index in range(len(more.names)) for each in more.known(index)]
+    vocabulary = vocabulary_of(known)
     codec = fit_codec_to(people, train, config.codec, generator)
-    latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
+    latents, unseen = _encoded(people, train, held, more, codec, vocabulary)
     prior = fit_prior(latents, codec, vocabulary, config.prior)
     shapes = fit_shapes(latents, prior)
     prepared = Prepared(latents, unseen, codec, prior, shapes, vocabulary, people.full_density)
@@ -83,16 +88,32 @@ def load_base(path: Path) -> DiffusionModel:
     return model
 
 
-def _prepared_with(base: DiffusionModel, people: PersonDataset, train: Sequence[int], held: Sequence[int]) -> Prepared:
+def _encoded(
+    people: PersonDataset,
+    train: Sequence[int],
+    held: Sequence[int],
+    more: PersonDataset | None,
+    codec: LinearCodec,
+    vocabulary: AttributeVocabulary,
+) -> tuple[LatentSet, LatentSet]:
+    """Latents to train on and held-out ones."""
+    latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
+    if more is not None:
+        latents = latents.and_blurred(encode_people(more, range(len(more.names)), codec, vocabulary))
+    return latents, unseen
+
+
+def _prepared_with(
+    base: DiffusionModel,
+    people: PersonDataset,
+    train: Sequence[int],
+    held: Sequence[int],
+    more: PersonDataset | None,
+) -> Prepared:
     assert isinstance(base.codec, CellCodec)
     assert isinstance(base.denoiser, PersonDenoiser)
-    if people.full_density != base.full_density:
-        raise ValueError(
-            f"humans with a full density of {people.full_density:g} cannot go on from a checkpoint of "
-            f"{base.full_density:g}: make them with `primdiffusion payloads`"
-        )
     codec, vocabulary = base.codec.codec, base.vocabulary
-    latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
+    latents, unseen = _encoded(people, train, held, more, codec, vocabulary)
     return Prepared(latents, unseen, codec, base.denoiser.prior, base.shapes, vocabulary, people.full_density)
 
 

@@ -136,6 +136,9 @@ class TrainingConfig(RunSettings):
     """Training set of `primdiffusion payloads`: a folder of files, or of shards from `payloads pack`."""
     run: Path
     """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
+    more_data: Path | None = None
+    """More humans, of `payloads --making from_mesh`: cheap, so they can be many, but blurred. The default preset learns
+    from them what noise does not hide: the closed form, and its networks at levels above t = 300."""
     preset: Literal["default", "paper"] = "default"
     """default: a light network on latents; paper: the paper's U-Net on whole slabs, for GPUs."""
     made_of: Literal["makehuman", "own"] = "own"
@@ -183,8 +186,9 @@ class TrainingConfig(RunSettings):
             raise ValueError("slab.weighting is whitened, for which slabs have no closed form: choose plain or min_snr")
         if self.preset == "paper" and self.slab.optimiser == "muon":
             raise ValueError("slab.optimiser is muon, which is for the default preset: choose adamw")
-        if self.preset == "paper" and self.start_from is not None:
-            raise ValueError("start_from is for the default preset: leave it out, or give --preset default")
+        for name in ("start_from", "more_data"):
+            if self.preset == "paper" and getattr(self, name) is not None:
+                raise ValueError(f"{name} is for the default preset: leave it out, or give --preset default")
 
 
 def _check(name: str, value: object, fits: bool, wanted: str) -> None:
@@ -201,6 +205,7 @@ MAY_CHANGE = frozenset(
     (
         "run",
         "data",
+        "more_data",
         "held",
         "made_of",
         "minutes",

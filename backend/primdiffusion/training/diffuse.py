@@ -99,7 +99,8 @@ def _trainee(
     if config.preset == "paper":
         return SlabTrainee(config, people, chosen, held, accelerator.device)
     base = None if config.start_from is None else load_base(config.start_from)
-    return CellTrainee(config, prepare(config, people, chosen, held, base), accelerator.device, base)
+    more = None if config.more_data is None else open_people(config.more_data)
+    return CellTrainee(config, prepare(config, people, chosen, held, base, more), accelerator.device, base)
 
 
 def _card(
@@ -136,6 +137,8 @@ def _card(
         card |= {"licence": "CC0-1.0", "data": DATA, "limits": _limits(config)}
     if isinstance(trainee, SlabTrainee):
         return {**card, "held_out_rms_x0_error": _rounded({"denoiser": trainee.errors()})}
+    if blurred := len(trainee.train.betas) - len(chosen):
+        card |= {"blurred_geometries": blurred}
     errors = trainee.errors_beside_closed_forms()
     better = all(errors["denoiser"][level] < errors["gaussian"][level] for level in errors["gaussian"])
     return {**card, "held_out_rms_x0_error": _rounded(errors), "beats_gaussian_at_every_level": better}

@@ -24,7 +24,7 @@ Item = TypeVar("Item", int, Path)
 
 @dataclasses.dataclass(frozen=True)
 class LatentSet(TensorRecord):
-    """Latents of N samples of G geometries."""
+    """Latents of N samples of G geometries, the detailed ones first."""
 
     latents: Float[Tensor, "n c 32 32"]
     """float16."""
@@ -33,9 +33,21 @@ class LatentSet(TensorRecord):
     betas: Float[Tensor, "g 10"]
     condition: Float[Tensor, "n a"]
     """All attributes of each person, as `AttributeVocabulary.encode`."""
+    detailed: Int[Tensor, ""]
+    """Number of samples to learn detail from; the others are blurred."""
 
     def __len__(self) -> int:
         return len(self.latents)
+
+    def and_blurred(self, more: LatentSet) -> LatentSet:
+        """Append another set, whose samples are blurred."""
+        return LatentSet(
+            torch.cat([self.latents, more.latents]),
+            torch.cat([self.geometry, more.geometry + len(self.betas)]),
+            torch.cat([self.betas, more.betas]),
+            torch.cat([self.condition, more.condition]),
+            self.detailed,
+        )
 
 
 def split_people(people: Sequence[Item], holdout: float, seed: int) -> tuple[list[Item], list[Item]]:
@@ -71,7 +83,8 @@ def encode_people(
         geometry.append(torch.full((len(person.voxels),), place))
         betas.append(person.betas)
         conditions += [vocabulary.encode(_known(each, vocabulary)) for each in person.attributes]
-    return LatentSet(torch.cat(latents), torch.cat(geometry), torch.stack(betas), torch.stack(conditions))
+    count = torch.tensor(len(conditions))
+    return LatentSet(torch.cat(latents), torch.cat(geometry), torch.stack(betas), torch.stack(conditions), count)
 
 
 def _known(attributes: Attributes, vocabulary: AttributeVocabulary) -> Attributes:

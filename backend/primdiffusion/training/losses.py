@@ -27,6 +27,8 @@ LOG_NORMAL_CENTRE, LOG_NORMAL_WIDTH = 2.0, 1.4
 """Median of noise over signal, in units of the samples' standard deviation, and standard deviation of its logarithm."""
 LOG_UNIFORM_SHARE = 0.2
 """Share of log-uniform levels among log-normal ones: no level stays untrained."""
+BLURRED_FROM = 300
+"""Step above which noise (1.2 of the signal and more) hides that people are blurred (by .03 in latents)."""
 
 
 def weighted_error(error: Float[Tensor, "b n"], std: Float[Tensor, "b n"], power: float) -> Tensor:
@@ -75,13 +77,13 @@ class PersonObjective:
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
-        weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
+        spread = float(self.denoiser.component_std.square().mean().sqrt())
+        t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config.levels, spread)
+        weights, indices = blends(self.people, t, self.config.blend, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
         flip = torch.rand(len(c), 1, generator=generator, device=generator.device) < 0.5
         c = torch.where(flip, c * self.denoiser.prior_parity, c)
-        spread = float(self.denoiser.component_std.square().mean().sqrt())
-        t = random_steps(self.denoiser.schedule, len(c), generator, self.config.levels, spread)
         y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
         signal, noise = self.denoiser.schedule.levels(t, c)
         std = self.denoiser.component_std
@@ -106,13 +108,13 @@ class RestObjective:
 
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
-        weights, indices = blends(self.people.geometry, self.config.batch, self.config.blend, generator)
+        spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
+        t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config.levels, spread)
+        weights, indices = blends(self.people, t, self.config.blend, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         z = mixed(self.people.latents, weights, indices)
         flip = torch.rand(len(z), 1, 1, 1, generator=generator, device=generator.device)[:, 0, 0, 0] < 0.5
         z[flip] = self.codec.mirror(z[flip])
-        spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
-        t = random_steps(self.denoiser.schedule, len(z), generator, self.config.levels, spread)
         x = self.denoiser.schedule.q_sample(z, t, gaussian_noise(z, generator))
         signal, noise = self.denoiser.schedule.levels(t, z)
         with torch.no_grad():
@@ -155,15 +157,18 @@ def _present(network: nn.Module | None) -> nn.Module:
 
 
 def blends(
-    geometry: Int[Tensor, "n"], batch: int, share: float, generator: torch.Generator
-) -> tuple[Float[Tensor, "batch 2"], Int[Tensor, "batch 2"]]:
+    people: LatentSet, t: Int[Tensor, "b"], share: float, generator: torch.Generator
+) -> tuple[Float[Tensor, "b 2"], Int[Tensor, "b 2"]]:
     """Weights and indices of pairs of samples of one geometry; a `share` of pairs is mixed, the others are not.
 
-    Colourings of one geometry have the same density, so their mixture is a valid sample of mixed colours. Weights
-    exceed 0 ... 1 by so much that mixing preserves the variance of colours: E[p^2 + (1-p)^2] = 1.
+    Pairs for steps t up to BLURRED_FROM are detailed. Colourings of one geometry have the same density, so their
+    mixture is a valid sample of mixed colours. Weights exceed 0 ... 1 by so much that mixing preserves the variance of
+    colours: E[p^2 + (1-p)^2] = 1.
     """
-    first = torch.randint(len(geometry), (batch,), generator=generator, device=generator.device)
-    which, mixed, chosen = torch.rand(3, batch, generator=generator, device=generator.device)
+    geometry = people.geometry
+    among = torch.where(t > BLURRED_FROM, len(people), people.detailed)
+    place, which, mixed, chosen = torch.rand(4, len(t), generator=generator, device=generator.device)
+    first = (place * among).long().clamp_max(among - 1)
     counts = torch.bincount(geometry)
     starts = counts.cumsum(0) - counts
     own = geometry[first]

@@ -14,6 +14,9 @@ from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.mixture import fit_mixture
 
+CHUNK = 256
+"""Samples whose latents are in float32 at once."""
+
 
 def fit_prior(
     people: LatentSet, codec: LinearCodec, vocabulary: AttributeVocabulary, config: PriorConfig
@@ -22,7 +25,8 @@ def fit_prior(
 
     Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under
     the mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest
-    too small: both are corrected by leaving `config.folds` parts of the geometries out in turn.
+    too small: both are corrected by leaving `config.folds` parts of the geometries out in turn. Mean and rest are those
+    of detailed people.
     """
     parts = _mirror_parts(people, codec, config.channels)
     grams = [part @ part.T for _, part in parts]
@@ -33,18 +37,20 @@ def fit_prior(
         for (_, part), (variance, vector) in zip(parts, vectors, strict=True)
     ]
     del parts
-    mean = people.latents.float().mean(0)
+    detailed = int(people.detailed)
+    mean = people.latents[:detailed].float().mean(0)
     mean = (mean + codec.mirror(mean)) / 2
     basis = torch.linalg.qr(torch.cat(rows)[order].T)[0].T.contiguous()
     kept, rest_ratio = _held_out_ratios(grams, people.geometry, config)
     coefficients, rest_energy = [], torch.zeros(mean.numel())
-    for chunk in people.latents.split(256):
-        centred = (chunk.float() - mean).flatten(1)
+    for first in range(0, len(people), CHUNK):
+        centred = (people.latents[first : first + CHUNK].float() - mean).flatten(1)
         c = centred[:, : basis.shape[1]] @ basis.T
         coefficients.append(c)
-        centred[:, : basis.shape[1]] -= c @ basis
+        centred = centred[: max(0, detailed - first)]
+        centred[:, : basis.shape[1]] -= c[: len(centred)] @ basis
         rest_energy += centred.square().sum(0)
-    rest = (rest_energy / len(people)).unflatten(0, mean.shape)
+    rest = (rest_energy / detailed).unflatten(0, mean.shape)
     rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
     c = torch.cat(coefficients) * kept.sqrt()
     mixture = fit_mixture(torch.cat([c, c * signs]), people.condition.repeat(2, 1), vocabulary, config)

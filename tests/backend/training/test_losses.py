@@ -14,6 +14,7 @@ from primdiffusion.training.cells import CellTrainee
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import (
+    BLURRED_FROM,
     blend_conditions,
     blends,
     closed_form,
@@ -24,6 +25,13 @@ from primdiffusion.training.losses import (
     weighted_error,
     x0_errors,
 )
+
+
+def latent_set(geometry, detailed):
+    """Empty latents of these samples."""
+    count, geometries = len(geometry), int(geometry.max()) + 1
+    latents, betas, condition = torch.zeros(count, 1, 32, 32), torch.zeros(geometries, 10), torch.zeros(count, 0)
+    return LatentSet(latents, geometry, betas, condition, torch.tensor(detailed))
 
 
 def test_a_network_that_knows_more_has_less_error(prepared_once):
@@ -65,12 +73,23 @@ def test_log_normal_levels_surround_the_spread_and_leave_no_level_untrained():
 
 def test_blends_stay_within_a_geometry_and_keep_the_variance():
     geometry = torch.tensor([0, 0, 0, 1, 1, 2])
-    weight, place = blends(geometry, 40_000, 1.0, torch.Generator().manual_seed(0))
+    people, t = latent_set(geometry, detailed=6), torch.zeros(40_000, dtype=torch.long)
+    weight, place = blends(people, t, 1.0, torch.Generator().manual_seed(0))
     assert torch.equal(geometry[place[:, 0]], geometry[place[:, 1]])
     assert torch.allclose(weight.sum(1), torch.ones(40_000), atol=1e-6)
     assert weight.square().sum(1).mean().item() == pytest.approx(1.0, abs=0.02)
-    alone, _ = blends(geometry, 100, 0.0, torch.Generator().manual_seed(0))
+    assert torch.allclose(torch.bincount(place[:, 0]) / 40_000, torch.full((6,), 1 / 6), atol=0.01)
+    alone, _ = blends(people, t[:100], 0.0, torch.Generator().manual_seed(0))
     assert torch.equal(alone[:, 1], torch.zeros(100))
+
+
+def test_blurred_people_are_learned_from_where_noise_hides_it():
+    people = latent_set(torch.tensor([0, 0, 1, 2, 2, 3]), detailed=3)
+    t = torch.tensor([BLURRED_FROM, BLURRED_FROM + 1]).repeat_interleave(5_000)
+    _, places = blends(people, t, 0.5, torch.Generator().manual_seed(0))
+    low, high = places.split(5_000)
+    assert set(low.flatten().tolist()) == {0, 1, 2}
+    assert set(high.flatten().tolist()) == {0, 1, 2, 3, 4, 5}
 
 
 def test_mixtures_are_weighted_sums_of_two():
@@ -135,7 +154,7 @@ def test_every_weighting_trains_both_networks(prepared_once, name):
 def test_blends_are_asked_for_by_what_both_people_have():
     condition = torch.tensor([[1.0, 0, 1, 0], [1.0, 0, 0, 1]])
     words = AttributeVocabulary({"sex": ("female", "male"), "pattern": ("patterned", "plain")}, {})
-    people = LatentSet(torch.zeros(2, 1, 32, 32), torch.zeros(2, dtype=torch.int64), torch.zeros(1, 10), condition)
+    people = dataclasses.replace(latent_set(torch.zeros(2, dtype=torch.int64), detailed=2), condition=condition)
     indices, weights = torch.tensor([[0, 1], [0, 1]]), torch.tensor([[0.6, 0.4], [1.0, 0.0]])
     asked = [
         blend_conditions(people, indices, weights, words, 0.0, torch.Generator().manual_seed(s)) for s in range(200)

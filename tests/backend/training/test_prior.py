@@ -52,3 +52,20 @@ def test_person_components_live_in_the_leading_channels_alone(prepared_once):
     assert torch.equal(rest[:, 2:], z[:, 2:] - prior.mean[2:])
     assert torch.allclose(prior.join(coefficients, rest), z, atol=1e-4)
     assert (prior.split(prior.join(coefficients, torch.zeros_like(rest)))[0] - coefficients).abs().max() < 1e-3
+
+
+def test_blurred_people_widen_the_components_but_not_the_rest(prepared_once):
+    config, prepared = prepared_once
+    people = prepared.train
+    blurred = dataclasses.replace(people, latents=people.latents.roll(1, 0) * 0.5)
+    both = people.and_blurred(blurred)
+    assert len(both) == 2 * len(people)
+    assert int(both.detailed) == len(people)
+    assert torch.equal(both.geometry[len(people) :], people.geometry + len(people.betas))
+    alone = fit_prior(people, prepared.codec, prepared.vocabulary, config.prior)
+    prior = fit_prior(both, prepared.codec, prepared.vocabulary, config.prior)
+    assert torch.allclose(prior.mean, alone.mean)
+    z = people.latents.float()
+    left = z - prior.mean - prior.picture(prior.split(z)[0])
+    assert prior.rest_variance.sum() >= left.square().sum((1, 2, 3)).mean() * 0.99
+    assert prior.marginal_variance().sum() < 0.9 * alone.marginal_variance().sum()
