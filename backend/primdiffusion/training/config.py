@@ -70,8 +70,12 @@ class PhaseConfig:
     error_power: float = 1.0
     """Whitened errors, in units of posterior std s, are weighted by s^power: 2 is the paper's error on one level."""
     levels: Levels = "uniform"
-    """Distribution of noise levels: uniform in t, as in the paper; log_uniform in noise over signal; log_normal around
-    the spread of the data (Karras et al. 2022), with a fifth log_uniform."""
+    """Distribution of noise levels: uniform in t, as in the paper; log_uniform in noise over signal; log_normal in the
+    same (Karras et al. 2022), with a fifth log_uniform."""
+    level_median: float = 2.0
+    """Median of log_normal levels: noise over signal, in units of the samples' standard deviation."""
+    level_width: float = 1.4
+    """Standard deviation of the logarithm of log_normal levels."""
     min_snr_gamma: float = 5.0
     """Largest weight of a level with min_snr."""
     blend: float = 0.3
@@ -87,7 +91,7 @@ class PhaseConfig:
         """Raise ValueError for values out of range."""
         for name in ("steps", "batch", "evaluate_every"):
             _check(name, getattr(self, name), getattr(self, name) >= 1, "1 or more")
-        for name in ("learning_rate", "gradient_clip", "min_snr_gamma"):
+        for name in ("learning_rate", "gradient_clip", "min_snr_gamma", "level_median", "level_width"):
             _check(name, getattr(self, name), 0 < getattr(self, name) < math.inf, "above 0")
         for name in ("weight_decay", "error_power"):
             _check(name, getattr(self, name), 0 <= getattr(self, name) < math.inf, "0 or more")

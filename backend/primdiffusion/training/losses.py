@@ -18,13 +18,11 @@ from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import Schedule
-from primdiffusion.training.config import Levels, PhaseConfig
+from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.latents import LatentSet
 
 LEVELS = (50, 100, 300, 500, 700, 900)
 """Steps at which held-out error is reported."""
-LOG_NORMAL_CENTRE, LOG_NORMAL_WIDTH = 2.0, 1.4
-"""Median of noise over signal, in units of the samples' standard deviation, and standard deviation of its logarithm."""
 LOG_UNIFORM_SHARE = 0.2
 """Share of log-uniform levels among log-normal ones: no level stays untrained."""
 BLURRED_FROM = 300
@@ -78,7 +76,7 @@ class PersonObjective:
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
         spread = float(self.denoiser.component_std.square().mean().sqrt())
-        t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config.levels, spread)
+        t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
         weights, indices = blends(self.people, t, self.config.blend, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
@@ -109,7 +107,7 @@ class RestObjective:
     def loss(self, generator: torch.Generator) -> Tensor:
         """Weighted x0 error of a random batch at random levels."""
         spread = float(self.denoiser.prior.rest_variance.mean().sqrt())
-        t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config.levels, spread)
+        t = random_steps(self.denoiser.schedule, self.config.batch, generator, self.config, spread)
         weights, indices = blends(self.people, t, self.config.blend, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         z = mixed(self.people.latents, weights, indices)
@@ -129,23 +127,23 @@ class RestObjective:
 
 
 def random_steps(
-    schedule: Schedule, count: int, generator: torch.Generator, levels: Levels = "uniform", spread: float = 1.0
+    schedule: Schedule, count: int, generator: torch.Generator, config: PhaseConfig, spread: float = 1.0
 ) -> Int[Tensor, "b"]:
-    """Random steps: "uniform" in t (paper eq. 9), or as `Levels` says in noise over signal.
+    """Random steps, distributed as `config.levels` says: uniform in t is the paper's (eq. 9).
 
-    `spread` is the standard deviation of the samples, which "log_normal" levels surround. Uniform steps are nearly all
-    so noisy that they drown what person components leave out.
+    `spread` is the standard deviation of the samples. Uniform steps are nearly all so noisy that they drown what person
+    components leave out.
     """
-    if levels == "uniform":
+    if config.levels == "uniform":
         return torch.randint(schedule.length, (count,), generator=generator, device=generator.device)
     alpha_bar = schedule.alpha_bar.to(generator.device)
     noise_over_signal = 0.5 * ((1 - alpha_bar).log() - alpha_bar.log())
     low, high = noise_over_signal[0], noise_over_signal[-1]
     uniform, which = torch.rand(2, count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
     drawn = low + (high - low) * uniform
-    if levels == "log_normal":
+    if config.levels == "log_normal":
         normal = torch.randn(count, generator=generator, device=generator.device, dtype=alpha_bar.dtype)
-        about = math.log(LOG_NORMAL_CENTRE * spread) + LOG_NORMAL_WIDTH * normal
+        about = math.log(config.level_median * spread) + config.level_width * normal
         drawn = torch.where(which < LOG_UNIFORM_SHARE, drawn, about.clamp(low, high))
     return torch.searchsorted(noise_over_signal, drawn).clamp_max(schedule.length - 1)
 

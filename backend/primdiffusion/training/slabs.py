@@ -69,7 +69,7 @@ class SlabTrainee:
             len(self.places), (self.config.batch,), generator=generator, device=generator.device
         ).tolist()
         slab = self.slabs([self.places[index] for index in chosen])
-        t = random_steps(self.schedule, len(slab), generator, self.config.levels)
+        t = random_steps(self.schedule, len(slab), generator, self.config)
         x = self.schedule.q_sample(slab, t, gaussian_noise(slab, generator))
         error = self._guess(x, t) - slab
         signal, noise = self.schedule.levels(t, slab)

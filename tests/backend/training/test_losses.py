@@ -27,6 +27,10 @@ from primdiffusion.training.losses import (
 )
 
 
+def leveled(levels, **kwargs):
+    return PhaseConfig(steps=1, batch=1, levels=levels, **kwargs)
+
+
 def latent_set(geometry, detailed):
     """Empty latents of these samples."""
     count, geometries = len(geometry), int(geometry.max()) + 1
@@ -52,23 +56,29 @@ def test_a_network_that_knows_more_has_less_error(prepared_once):
 
 def test_log_uniform_levels_are_even_in_the_logarithm_of_noise_over_signal():
     schedule = fine_linear()
-    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), "log_uniform")
+    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), leveled("log_uniform"))
     ratio = (schedule.half_log_snr(0) - torch.tensor([schedule.half_log_snr(int(one)) for one in t])) / (
         schedule.half_log_snr(0) - schedule.half_log_snr(999)
     )
     assert torch.histc(ratio.float(), 8, 0, 1).min() > 0.1 * len(t)
-    even = random_steps(schedule, 20_000, torch.Generator().manual_seed(0))
+    even = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), leveled("uniform"))
     assert (t < 50).float().mean() > 6 * (even < 50).float().mean()
 
 
 def test_log_normal_levels_surround_the_spread_and_leave_no_level_untrained():
     schedule = fine_linear()
-    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), "log_normal", spread=0.05)
+    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), leveled("log_normal"), spread=0.05)
     clean, noise = schedule.levels(t, torch.empty(0, 1))
     ratio = (noise / clean).flatten().log()
     assert abs(float(ratio.median()) - math.log(2 * 0.05)) < 0.3
     assert ((ratio > math.log(0.01)) & (ratio < math.log(1.0))).float().mean() > 0.75
     assert (ratio > math.log(10.0)).float().mean() > 0.02
+    noisier = leveled("log_normal", level_median=10.0, level_width=0.5)
+    t = random_steps(schedule, 20_000, torch.Generator().manual_seed(0), noisier, spread=0.05)
+    clean, noise = schedule.levels(t, torch.empty(0, 1))
+    ratio = (noise / clean).flatten().log()
+    assert abs(float(ratio.median()) - math.log(10 * 0.05)) < 0.1
+    assert ((ratio - math.log(10 * 0.05)).abs() < 1.0).float().mean() > 0.75
 
 
 def test_blends_stay_within_a_geometry_and_keep_the_variance():
