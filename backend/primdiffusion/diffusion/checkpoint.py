@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion import tensor_file
@@ -33,7 +34,7 @@ from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
-from primdiffusion.primitives.primitives import K
+from primdiffusion.primitives.primitives import GRID, K
 
 FORMAT = "primdiffusion-checkpoint"
 RELEASED = "released"
@@ -44,6 +45,8 @@ FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
 _HALVED = ("codec.mean", "codec.basis", "denoiser.", "fine.mean", "fine.basis", "detail.")
 _WHOLE = ("prior_variance", "prior_log_weight")
+SYMMETRIC = 1e-4
+"""Largest difference between an entry of a person component and its mirror image; entries are up to 1."""
 _SECTIONS = ("held_out_rms_x0_error", "held_out_rms_detail_error", "limits")
 
 
@@ -65,6 +68,7 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     if isinstance(model.codec, CellCodec):
         codec = model.codec.codec
         tensors |= _fields("codec", codec)
+        _store_half(tensors, codec)
         if isinstance(model.codec, DetailCodec):
             fine, decoder = model.codec.fine, model.codec.decoder
             tensors |= _fields("fine", fine.codec) | {"back": fine.back}
@@ -170,8 +174,9 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
         denoiser: torch.nn.Module = tensor_file.load_network(lambda: SlabUNet(_unet_config(config)), weights)
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
-        prior = PersonPrior(**under(weights, "prior_"))
         codec = _cell_codec(tensors, architecture.get("detail"))
+        _restore_half(weights, codec.codec)
+        prior = PersonPrior(**under(weights, "prior_"))
         shapes = ShapePrior(**under(tensors, "shapes."))
         check_parts(codec.codec, prior, shapes, vocabulary)
         denoiser = tensor_file.load_network(lambda: PersonDenoiser(denoiser_config(config), prior, schedule), weights)
@@ -179,6 +184,29 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
     chain = CHAINS[architecture.get("chain", "trailing")]
     density = float(architecture["full_density"])
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
+
+
+def _store_half(tensors: dict[str, Tensor], codec: LinearCodec) -> None:
+    """Keep the left half of each person component where the right one is its mirror image times its parity."""
+    basis, parity = tensors["denoiser.prior_basis"], tensors["denoiser.prior_parity"]
+    half = basis.unflatten(1, (-1, GRID, GRID))[..., : GRID // 2]
+    if torch.allclose(_whole_components(half, parity, codec), basis, atol=SYMMETRIC):
+        del tensors["denoiser.prior_basis"]
+        tensors["denoiser.prior_basis_half"] = half
+
+
+def _restore_half(weights: dict[str, Tensor], codec: LinearCodec) -> None:
+    """Undo `_store_half`, in what `_model` reads; older files hold whole components."""
+    half = weights.pop("prior_basis_half", None)
+    if half is not None:
+        weights["prior_basis"] = _whole_components(half, weights["prior_parity"], codec)
+
+
+def _whole_components(
+    half: Float[Tensor, "r c 32 16"], parity: Float[Tensor, "r"], codec: LinearCodec
+) -> Float[Tensor, "r d"]:
+    left = torch.nn.functional.pad(half, (0, GRID // 2))
+    return (left + parity[:, None, None, None] * codec.mirror(left)).flatten(1)
 
 
 def _cell_codec(tensors: Mapping[str, Tensor], detail: Mapping[str, Any] | None) -> CellCodec:

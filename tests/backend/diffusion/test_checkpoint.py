@@ -57,6 +57,23 @@ def test_the_steps_that_a_model_is_sampled_in_are_part_of_it(path):
     assert load_checkpoint(path).chain is trailing_steps
 
 
+def test_symmetric_person_components_are_stored_by_half(path):
+    model = small_model()
+    denoiser, codec = model.denoiser, model.codec.codec
+    pictures = torch.randn(len(denoiser.prior_parity), *model.codec.shape)
+    denoiser.prior_parity[::2] = -1.0
+    codec.parity[0, 1] = -1.0
+    signs = denoiser.prior_parity[:, None, None, None]
+    symmetric = torch.nn.functional.normalize((pictures + signs * codec.mirror(pictures)).flatten(1), dim=1)
+    sizes = []
+    for basis in (denoiser.prior_basis.clone(), symmetric):
+        denoiser.prior_basis.copy_(basis)
+        save_checkpoint(path, model, "linear")
+        sizes.append(path.stat().st_size)
+        assert torch.allclose(load_checkpoint(path).denoiser.prior_basis, basis, atol=1e-4)
+    assert sizes[0] - sizes[1] == pytest.approx(basis.numel(), abs=200)
+
+
 def test_a_codec_of_before_weights_is_read_as_it_was(path):
     rewrite(path, lambda t: {k: v for k, v in t.items() if k not in ("codec.weight", "codec.dead_zone")})
     codec = load_checkpoint(path).codec.codec

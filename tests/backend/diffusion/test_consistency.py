@@ -52,7 +52,7 @@ def test_what_loads_generates_and_what_does_not_fit_does_not_load(content, tmp_p
     ("name", "value", "reason"),
     [
         ("denoiser.prior_variance", torch.full((1, 3), -1.0), "negative"),
-        ("denoiser.prior_basis", torch.full((3, 4096), 6.0), "rows longer than 1"),
+        ("denoiser.prior_basis_half", torch.full((3, 4, 32, 16), 6.0), "rows longer than 1"),
         ("codec.weight", torch.zeros(2051), "not positive"),
         ("shapes.limit", torch.full((10,), 1e6), "betas over 5"),
     ],
