@@ -19,7 +19,7 @@ from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.consistency import check_fine, check_parts
+from primdiffusion.diffusion.consistency import check_codec, check_fine, check_parts
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.detail import DetailCodec, DetailConfig, DetailDecoder, FineCodec
 from primdiffusion.diffusion.gaussian import PersonPrior
@@ -199,6 +199,8 @@ def _restore_half(weights: dict[str, Tensor], codec: LinearCodec) -> None:
     """Undo `_store_half`, in what `_model` reads; older files hold whole components."""
     half = weights.pop("prior_basis_half", None)
     if half is not None:
+        if half.ndim != 4 or half.shape[2:] != (GRID, GRID // 2) or half.shape[1] > codec.channels:
+            raise ValueError(f"halves of person components have shape {tuple(half.shape)}")
         weights["prior_basis"] = _whole_components(half, weights["prior_parity"], codec)
 
 
@@ -212,6 +214,7 @@ def _whole_components(
 def _cell_codec(tensors: Mapping[str, Tensor], detail: Mapping[str, Any] | None) -> CellCodec:
     """The codec of latents, with its detail decoder if the checkpoint has one."""
     codec = _linear_codec(under(tensors, "codec."))
+    check_codec(codec)
     if detail is None:
         return CellCodec(codec)
     fine = FineCodec(_linear_codec(under(tensors, "fine.")), tensors["back"])

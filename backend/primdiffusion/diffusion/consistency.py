@@ -15,16 +15,26 @@ LARGEST_ENTRY = 1.01
 """Of a row of length 1, rounded to half precision."""
 
 
-def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, vocabulary: AttributeVocabulary) -> None:
-    """Raise ValueError unless codec, prior, body shapes and vocabulary have the sizes and values of one model."""
+def check_codec(codec: LinearCodec) -> None:
+    """Raise ValueError unless the tensors of a codec fit each other and the primitives."""
     check_shapes(codec)
+    if not bool((codec.weight > 0).all()) or bool((codec.basis.abs() > LARGEST_ENTRY).any()):
+        raise ValueError("a weight of the codec is not positive, or its basis has rows longer than 1")
+    if codec.region.shape != (K,) or not bool(((codec.region >= 0) & (codec.region < len(codec.basis))).all()):
+        raise ValueError(f"regions of the codec are not {K} numbers below {len(codec.basis)}")
+    if tuple(codec.mean.shape) != (K, VALUES):
+        raise ValueError(f"mean has shape {tuple(codec.mean.shape)}, not {K} x {VALUES}")
+
+
+def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, vocabulary: AttributeVocabulary) -> None:
+    """Raise ValueError unless prior, body shapes and vocabulary have the sizes and values of one model, with a codec
+    that passes `check_codec`."""
     latents = (codec.channels, GRID, GRID)
     if latents != tuple(prior.mean.shape):
         raise ValueError(f"codec latents are {latents}, the network expects {tuple(prior.mean.shape)}")
     check_shapes(codec, prior)
     check_shapes(shapes)
     _check_values(prior, shapes)
-    _check_cells(codec)
     components, drawn = prior.basis.shape
     if drawn % GRID**2 or not 0 < drawn <= prior.mean.numel():
         raise ValueError(f"basis has rows of {drawn}, which are no whole channels of {tuple(prior.mean.shape)}")
@@ -36,8 +46,7 @@ def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, voca
 
 def check_fine(fine: FineCodec, codec: LinearCodec) -> None:
     """Raise ValueError unless the codec of a detail decoder leads back to the latents of `codec`."""
-    check_shapes(fine.codec)
-    _check_cells(fine.codec)
+    check_codec(fine.codec)
     channels = codec.channels
     if tuple(fine.back.shape) != (channels, channels):
         raise ValueError(f"back has shape {tuple(fine.back.shape)}, not {channels} x {channels}")
@@ -52,12 +61,3 @@ def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:
     for name, rows in (("basis", prior.basis), ("axes", prior.axes)):
         if bool((rows.abs() > LARGEST_ENTRY).any()):
             raise ValueError(f"{name} has rows longer than 1")
-
-
-def _check_cells(codec: LinearCodec) -> None:
-    if not bool((codec.weight > 0).all()) or bool((codec.basis.abs() > LARGEST_ENTRY).any()):
-        raise ValueError("a weight of the codec is not positive, or its basis has rows longer than 1")
-    if codec.region.shape != (K,) or not bool(((codec.region >= 0) & (codec.region < len(codec.basis))).all()):
-        raise ValueError(f"regions of the codec are not {K} numbers below {len(codec.basis)}")
-    if tuple(codec.mean.shape) != (K, VALUES):
-        raise ValueError(f"mean has shape {tuple(codec.mean.shape)}, not {K} x {VALUES}")

@@ -39,7 +39,8 @@ def test_what_loads_generates_and_what_does_not_fit_does_not_load(content, tmp_p
     rejected = 0
     for name, value in content[0].items():
         for changed in other_shapes(value):
-            if changed.shape == value.shape:
+            fewer_channels = name == "denoiser.prior_basis_half" and changed.shape == (3, 3, 32, 16)  # is possible
+            if changed.shape == value.shape or fewer_channels:
                 continue
             with pytest.raises(CheckpointError, match="does not match its own description"):
                 load_with(content, tmp_path / "a.safetensors", **{name: changed})
