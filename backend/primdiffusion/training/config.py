@@ -55,7 +55,7 @@ class PhaseConfig:
     """Samples per step, each at a random noise level."""
     optimiser: Literal["adamw", "muon"] = "adamw"
     """adamw; or muon, Muon for hidden layers at three times the learning rate, AdamW for the rest. Muon is for the
-    default preset."""
+    default preset, and computes in bfloat16: devices that are slow in it take AdamW."""
     learning_rate: float = 1e-3
     """Learning rate of AdamW after a warm-up of 100 steps."""
     weight_decay: float = 0.01

@@ -24,6 +24,7 @@ from primdiffusion.formats import requests
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, generate_batch, place
+from primdiffusion.machine import has_fast_bfloat16
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.muon import MuonAdamW
@@ -133,9 +134,26 @@ class PhaseState(AcceleratedState):
     config: PhaseConfig
 
     def _optimiser(self) -> torch.optim.Optimizer:
-        if self.config.optimiser == "muon":
+        fast = has_fast_bfloat16(next(self.network.parameters()).device)
+        self._kind = "muon" if fast and self.config.optimiser == "muon" else "adamw"
+        if self._kind == "muon":
             return MuonAdamW(self.network, self.config.learning_rate, self.config.weight_decay)
         return super()._optimiser()
+
+    def save(self, path: Path) -> None:
+        """Save as `TrainingState.save`, with the kind of optimiser."""
+        self.place["optimiser"] = self._kind
+        super().save(path)
+
+    def load(self, path: Path) -> None:
+        """Restore as `TrainingState.load`; ValueError also for the state of another optimiser."""
+        super().load(path)
+        before = self.place.get("optimiser", self._kind)
+        if before != self._kind:
+            raise ValueError(
+                f"{path} was trained with {before}, but this device trains with {self._kind} (Muon needs "
+                "bfloat16): resume on a device like the first, or begin a new run with --start-from"
+            )
 
 
 def step(config: PhaseRun, trainee: Trainee, name: str, state: AcceleratedState) -> StepMetrics:

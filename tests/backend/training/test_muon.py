@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
+from primdiffusion.training import phase
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.phase import PhaseState
 from primdiffusion.training.state import accelerator_of
@@ -21,10 +22,16 @@ class Net(nn.Module):
         return self.outer(torch.tanh(self.hidden(self.inner(x))))
 
 
+@pytest.fixture(autouse=True)
+def fast(monkeypatch):
+    """A device that multiplies bfloat16 fast."""
+    monkeypatch.setattr(phase, "has_fast_bfloat16", lambda device: True)
+
+
 def started(memory_format=torch.channels_last, **settings):
     torch.manual_seed(3)
-    phase = PhaseConfig(steps=50, batch=4, weight_decay=0.0, optimiser="muon", **settings)
-    return PhaseState(Net().to(memory_format=memory_format), phase, 0, accelerator_of())
+    config = PhaseConfig(steps=50, batch=4, weight_decay=0.0, optimiser="muon", **settings)
+    return PhaseState(Net().to(memory_format=memory_format), config, 0, accelerator_of())
 
 
 def advance(state, steps):
@@ -75,3 +82,16 @@ def test_a_saved_state_goes_on_bit_for_bit(tmp_path):
     advance(resumed, 5)
     for a, b in zip(whole.network.parameters(), resumed.network.parameters(), strict=True):
         assert torch.equal(a, b)
+
+
+def test_a_device_that_is_slow_in_bfloat16_takes_adamw(monkeypatch, tmp_path):
+    state = started()
+    state.save(tmp_path / "muon.safetensors")
+    monkeypatch.setattr(phase, "has_fast_bfloat16", lambda device: False)
+    slow = started()
+    advance(slow, 1)
+    assert all("exp_avg" in slow.optimiser.state[parameter] for parameter in slow.network.parameters())
+    slow.save(tmp_path / "adamw.safetensors")
+    started().load(tmp_path / "adamw.safetensors")
+    with pytest.raises(ValueError, match="trained with muon"):
+        slow.load(tmp_path / "muon.safetensors")
