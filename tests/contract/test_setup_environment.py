@@ -136,7 +136,7 @@ def test_pip_gets_the_lock_as_it_was_checked(place):
     place.lock.write_text("--index-url http://localhost:9/\nevil==1\n")
     assert done(steps).startswith("The backend is ready")
     place.lock.write_text("--index-url http://localhost:9/\nevil==1\n")
-    with pytest.raises(ValueError, match="line 1 of .* is not"):
+    with pytest.raises(ValueError, match=r"line 1 of .* is not"):
         read_lock(place.lock)
 
 

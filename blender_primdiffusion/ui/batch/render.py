@@ -26,6 +26,7 @@ from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
 from ...jobs import cycles_check
 from ...jobs.open_human import opened
+from ...scene.collect import collect_unwritten
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
 from ...scene.human import NPZ_FILE, PERSON_FILE, humans, humans_folder, volume_path
 from ...scene.unwritten import write_all_unwritten
@@ -276,6 +277,7 @@ class _Drawing:
 
 
 def _check_volumes(scene: bpy.types.Scene) -> None:
+    collect_unwritten()
     write_all_unwritten()
     volumes = {obj.data for person in humans(scene) for obj in person.all_objects if obj.type == "VOLUME"}
     paths = [path for path in map(volume_path, volumes) if path is not None]
