@@ -21,7 +21,7 @@ from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
-from ...formats.regular_files import exists_in_its_folder, real_path
+from ...formats.regular_files import check_regular, exists_in_its_folder, real_path
 from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
 from ...jobs import cycles_check
@@ -184,6 +184,7 @@ class _Drawing:
 
     def draw(self, source: RenderSource) -> int:
         if source.is_blend:
+            check_regular(source.path)  # Blender would wait for a pipe
             bpy.ops.wm.open_mainfile(filepath=str(source.path), load_ui=False, use_scripts=False)
             self._prepare_blend()
         elif all(shot.path.is_file() for shot in self._shots(source.name, 1, self._last_frame())):
