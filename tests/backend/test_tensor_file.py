@@ -107,7 +107,7 @@ def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
 @pytest.mark.parametrize("how", ["overwritten", "cut short", "replaced"])
 def test_what_is_overwritten_later_is_not_read(tmp_path, how):
     path = tmp_path / "a.safetensors"
-    path.write_bytes(tensor_file.save({"a": torch.arange(100_000.0)}))
+    path.write_bytes(save({"a": torch.arange(100_000.0)}))
     size, file = path.stat().st_size, opened(path)
     if how == "cut short":
         os.truncate(path, 10)
@@ -123,7 +123,7 @@ def test_what_is_overwritten_later_is_not_read(tmp_path, how):
 def test_a_file_above_the_size_of_copies_is_mapped(tmp_path, monkeypatch):
     monkeypatch.setattr("primdiffusion.formats.regular_files.COPIED_BYTES", 100)
     path = tmp_path / "a.safetensors"
-    path.write_bytes(tensor_file.save({"a": torch.arange(1000.0)}))
+    path.write_bytes(save({"a": torch.arange(1000.0)}))
     file = opened(path)
     file.tensor("a")[:] = 0
     assert not file.tensor("a").any()

@@ -85,6 +85,7 @@ OPTIONAL = {
 AS_MISSING = {
     ("captures: settings", "circle"), ("batch settings", "circle"), ("run: settings", "circle"),
     ("run: starts", "circle"), ("run: metrics", "circle"), ("run: metrics", "endless"), ("Blender: scan", "endless"),
+    ("Blender: HDRI", "endless"),
 }  # fmt: skip
 """A link that leads nowhere is replaced where the program writes such a file; a file of /proc counts as empty."""
 LENIENT = {"dataset.json", "complete.json", "cameras.json"}
@@ -225,14 +226,24 @@ DOTTED = (
 )
 
 
+ENDS = {name.rpartition(".")[2] for name in DOTTED}
+
+
+def _is_reader(called: ast.expr) -> bool:
+    if isinstance(called, ast.Name):
+        return called.id in READERS
+    return isinstance(called, ast.Attribute) and (
+        called.attr in READERS or (called.attr in ENDS and ast.unparse(called).endswith(DOTTED))
+    )
+
+
 def reading_modules() -> set[str]:
     """Modules that call a reader, by their path in the repository."""
     found = set()
     for root in (ROOT / "backend" / "primdiffusion", ROOT / "blender_primdiffusion"):
         for path in root.rglob("*.py"):
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-                name = ast.unparse(node.func) if isinstance(node, ast.Call) else ""
-                if name.rpartition(".")[2] in READERS or any(name.endswith(dotted) for dotted in DOTTED):
+                if isinstance(node, ast.Call) and _is_reader(node.func):
                     found.add(path.relative_to(ROOT).as_posix())
     return found
 
