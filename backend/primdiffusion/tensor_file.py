@@ -17,7 +17,7 @@ from torch.overrides import TorchFunctionMode
 
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import map_privately, open_regular
+from primdiffusion.formats.regular_files import open_regular, private_content
 from primdiffusion.formats.tensor_layout import (
     LENGTH_BYTES,
     StoredTensor,
@@ -66,15 +66,16 @@ def opened(path: Path, limit: int = LARGEST_FILE) -> TensorFile:
 
 
 class TensorFile:
-    """A safetensors file that is mapped into memory; tensors are views of it, and writing to them leaves it as it is.
+    """A safetensors file in memory; tensors are views of it, and writing to them leaves the file as it is.
 
-    Everything is read from the file that was opened, also after another one has taken its name.
+    Everything is read from the file that was opened, also after another one has taken its name; up to COPIED_BYTES also
+    after it was overwritten (see `private_content`).
     """
 
     def __init__(self, file: io.BufferedReader | io.BytesIO) -> None:
-        """Check the header of an open file and map it; the file may be closed. Raises TensorFileError, OSError."""
+        """Check and keep the content of an open file, which may be closed. Raises TensorFileError, OSError."""
         self._layout = _layout(file)
-        self._bytes = map_privately(file)
+        self._bytes = private_content(file)
         if len(self._bytes) < self._layout.size:
             raise TensorFileError("it was cut short while it was read")
 

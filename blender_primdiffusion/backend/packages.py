@@ -55,6 +55,8 @@ class Lock:
     digest: str
     """SHA-256 of the file: says whether an environment was made of this very lock."""
     packages: tuple[Package, ...]
+    content: bytes
+    """The file as it was read and checked: pip gets a copy of it."""
 
     @property
     def download_bytes(self) -> int:
@@ -83,7 +85,7 @@ def read_lock(path: Path) -> Lock:
         packages.append(Package(found["name"], found["version"], size, installed))
     if not packages:
         raise ValueError(f"{path} names no packages")
-    return Lock(path, hashlib.sha256(data).hexdigest(), tuple(packages))
+    return Lock(path, hashlib.sha256(data).hexdigest(), tuple(packages), data)
 
 
 def locks_for(folder: Path, platform: str, python: tuple[int, int]) -> dict[str, Path]:

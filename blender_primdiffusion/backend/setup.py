@@ -97,7 +97,9 @@ def set_up(
     for _ in followed(making, folder.log, environment, _no_venv):
         yield Step("Making the environment", 0.0)
     source = [] if wheels is None else ["--no-index", "--find-links", str(wheels)]
-    command = [*_pip(python), *_INSTALL, *source, "-r", str(lock.path)]
+    requirements = folder.temporary / "requirements.txt"  # of what was checked
+    write_atomically(requirements, lock.content)
+    command = [*_pip(python), *_INSTALL, *source, "-r", str(requirements)]
     for said in followed(command, folder.log, environment, what_went_wrong):
         yield _installing(folder, lock, said)
     about = yield from _trial(python, module_path, cache, folder.temporary)

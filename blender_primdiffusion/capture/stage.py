@@ -10,6 +10,7 @@ from pathlib import Path
 import bpy
 
 from ..formats.camera_rig import View
+from ..formats.regular_files import check_regular
 from ..formats.removing import remove_file, remove_folder
 from .blender_camera import aim
 from .passes import Centres, Colours, read_centres, read_colours
@@ -174,8 +175,9 @@ def _light(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
     if settings.light == "hdri":
         picture = world.node_tree.nodes.new("ShaderNodeTexEnvironment")
         try:
+            check_regular(str(settings.hdri))  # Blender would wait for a pipe
             picture.image = bpy.data.images.load(str(settings.hdri))
-        except RuntimeError as error:
+        except (RuntimeError, OSError) as error:
             raise StageError(f"the HDRI {settings.hdri} cannot be read: choose an .hdr or .exr picture") from error
         world.node_tree.links.new(picture.outputs["Color"], background.inputs["Color"])
 

@@ -41,7 +41,7 @@ def pictures_beside(path: Path) -> Iterator[Path]:
     for folder in _FOLDERS:
         place = path.parent / folder
         if place.is_dir():
-            yield from sorted(file for file in place.iterdir() if file.suffix.lower() in _PICTURES)
+            yield from sorted(file for file in place.iterdir() if file.suffix.lower() in _PICTURES and file.is_file())
 
 
 def choose_picture(path: Path, pictures: Sequence[Path]) -> Path | None:

@@ -40,6 +40,7 @@ class LateVolumes:
         """Write for about `seconds`, one step at least; whether more is left."""
         from ..scene.unwritten import unwritten, write_unwritten  # needs numpy
 
+        self.bring_here()
         left = [source for source in unwritten() if source not in self._failed]
         if self._source not in left:  # written by a render, or the human is gone
             self.stop()
@@ -58,11 +59,25 @@ class LateVolumes:
             self._fail(self._source, error)
         return True
 
+    def bring_here(self) -> None:
+        """Have humans elsewhere, whose volumes are still to be written, in this .blend's own folders (see
+        `collect_unwritten`)."""
+        from ..scene.collect import collect_unwritten  # needs numpy
+
+        try:
+            collect_unwritten()
+        except OSError as error:
+            if self.error != str(error):
+                print(f"PrimDiffusion: {error}")
+            self.error = str(error)
+
     def finish(self) -> None:
         """Write all that is left, with steps of its own: renders call it from another thread."""
         from ..scene.unwritten import write_all_unwritten  # needs numpy
 
         self.forget_failures()
+        if bpy.app.background:  # in the main thread
+            self.bring_here()
         try:
             write_all_unwritten()
         except (OSError, ValueError) as error:
@@ -117,13 +132,19 @@ def keep_writing() -> None:
         bpy.app.timers.register(_tick, first_interval=FIRST_S, persistent=True)
 
 
+def _bring_here() -> None:
+    if any_humans():
+        late_volumes.bring_here()
+
+
 def _tick() -> float | None:
     return late_volumes.tick()
 
 
 @persistent
 def write_soon(*_: object) -> None:
-    """Handler of save_post, undo_post and redo_post, after which other files may be wanted."""
+    """Handler of save_post, undo_post, redo_post and blend_import_post, after which other files may be wanted."""
+    _bring_here()
     keep_writing()
 
 
@@ -131,6 +152,7 @@ def write_soon(*_: object) -> None:
 def write_after_loading(*_: object) -> None:
     """Handler of load_post."""
     late_volumes.forget_failures()
+    _bring_here()
     keep_writing()
 
 
@@ -154,6 +176,7 @@ HANDLERS = (
     ("undo_post", write_soon),
     ("redo_post", write_soon),
     ("render_init", write_before_rendering),
+    *([("blend_import_post", write_soon)] if hasattr(bpy.app.handlers, "blend_import_post") else ()),
 )
 
 

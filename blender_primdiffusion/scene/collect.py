@@ -33,6 +33,7 @@ from .human import (
     copy_file,
     folders_of,
     humans_folder,
+    is_own,
     person_file_name,
     sequence_files,
     stored_path,
@@ -58,11 +59,25 @@ class Collected:
 def collect_temporary_volumes(blend_path: str) -> Collected:
     """Copy files of humans from temporary folders to the folder of `blend_path`, and point to the copies.
 
-    Includes temporary folders of an earlier Blender that has crashed. Files that the .blend does not use stay, for
-    undo. In a .blend never saved, paths become absolute: Blender makes them relative when it first writes it. Raises
-    VolumeWriteError when the folder beside the .blend cannot be written.
+    Includes temporary folders of an earlier Blender that has crashed, and humans elsewhere whose volumes are still to
+    be written, which is done in that folder alone. Files that the .blend does not use stay, for undo. In a .blend never
+    saved, paths become absolute: Blender makes them relative when it first writes it. Raises VolumeWriteError when the
+    folder beside the .blend cannot be written.
     """
-    return _collect(blend_path, {volume: path for volume, path in _local().items() if _temporary(path)})
+    waiting = _waiting(blend_path)
+    return _collect(
+        blend_path, {volume: path for volume, path in _local().items() if volume in waiting or _temporary(path)}
+    )
+
+
+def collect_unwritten() -> Collected:
+    """Copy files of humans elsewhere whose volumes are still to be written to the temporary folder of this Blender, and
+    point to the copies: they are written there. Linked humans are among them, in this session.
+
+    Only paths of volumes change, and names of the backend's files. Raises VolumeWriteError.
+    """
+    waiting = _waiting(bpy.data.filepath)
+    return _collect("", waiting) if waiting else Collected(0, 0, 0)
 
 
 def collect_files() -> Collected:
@@ -173,6 +188,21 @@ def _local() -> dict[bpy.types.Volume, Path]:
     return {volume: path for volume, path in paths.items() if path is not None}
 
 
+def _waiting(blend_path: str) -> dict[bpy.types.Volume, Path]:
+    """Volumes of humans, linked ones included, that are to be written from a file in a folder that is not the own one
+    of `blend_path`; and their paths."""
+    found: dict[bpy.types.Volume, Path] = {}
+    for person in bpy.data.collections:
+        if MARK not in person or is_own(folder := folders_of(person)[0], blend_path) or not unwritten_in(folder):
+            continue
+        volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME"}
+        paths = {volume: path for volume in volumes if (path := volume_path(volume)) is not None}
+        beside = {volume: path for volume, path in paths.items() if path.parent == folder}
+        if not all(map(exists_in_its_folder, beside.values())):
+            found |= beside
+    return found
+
+
 def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path]) -> Collected:
     target = humans_folder(blend_path)
     sources = _present(away)
@@ -182,7 +212,7 @@ def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path]) -> Collecte
     copies = {path: homes[folder] / path.name for folder, paths in files.items() for path in paths}
     names = {}
     for person in bpy.data.collections:
-        if MARK in person and person.library is None:
+        if MARK in person:
             copies |= _of_person(person, moved, target, names)
     made: list[Path] = []
     try:
@@ -197,7 +227,7 @@ def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path]) -> Collecte
             "write permission and free space"
         ) from error
     for volume, path in moved.items():
-        volume.filepath = stored_path(path)
+        volume.filepath = stored_path(path) if blend_path else str(path)
     for person, name in names.items():
         person[PERSON] = name
     return Collected(len(moved), len(made), sum(path.stat().st_size for path in made))

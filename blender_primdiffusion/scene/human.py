@@ -129,6 +129,15 @@ def folders_of(collection: bpy.types.Collection) -> list[Path]:
     return [*merged[:1], folder_of(collection)]
 
 
+def is_own(folder: Path, blend_path: str | None = None) -> bool:
+    """Whether a folder is one of a .blend's own: inside its `humans_folder`, or that of the unsaved one.
+
+    Volumes are written in these alone, wherever a .blend says that they are.
+    """
+    inner = real_path(folder)
+    return any(inner.is_relative_to(real_path(own)) for own in (humans_folder(blend_path), humans_folder("")))
+
+
 def home_of(collection: bpy.types.Collection) -> Path:
     """The folder for new files of a human: the one of its files, if that belongs to this .blend.
 
@@ -138,10 +147,7 @@ def home_of(collection: bpy.types.Collection) -> Path:
     folders = folders_of(collection)
     name = person_file_name(collection)
     home = next((folder for folder in folders if exists_in_its_folder(folder / name)), folders[0])
-    for own in (humans_folder(), humans_folder("")):
-        if real_path(home).parent.is_relative_to(real_path(own)):  # bodies are in the parent
-            return home
-    return folder_of(collection)
+    return home if is_own(real_path(home).parent) else folder_of(collection)  # bodies are in the parent
 
 
 def person_file_name(collection: bpy.types.Collection) -> str:

@@ -15,7 +15,7 @@ import bpy
 
 from ..formats.removing import remove_file
 from ..formats.whole_files import temporary_folder
-from .human import MARK, folders_of, unwritten_in
+from .human import MARK, folders_of, is_own, unwritten_in
 from .human_npz import HumanNpzError, file_names, read_human, unwritten_name
 from .volumes import bake, write_error, write_file
 
@@ -24,9 +24,12 @@ _VERSIONS = ((5, 0, 0), (4, 5, 0))
 
 
 def unwritten() -> list[Path]:
-    """Files from which volumes of this .blend's humans are still to be written."""
+    """Files from which volumes of this .blend's humans are still to be written, in its own folders.
+
+    Those in other folders are for `collect.collect_unwritten`.
+    """
     folders = {folders_of(person)[0] for person in bpy.data.collections if MARK in person}
-    return [path for folder in sorted(folders) for path in unwritten_in(folder)]
+    return [path for folder in sorted(folders) if is_own(folder) for path in unwritten_in(folder)]
 
 
 def write_unwritten(source: Path) -> Generator[None, None, None]:

@@ -62,11 +62,13 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         # needs numpy
         from ..jobs.export import show, shown
+        from ..scene.collect import collect_unwritten
         from ..scene.proxy import proxy_of
         from ..scene.unwritten import write_all_unwritten
 
         visible = not in_viewport(person)
         if visible:
+            collect_unwritten()
             write_all_unwritten()
         for each in humans(context.scene) if self.everyone else [person]:
             what = shown(each)

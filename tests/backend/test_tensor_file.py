@@ -104,6 +104,32 @@ def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
             read(pathlib.Path("/proc/self/pagemap"))
 
 
+@pytest.mark.parametrize("how", ["overwritten", "cut short", "replaced"])
+def test_what_is_overwritten_later_is_not_read(tmp_path, how):
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(save({"a": torch.arange(100_000.0)}))
+    size, file = path.stat().st_size, opened(path)
+    if how == "cut short":
+        os.truncate(path, 10)
+    elif how == "overwritten":
+        with path.open("r+b") as again:
+            again.write(bytes([255]) * size)
+    else:
+        path.unlink()
+        path.write_bytes(bytes(size))
+    assert torch.equal(file.finite_tensors()["a"], torch.arange(100_000.0))
+
+
+def test_a_file_above_the_size_of_copies_is_mapped(tmp_path, monkeypatch):
+    monkeypatch.setattr("primdiffusion.formats.regular_files.COPIED_BYTES", 100)
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(save({"a": torch.arange(1000.0)}))
+    file = opened(path)
+    file.tensor("a")[:] = 0
+    assert not file.tensor("a").any()
+    assert torch.equal(read(path)[0]["a"], torch.arange(1000.0))
+
+
 def test_a_network_gets_the_weights_of_a_file():
     weights = {"weight": torch.ones(2, 3), "bias": torch.zeros(2)}
     network = load_network(lambda: nn.Linear(3, 2), weights)

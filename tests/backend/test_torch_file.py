@@ -1,9 +1,12 @@
 """Files of torch.save: tensors are read, constructors that take memory are not called."""
 
+import importlib.util
 import io
 import os
 import pickle
 import struct
+import sys
+import types
 import warnings
 import zipfile
 
@@ -11,6 +14,15 @@ import pytest
 import torch
 from primdiffusion import torch_file
 from primdiffusion.formats.arrays import ArrayFileError
+
+
+@pytest.fixture(params=["private", "public"], autouse=True)
+def unpickler(request, monkeypatch):
+    """Every test is run with torch's private unpickler, and as if this torch had none."""
+    if request.param == "public":
+        monkeypatch.setattr(torch_file, "_weights_only_unpickler", None)
+    return request.param
+
 
 HOSTILE = {
     "memory": b"\x80\x02cbuiltins\nbytearray\n\x8a\x08" + struct.pack("<q", 10**10) + b"\x85R.",
@@ -192,3 +204,97 @@ def test_what_torch_loads_is_what_is_loaded(tmp_path):
     found["content"]["base"][:, 2] = -1
     assert (found["content"]["column"] == -1).all()
     assert torch.equal(torch.load(tmp_path / "a.pt", weights_only=True)["content"]["base"], base)
+
+
+def test_the_public_loader_gets_the_checked_members_alone(tmp_path, monkeypatch, unpickler):
+    """Never anything weaker than weights_only, and no byte of the file that was not checked."""
+    torch.save(SAVED, tmp_path / "a.pt")
+    calls, load = [], torch.load
+
+    def noted(file, **options):
+        calls.append((file, options))
+        return load(file, **options)
+
+    monkeypatch.setattr(torch, "load", noted)
+    assert torch.equal(torch_file.load(tmp_path / "a.pt")["b"], SAVED["b"])
+    if unpickler == "private":
+        assert not calls
+        return
+    ((file, options),) = calls
+    assert isinstance(file, io.BytesIO)
+    assert options == {"map_location": "cpu", "weights_only": True}
+    with zipfile.ZipFile(file) as archive:
+        names = ("data.pkl", "byteorder", "version", "data/0", "data/1")
+        assert archive.namelist() == [f"archive/{name}" for name in names]
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        types.SimpleNamespace(),
+        types.SimpleNamespace(Unpickler=lambda *_, **__: types.SimpleNamespace()),
+        types.SimpleNamespace(Unpickler=lambda file: None),
+    ],
+    ids=["another name", "another method", "other parameters"],
+)
+def test_a_private_unpickler_of_another_form_is_not_used(tmp_path, monkeypatch, other):
+    monkeypatch.setattr(torch_file, "_weights_only_unpickler", other)
+    torch.save(SAVED, tmp_path / "a.pt")
+    assert torch.equal(torch_file.load(tmp_path / "a.pt")["b"], SAVED["b"])
+
+
+def test_without_the_private_module_the_reader_is_imported_and_reads(tmp_path, monkeypatch):
+    monkeypatch.delattr(torch, "_weights_only_unpickler")
+    monkeypatch.setitem(sys.modules, "torch._weights_only_unpickler", None)
+    spec = importlib.util.spec_from_file_location("torch_file_elsewhere", torch_file.__file__)
+    again = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(again)
+    assert again._weights_only_unpickler is None
+    archive_of(tmp_path / "a.pt", [("x/data.pkl", HOSTILE["memory"])])
+    with pytest.raises(again.PICKLE_ERRORS, match=r"GLOBAL builtins\.bytearray"):
+        again.load(tmp_path / "a.pt")
+
+
+PERSISTENT_HEAD = b"\x80\x02(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpu"
+PERSISTENT = PERSISTENT_HEAD[2:] + b"K\x02t"
+ELSEWHERE = {
+    "no tuple": b"\x80\x02X\x07\x00\x00\x00storageQ.",
+    "a tuple from the memo": b"\x80\x02" + PERSISTENT + b"q\x01Qh\x01Q.",
+    "a part that is made": PERSISTENT_HEAD + b"K\x01K\x01\x86tQ.",
+    "a part from an unknown place": PERSISTENT_HEAD + b"h\x07tQ.",
+    "another length": PERSISTENT_HEAD + b"tQ.",
+    "another type": b"\x80\x02(X\x07\x00\x00\x00storagectorch\nfloat32\nX\x01\x00\x00\x000X\x03\x00\x00\x00cpuK\x02tQ.",
+    "a text": b"\x80\x02Pstorage\n.",
+}
+
+
+@pytest.mark.parametrize("content", ELSEWHERE.values(), ids=ELSEWHERE)
+def test_a_storage_that_is_named_in_another_way_is_refused(content, unpickler):
+    with pytest.raises(pickle.UnpicklingError):
+        list(torch_file._storage_ids(content))
+
+
+def test_storages_are_named_as_torch_names_them():
+    (_, pickled), *_ = members_of({"a": SAVED["a"], "part": SAVED["a"][2:], "b": SAVED["b"].double()})
+    assert [(kind, key, count) for _, kind, key, _, count in torch_file._storage_ids(pickled)] == [
+        (torch.FloatStorage, "0", 1000),
+        (torch.FloatStorage, "0", 1000),
+        (torch.DoubleStorage, "1", 6),
+    ]
+
+
+@pytest.mark.parametrize("legacy", [False, True])
+def test_a_file_that_is_overwritten_after_the_check_is_not_loaded(tmp_path, monkeypatch, legacy):
+    path, other = tmp_path / "a.pt", tmp_path / "b.pt"
+    torch.save(SAVED, path, _use_new_zipfile_serialization=not legacy)
+    torch.save({"a": torch.zeros(1000), "b": SAVED["b"]}, other, _use_new_zipfile_serialization=not legacy)
+    check, size = torch_file._check, path.stat().st_size
+
+    def checked_then_overwritten(source):
+        check(source)
+        with path.open("r+b") as file:
+            file.write(other.read_bytes()[:size])
+
+    monkeypatch.setattr(torch_file, "_check", checked_then_overwritten)
+    found = torch_file.load(path)
+    assert found["a"].equal(SAVED["a"])

@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import bpy
 import pytest
-from blend_tampering import PROPERTIES, SECRET, Stage, build, in_preferences, panels_fault, person, tried
+from blend_tampering import COUNT, PROPERTIES, SECRET, Stage, build, in_preferences, panels_fault, person, tried
 
 from blender_primdiffusion.backend import environment
 from blender_primdiffusion.backend.environment import BackendNotFound, candidates
+from blender_primdiffusion.jobs.late_volumes import late_volumes, write_before_rendering
 from blender_primdiffusion.jobs.queue import chosen_checkpoint, queue
 from blender_primdiffusion.places import EXTENSION, preference
-from blender_primdiffusion.scene import merged
+from blender_primdiffusion.scene import collect, merged
 from blender_primdiffusion.scene.body_file import BODY_FILE
 from blender_primdiffusion.scene.edit import edit_destination, replace_person
-from blender_primdiffusion.scene.human import PERSON, VolumeWriteError, folder_of, person_file, volume_path
-from blender_primdiffusion.scene.human_npz import write_now
+from blender_primdiffusion.scene.human import (
+    PERSON,
+    VolumeWriteError,
+    armature_of,
+    folder_of,
+    humans_folder,
+    person_file,
+    unwritten_in,
+    volume_path,
+    volumes_of,
+)
+from blender_primdiffusion.scene.human_npz import unwritten_name, write_now
 from blender_primdiffusion.ui.setup import known
 
 
@@ -87,6 +99,107 @@ def test_an_edit_writes_nothing_through_a_link_in_place_of_the_humans_folder(pri
     with pytest.raises(VolumeWriteError, match="is a link to another folder"):
         merged.publish([pristine.source / "grid.vdb"], ["a"], merged.merged_folder(person()))
     assert not list((tmp_path / "outside").iterdir())
+
+
+def elsewhere(stage: Stage, place: str) -> Path:
+    """A .blend whose human is in a folder of the user's, where its volumes are still to be written."""
+    folder = {"temporary": stage.shipped, "named": stage.root / "home" / ".config" / "Anna"}[place]
+    bpy.ops.wm.open_mainfile(filepath=str(stage.blend))
+    if folder != stage.shipped:
+        folder.parent.mkdir()
+        shutil.move(stage.shipped, folder)
+        for body in stage.shipped.parent.glob("body_*.npz"):
+            shutil.move(body, folder.parent)
+        for volume in bpy.data.volumes:
+            volume.filepath = str(folder / Path(volume.filepath).name)
+    names = sorted(path.name for path in folder.glob("prim_*.vdb") if not path.is_symlink())
+    for name in names:
+        (folder / name).unlink()
+    shutil.copy(stage.source / "human.npz", folder / unwritten_name(names))
+    saving = bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]
+    bpy.app.handlers.save_pre.clear()  # the stranger has no extension
+    bpy.app.handlers.save_post.clear()
+    bpy.ops.wm.save_mainfile()
+    bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:] = saving
+    assert len(names) == COUNT
+    return folder
+
+
+def by_timer() -> None:
+    while late_volumes.work(0.0):
+        pass
+
+
+WRITERS = {
+    "timer": by_timer,
+    "render": lambda: write_before_rendering(bpy.context.scene),
+    "viewport": lambda: bpy.ops.primdiffusion.volumes_in_viewport(),
+    "save": lambda: (bpy.ops.wm.save_mainfile(), by_timer()),
+    "undo": lambda: (bpy.ops.ed.undo_push(), bpy.ops.ed.undo_push(), bpy.ops.ed.undo(), by_timer()),
+}
+
+
+@pytest.mark.parametrize("place", ["temporary", "named"])
+@pytest.mark.parametrize("writer", WRITERS)
+def test_no_volume_is_written_in_a_folder_that_a_blend_merely_names(pristine, writer, place):
+    folder = elsewhere(pristine, place)
+    before = pristine.before()
+    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
+    bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
+    bpy.context.view_layer.objects.active = armature_of(person())
+    WRITERS[writer]()
+    primitives = [volume_path(obj.data) for objects in volumes_of(person()).values() for obj in objects]
+    own = pristine.humans if writer == "save" else humans_folder("")
+    assert len(primitives) == COUNT
+    assert all(path.is_file() and path.is_relative_to(own) for path in primitives)
+    assert not pristine.changed_outside(before)
+    assert unwritten_in(folder), "the stranger's file stays"
+    assert not late_volumes.error
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_no_volume_is_written_beside_a_blend_that_a_human_is_appended_or_linked_from(pristine, link):
+    elsewhere(pristine, "named")
+    before = pristine.before()
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(str(pristine.blend), link=link) as (_, wanted):
+        wanted.collections = ["Anna"]
+    bpy.context.scene.collection.children.link(bpy.data.collections["Anna"])
+    by_timer()
+    paths = [volume_path(obj.data) for objects in volumes_of(person()).values() for obj in objects]
+    assert len(paths) == COUNT
+    assert all(path.is_file() and path.is_relative_to(humans_folder("")) for path in paths)
+    assert person_file(person()).is_file()
+    assert pristine.before() == before
+
+
+def test_nothing_is_written_through_a_link_in_place_of_a_folder_of_volumes(pristine, tmp_path):
+    folder = elsewhere(pristine, "named")
+    pristine.humans.mkdir()
+    (pristine.humans / "Anna").symlink_to(folder)
+    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
+    for volume in bpy.data.volumes:
+        volume.filepath = str(pristine.humans / "Anna" / Path(volume.filepath).name)
+    before = pristine.before()
+    by_timer()
+    assert pristine.before() == before
+    assert volume_path(bpy.data.volumes[0]).is_relative_to(humans_folder(""))
+
+
+def test_a_folder_that_cannot_be_copied_is_told_once(pristine, monkeypatch, capsys):
+    elsewhere(pristine, "named")
+    before = pristine.before()
+
+    def full(*_: object) -> bool:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(collect, "copy_file", full)
+    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
+    by_timer()
+    by_timer()
+    assert "could not be copied" in late_volumes.error
+    assert capsys.readouterr().out.count("could not be copied") == 1
+    assert pristine.before() == before
 
 
 @pytest.fixture

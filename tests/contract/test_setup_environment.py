@@ -131,6 +131,15 @@ def test_a_wheel_that_is_not_the_locked_one_is_not_installed(place, monkeypatch)
     assert not list(place.folder.environment.rglob("torch.py"))
 
 
+def test_pip_gets_the_lock_as_it_was_checked(place):
+    steps = place.from_folder()
+    place.lock.write_text("--index-url http://localhost:9/\nevil==1\n")
+    assert done(steps).startswith("The backend is ready")
+    place.lock.write_text("--index-url http://localhost:9/\nevil==1\n")
+    with pytest.raises(ValueError, match=r"line 1 of .* is not"):
+        read_lock(place.lock)
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
 def test_a_pipe_among_the_wheels_is_named_before_anything_is_made(place):
     os.mkfifo(place.wheels / "torch-9-py3-none-any.whl")

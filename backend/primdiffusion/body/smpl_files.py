@@ -15,8 +15,10 @@ import torch
 from primdiffusion.body.model import BodyModel, J
 from primdiffusion.body.smpl_pickle import BodyFileError, as_array, read_pickle
 from primdiffusion.formats.arrays import ArrayFileError, all_finite, array_names, read_arrays, read_npy
-from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.regular_files import FileContent, read_regular
 
+LARGEST_BODY_FILE = 512 * 2**20
+"""SMPL with 300 shape components takes 250 MB."""
 LARGEST_OBJ = 32 * 2**20
 MOST_FACES, MOST_NUMBERS = 100_000, 32_000_000
 """Faces of a body, and numbers in one of its arrays: five and two times SMPL-X's. They become larger types, and a body
@@ -30,12 +32,13 @@ _ROOT_MARKS = (-1, 2**32 - 1, 2**64 - 1)
 """Encodings of "no parent": -1, or -1 converted to an unsigned integer."""
 
 Path = str | os.PathLike[str]
+Source = Path | FileContent
 
 
 def load_body(
-    path: Path, uv: Path | tuple[Path, Path] | None = None, shape_components: int = SHAPE_COMPONENTS
+    path: Source, uv: Source | tuple[Source, Source] | None = None, shape_components: int = SHAPE_COMPONENTS
 ) -> BodyModel:
-    """Load a body (float32) from an SMPL .pkl or .npz.
+    """Load a body (float32) from an SMPL .pkl or .npz. Each file is opened once, or given as it was read before.
 
     Args:
         path: the body model. Pickles are read by `smpl_pickle` and cannot run code.
@@ -49,10 +52,9 @@ def load_body(
         BodyFileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range.
         UnsafePickleError: a pickle names a global that a body model does not need.
     """
-    path = pathlib.Path(path)
-    if not path.is_file():
+    if not isinstance(path, FileContent) and not pathlib.Path(path).is_file():
         raise FileNotFoundError(f"There is no body model at {path}; give the path of an SMPL .pkl or .npz file.")
-    arrays = _ArrayFile(path)
+    arrays = _ArrayFile(read_body_file(path))
     template = arrays.real("v_template", ("V", 3))
     vertex_count = len(template)
     if np.abs(template).max() > LARGEST_BODY_M:
@@ -78,22 +80,27 @@ def load_body(
     )
 
 
+def read_body_file(path: Source) -> FileContent:
+    """Read a file of a body, or of its texture coordinates, once. Raises TooLargeError and OSError."""
+    return path if isinstance(path, FileContent) else FileContent.read(os.fspath(path), LARGEST_BODY_FILE)
+
+
 class _ArrayFile:
     """Named arrays of one file, validated on access."""
 
-    def __init__(self, path: pathlib.Path) -> None:
-        self.path = path
-        if path.suffix not in (".pkl", ".npz"):
-            raise BodyFileError(f"{path} ends in {path.suffix!r}; body models are .pkl or .npz files.")
-        self._pickled = read_pickle(path) if path.suffix == ".pkl" else None
-        self._names = _npz_names(path) if self._pickled is None else set(self._pickled)
+    def __init__(self, file: FileContent) -> None:
+        self.file, suffix = file, file.path.suffix
+        if suffix not in (".pkl", ".npz"):
+            raise BodyFileError(f"{file} ends in {suffix!r}; body models are .pkl or .npz files.")
+        self._pickled = read_pickle(file) if suffix == ".pkl" else None
+        self._names = _npz_names(file) if self._pickled is None else set(self._pickled)
 
     def __contains__(self, name: str) -> bool:
         return name in self._names
 
     def wrong(self, name: str, complaint: str) -> BodyFileError:
         return BodyFileError(
-            f"{self.path}: {name!r} {complaint}; use an unchanged SMPL file or one in the same format."
+            f"{self.file}: {name!r} {complaint}; use an unchanged SMPL file or one in the same format."
         )
 
     def raw(self, name: str) -> np.ndarray:
@@ -102,9 +109,9 @@ class _ArrayFile:
         try:
             if self._pickled is not None:
                 return as_array(self._pickled[name])
-            return read_arrays(self.path, (name,))[name]
+            return read_arrays(self.file, (name,))[name]
         except (ValueError, OSError) as error:
-            raise self.wrong(name, f"cannot be read ({str(error).removeprefix(f'{self.path}: ')[:120]})") from error
+            raise self.wrong(name, f"cannot be read ({str(error).removeprefix(f'{self.file}: ')[:120]})") from error
 
     def shaped(self, name: str, shape: tuple[int | str, ...]) -> np.ndarray:
         array = self.raw(name)
@@ -138,9 +145,9 @@ class _ArrayFile:
         return number
 
 
-def _npz_names(path: pathlib.Path) -> set[str]:
+def _npz_names(file: FileContent) -> set[str]:
     try:
-        return set(array_names(path))
+        return set(array_names(file))
     except ArrayFileError as error:
         raise BodyFileError(str(error)) from error
 
@@ -155,22 +162,22 @@ def _parents(arrays: _ArrayFile) -> np.ndarray:
 
 
 def _texture_coordinates(
-    arrays: _ArrayFile, uv: Path | tuple[Path, Path] | None, template: np.ndarray, faces: np.ndarray
+    arrays: _ArrayFile, uv: Source | tuple[Source, Source] | None, template: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    if isinstance(uv, tuple):
-        coordinates, coordinate_faces = (_numpy_file(pathlib.Path(part)) for part in uv)
-        source = str(uv[1])
-    elif uv is not None and pathlib.Path(uv).suffix == ".npz":
-        held = _ArrayFile(pathlib.Path(uv))
-        coordinates, coordinate_faces, source = held.raw("vt"), held.raw("ft"), str(uv)
-    elif uv is not None:
-        coordinates, coordinate_faces = _obj_texture_coordinates(pathlib.Path(uv), faces)
-        source = str(uv)
+    given = () if uv is None else tuple(map(read_body_file, uv if isinstance(uv, tuple) else (uv,)))
+    source = str(given[-1]) if given else str(arrays.file)
+    if len(given) == 2:
+        coordinates, coordinate_faces = map(_numpy_file, given)
+    elif given and given[0].path.suffix == ".npz":
+        held = _ArrayFile(given[0])
+        coordinates, coordinate_faces = held.raw("vt"), held.raw("ft")
+    elif given:
+        coordinates, coordinate_faces = _obj_texture_coordinates(given[0], faces)
     elif "vt" in arrays and "ft" in arrays:
-        coordinates, coordinate_faces, source = arrays.raw("vt"), arrays.raw("ft"), str(arrays.path)
+        coordinates, coordinate_faces = arrays.raw("vt"), arrays.raw("ft")
     else:
         coordinate_faces, coordinates = _unwrapped(template, faces)
-        source = f"the automatic unwrap of {arrays.path.name}"
+        source = f"the automatic unwrap of {arrays.file.path.name}"
     numbers = coordinates.dtype.kind in "iuf" and coordinate_faces.dtype.kind in "iuf"
     if not numbers or coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
         raise BodyFileError(
@@ -198,22 +205,22 @@ def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
     return coordinate_faces, coordinates
 
 
-def _numpy_file(path: pathlib.Path) -> np.ndarray:
+def _numpy_file(file: FileContent) -> np.ndarray:
     try:
-        array = read_npy(path)
+        array = read_npy(file)
     except ArrayFileError as error:
         raise BodyFileError(str(error)) from error
     if array.dtype.kind not in "iuf":
-        raise BodyFileError(f"{path} does not hold one array of numbers; give the pair (vt.npy, ft.npy).")
+        raise BodyFileError(f"{file} does not hold one array of numbers; give the pair (vt.npy, ft.npy).")
     return array
 
 
-def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _obj_texture_coordinates(file: FileContent, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Read texture coordinates from an OBJ with the body's triangles, in any order."""
     coordinates: list[list[float]] = []
     corner_of_face: dict[frozenset[int], dict[int, int]] = {}
     try:
-        for line in read_regular(path, LARGEST_OBJ).decode("latin1").splitlines():
+        for line in read_regular(file, LARGEST_OBJ).decode("latin1").splitlines():
             key, _, rest = line.partition(" ")
             if key == "vt":
                 coordinates.append([float(number) for number in rest.split()[:2]])
@@ -224,9 +231,9 @@ def _obj_texture_coordinates(path: pathlib.Path, faces: np.ndarray) -> tuple[np.
         coordinate_faces = [[corner_of_face[frozenset(face)][v] for v in face] for face in faces.tolist()]
         return np.array(coordinates), np.array(coordinate_faces)
     except (ValueError, TypeError, IndexError, OverflowError) as error:
-        raise BodyFileError(f"{path} is not an OBJ with texture coordinates in every face ({error!s:.100}).") from error
+        raise BodyFileError(f"{file} is not an OBJ with texture coordinates in every face ({error!s:.100}).") from error
     except KeyError as error:
         raise BodyFileError(
-            f"{path} lacks a face of the body (vertices {sorted(error.args[0])}, counted from 0); "
+            f"{file} lacks a face of the body (vertices {sorted(error.args[0])}, counted from 0); "
             "use the OBJ made for this body."
         ) from error

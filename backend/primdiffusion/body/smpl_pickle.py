@@ -8,17 +8,14 @@ old and new versions of numpy and scipy; chumpy need not be installed.
 
 from __future__ import annotations
 
-import pathlib
 import re
 
 import numpy as np
 import scipy.sparse
 
 from primdiffusion.body.pickle_opcodes import Inert, load_pickle
-from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.regular_files import FileContent
 
-LARGEST_PICKLE = 512 * 2**20
-"""SMPL with 300 shape components takes 250 MB."""
 MOST_NUMBERS = 10_000_000
 """In sparse matrices as they become dense; the regressor of SMPL's joints has 165,360."""
 MOST_LISTED = 2_000_000
@@ -111,18 +108,17 @@ def _find(module: str, name: str) -> type:
         ) from None
 
 
-def read_pickle(path: pathlib.Path) -> dict[str, object]:
+def read_pickle(file: FileContent) -> dict[str, object]:
     """Return the top-level dictionary of an SMPL pickle; convert values to arrays with `as_array`.
 
     Raises:
         UnsafePickleError: the pickle names a global outside the list above.
         BodyFileError: it is not a pickle, is truncated, or does not hold a dictionary.
-        TooLargeError: it is larger than `LARGEST_PICKLE`.
     """
-    content = load_restricted(read_regular(path, LARGEST_PICKLE), str(path))
+    content = load_restricted(file.content, str(file))
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
         raise BodyFileError(
-            f"{path} holds no dictionary of named arrays but a {type(content).__name__}; is it an SMPL file?"
+            f"{file} holds no dictionary of named arrays but a {type(content).__name__}; is it an SMPL file?"
         )
     return content
 

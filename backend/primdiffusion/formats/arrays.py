@@ -12,14 +12,14 @@ import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .regular_files import open_regular
+from .regular_files import FileContent, open_regular
 
 LARGEST_BYTES = 512 * 2**20
 """Largest size of what one call reads: small files can claim petabytes. An hour of motion at 60 frames/s takes 285
@@ -49,11 +49,15 @@ _NO_ARRAY = (
 )  # fmt: skip
 
 
+Source = str | Path | FileContent
+"""A file by its path, or as it was read before."""
+
+
 class ArrayFileError(ValueError):
     """A file of arrays that cannot be read; the message names the file."""
 
 
-def array_names(path: str | Path) -> list[str]:
+def array_names(path: Source) -> list[str]:
     """Return the names of the arrays in an .npz. Raises ArrayFileError for a damaged file, and OSError."""
     with _archive(path) as archive:
         return [name.removesuffix(".npy") for name in archive.namelist()]
@@ -70,7 +74,7 @@ def array_shape(path: str | Path, name: str) -> tuple[int, ...]:
 
 
 def read_arrays(
-    path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = (), *, most_values: int | None = None
+    path: Source, required: Sequence[str] = (), optional: Sequence[str] = (), *, most_values: int | None = None
 ) -> dict[str, NDArray]:
     """Read the arrays `required` of an .npz, and those of `optional` that it contains; others are not unpacked.
 
@@ -90,13 +94,12 @@ def read_arrays(
             total, packed = total + member.file_size, packed + member.compress_size
             _check_size(total, f"{path}: {name!r}")
             _check_ratio(total, packed, f"{path}: {name!r}")
-            if most_values is not None:
-                with archive.open(member) as stream:
-                    values += math.prod(_header(stream, member.file_size, f"{path}: {name!r}")[0])
-                if values > most_values:
-                    raise ArrayFileError(f"{path}: {name!r} makes it {values} values, more than {most_values}: cut it")
             with archive.open(member) as stream:
-                arrays[name] = _read(stream, member.file_size, f"{path}: {name!r}")
+                head = _header(stream, member.file_size, f"{path}: {name!r}")
+                values += math.prod(head[0])
+                if most_values is not None and values > most_values:
+                    raise ArrayFileError(f"{path}: {name!r} makes it {values} values, more than {most_values}: cut it")
+                arrays[name] = _filled(stream, *head, f"{path}: {name!r}")
     return arrays
 
 
@@ -140,7 +143,7 @@ def check_shapes(
             )
 
 
-def read_npy(path: str | Path) -> NDArray:
+def read_npy(path: Source) -> NDArray:
     """Read an .npy file. Raises as `read_arrays`."""
     with _npy(path) as (stream, size):
         return _read(stream, size, str(path))
@@ -204,6 +207,16 @@ def stored_members(file: BinaryIO, path: str | Path) -> dict[str, StoredMember]:
         return members
 
 
+def stored_archive(members: Iterable[tuple[str, bytes | memoryview]]) -> io.BytesIO:
+    """An archive without compression in memory, of names and contents."""
+    made = io.BytesIO()
+    with zipfile.ZipFile(made, "w", zipfile.ZIP_STORED) as archive:
+        for name, content in members:
+            archive.writestr(name, content)  # type: ignore[arg-type]
+    made.seek(0)
+    return made
+
+
 def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
     """Write an .npz at the fastest level: higher ones take long and gain little. Raises OSError."""
     _write(zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1), arrays)
@@ -240,13 +253,13 @@ class _Reads:
 
 
 @contextlib.contextmanager
-def _archive(path: str | Path) -> Iterator[zipfile.ZipFile]:
+def _archive(path: Source) -> Iterator[zipfile.ZipFile]:
     with open_regular(path, LARGEST_FILE) as file, _archive_in(file, path) as archive:
         yield archive
 
 
 @contextlib.contextmanager
-def _archive_in(file: BinaryIO, path: str | Path) -> Iterator[zipfile.ZipFile]:
+def _archive_in(file: BinaryIO, path: Source) -> Iterator[zipfile.ZipFile]:
     try:
         with zipfile.ZipFile(_Reads(file)) as archive:  # type: ignore[arg-type]
             _check_names(path, [name.removesuffix(".npy") for name in archive.namelist()])
@@ -257,7 +270,7 @@ def _archive_in(file: BinaryIO, path: str | Path) -> Iterator[zipfile.ZipFile]:
         raise ArrayFileError(f"{path} is not a whole .npz file ({str(e)[:100]}): copy or export it again") from e
 
 
-def _check_names(path: str | Path, names: Sequence[str]) -> None:
+def _check_names(path: Source, names: Sequence[str]) -> None:
     """Check that names differ: of two members of one name, readers choose different ones."""
     if len(set(names)) < len(names):
         twice = next(name for name, count in collections.Counter(names).items() if count > 1)
@@ -265,7 +278,7 @@ def _check_names(path: str | Path, names: Sequence[str]) -> None:
 
 
 @contextlib.contextmanager
-def _npy(path: str | Path) -> Iterator[tuple[BinaryIO, int]]:
+def _npy(path: Source) -> Iterator[tuple[BinaryIO, int]]:
     with open_regular(path, LARGEST_BYTES) as stream:
         size = stream.seek(0, io.SEEK_END)
         stream.seek(0)
@@ -276,7 +289,7 @@ def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo | None:
     return archive.NameToInfo.get(f"{name}.npy") or archive.NameToInfo.get(name)
 
 
-def _needed(archive: zipfile.ZipFile, path: str | Path, name: str) -> zipfile.ZipInfo:
+def _needed(archive: zipfile.ZipFile, path: Source, name: str) -> zipfile.ZipInfo:
     member = _member(archive, name)
     if member is None:
         raise ArrayFileError(f"{path} holds no array {name!r}: make it again")
@@ -336,7 +349,11 @@ def _header(stream: IO[bytes], size: int, what: str) -> tuple[tuple[int, ...], b
 def _read(stream: IO[bytes], size: int, what: str) -> NDArray:
     """Read an array of `size` bytes including its header, which must agree with that size."""
     _check_size(size, what)
-    shape, fortran, dtype = _header(stream, size, what)
+    return _filled(stream, *_header(stream, size, what), what)
+
+
+def _filled(stream: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: np.dtype, what: str) -> NDArray:
+    """Read the values of an array, which follow its header."""
     raw = np.empty(math.prod(shape) * dtype.itemsize, np.uint8)  # memory is taken as it is filled
     filled = 0
     while filled < raw.size:

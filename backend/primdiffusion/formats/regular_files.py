@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import errno
+import hashlib
 import io
 import mmap
 import os
@@ -13,6 +15,8 @@ from pathlib import Path
 _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 """Starts of UNC paths, Windows' devices and URLs."""
 _LONGEST_PATH = 4096
+COPIED_BYTES = 256 * 2**20
+"""Files up to this size are copied into memory before they are checked and used; larger ones are mapped."""
 
 
 class TooLargeError(ValueError):
@@ -40,11 +44,38 @@ def check_regular(path: str | Path) -> os.stat_result:
     return status
 
 
-def open_regular(path: str | Path, limit: int) -> io.BufferedReader | io.BytesIO:
+@dataclasses.dataclass(frozen=True, eq=False)
+class FileContent:
+    """A regular file as it was when it was read. Readers take it in place of its path, which it is printed as.
+
+    So what was checked, by its hash for instance, is what is used, whatever happens to the file meanwhile.
+    """
+
+    path: Path
+    content: bytes
+
+    @classmethod
+    def read(cls, path: str | Path, limit: int) -> FileContent:
+        """Read a regular file of at most `limit` bytes. Raises as `open_regular`."""
+        return cls(Path(path), read_regular(path, limit))
+
+    @property
+    def sha256(self) -> str:
+        """SHA-256 of the content, hexadecimal."""
+        return hashlib.sha256(self.content).hexdigest()
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+
+def open_regular(path: str | Path | FileContent, limit: int) -> io.BufferedReader | io.BytesIO:
     """Open a regular file of at most `limit` bytes for reading. Raises as `check_regular`, and TooLargeError.
 
     A file that states no size is read as empty: those of /proc may be endless.
     """
+    if isinstance(path, FileContent):
+        check_size(path, len(path.content), limit)
+        return io.BytesIO(path.content)
     size = check_regular(path).st_size  # before it is opened: to open a device may already do something
     check_size(path, size, limit)
     if not size:
@@ -61,17 +92,28 @@ def open_regular(path: str | Path, limit: int) -> io.BufferedReader | io.BytesIO
     return file
 
 
-def map_privately(file: io.BufferedReader | io.BytesIO) -> mmap.mmap | bytearray:
-    """Map an open file into memory, so that what is written there stays in memory; closing the file does no harm.
+def private_content(file: io.BufferedReader | io.BytesIO) -> mmap.mmap | bytearray:
+    """Return the content of an open file, so that what is written there stays in memory; the file may be closed then.
 
-    Raises OSError, also for lack of memory, and ValueError for a file that is empty now.
+    Up to COPIED_BYTES it is a copy, which nobody else can change. A larger file is mapped: a program that overwrites it
+    meanwhile changes the numbers, and one that cuts it short ends this process. Raises OSError, also for lack of
+    memory, and ValueError for a file that is empty now.
     """
     if isinstance(file, io.BytesIO):
         return bytearray(file.getvalue())
-    return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    size = os.fstat(file.fileno()).st_size
+    if size > COPIED_BYTES:
+        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
+    content = bytearray(size)
+    file.seek(0)
+    filled = file.readinto(content)
+    if not filled:
+        raise ValueError("the file is empty now")
+    del content[filled:]
+    return content
 
 
-def read_regular(path: str | Path, limit: int) -> bytes:
+def read_regular(path: str | Path | FileContent, limit: int) -> bytes:
     """Read a regular file of at most `limit` bytes. Raises as `open_regular`."""
     with open_regular(path, limit) as file:
         size = file.seek(0, io.SEEK_END)  # some files grow
@@ -80,7 +122,7 @@ def read_regular(path: str | Path, limit: int) -> bytes:
         return file.read(size)  # not up to the limit, for which Python would take memory
 
 
-def check_size(path: str | Path, size: int, limit: int) -> None:
+def check_size(path: str | Path | FileContent, size: int, limit: int) -> None:
     """Raise TooLargeError where `size` is over `limit`, bytes."""
     if size > limit:
         raise TooLargeError(f"{path} is larger than {limit / 2**20:.0f} MB, the most for its kind: use a smaller file")

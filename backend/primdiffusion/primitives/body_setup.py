@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import errno
 import functools
-import hashlib
 import json
 from collections.abc import Iterable
 from pathlib import Path, PureWindowsPath
@@ -17,15 +16,14 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel
-from primdiffusion.body.smpl_files import load_body
-from primdiffusion.body.smpl_pickle import LARGEST_PICKLE
+from primdiffusion.body.smpl_files import LARGEST_BODY_FILE, load_body, read_body_file
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import (
+    FileContent,
     TooLargeError,
     check_regular,
     check_size,
     is_plain_path,
-    open_regular,
     real_path,
 )
 from primdiffusion.geometry.records import TensorRecord
@@ -45,10 +43,9 @@ class FileFingerprint:
     sha256: str
 
     @classmethod
-    def of(cls, path: Path) -> FileFingerprint:
-        """Hash the file. Raises as `open_regular`."""
-        with open_regular(path, LARGEST_PICKLE) as file:
-            return cls(str(real_path(path)), hashlib.file_digest(file, "sha256").hexdigest())
+    def of(cls, file: FileContent) -> FileFingerprint:
+        """Path and hash of what was read."""
+        return cls(str(real_path(file.path)), file.sha256)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,22 +85,29 @@ class BodySetup(TensorRecord):
 def body_setup_from_files(smpl: Path, uv: tuple[Path, ...]) -> BodySetup:
     """Load a body and build its anchors; rest extents are those of the template in the T pose.
 
-    Raises OSError and the errors of `load_body`.
+    Each file is opened once, so that what is recorded of it is what was loaded. Raises OSError and the errors of
+    `load_body`.
     """
-    files = BodyFiles(FileFingerprint.of(smpl), tuple(map(FileFingerprint.of, uv)))
-    body = load_body(smpl, uv=uv[0] if len(uv) == 1 else (uv[0], uv[1]))
-    return BodySetup(body, build_anchors(body, "released"), files)
+    return _load(read_body_file(smpl), tuple(map(read_body_file, uv)))
 
 
 def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], beside: Iterable[Path]) -> BodySetup:
     """Load the body that a checkpoint or human refers to, with the rest extents stored there.
 
-    Each file is searched at its recorded path, then by name in the folders `beside`; the content hash must match.
-    Raises BodySetupError if a file is missing or has changed, and BodyFileError.
+    Each file is searched at its recorded path, then by name in the folders `beside`; the content hash must match, and
+    what is loaded are the bytes that were hashed. Raises BodySetupError if a file is missing or has changed, and
+    BodyFileError.
     """
-    folders = tuple(beside)
-    smpl, *uv = (_found(file, folders) for file in (files.smpl, *files.uv))
-    body_setup = _loaded(smpl, tuple(uv))
+    folders, wanted = tuple(beside), (files.smpl, *files.uv)
+    paths = [_found(file, folders) for file in wanted]
+    key = tuple((file.sha256, path.suffix) for file, path in zip(wanted, paths, strict=True))
+    body_setup = _loaded.pop(key, None)
+    if body_setup is None:
+        smpl, *uv = (_read(path, file) for file, path in zip(wanted, paths, strict=True))
+        body_setup = _load(smpl, tuple(uv))
+    _loaded[key] = body_setup
+    while len(_loaded) > _KEPT:
+        del _loaded[next(iter(_loaded))]
     if tuple(rest_half_extent.shape) != (K, 3) or not bool((rest_half_extent > 0).all()):
         raise BodySetupError(f"the stored rest extents are not {K} x 3 positive: import or generate the file again")
     return dataclasses.replace(
@@ -111,7 +115,20 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
     )
 
 
-def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> _Stamp:
+_KEPT = 2
+_loaded: dict[tuple[tuple[str, str], ...], BodySetup] = {}
+"""Bodies that were loaded, by the hashes and endings of their files, the last used last."""
+
+
+def _load(smpl: FileContent, uv: tuple[FileContent, ...]) -> BodySetup:
+    if not 1 <= len(uv) <= 2:
+        raise BodySetupError(f"{len(uv)} files of texture coordinates belong to the body {smpl!s:.120}, not 1 or 2")
+    body = load_body(smpl, uv=uv[0] if len(uv) == 1 else (uv[0], uv[1]))
+    files = BodyFiles(FileFingerprint.of(smpl), tuple(map(FileFingerprint.of, uv)))
+    return BodySetup(body, build_anchors(body, "released"), files)
+
+
+def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
     shown, name = f"{file.path!r:.120}".strip("'"), PureWindowsPath(file.path).name  # also parses POSIX paths
     named = [Path(file.path)] if is_plain_path(file.path) else []
     problem = "is missing" if named else "is not named by a path on this machine"
@@ -124,16 +141,28 @@ def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> _Stamp:
             problem = f"cannot be read ({getattr(error, 'strerror', None) or 'it is too large'})"
             continue
         if _sha256(stamp) == file.sha256:
-            return stamp
+            return path
         shown, problem = f"{path!s:.120}", "has changed"
     if problem == "has changed":
-        raise BodySetupError(
-            f"the body file {shown} has changed (expected sha256 {file.sha256[:12]}...): restore it, or import the "
-            "checkpoint again with this file"
-        )
+        raise _changed(shown, file)
     raise BodySetupError(
         f"the body file {shown} {problem} (sha256 {file.sha256[:12]}...): restore it, or put a copy beside the "
         "file that refers to it"
+    )
+
+
+def _read(path: Path, file: FileFingerprint) -> FileContent:
+    """The file at `path`, read once. Raises BodySetupError where it is not the one that `file` describes, OSError."""
+    content = read_body_file(path)
+    if content.sha256 != file.sha256:
+        raise _changed(f"{path!s:.120}", file)
+    return content
+
+
+def _changed(shown: str, file: FileFingerprint) -> BodySetupError:
+    return BodySetupError(
+        f"the body file {shown} has changed (expected sha256 {file.sha256[:12]}...): restore it, or import the "
+        "checkpoint again with this file"
     )
 
 
@@ -151,15 +180,11 @@ class _Stamp:
         stat = check_regular(path)
         if not stat.st_size:  # also endless files of /proc
             raise FileNotFoundError(errno.ENOENT, "the file is empty", str(path))
-        check_size(path, stat.st_size, LARGEST_PICKLE)
+        check_size(path, stat.st_size, LARGEST_BODY_FILE)
         return cls(path, stat.st_mtime_ns, stat.st_size)
 
 
 @functools.lru_cache(maxsize=16)
 def _sha256(stamp: _Stamp) -> str:
-    return FileFingerprint.of(stamp.path).sha256
-
-
-@functools.lru_cache(maxsize=2)
-def _loaded(smpl: _Stamp, uv: tuple[_Stamp, ...]) -> BodySetup:
-    return body_setup_from_files(smpl.path, tuple(part.path for part in uv))
+    """The hash when the file had this stamp: to find the file, not to trust it."""
+    return read_body_file(stamp.path).sha256

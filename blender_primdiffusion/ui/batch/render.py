@@ -21,11 +21,12 @@ from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
-from ...formats.regular_files import exists_in_its_folder, real_path
+from ...formats.regular_files import check_regular, exists_in_its_folder, real_path
 from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
 from ...jobs import cycles_check
 from ...jobs.open_human import opened
+from ...scene.collect import collect_unwritten
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
 from ...scene.human import NPZ_FILE, PERSON_FILE, humans, humans_folder, volume_path
 from ...scene.unwritten import write_all_unwritten
@@ -183,6 +184,7 @@ class _Drawing:
 
     def draw(self, source: RenderSource) -> int:
         if source.is_blend:
+            check_regular(source.path)  # Blender would wait for a pipe
             bpy.ops.wm.open_mainfile(filepath=str(source.path), load_ui=False, use_scripts=False)
             self._prepare_blend()
         elif all(shot.path.is_file() for shot in self._shots(source.name, 1, self._last_frame())):
@@ -276,6 +278,7 @@ class _Drawing:
 
 
 def _check_volumes(scene: bpy.types.Scene) -> None:
+    collect_unwritten()
     write_all_unwritten()
     volumes = {obj.data for person in humans(scene) for obj in person.all_objects if obj.type == "VOLUME"}
     paths = [path for path in map(volume_path, volumes) if path is not None]

@@ -1,0 +1,255 @@
+"""What is no regular file in place of any input is rejected in a sentence, and nobody waits for it.
+
+`MODULES` lists every module of both programs that reads a file, with the kinds of files that try it.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import bpy  # noqa: F401  before the rest, which it would otherwise load anew
+import pytest
+
+from fuzz import other_files
+from fuzz.run import LONGEST_SENTENCE, ROOT
+from fuzz.target import Target, said
+from fuzz.targets import TARGETS
+
+LONGEST_S = 10
+"""Until what waits is interrupted."""
+
+
+class Waits(BaseException):
+    """It took longer."""
+
+
+@contextlib.contextmanager
+def interrupted() -> Iterator[None]:
+    def interrupt(*_: object) -> None:
+        raise Waits
+
+    before = signal.signal(signal.SIGALRM, interrupt)
+    signal.setitimer(signal.ITIMER_REAL, LONGEST_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
+
+
+def make_socket(path: Path) -> None:
+    with contextlib.chdir(path.parent), socket.socket(socket.AF_UNIX) as one:  # its address may have 107 characters
+        one.bind(path.name)
+
+
+KINDS = {
+    "pipe": os.mkfifo,
+    "socket": make_socket,
+    "folder": Path.mkdir,
+    "device": lambda path: path.symlink_to("/dev/zero"),
+    "endless": lambda path: path.symlink_to("/proc/self/pagemap"),
+    "circle": lambda path: path.symlink_to(path.name),
+}
+
+
+def outcome(target: Target, path: Path, folder: Path) -> str:
+    """`rejected` in a sentence that names something in `folder`, `read` without a sentence, or what is wrong."""
+    try:
+        with interrupted():
+            target.read(path)
+    except Waits:
+        return "WAITS"
+    except Exception as error:
+        sentence = said(error)
+        if sentence is None:
+            return f"TRACEBACK {error!r:.300}"
+        short = sentence.replace(f"{path.parent}{os.sep}", "")
+        named = path.name in sentence or str(folder) in sentence
+        good = named and "\n" not in short and len(short) <= LONGEST_SENTENCE
+        return "rejected" if good else f"FAULT {sentence}"
+    return "read"
+
+
+OPTIONAL = {
+    "human's card", "joints of shots", "depth of a shot", "licences", "shape of a scan", "material of an asset",
+    "captures: list", "captures: poses", "captures: completion mark", "captures: pack", "captures: about a pack",
+    "hub: commit", "Blender: picture of a scan",
+}  # fmt: skip
+"""Files that may be missing: what is no file counts as that."""
+AS_MISSING = {
+    ("captures: settings", "circle"), ("batch settings", "circle"), ("run: settings", "circle"),
+    ("run: starts", "circle"), ("run: metrics", "circle"), ("run: metrics", "endless"), ("Blender: scan", "endless"),
+    ("Blender: HDRI", "endless"),
+}  # fmt: skip
+"""A link that leads nowhere is replaced where the program writes such a file; a file of /proc counts as empty."""
+LENIENT = {"dataset.json", "complete.json", "cameras.json"}
+"""Their reading in `targets` goes on after sentences; `captures: ...` do not."""
+FILES = [one for one in (*TARGETS, *other_files.TARGETS) if one.is_file and one.name not in LENIENT]
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory) -> Path:
+    return tmp_path_factory.mktemp("files")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
+@pytest.mark.parametrize("target", FILES, ids=lambda target: target.name)
+def test_what_is_no_file_is_rejected_at_once(target, place, monkeypatch):
+    folder = place / str(FILES.index(target))
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    path = target.make(folder)
+    found = {}
+    for kind, put in KINDS.items():
+        if path.is_dir() and not path.is_symlink():
+            path.rmdir()
+        else:
+            path.unlink()
+        put(path)
+        found[kind] = outcome(target, path, folder)
+    missing = {kind for kind in KINDS if target.name in OPTIONAL or (target.name, kind) in AS_MISSING}
+    wrong = {
+        kind: what for kind, what in found.items() if what != "rejected" and not (kind in missing and what == "read")
+    }
+    assert not wrong
+
+
+def test_the_interruption_ends_what_waits_for_a_pipe(tmp_path, monkeypatch):
+    monkeypatch.setattr(f"{__name__}.LONGEST_S", 0.1)
+    os.mkfifo(tmp_path / "pipe")
+    waits = Target("waits", lambda folder: folder, (), lambda path: path.read_bytes())  # pyright: ignore
+    assert outcome(waits, tmp_path / "pipe", tmp_path) == "WAITS"
+
+
+FORMATS = "it reads for others, with a path of theirs"
+OWN = "it reads what ships with the program, or what this program has just written"
+BACKEND = {
+    "body/model.py": OWN,
+    "body/smpl_files.py": ("SMPL .npz", "SMPL .pkl", "UV .obj"),
+    "capture/dataset.py": ("captures: pack", "captures: about a pack"),
+    "capture/people_files.py": ("glb",),
+    "capture/poses.py": ("poses .npy", "poses .npz", "poses .json"),
+    "capture/reader.py": ("picture", "captures: cameras", "captures: picture", "captures: first picture"),
+    "capture/sheet.py": ("captures: joints",),
+    "capture/smpl_parameters.py": ("captures: poses", "captures: pickled poses"),
+    "commands/frame_drawer.py": ("solids", "frame"),
+    "diffusion/checkpoint.py": ("checkpoint", "encoder"),
+    "diffusion/pretrained.py": ("hub: commit", "hub: weights"),
+    "editing/regions.py": ("painted weights",),
+    "evaluation/attribute_network.py": ("attribute network",),
+    "evaluation/gallery.py": ("payload of a gallery",),
+    "evaluation/onnx_networks.py": ("ONNX network",),
+    "evaluation/pose_depth_network.py": ("joints network",),
+    "evaluation/pretrained_networks.py": ("network .pth",),
+    "evaluation/shots.py": ("shot", "joints of shots", "depth of a shot"),
+    "formats/arrays.py": FORMATS,
+    "formats/body_layout.py": OWN,
+    "formats/capture_layout.py": ("captures: settings", "captures: list", "captures: completion mark"),
+    "formats/capture_repair.py": ("captures: completion mark",),
+    "formats/json_files.py": FORMATS,
+    "formats/picture_files.py": FORMATS,
+    "formats/regular_files.py": FORMATS,
+    "geometry/pictures.py": FORMATS,
+    "human_file.py": ("human", "compact human"),
+    "people/assets.py": ("licences", "material of an asset", "texture of an asset"),
+    "people/base_mesh.py": OWN,
+    "people/folder.py": ("human's card", "manifest"),
+    "people/mhclo.py": ("mhclo", "obj"),
+    "people/payloads.py": ("payload",),  # whatever cannot be read is made again
+    "pose_file.py": ("pose", "pose .npz"),
+    "primitives/body_setup.py": ("SMPL .npz", "SMPL .pkl", "UV .obj"),
+    "released/reading.py": ("released checkpoint",),
+    "tensor_file.py": FORMATS,
+    "torch_file.py": FORMATS,
+    "training/captured_people.py": ("human's card", "payload"),
+    "training/cells.py": ("run: latents",),
+    "training/detail_latents.py": ("run: latents of detail",),
+    "training/run_folder.py": ("run: settings", "run: starts", "run: metrics"),
+    "training/shards.py": ("packed index", "packed shard"),
+    "training/state.py": ("training state",),
+    "training/stored_people.py": ("payload",),
+}
+EXTENSION = {
+    "backend/packages.py": ("lock of packages",),
+    "backend/setup.py": OWN,  # and looks at wheels: tests/contract/test_setup_environment.py
+    "backend/vocabulary.py": ("vocabulary",),
+    "capture/body.py": ("body of captures",),
+    "capture/options.py": ("cameras",),
+    "capture/passes.py": ("picture of Cycles",),
+    "capture/scan_files.py": ("shape of a scan", "parameters of a scan", "Blender: scan"),
+    "capture/stage.py": ("Blender: HDRI",),
+    "capture/surfaces.py": ("Blender: picture of a scan",),
+    "engine/boxes.py": ("body file",),
+    "engine/frames.py": OWN,
+    "jobs/assets.py": ("Blender: preview",),
+    "jobs/cycles_check.py": OWN,
+    "jobs/open_human.py": OWN,
+    "motion/bvh.py": ("BVH", "motion .bvh"),
+    "motion/files.py": ("AMASS", "motion .npy", "motion .json"),
+    "motion/own_poses.py": ("own pose",),
+    "scene/body_file.py": ("body file",),
+    "scene/human.py": ("human in Blender",),
+    "scene/human_file.py": ("human in Blender", "compact human in Blender", "moving human in Blender"),
+    "scene/human_npz.py": ("human.npz", "small human.npz"),
+    "scene/merged.py": ("merged grid",),
+    "scene/proxy.py": ("proxy",),
+    "scene/volume_check.py": OWN,
+    "ui/batch/render.py": ("Blender: .blend",),
+    "ui/batch/running.py": ("batch settings",),
+    "ui/presets.py": ("preset",),
+    "ui/translations/__init__.py": OWN,
+}
+MODULES: dict[str, tuple[str, ...] | str] = {
+    **{f"backend/primdiffusion/{name}": tried for name, tried in BACKEND.items()},
+    **{f"blender_primdiffusion/{name}": tried for name, tried in EXTENSION.items()},
+}
+"""What tries each module that reads a file, or why nothing does."""
+READERS = {
+    "open_regular", "read_regular", "check_regular", "read_json", "read_arrays", "read_numbers", "array_names",
+    "array_shape", "read_npy", "map_npy", "read_pickled_bytes", "stored_members", "opened_picture",
+    "is_whole_picture", "read_body_file", "read_metadata", "memmap", "fromfile", "InferenceSession",
+    "open_mainfile", "gltf", "fbx", "fbx_import", "obj_import",
+}  # fmt: skip
+DOTTED = (
+    "tensor_file.read",
+    "tensor_file.opened",
+    "torch_file.load",
+    "images.load",
+    "libraries.load",
+    "FileContent.read",
+)
+
+
+ENDS = {name.rpartition(".")[2] for name in DOTTED}
+
+
+def _is_reader(called: ast.expr) -> bool:
+    if isinstance(called, ast.Name):
+        return called.id in READERS
+    return isinstance(called, ast.Attribute) and (
+        called.attr in READERS or (called.attr in ENDS and ast.unparse(called).endswith(DOTTED))
+    )
+
+
+def reading_modules() -> set[str]:
+    """Modules that call a reader, by their path in the repository."""
+    found = set()
+    for root in (ROOT / "backend" / "primdiffusion", ROOT / "blender_primdiffusion"):
+        for path in root.rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and _is_reader(node.func):
+                    found.add(path.relative_to(ROOT).as_posix())
+    return found
+
+
+def test_every_module_that_reads_a_file_is_tried():
+    assert set(MODULES) == reading_modules()
+    tried = [kinds for kinds in MODULES.values() if not isinstance(kinds, str)]
+    assert {name for kinds in tried for name in kinds} == {target.name for target in FILES}
+    assert all(tried)
