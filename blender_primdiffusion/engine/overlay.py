@@ -30,6 +30,7 @@ from .picture import PosedHuman, human_armatures, pose_of
 from .solids import visible_instances
 from .view import NO_SURFACE_M, PinholeView, view_from_matrices
 from .viewport import camera_frame
+from .who_draws import Drawer, who_draws
 
 COARSEST = 8
 """Pixels of the region per marched pixel along a side, while the view or the scene changes."""
@@ -89,7 +90,7 @@ class Overlay:
         self._regions: dict[int, GpuRefinement] = {}
         """By the region's address; the latest drawn last."""
         self._readings: dict[object, SceneReading] = {}
-        """By view layer and local view, since the scene has changed."""
+        """By view layer, local view and what Blender draws there, since the scene has changed."""
         self._placed: dict[object, tuple[GpuPayload, Boxes]] = {}
         self.undrawn = False
         """There are pictures that the windows have not drawn."""
@@ -217,17 +218,22 @@ class Overlay:
     def reading(self, context: bpy.types.Context) -> SceneReading:
         """What the space shows."""
         space = context.space_data
-        key = (context.view_layer.as_pointer(), space.as_pointer() if space.local_view else None)
+        by_volumes = who_draws(context.scene.render.engine, space.shading.type, True) is Drawer.VOLUMES
+        types = frozenset(kind for kind in ("mesh", "volume") if getattr(space, f"show_object_viewport_{kind}"))
+        key = (context.view_layer.as_pointer(), space.as_pointer() if space.local_view else None, by_volumes, types)
         if key not in self._readings:
-            self._readings[key] = self._read(context.evaluated_depsgraph_get(), space)
+            self._readings[key] = self._read(context.evaluated_depsgraph_get(), space, by_volumes, types)
         return self._readings[key]
 
-    def _read(self, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> SceneReading:
+    def _read(
+        self, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D, by_volumes: bool, types: frozenset[str]
+    ) -> SceneReading:
         humans: dict[object, ShownHuman] = {}
         candidates: list[tuple[bpy.types.Object, bpy.types.Collection, PosedHuman | Exception]] = []
-        bones, drawn = [np.zeros((0, 2, 3))], set[bpy.types.Object]()
+        bones, meshes, volumes = [np.zeros((0, 2, 3))], set[bpy.types.Object](), set[bpy.types.Object]()
+        noting = {kind: found for kind, found in (("mesh", meshes), ("volume", volumes)) if kind in types}
         self.error, complete, end = "", True, time.monotonic() + READING_S
-        for obj, armature, matrix, owner in human_armatures(_noting(visible_instances(depsgraph, space), drawn)):
+        for obj, armature, matrix, owner in human_armatures(_noting(visible_instances(depsgraph, space), noting)):
             if armature.show_in_front:
                 bones.append(_bones(armature, matrix))
             try:
@@ -235,7 +241,8 @@ class Overlay:
             except (ValueError, OSError) as error:
                 candidates.append((obj, owner, error))
         for number, (obj, owner, pose) in enumerate(candidates, 1):
-            if drawn and not drawn.isdisjoint(owner.all_objects):
+            fog = bool(volumes) and not volumes.isdisjoint(owner.all_objects)
+            if (fog and by_volumes) or (meshes and not meshes.isdisjoint(owner.all_objects)):
                 continue
             try:
                 if isinstance(pose, Exception):
@@ -243,10 +250,10 @@ class Overlay:
                 key, known = _key(pose), studio.gpu_humans().holds(pose)
                 placed = self._placed.get(key) or studio.gpu_humans().placed(pose)
             except EarlierVersionError:
-                self.error = _EARLIER.format(owner.name)
+                self.error = self.error if fog else _EARLIER.format(owner.name)
                 continue
             except (ValueError, OSError) as error:
-                self.error = str(error)
+                self.error = self.error if fog else str(error)
                 continue
             humans[key] = ShownHuman(obj.session_uid, pose, placed)
             if not known and number < len(candidates) and time.monotonic() > end:
@@ -344,13 +351,15 @@ def _key(pose: PosedHuman) -> object:
 
 
 def _noting(
-    instances: Iterable[bpy.types.DepsgraphObjectInstance], drawn: set[bpy.types.Object]
+    instances: Iterable[bpy.types.DepsgraphObjectInstance], noted: dict[str, set[bpy.types.Object]]
 ) -> Iterator[bpy.types.DepsgraphObjectInstance]:
-    """The same instances; `drawn` gets objects by which Blender draws humans: volumes, mesh proxies, body meshes."""
+    """The same instances; `noted`, by kind, gets what Blender may draw of humans: volumes, and as "mesh" their mesh
+    proxies and body meshes."""
     for instance in instances:
         obj = instance.object
-        if obj.type == "VOLUME" or PROXY_MARK in obj or BODY_MARK in obj:
-            drawn.add(obj.original)
+        kind = "volume" if obj.type == "VOLUME" else "mesh" if PROXY_MARK in obj or BODY_MARK in obj else ""
+        if kind in noted:
+            noted[kind].add(obj.original)
         yield instance
 
 

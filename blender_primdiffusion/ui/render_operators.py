@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 import bpy
@@ -60,20 +61,29 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
     everyone: bpy.props.BoolProperty(name="All Humans", description="Do it for all humans of the scene", options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        # needs numpy
-        from ..jobs.export import show, shown
-        from ..scene.proxy import proxy_of
-        from ..scene.unwritten import write_all_unwritten
-
-        visible = not in_viewport(person)
-        if visible:
-            write_all_unwritten()
-        for each in humans(context.scene) if self.everyone else [person]:
-            what = shown(each)
-            show_in_viewport(each, visible)
-            if proxy_of(each) is not None:
-                show(each, what)
+        show_volumes(humans(context.scene) if self.everyone else [person], not in_viewport(person))
         return {"FINISHED"}
+
+
+def show_volumes(people: Iterable[bpy.types.Collection], visible: bool) -> None:
+    """Show humans' volumes in viewports, or hide them there; makes no undo step.
+
+    Volumes that are shown are written before: Blender remembers that a file was missing. Raises ValueError for a human
+    that cannot be edited.
+    """
+    # needs numpy
+    from ..jobs.export import show, shown
+    from ..scene.proxy import proxy_of
+    from ..scene.unwritten import write_all_unwritten
+
+    changing = [person for person in people if in_viewport(person) != visible]
+    if changing and visible:
+        write_all_unwritten()
+    for person in changing:
+        what = shown(person)
+        show_in_viewport(person, visible)
+        if proxy_of(person) is not None:
+            show(person, what)
 
 
 class _Merging(OnPerson):

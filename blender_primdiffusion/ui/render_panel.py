@@ -11,15 +11,16 @@ from mathutils import Euler, Vector
 
 from ..backend.requests import sentence
 from ..engine.engine import ENGINE
+from ..engine.who_draws import Drawer, renders_volumes, who_draws
 from ..formats.requests import DENSITY_GAIN, VOXEL
 from ..jobs import cycles_check
 from ..jobs.follow import Reporting
 from ..jobs.target import selected_person
 from ..scene.attachment import MODES, attachment_of, in_viewport
-from ..scene.human import human_of, humans
+from ..scene.human import check_editable, human_of, humans
 from ..scene.material import density_gain, set_density_gain
 from .drawing import OUTPUT, SidebarPanel, draw_job, draw_lines, property_columns
-from .render_operators import ATTACHMENT_ITEMS
+from .render_operators import ATTACHMENT_ITEMS, show_volumes
 
 _FROM_EEVEE = frozenset(
     {
@@ -155,7 +156,7 @@ _YAW = math.radians(20)
 
 
 class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
-    """Render with PrimDiffusion: exact, a few seconds per picture; other objects get simple shading"""
+    """Render with PrimDiffusion: exact, a few seconds per picture; other objects get simple shading. Viewports hide volumes"""
 
     bl_idname = "primdiffusion.set_up_engine"
     bl_label = "PrimDiffusion (Exact)"
@@ -163,12 +164,13 @@ class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         context.scene.render.engine = ENGINE
+        show_volumes(_editable(context.scene), False)
         _plain_colours(context.scene)
         return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_set_up_cycles(Reporting, bpy.types.Operator):
-    """Render with Cycles: humans are approximate; shadows and light on other objects are correct"""
+    """Render with Cycles: humans are approximate, with light and shadows, in Rendered viewports too. Drawn, each takes a gigabyte"""
 
     bl_idname = "primdiffusion.set_up_cycles"
     bl_label = "Cycles (Approximate)"
@@ -185,6 +187,8 @@ class PRIMDIFFUSION_OT_set_up_cycles(Reporting, bpy.types.Operator):
         bounces = scene.cycles.max_bounces
         fit_cycles_to_volumes(scene, _SAMPLES)
         scene.cycles.max_bounces = bounces
+        if not cycles_check.volumes_are_empty():
+            show_volumes(_editable(scene), True)
         _plain_colours(scene)
         return {"FINISHED"}
 
@@ -214,27 +218,46 @@ class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
         return {"FINISHED"}
 
 
+def _editable(scene: bpy.types.Scene) -> Iterator[bpy.types.Collection]:
+    """The scene's humans but those that are linked or broken."""
+    for person in humans(scene):
+        try:
+            check_editable(person)
+        except ValueError:
+            continue
+        yield person
+
+
 def _plain_colours(scene: bpy.types.Scene) -> None:
     """Other transforms change the colours that humans were made with."""
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
 
 
-SHOWN_BY = {
-    ENGINE: "Renders humans exactly, other objects with simple shading",
-    "CYCLES": "Renders humans approximately, with light and shadows",
-}
+EXACT = "Renders humans exactly, other objects with simple shading"
+APPROXIMATE = "Renders humans approximately, with light and shadows"
+UNLIT = "Renders humans approximately, with light and shadows; 3D views show them without: press Cycles again"
 OTHER_ENGINE = "Renders humans blurred: choose an engine above"
+
+
+def how_shown(scene: bpy.types.Scene) -> str:
+    """How the scene's engine shows humans, in renders and in Rendered views."""
+    engine = scene.render.engine
+    drawer = who_draws(engine, "RENDERED", all(in_viewport(person) for person in humans(scene)))
+    if drawer is Drawer.ENGINE:
+        return EXACT
+    if engine != "CYCLES":
+        return OTHER_ENGINE
+    return UNLIT if drawer is Drawer.OVERLAY and renders_volumes(engine) else APPROXIMATE
 
 
 def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """A choice of engines for humans, and how the current one shows them."""
-    engine = scene.render.engine
+    engine, line = scene.render.engine, how_shown(scene)
     row = layout.row(align=True)
     row.operator("primdiffusion.set_up_engine", text="PrimDiffusion", depress=engine == ENGINE, icon="SHADING_RENDERED")
     row.operator("primdiffusion.set_up_cycles", text="Cycles", depress=engine == "CYCLES", icon="SHADING_TEXTURE")
-    known = engine in SHOWN_BY
-    draw_lines(layout, pgettext_iface(SHOWN_BY.get(engine, OTHER_ENGINE)), "INFO" if known else "ERROR")
+    draw_lines(layout, pgettext_iface(line), "ERROR" if line == OTHER_ENGINE else "INFO")
     if engine == "CYCLES" and cycles_check.volumes_are_empty():
         draw_lines(layout, sentence(cycles_check.FAULT), "ERROR")
 
