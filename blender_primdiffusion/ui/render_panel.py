@@ -156,7 +156,7 @@ _YAW = math.radians(20)
 
 
 class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
-    """Render with PrimDiffusion: exact, a few seconds per picture; other objects get simple shading. Viewports hide volumes"""
+    """Render with PrimDiffusion: exact, a few seconds per picture; other objects get simple shading"""
 
     bl_idname = "primdiffusion.set_up_engine"
     bl_label = "PrimDiffusion (Exact)"
@@ -170,7 +170,7 @@ class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_set_up_cycles(Reporting, bpy.types.Operator):
-    """Render with Cycles: humans are approximate, with light and shadows, in Rendered viewports too. Drawn, each takes a gigabyte"""
+    """Render with Cycles: humans are approximate, with light and shadows; views draw them too, a gigabyte each"""
 
     bl_idname = "primdiffusion.set_up_cycles"
     bl_label = "Cycles (Approximate)"
