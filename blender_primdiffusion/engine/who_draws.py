@@ -44,6 +44,6 @@ def renders_volumes(engine: str) -> bool:
     return engine in getattr(panel, "COMPAT_ENGINES", ()) and engine not in _without | {ENGINE}
 
 
-def draws_volumes_empty(engine: str) -> None:
-    """From now on an engine counts as one that renders none, because it draws them empty in this Blender."""
-    _without.add(engine)
+def note_volumes(engine: str, empty: bool) -> None:
+    """Say whether an engine draws volumes empty in this Blender, and so counts as one that renders none."""
+    (_without.add if empty else _without.discard)(engine)

@@ -6,11 +6,17 @@ import bpy
 import pytest
 
 from blender_primdiffusion.engine import who_draws as module
-from blender_primdiffusion.engine.who_draws import Drawer, draws_volumes_empty, renders_volumes, view_engine, who_draws
+from blender_primdiffusion.engine.who_draws import Drawer, note_volumes, renders_volumes, view_engine, who_draws
+from blender_primdiffusion.jobs import cycles_check
 
 pytestmark = pytest.mark.any_blender
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
 SHADINGS = ("WIREFRAME", "SOLID", "MATERIAL", "RENDERED")
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_known_of_this_build(monkeypatch):
+    monkeypatch.setattr(module, "_without", {module.WORKBENCH})
 
 
 def drawers(engine: str, volumes_shown: bool) -> list[Drawer]:
@@ -45,8 +51,12 @@ def test_an_engine_declares_that_it_renders_volumes_as_blenders_own_do(addon):
         engines.discard("SOMEBODYS")
 
 
-def test_an_engine_that_draws_volumes_empty_gets_the_overlay(addon, monkeypatch):
-    monkeypatch.setattr(module, "_without", set(module._without))
+def test_where_an_engine_draws_volumes_empty_the_overlay_draws(addon, monkeypatch):
+    monkeypatch.setattr(cycles_check, "_recall", lambda: True)
+    assert cycles_check.volumes_are_empty()
+    assert who_draws("CYCLES", "RENDERED", True) is Drawer.OVERLAY
+    monkeypatch.setattr(cycles_check, "_recall", lambda: False)
+    assert not cycles_check.volumes_are_empty()
     assert renders_volumes("CYCLES")
-    draws_volumes_empty("CYCLES")
+    note_volumes("CYCLES", empty=True)
     assert who_draws("CYCLES", "RENDERED", True) is Drawer.OVERLAY

@@ -14,13 +14,14 @@ from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion import places
-from blender_primdiffusion.jobs import merge
+from blender_primdiffusion.engine.who_draws import note_volumes
+from blender_primdiffusion.jobs import cycles_check, merge
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of
+from blender_primdiffusion.scene.attachment import attachment_of, in_viewport, show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import (
     MARK,
@@ -248,6 +249,34 @@ def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(perso
     assert bpy.app.version < (5, 0) or scene.cycles.volume_biased
     assert ops.set_up_engine() == {"FINISHED"}
     assert (scene.render.engine, scene.camera) == ("PRIMDIFFUSION", camera)
+    scene.render.engine = "CYCLES"
+
+
+def test_the_buttons_show_volumes_to_views_that_light_them_and_the_panel_says_who_draws(person, monkeypatch):
+    scene = bpy.context.scene
+    monkeypatch.setattr(cycles_check, "volumes_are_empty", lambda: False)
+    volumes = next(child for child in person.children if child.name.endswith("_primitives"))
+    show_in_viewport(person, False)
+    scene.render.engine = "CYCLES"
+    assert render_panel.how_shown(scene) == render_panel.UNLIT, "chosen in Blender's own menu"
+    assert ops.set_up_cycles() == {"FINISHED"}
+    assert (volumes.hide_viewport, in_viewport(person)) == (False, True)
+    assert render_panel.how_shown(scene) == render_panel.APPROXIMATE
+    assert "with light and shadows" in " ".join(shown(render_panel.PRIMDIFFUSION_PT_render, bpy.context))
+    assert ops.set_up_engine() == {"FINISHED"}
+    assert (volumes.hide_viewport, in_viewport(person)) == (True, False)
+    assert render_panel.how_shown(scene) == render_panel.EXACT
+    monkeypatch.setattr(cycles_check, "volumes_are_empty", lambda: True)
+    assert ops.set_up_cycles() == {"FINISHED"}
+    assert volumes.hide_viewport, "this Cycles would show nothing"
+    assert render_panel.how_shown(scene) == render_panel.UNLIT
+    note_volumes("CYCLES", empty=True)
+    assert render_panel.how_shown(scene) == render_panel.APPROXIMATE, (
+        "renders of another Blender; the fault is said below"
+    )
+    note_volumes("CYCLES", empty=False)
+    scene.render.engine = "BLENDER_WORKBENCH"
+    assert render_panel.how_shown(scene) == render_panel.OTHER_ENGINE
     scene.render.engine = "CYCLES"
 
 
