@@ -144,8 +144,7 @@ class GpuPicture:
 
     def wait(self) -> None:
         """As `GpuMarch.wait`."""
-        if self._march is not None:
-            self._march.wait()
+        self._humans.wait()
 
     def compose(self, before: gpu.types.GPUTexture | None = None, averaged: int = 0) -> gpu.types.GPUTexture:
         """The picture, RGBA16F, linear and premultiplied; the mean with `before`, the mean of `averaged` ones."""

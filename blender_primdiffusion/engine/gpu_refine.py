@@ -18,7 +18,9 @@ from .view import PinholeView
 
 SLICE_S = 0.1
 SKETCH = 4
-"""Coarseness of a sketch, which is as sharp as the window and less true than any marched picture."""
+"""Coarseness of a sketch, which is sharp, and less true than any marched picture."""
+SKETCHED_S = FLUENT_S / 2
+"""A sketch that takes longer is followed by ones of half the resolution, until these take a fourth of it."""
 MARCHED = (2, 1)
 """Pixels of the window per marched pixel along a side, in the order of marching."""
 REVEAL_S = 0.4
@@ -29,6 +31,14 @@ SLOW_S, SLOW_SAMPLES = 0.5, 4
 """Where a full picture takes longer, fewer are averaged."""
 _FIRST_WORK = 2.0**15
 _GROWTH = 4.0
+
+
+class Sketch(Protocol):
+    """A picture that is whole at once, such as a `ReliefPicture`."""
+
+    def wait(self) -> None:
+        """Return when the GPU has finished it."""
+        ...
 
 
 class Pass(Protocol):
@@ -56,8 +66,8 @@ class MarchRequest:
     """Equal for equal pictures."""
     view: PinholeView
     """At the window's resolution."""
-    sketch: Callable[[PinholeView], Any]
-    """Draws a picture that is whole at once."""
+    sketch: Callable[[PinholeView], Sketch]
+    """Draws a picture that is whole at once, from this view, perhaps with fewer pixels."""
     begin: Callable[[PinholeView], Pass] | None
     """Starts a picture: from this view with fewer pixels, or with its rays elsewhere in the pixels. None while the GPU
     cannot march: the sketch stays."""
@@ -86,7 +96,7 @@ class GpuRefinement:
         self._pending: ShownMarch | None = None
         self._seconds, self._pixel_seconds = 0.0, np.inf
         """Of the pending picture so far, and of a pixel of the last one."""
-        self._work = _FIRST_WORK
+        self._work, self._sketch_side = _FIRST_WORK, 1
         self.shown: ShownMarch | None = None
         self.reveal_s = REVEAL_S
         """As the constant: a slow window redraws less often."""
@@ -147,7 +157,16 @@ class GpuRefinement:
                     if self._march(marched):
                         return marched
                 self._pixel_seconds = np.inf  # sketches, until it is measured again
-        return ShownMarch(request, SKETCH, 0, request.sketch(request.view))
+        return ShownMarch(request, SKETCH, 0, self._sketch(request))
+
+    def _sketch(self, request: MarchRequest) -> Sketch:
+        began = self._clock()
+        sketch = request.sketch(_coarser(request.view, self._sketch_side))
+        sketch.wait()
+        seconds = self._clock() - began
+        if seconds > SKETCHED_S or seconds < SKETCHED_S / 4:
+            self._sketch_side = 2 if seconds > SKETCHED_S else 1
+        return sketch
 
     def _next(self) -> tuple[int, int] | None:
         """Coarseness and number of the picture after the shown one; None after the last."""
@@ -164,7 +183,7 @@ class GpuRefinement:
     def _begin(self, request: MarchRequest, which: tuple[int, int] | None = None) -> ShownMarch:
         """Start the next picture, or the one of this coarseness and number."""
         coarseness, sample = which or self._next()
-        view = request.view.scaled(*(-(-side // coarseness) for side in (request.view.width, request.view.height)))
+        view = _coarser(request.view, coarseness)
         began = self._revealed_at = self._clock()
         begun = ShownMarch(request, coarseness, sample, request.begin(jittered(view, sample)))
         self._seconds = self._clock() - began
@@ -184,6 +203,10 @@ class GpuRefinement:
             view = pending.request.view
             self._pixel_seconds = self._seconds * pending.coarseness**2 / (view.width * view.height)
         return done
+
+
+def _coarser(view: PinholeView, coarseness: int) -> PinholeView:
+    return view.scaled(-(-view.width // coarseness), -(-view.height // coarseness))
 
 
 def jittered(view: PinholeView, sample: int) -> PinholeView:

@@ -88,12 +88,20 @@ class ReliefPicture:
             shader.uniform_int("ended", int(ends is not None))
             for relief, boxes in humans:
                 if relief is not None:
+                    gpu.state.face_culling_set("FRONT" if np.linalg.det(boxes.rotation[0]) < 0 else "BACK")
                     places = _places(boxes, view)
                     shader.uniform_sampler("places", places)
                     shader.uniform_sampler("ends", ends or places)
                     relief.batch.draw(shader)
+            gpu.state.face_culling_set("NONE")
             gpu.state.depth_test_set("NONE")
             gpu.state.depth_mask_set(False)
+
+    def wait(self) -> None:
+        """Return when the GPU has drawn it."""
+        frame = gpu.types.GPUFrameBuffer(color_slots=self.colour)
+        with frame.bind():
+            frame.read_color(0, 0, 1, 1, 4, 0, "FLOAT")
 
 
 def _places(boxes: Boxes, view: PinholeView) -> gpu.types.GPUTexture:

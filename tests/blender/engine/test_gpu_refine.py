@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,14 +31,21 @@ class SlowGpu:
     def __init__(self, pixel_s: float, boxes: Callable[[float], int] = lambda _height: 0):
         """`boxes` by the height in the picture, from 0 at the top to 1."""
         self.now, self.pixel_s, self.boxes, self.sizes, self.longest = 0.0, pixel_s, boxes, [], 0.0
+        self.sketched: list[tuple[int, int]] = []
+        self.sketch_s = 0.01
 
     def begin(self, view: PinholeView) -> OnePass:
         self.sizes.append((view.width, view.height))
         return OnePass(self, view)
 
-    def sketch(self, view: PinholeView) -> str:
-        self.now += 0.01
-        return f"sketch of {view.width} x {view.height}"
+    def sketch(self, view: PinholeView) -> SimpleNamespace:
+        """Its time is seen by who waits for it."""
+        self.sketched.append((view.width, view.height))
+        seconds = self.sketch_s * view.width * view.height / (VIEW.width * VIEW.height)
+        return SimpleNamespace(wait=lambda: self.wait(seconds))
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
 
     def refine_to_the_end(self, refinement: GpuRefinement) -> list[tuple[int, int]]:
         """Coarseness and sample of the pictures that appear."""
@@ -132,6 +140,17 @@ def test_a_gpu_that_has_become_slow_is_noticed_at_the_first_picture():
         assert refinement.advance()
         assert refinement.shown.coarseness == coarseness
     assert gpu.now - began < 0.05
+
+
+def test_sketches_that_take_long_are_followed_by_ones_of_half_the_resolution():
+    gpu = SlowGpu(1e-5)
+    refinement = GpuRefinement(lambda: gpu.now)
+    for key, seconds in enumerate((0.1, 0.1, 0.05, 0.02, 0.02)):
+        gpu.sketch_s = seconds
+        refinement.want(request(gpu, key))
+        refinement.advance()
+    whole, half = (640, 480), (320, 240)
+    assert gpu.sketched == [whole, half, half, half, whole]
 
 
 def test_a_sketch_stays_while_the_gpu_cannot_march_and_is_refined_as_soon_as_it_can():
