@@ -74,6 +74,7 @@ def turning(module: str, python: str) -> Steps:
         yield from wait(lambda: overlay.overlay.resting, 120)
         print(f"turning: refined {time.monotonic() - began:.1f} s after the stop", flush=True)
     yield "turning_refined"
+    print(f"turning: whole after {stops} s, redraws of {empty:.0f} and {shown:.0f} ms", flush=True)
     figures = {"orbit_empty_ms": empty, "orbit_ratio_1": shown / empty, "coarse_after_stop_seconds": max(stops)}
     yield {"figures": {name: round(value, 3) for name, value in figures.items()}}
 

@@ -27,6 +27,10 @@ moments: dict[str, float] = {}
 
 def tick() -> float | None:
     now = time.monotonic()
+    if "enabled" not in moments:
+        moments["enabled"] = now
+        bpy.ops.preferences.addon_enable(module=MODULE)
+        return 1.0
     if "began" not in moments:
         moments["began"] = now
         bpy.ops.wm.open_mainfile(filepath=BLEND)

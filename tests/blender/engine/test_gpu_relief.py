@@ -42,6 +42,14 @@ def test_a_relief_shows_what_is_marched(marcher, human, angle):
     assert (near[shown[..., 3] == 0] == np.float32(NO_SURFACE_M)).all()
 
 
+def test_of_a_march_that_is_not_complete_the_upper_part_can_be_shown(marcher, human):
+    view = pinhole(human[1].position.mean(0), (0.0, 0.3, 3.0), size=(160, 240))
+    march = marcher.march([human], view, STEP)
+    assert march.done == 0.0
+    assert not march.advance(1.0)
+    assert march.done == 7.5 / 240, "eight rows, of which the last is mixed with the next where they are smoothed"
+
+
 def test_a_relief_is_hidden_by_other_objects(human):
     middle = human[1].position.mean(0)
     view = pinhole(middle, (0.0, 0.0, 3.0), size=(80, 120))
