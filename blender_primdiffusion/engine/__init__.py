@@ -10,6 +10,7 @@ import bpy
 from ..scene.human import any_humans
 from .engine import ENGINE, PRIMDIFFUSION_RenderEngine
 from .settings import PRIMDIFFUSION_PG_render
+from .who_draws import view_engine
 
 CHECK_S = 5.0
 """Between checks on a child that may be idle, which is stopped after a while."""
@@ -49,10 +50,13 @@ def unregister() -> None:
 
 
 def shows_humans(context: bpy.types.Context) -> bool:
-    """Whether humans are drawn into this 3D view beside what Blender draws: in Rendered by other engines alone."""
-    scene = context.scene
-    by_engine = context.space_data.shading.type == "RENDERED" and scene.render.engine == ENGINE
-    return scene.primdiffusion_render.in_viewports and not by_engine and any_humans()
+    """Whether humans may be drawn into this 3D view over what Blender draws; `who_draws` then decides for each."""
+    return context.scene.primdiffusion_render.in_viewports and not by_engine(context) and any_humans()
+
+
+def by_engine(context: bpy.types.Context) -> bool:
+    """Whether the PrimDiffusion engine draws this 3D view."""
+    return view_engine(context.scene.render.engine, context.space_data.shading.type) == ENGINE
 
 
 def _draw_humans() -> None:
@@ -70,8 +74,7 @@ def _draw_humans() -> None:
 
 def _shows_overlays(context: bpy.types.Context) -> bool:
     """Whether the engine draws this 3D view, beneath Blender's overlays."""
-    space = context.space_data
-    return space.shading.type == "RENDERED" and context.engine == ENGINE and space.overlay.show_overlays
+    return by_engine(context) and context.space_data.overlay.show_overlays
 
 
 def _draw_error() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,10 +14,13 @@ from ..scene.body_file import read_body_file
 from ..scene.human_file import HumanPayload, file_version, read_sizes
 from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, tangent_frames
 from .picture import PosedHuman
+from .view import PinholeView
 
 JOINTS = len(JOINT_NAMES)
 SMALLEST_SCALE = 1e-6
 """The backend's `human.SMALLEST_SCALE`."""
+EDGE_PX = 4.0
+"""Around what shows boxes: pictures with fewer pixels are drawn smoothly."""
 SHAPES_CACHED = 32
 """On one body; 1.2 MB each."""
 
@@ -149,6 +153,24 @@ def boxes_of(human: PosedHuman) -> Boxes:
 @functools.lru_cache(maxsize=4)
 def _rig(model: ShapeModel) -> BoxRig:
     return BoxRig(model)
+
+
+def seen_part(humans: Iterable[Boxes], view: PinholeView) -> tuple[float, float, float, float]:
+    """Left, bottom, right and top of the part of a view that may show these boxes, as fractions of it."""
+    size = np.array([view.width, view.height])
+    focal, middle = np.diag(view.intrinsics)[:2], view.intrinsics[:2, 2]
+    low, high = size.astype(np.float64), np.zeros(2)
+    for boxes in humans:
+        centre = boxes.position @ view.world_to_camera[:, :3].T + view.world_to_camera[:, 3]
+        radius = np.linalg.norm(boxes.half_extent, axis=1)[:, None]
+        near, far = centre[:, 2:] - radius, centre[:, 2:] + radius
+        if (near <= 0).any():
+            return 0.0, 0.0, 1.0, 1.0
+        first, last = centre[:, :2] - radius, centre[:, :2] + radius
+        low = np.minimum(low, (first / np.where(first < 0, near, far) * focal + middle).min(0) - EDGE_PX)
+        high = np.maximum(high, (last / np.where(last > 0, near, far) * focal + middle).max(0) + EDGE_PX)
+    (left, top), (right, below) = np.clip(low / size, 0, 1), np.clip(high / size, 0, 1)
+    return float(left), float(1 - below), float(max(left, right)), float(max(1 - top, 1 - below))
 
 
 def polar(matrix: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

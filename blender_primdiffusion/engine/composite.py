@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Iterator
 
 import gpu
 import numpy as np
@@ -12,12 +11,16 @@ from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
 from .gpu_march import GpuMarch
+from .gpu_relief import ReliefPicture
 
 NO_PLANES: NDArray[np.float32] = np.zeros((1, 4), np.float32)
 _NOTHING = "1e9"
 """Depths beyond are pixels without a surface."""
 _OPAQUE = "0.9"
 """From this alpha on a picture that is drawn again hides what was drawn between."""
+Part = tuple[float, float, float, float]
+"""Left, bottom, right and top of a part of the region, as fractions of it."""
+WHOLE: Part = (0.0, 0.0, 1.0, 1.0)
 _AGAIN, _XRAY = 1, 2
 """Modes of the shader: as `ViewLook.again`; before everything but bones in front."""
 _CORNERS = 10
@@ -83,8 +86,8 @@ class ViewLook:
     """Objects do not hide humans."""
     planes: NDArray[np.float32] = dataclasses.field(default_factory=lambda: NO_PLANES)
     """Clipping planes [N, 4] in the view's space; what is on their negative side is not drawn."""
-    frame: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0)
-    """Left, bottom, right and top of the camera's picture, as fractions of the region."""
+    frame: Part = WHOLE
+    """The camera's picture."""
     darkening: float = 0.0
     """Outside of the frame."""
     again: bool = False
@@ -99,8 +102,8 @@ class PictureTextures:
     depth: gpu.types.GPUTexture
 
 
-def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook) -> None:
-    """Draw over the whole region, for handlers of the kind POST_VIEW.
+def draw_picture(picture: GpuMarch | ReliefPicture | PictureTextures, look: ViewLook, part: Part = WHOLE) -> None:
+    """Draw a picture of the whole region, or a part of it, over the region, for handlers of the kind POST_VIEW.
 
     Blender's overlays are drawn before: their depth is in the buffer, but for those of objects in front. What is drawn
     here is encoded as sRGB, without the scene's view transform.
@@ -123,7 +126,9 @@ def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook) -> None:
     texels = gpu.types.Buffer("FLOAT", planes.size, planes.ravel())
     clipping = gpu.types.GPUTexture((len(planes), 1), format="RGBA32F", data=texels)  # too large for push constants
     shader.uniform_sampler("planes", clipping)
-    batch_for_shader(shader, "TRI_STRIP", {"pos": [(-1, -1), (1, -1), (-1, 1), (1, 1)]}).draw(shader)
+    left, bottom, right, top = (2 * edge - 1 for edge in part)
+    corners = [(left, bottom), (right, bottom), (left, top), (right, top)]
+    batch_for_shader(shader, "TRI_STRIP", {"pos": corners}).draw(shader)
     restore()
 
 
@@ -156,13 +161,6 @@ def _triangles(bones: NDArray, width: float, radius: float) -> NDArray[np.float6
     circle = np.stack([np.cos(turns), np.sin(turns)], 1) * radius
     fan = np.stack([np.zeros((_CORNERS, 2)), circle[:-1], circle[1:]], 1).reshape(-1, 2)
     return np.concatenate([sticks, (bones.reshape(-1, 1, 2) + fan).reshape(-1, 2)])
-
-
-def compile_shaders() -> Iterator[None]:
-    """Compile what `draw_picture` and `keep_bones` draw with, a shader a step."""
-    for shader in (_picture_shader, _bones_shader):
-        shader()
-        yield
 
 
 def restore() -> None:

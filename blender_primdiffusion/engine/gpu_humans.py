@@ -1,4 +1,4 @@
-"""Humans of the scene for the marcher on the GPU: their payloads, uploaded once, and their boxes where they are."""
+"""Humans of the scene on the GPU: their payloads and reliefs, uploaded once, and their boxes where they are."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ class GpuHumans:
         payload = self._payloads.pop(version, None)
         if payload is None:
             tensors = read_payload(human.file)
-            payload = GpuPayload(tensors.rgb, tensors.density)
+            thickness = 2 * boxes.half_extent[:, 2] * boxes.density_scale
+            payload = GpuPayload(tensors.rgb, tensors.density, thickness)
         self._payloads[version] = payload
         return payload, boxes
 

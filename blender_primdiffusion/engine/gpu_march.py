@@ -17,7 +17,7 @@ common one near the boxes. Records and lists are textures: Python gets storage b
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import bpy
 import gpu
@@ -26,7 +26,9 @@ from numpy.typing import NDArray
 
 from . import gpu_shaders
 from .boxes import Boxes
+from .gpu_relief import GpuRelief
 from .gpu_shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
+from .relief import relief_of
 from .view import PinholeView
 
 STRIDES = [1, 2, 4]
@@ -36,6 +38,11 @@ MOST_DOUBLINGS = 16
 """Of strides, for large humans beside small ones; as the backend's."""
 MOST_ENTRIES = 2**22
 """Of all tiles' lists; with more, boxes are listed for larger tiles."""
+_SHADERS = {
+    "list": gpu_shaders.list_shader,
+    "march": gpu_shaders.march_shader,
+    "copy": gpu_shaders.copy_shader,
+}
 _OPTICAL = 1e-2
 _FAR_PIXEL = 1e6
 _LARGEST_HALF = 65504.0
@@ -46,8 +53,11 @@ _EDGES = np.array([[i, i | 1 << axis] for axis in range(3) for i in range(8) if 
 class GpuPayload:
     """Colour and density of a human's boxes on the GPU, 4 MB for 1024 boxes; freed with the object."""
 
-    def __init__(self, rgb: NDArray, density: NDArray):
-        """`rgb` [K, 3, 8, 8, 8] is linear, `density` [K, 8, 8, 8] in 1/m; voxel axes N, B, T as in the backend."""
+    def __init__(self, rgb: NDArray, density: NDArray, thickness: NDArray | None = None):
+        """`rgb` [K, 3, 8, 8, 8] is linear, `density` [K, 8, 8, 8] in 1/m; voxel axes N, B, T as in the backend.
+
+        `thickness` [K] of the boxes along N, in metres at natural size, is what `relief` needs.
+        """
         self.count = len(density)
         self.rows = max(-(-self.count // ACROSS), 1)
         values = np.zeros((self.rows * ACROSS, 4, VOXELS, VOXELS, VOXELS), np.float32)
@@ -56,6 +66,7 @@ class GpuPayload:
         parts = values.reshape(self.rows, ACROSS, 4, VOXELS, VOXELS, VOXELS)
         self.texture = _texture(parts.transpose(3, 0, 4, 1, 5, 2).reshape(VOXELS, self.rows * VOXELS, -1, 4), "RGBA16F")
         self.bounds = _content(values[: self.count, 3] > 0)
+        self.relief = None if thickness is None else GpuRelief(relief_of(rgb, density, thickness))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -157,6 +168,12 @@ class GpuMarch:
             self._done += rows
         return self._done >= self._rows
 
+    @property
+    def done(self) -> float:
+        """The part of the picture's height, from the top, where it can be shown: smoothing reads half a row more."""
+        height = self._size[1]
+        return 1.0 if self._done >= self._rows else max(self._done * TILE - 0.5, 0.0) / height
+
     def wait(self) -> None:
         """Return when the GPU has finished what it was given."""
         frame = gpu.types.GPUFrameBuffer(color_slots=self.colour)
@@ -165,19 +182,22 @@ class GpuMarch:
 
 
 class GpuMarcher:
-    """Compiled shaders, and the common atlas of the humans that were marched last. Needs a GPU context."""
+    """The shaders, and the common atlas of the humans that were marched last. Needs a GPU context."""
 
     def __init__(self) -> None:
-        """Raises RuntimeError where there are no compute shaders or they do not compile."""
+        """Raises RuntimeError where there are no compute shaders."""
         if bpy.app.version < (5, 0) and not gpu.capabilities.compute_shader_support_get():
             raise RuntimeError("this GPU or driver has no compute shaders")
-        self._shaders = {
-            "list": gpu_shaders.list_shader(),
-            "march": gpu_shaders.march_shader(),
-            "copy": gpu_shaders.copy_shader(),
-        }
+        self._shaders: dict[str, gpu.types.GPUShader] = {}
         self._humans: tuple[GpuPayload, ...] = ()
         self._atlas: gpu.types.GPUTexture | None = None
+
+    def compile(self) -> Iterator[None]:
+        """Compile the shaders, one a step; each takes a moment. Raises RuntimeError where one does not compile."""
+        for name, shader in _SHADERS.items():
+            if name not in self._shaders:
+                self._shaders[name] = shader()
+                yield
 
     def march(
         self,
@@ -190,8 +210,10 @@ class GpuMarcher:
         samples through large boxes of humans of natural size.
 
         Overlapping boxes are mixed at lattice points, also those of several humans. `ends` holds, as `GpuMarch.depth`
-        does, where each pixel's ray ends at other objects.
+        does, where each pixel's ray ends at other objects. Compiles the shaders if that was not done.
         """
+        for _ in self.compile():
+            pass
         spacing, strides = _lattice([boxes.density_scale for _, boxes in humans], step)
         size = (ACROSS * VOXELS, max([payload.rows for payload, _ in humans], default=1) * VOXELS)
         atlas_size = (*size, max(len(humans), 1) * VOXELS)

@@ -16,9 +16,10 @@ from mathutils import Matrix
 
 from .boxes import Boxes
 from .gpu_march import GpuMarch, GpuMarcher, GpuPayload
+from .gpu_relief import ReliefPicture
 from .gpu_shaders import TILE, compiled, shader_of
 from .solids import SceneSolids
-from .view import NO_SURFACE_M, PinholeView
+from .view import NO_SURFACE_M, PinholeView, opengl_projection
 
 _VERTEX = """
 void main()
@@ -118,32 +119,40 @@ class GpuScene:
 class GpuPicture:
     """A picture that is drawn in slices; `compose` it when `advance` has returned True."""
 
-    def __init__(self, marcher: GpuMarcher, scene: GpuScene, view: PinholeView):
+    def __init__(self, marcher: GpuMarcher | None, scene: GpuScene, view: PinholeView):
+        """Without a marcher humans are drawn by their reliefs, in full at once."""
         self._size = (view.width, view.height)
         self._background = (0.0, 0.0, 0.0, 0.0) if scene.background is None else (*scene.background, 1.0)
         self._solids = None if scene.solids is None else scene.solids.draw(view)
-        self._march = marcher.march(scene.humans, view, scene.step, None if self._solids is None else self._solids[1])
+        ends = None if self._solids is None else self._solids[1]
+        self._march = None if marcher is None else marcher.march(scene.humans, view, scene.step, ends)
+        self._humans = self._march or ReliefPicture([(one.relief, boxes) for one, boxes in scene.humans], view, ends)
 
     @property
-    def march(self) -> GpuMarch:
+    def humans(self) -> GpuMarch | ReliefPicture:
         """The humans alone."""
-        return self._march
+        return self._humans
+
+    @property
+    def done(self) -> float:
+        """As `GpuMarch.done`."""
+        return 1.0 if self._march is None else self._march.done
 
     def advance(self, work: float = np.inf) -> bool:
         """As `GpuMarch.advance`."""
-        return self._march.advance(work)
+        return self._march is None or self._march.advance(work)
 
     def wait(self) -> None:
         """As `GpuMarch.wait`."""
-        self._march.wait()
+        self._humans.wait()
 
     def compose(self, before: gpu.types.GPUTexture | None = None, averaged: int = 0) -> gpu.types.GPUTexture:
         """The picture, RGBA16F, linear and premultiplied; the mean with `before`, the mean of `averaged` ones."""
         composed = gpu.types.GPUTexture(self._size, format="RGBA16F")
-        solids, ends = self._solids or (self._march.colour, self._march.depth)
+        solids, ends = self._solids or (self._humans.colour, self._humans.depth)
         shader = _compose_shader()
         shader.bind()
-        textures = {"humans": self._march.colour, "solids": solids, "ends": ends, "before": before or solids}
+        textures = {"humans": self._humans.colour, "solids": solids, "ends": ends, "before": before or solids}
         for name, texture in textures.items():
             shader.uniform_sampler(name, texture)
         shader.image("composed", composed)
@@ -151,23 +160,6 @@ class GpuPicture:
         shader.uniform_int("size", (*self._size, int(self._solids is not None), averaged if before else 0))
         gpu.compute.dispatch(shader, *(-(-side // TILE) for side in self._size), 1)
         return composed
-
-
-def opengl_projection(view: PinholeView) -> np.ndarray:
-    """The matrix [4, 4] from the world, y up, to OpenGL's clip space."""
-    near = max(view.clip[0], 1e-4)
-    far = max(view.clip[1], near * 1.001)
-    half = np.array([view.width, view.height]) / 2
-    focal, middle = np.diag(view.intrinsics)[:2] / half, view.intrinsics[:2, 2] / half - 1
-    projection = np.array(
-        [
-            [focal[0], 0, middle[0], 0],
-            [0, -focal[1], -middle[1], 0],
-            [0, 0, (far + near) / (far - near), -2 * far * near / (far - near)],
-            [0, 0, 1, 0],
-        ]
-    )
-    return projection @ np.concatenate([view.world_to_camera, [[0, 0, 0, 1]]])
 
 
 @functools.cache

@@ -1,7 +1,7 @@
-"""Which picture a view marches on the GPU when: coarse ones while anything moves, finer ones at rest, then antialiased.
+"""Which picture a view shows when: a whole one at once while anything moves, finer ones at rest, then antialiased.
 
-Needs no Blender. `advance` is called while a view is drawn, where Blender gives a GPU context, and marches for about
-SLICE_S, so that a slow GPU does not stall the window.
+Needs no Blender. `advance` is called where Blender gives a GPU context, and marches for about SLICE_S, so that a slow
+GPU does not stall the window.
 """
 
 from __future__ import annotations
@@ -9,14 +9,22 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from .refine import COARSENESS, FLUENT_S, REST_S
+from .refine import FLUENT_S, REST_S
 from .view import PinholeView
 
 SLICE_S = 0.1
+SKETCH = 4
+"""Coarseness of a sketch, which is sharp, and less true than any marched picture."""
+SKETCHED_S = FLUENT_S / 2
+"""A sketch that takes longer is followed by ones of half the resolution, until these take a fourth of it."""
+MARCHED = (2, 1)
+"""Pixels of the window per marched pixel along a side, in the order of marching."""
+REVEAL_S = 0.4
+"""Between redraws that show how far a picture has come."""
 SAMPLES = 8
 """Pictures that are averaged when nothing moves, each with its rays elsewhere in the pixels."""
 SLOW_S, SLOW_SAMPLES = 0.5, 4
@@ -25,8 +33,21 @@ _FIRST_WORK = 2.0**15
 _GROWTH = 4.0
 
 
+class Sketch(Protocol):
+    """A picture that is whole at once, such as a `ReliefPicture`."""
+
+    def wait(self) -> None:
+        """Return when the GPU has finished it."""
+        ...
+
+
 class Pass(Protocol):
     """One picture that is being marched, such as a `GpuMarch`."""
+
+    @property
+    def done(self) -> float:
+        """The part of its height that is complete, from the top."""
+        ...
 
     def advance(self, work: float) -> bool:
         """March for about this work, in pixels times boxes; True when the picture is complete."""
@@ -45,8 +66,11 @@ class MarchRequest:
     """Equal for equal pictures."""
     view: PinholeView
     """At the window's resolution."""
-    begin: Callable[[PinholeView], Pass]
-    """Starts a picture: from this view with fewer pixels, or with its rays elsewhere in the pixels."""
+    sketch: Callable[[PinholeView], Sketch]
+    """Draws a picture that is whole at once, from this view, perhaps with fewer pixels."""
+    begin: Callable[[PinholeView], Pass] | None
+    """Starts a picture: from this view with fewer pixels, or with its rays elsewhere in the pixels. None while the GPU
+    cannot march: the sketch stays."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,82 +79,112 @@ class ShownMarch:
 
     request: MarchRequest
     coarseness: int
+    """SKETCH, or one of MARCHED."""
     sample: int
     """0 for rays through the pixels' centres; picture number n of those to be averaged."""
-    picture: Pass
+    picture: Any
 
 
 class GpuRefinement:
-    """Marches the newest request, one picture at a time."""
+    """Sketches the newest request at once, or marches it where that is as quick; then marches it finely."""
 
-    def __init__(
-        self, clock: Callable[[], float] = time.monotonic, coarsest: int = COARSENESS[0], samples: int = SAMPLES
-    ):
-        """`coarsest`, a power of two, is the coarseness while anything moves; of `samples` pictures at rest."""
-        self._clock, self._coarsest, self._samples = clock, coarsest, samples
+    def __init__(self, clock: Callable[[], float] = time.monotonic, samples: int = SAMPLES):
+        """Of `samples` pictures at rest."""
+        self._clock, self._samples = clock, samples
         self._request: MarchRequest | None = None
-        self._changed_at = 0.0
+        self._changed_at = self._revealed_at = 0.0
         self._pending: ShownMarch | None = None
         self._seconds, self._pixel_seconds = 0.0, np.inf
         """Of the pending picture so far, and of a pixel of the last one."""
-        self._work = _FIRST_WORK
+        self._work, self._sketch_side = _FIRST_WORK, 1
         self.shown: ShownMarch | None = None
+        self.reveal_s = REVEAL_S
+        """As the constant: a slow window redraws less often."""
 
     def want(self, request: MarchRequest) -> None:
-        """Set the newest request; an equal one changes nothing."""
-        if self._request is not None and self._request.key == request.key:
-            return
-        self._request, self._changed_at = request, self._clock()
-        if self._pending is not None and self._pending.coarseness < self._moving(self._pending.request.view):
-            self._pending = None
+        """Set the newest request; an equal one changes no more than whether the GPU can march."""
+        if self._request is None or self._request.key != request.key:
+            self._changed_at, self._pending = self._clock(), None
+        self._request = request
+
+    @property
+    def fresh(self) -> bool:
+        """Whether there is no picture yet of the newest request: `advance` makes one that is whole."""
+        return self._request is not None and (self.shown is None or self.shown.request.key != self._request.key)
 
     @property
     def resting(self) -> bool:
-        """Whether the newest request is drawn in full."""
-        return self._request is None or (self._pending is None and self._next() is None)
+        """Whether the newest request is drawn as finely as can be."""
+        return not self.fresh and self._pending is None and self._next() is None
 
     @property
     def due(self) -> bool:
-        """Whether `advance` would march now: it waits for a while before it begins finer pictures."""
-        if self._request is None or self._pending is not None:
-            return self._pending is not None
-        fresh = self.shown is None or self.shown.request is not self._request
-        return self._next() is not None and (fresh or self._clock() - self._changed_at >= REST_S)
+        """Whether `advance` would do anything now: it waits for a while before it begins finer pictures."""
+        rested = self._clock() - self._changed_at >= REST_S
+        return self.fresh or self._pending is not None or (rested and self._next() is not None)
+
+    @property
+    def coming(self) -> Pass | None:
+        """A finer picture than the shown one that is complete above its lower end (see `Pass.done`)."""
+        pending = self._pending
+        return None if pending is None or pending.sample or not pending.picture.done else pending.picture
 
     def advance(self) -> bool:
-        """March for about SLICE_S; True when there is a new picture in `shown`. Raises what `begin` raises."""
+        """Make a first picture, or march for about SLICE_S; True when there is more to show. Raises what `begin` and
+        `sketch` raise."""
+        if self.fresh:
+            self.shown = self._at_once(self._request)
+            return True
         end = self._clock() + SLICE_S
         while self.due and self._clock() < end:
             self._pending = self._pending or self._begin(self._request)
             if self._march(self._pending):
                 self.shown, self._pending = self._pending, None
                 return True
+        if self.coming is not None and self._clock() - self._revealed_at >= self.reveal_s:
+            self._revealed_at = self._clock()
+            return True
         return False
 
-    def _moving(self, view: PinholeView) -> int:
-        """How coarse pictures are while the scene moves, from the time of the last one."""
-        pixels = view.width * view.height
-        coarseness = 1
-        while coarseness < self._coarsest and pixels / coarseness**2 * self._pixel_seconds > FLUENT_S:
-            coarseness *= 2
-        return coarseness
+    def _at_once(self, request: MarchRequest) -> ShownMarch:
+        """The finest picture that fits into FLUENT_S by the time of the last one, or a sketch."""
+        pixels = request.view.width * request.view.height
+        for coarseness in sorted(MARCHED):
+            if request.begin is not None and pixels / coarseness**2 * self._pixel_seconds <= FLUENT_S:
+                end = self._clock() + 2 * FLUENT_S
+                marched = self._begin(request, (coarseness, 0))
+                while self._clock() < end:
+                    if self._march(marched):
+                        return marched
+                self._pixel_seconds = np.inf  # sketches, until it is measured again
+        return ShownMarch(request, SKETCH, 0, self._sketch(request))
+
+    def _sketch(self, request: MarchRequest) -> Sketch:
+        began = self._clock()
+        sketch = request.sketch(_coarser(request.view, self._sketch_side))
+        sketch.wait()
+        seconds = self._clock() - began
+        if seconds > SKETCHED_S or seconds < SKETCHED_S / 4:
+            self._sketch_side = 2 if seconds > SKETCHED_S else 1
+        return sketch
 
     def _next(self) -> tuple[int, int] | None:
         """Coarseness and number of the picture after the shown one; None after the last."""
-        shown = self.shown
-        if shown is None or shown.request is not self._request:
-            return self._moving(self._request.view), 0
-        if shown.coarseness > 1:
-            return shown.coarseness // 2, 0
-        view = self._request.view
-        slow = view.width * view.height * self._pixel_seconds > SLOW_S
+        shown, request = self.shown, self._request
+        if shown is None or request is None or request.begin is None:
+            return None
+        finer = [coarseness for coarseness in MARCHED if coarseness < shown.coarseness]
+        if finer:
+            return finer[0], 0
+        slow = request.view.width * request.view.height * self._pixel_seconds > SLOW_S
         samples = min(self._samples, SLOW_SAMPLES) if slow else self._samples
         return (1, shown.sample + 1) if shown.sample + 1 < samples else None
 
-    def _begin(self, request: MarchRequest) -> ShownMarch:
-        coarseness, sample = self._next()
-        view = request.view.scaled(*(-(-side // coarseness) for side in (request.view.width, request.view.height)))
-        began = self._clock()
+    def _begin(self, request: MarchRequest, which: tuple[int, int] | None = None) -> ShownMarch:
+        """Start the next picture, or the one of this coarseness and number."""
+        coarseness, sample = which or self._next()
+        view = _coarser(request.view, coarseness)
+        began = self._revealed_at = self._clock()
         begun = ShownMarch(request, coarseness, sample, request.begin(jittered(view, sample)))
         self._seconds = self._clock() - began
         return begun
@@ -149,6 +203,10 @@ class GpuRefinement:
             view = pending.request.view
             self._pixel_seconds = self._seconds * pending.coarseness**2 / (view.width * view.height)
         return done
+
+
+def _coarser(view: PinholeView, coarseness: int) -> PinholeView:
+    return view.scaled(-(-view.width // coarseness), -(-view.height // coarseness))
 
 
 def jittered(view: PinholeView, sample: int) -> PinholeView:

@@ -1,12 +1,11 @@
-"""Humans in the 3D views that this engine does not render, Solid above all, marched on the viewport's GPU.
+"""Humans in the 3D views that this engine does not render, Solid above all, drawn on the viewport's GPU.
 
-Blender calls `draw` for each region that it redraws. A changed view gets a picture at once, as coarse as it must be to
-be quick; a timer marches finer ones in slices when nothing has changed for a while. Nothing is marched otherwise.
+Blender calls `draw` for each region that it redraws. A changed view gets a whole picture at once; a timer marches finer
+ones in slices when nothing has changed for a while. Nothing is marched otherwise.
 """
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator
@@ -14,186 +13,136 @@ from collections.abc import Iterable, Iterator
 import blf
 import bpy
 import numpy as np
-from mathutils import Vector
+from mathutils import Matrix, Vector
 from numpy.typing import NDArray
 
 from ..scene.convention import points_to_backend
-from ..scene.human import BODY_MARK
-from ..scene.human_file import file_version
-from ..scene.proxy import PROXY_MARK
-from . import studio
-from .boxes import Boxes, EarlierVersionError
-from .composite import NO_PLANES, PictureTextures, ViewLook, compile_shaders, draw_picture, keep_bones
-from .gpu_march import GpuMarcher, GpuPayload
-from .gpu_refine import GpuRefinement, MarchRequest
-from .picture import PosedHuman, human_armatures, pose_of
-from .solids import visible_instances
+from .boxes import Boxes, seen_part
+from .composite import NO_PLANES, Part, PictureTextures, ViewLook, draw_picture, keep_bones
+from .gpu_march import GpuMarch, GpuMarcher
+from .gpu_refine import REVEAL_S, GpuRefinement, MarchRequest
+from .gpu_relief import ReliefPicture
+from .gpu_start import gpu_start
+from .scene_reading import SceneReader, SceneReading, ViewContent, concerns_humans
 from .view import NO_SURFACE_M, PinholeView, view_from_matrices
 from .viewport import camera_frame
 
-COARSEST = 8
-"""Pixels of the region per marched pixel along a side, while the view or the scene changes."""
-MOST_SLICES = 2
-"""Of a picture that is marched while Blender waits."""
-READING_S = 0.1
-"""Time for reading the files of new humans in one go."""
 TICK_S = 0.02
+START_S = 0.3
+"""After the last picture of a moving view the shaders that march are compiled, which stalls the window."""
+REDRAWS = 3.0
+"""Of a window's time, a redraw takes at most one part in so many more, while a picture comes."""
 REGIONS_KEPT = 8
 WIREFRAME_OPACITY = 0.5
 """At least: without it, humans would be invisible, since they have no wires."""
-_EARLIER = (
-    "the human {!r} was made by an earlier version and its volumes are hidden: show these (in the Outliner, or tab "
-    "Output, Volumes in Viewport), edit the human, or generate it again"
-)
-_UNRELATED = (
-    bpy.types.Mesh,
-    bpy.types.Curve,
-    bpy.types.Material,
-    bpy.types.NodeTree,
-    bpy.types.Light,
-    bpy.types.Camera,
-)
 _STICK_PX, _JOINT_PX = 2.2, 2.2
 """Width of Blender's sticks and radius of their joints."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ShownHuman:
-    """A human whom a 3D view shows."""
-
-    object_uid: int
-    """Of the armature, or of the object that instances it; a reference would not outlive undo."""
-    pose: PosedHuman
-    placed: tuple[GpuPayload, Boxes]
-
-
-@dataclasses.dataclass(frozen=True)
-class SceneReading:
-    """What a 3D view shows besides Blender's objects."""
-
-    humans: dict[object, ShownHuman]
-    """By what their pictures depend on."""
-    bones: NDArray[np.float64]
-    """Ends of the bones that are shown in front [N, 2, 3], Blender's world."""
-    complete: bool
-    """False where files had to be read, which took long enough: the next reading continues."""
 
 
 class Overlay:
     """Pictures of all regions. All methods are for Blender's main thread, `draw` for its draw handlers."""
 
     def __init__(self) -> None:
-        self._start: Iterator[None] | None = None
-        """Compiles the shaders in steps, each of which stalls for a moment."""
-        self._ready = False
         self._regions: dict[int, GpuRefinement] = {}
         """By the region's address; the latest drawn last."""
-        self._readings: dict[object, SceneReading] = {}
-        """By view layer and local view, since the scene has changed."""
-        self._placed: dict[object, tuple[GpuPayload, Boxes]] = {}
+        self._reader = SceneReader()
+        self._readings: dict[ViewContent, SceneReading] = {}
+        """Since the scene has changed."""
+        self._drawn_at = 0.0
         self.undrawn = False
         """There are pictures that the windows have not drawn."""
         self._fault = ""
-        """Why the GPU cannot march."""
+        """Why the GPU can draw nothing."""
         self.error = ""
-        """Why humans are not drawn, or not all of them."""
+        """Why humans are not drawn, or not all of them, or roughly."""
 
     def scene_changed(self, changed: Iterable[bpy.types.ID] | None = None) -> None:
         """Read the scene again for the next picture, if one of these data (None: any) may concern humans."""
-        if changed is None or any(map(_concerns_humans, changed)):
+        if changed is None or any(map(concerns_humans, changed)):
             self._readings.clear()
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the humans into the region that Blender draws now."""
         marcher = self.prepare()
-        if marcher is not None:
-            with self._noting_faults():
-                self._draw(context, marcher)
+        if self._fault:
+            self.error = f"{self._fault}: show the volumes instead (tab Output, Volumes in Viewport)"
+            return
+        try:
+            self._draw_or_sketch(context, marcher)
+        except RuntimeError as error:
+            self._fault = str(error)
+            self._regions.clear()
 
     def prepare(self) -> GpuMarcher | None:
         """The marcher; None until its shaders are compiled, which a timer does, and where the GPU cannot march.
 
         For draw handlers. Called before the first human stands, it saves them the wait.
         """
-        marcher = self._fault or studio.gpu_marcher()
-        if isinstance(marcher, str):
-            self.error = f"{marcher}: show the volumes instead (tab Output, Volumes in Viewport)"
-            return None
-        if self._ready:
-            return marcher
-        self._start = self._start or self._starting(marcher)
-        follow()
-        return None
+        marcher = gpu_start.marcher()
+        if gpu_start.working:
+            follow()
+        return marcher
 
-    @contextlib.contextmanager
-    def _noting_faults(self) -> Iterator[None]:
-        """After an error of the GPU nothing is marched any more."""
-        try:
-            yield
-        except RuntimeError as error:
-            self._fault, self._start = str(error), None
-            self._regions.clear()
+    def _draw_or_sketch(self, context: bpy.types.Context, marcher: GpuMarcher | None) -> None:
+        """After an error of the GPU while it marches, only sketches are drawn. Raises RuntimeError if they fail too."""
+        if marcher is not None:
+            try:
+                self._draw(context, marcher)
+                return
+            except RuntimeError as error:
+                self._marching_failed(error)
+        self._draw(context, None)
 
-    def _draw(self, context: bpy.types.Context, marcher: GpuMarcher) -> None:
+    def _marching_failed(self, error: RuntimeError) -> None:
+        gpu_start.failed(str(error))
+        self._regions.clear()
+
+    def _draw(self, context: bpy.types.Context, marcher: GpuMarcher | None) -> None:
         reading = self.reading(context)
+        self.error = reading.error or (gpu_start.fault and f"{gpu_start.fault}: humans are drawn roughly")
         if not reading.humans:
             return
-        region, around = context.region, context.region_data
-        size, step = (region.width, region.height), context.scene.primdiffusion_render.step
-        window, to_view = (np.array(matrix, np.float64) for matrix in (around.window_matrix, around.view_matrix))
-        placed = [human.placed for human in reading.humans.values()]
-        subject = np.mean([human.pose.pelvis for human in reading.humans.values()], 0)
-        view = view_from_matrices(window, to_view, _clip(window), size, subject)
-        key = (tuple(reading.humans), window.tobytes(), to_view.tobytes(), size, step)
-        request = MarchRequest(key, view, lambda view: marcher.march(placed, view, step))
-        picture = self._picture_of(region)
-        if reading.complete:
-            picture.want(request)
-            for _ in range(MOST_SLICES):
-                if picture.shown is None or picture.shown.request.key != key:
-                    picture.advance()
+        self._drawn_at = time.monotonic()
+        window, to_view = (np.array(matrix, np.float64) for matrix in _matrices(context))
+        picture, request = self._picture_of(context.region), _request(context, reading, marcher)
+        picture.want(request)
+        if picture.fresh:
+            picture.advance()
         if not (picture.resting and reading.complete):
             follow()
         keep_bones_in_front(context, reading.bones)
-        if picture.shown is not None:
-            draw_picture(picture.shown.picture, _look(context, window, to_view))
+        look = _look(context, window, to_view)
+        boxes = [human.placed[1] for human in reading.humans.values()]
+        for part, drawn in _parts(picture, seen_part(boxes, request.view)):
+            draw_picture(drawn, look, part)
 
     def advance(self) -> bool:
         """Do some work that does not need the window; True when it must be drawn again."""
-        news = True
-        with self._noting_faults():
-            news = self._advance()
-        return news
-
-    def _advance(self) -> bool:
-        if self._start is not None:
-            if next(self._start, self) is self:
-                self._start, self._ready = None, True
-            return self._ready
-        news = [picture.advance() for picture in self._regions.values()]
+        if gpu_start.working:
+            return time.monotonic() - self._drawn_at >= START_S and gpu_start.advance()
+        news = False
+        try:
+            for picture in self._regions.values():
+                news = (not picture.fresh and picture.advance()) or news
+        except RuntimeError as error:
+            self._marching_failed(error)
+            news = True
         unread = [key for key, reading in self._readings.items() if not reading.complete]
         for key in unread:
             del self._readings[key]
-        return any(news) or bool(unread)
+        return news or bool(unread)
+
+    def redrawn_in(self, seconds: float) -> None:
+        """Say how long the windows take to draw."""
+        for picture in self._regions.values():
+            picture.reveal_s = max(REVEAL_S, REDRAWS * seconds)
 
     @property
     def resting(self) -> bool:
         """Whether every region shows its finest picture."""
         complete = all(reading.complete for reading in self._readings.values())
         at_rest = complete and all(picture.resting for picture in self._regions.values())
-        return at_rest and self._start is None and not self.undrawn
-
-    def _starting(self, marcher: GpuMarcher) -> Iterator[None]:
-        payload = GpuPayload(np.zeros((1, 3, 8, 8, 8)), np.ones((1, 8, 8, 8)))
-        boxes = Boxes(np.array([[0.0, 0.0, 1.0]]), np.eye(3)[None], np.full((1, 3), 0.1))
-        view = PinholeView(np.diag([8.0, 8.0, 1.0]), np.eye(3, 4), (0.0, 2.0), 8, 8)
-        yield
-        for _ in compile_shaders():
-            yield
-        picture = marcher.march([(payload, boxes)] * 2, view, 0.1)
-        yield
-        picture.advance()
-        picture.wait()
+        return at_rest and not gpu_start.working and not self.undrawn
 
     def object_at(self, context: bpy.types.Context, x: int, y: int) -> bpy.types.Object | None:
         """The object whose human is under a pixel of the region; None where another object is in front."""
@@ -216,49 +165,16 @@ class Overlay:
 
     def reading(self, context: bpy.types.Context) -> SceneReading:
         """What the space shows."""
-        space = context.space_data
-        key = (context.view_layer.as_pointer(), space.as_pointer() if space.local_view else None)
-        if key not in self._readings:
-            self._readings[key] = self._read(context.evaluated_depsgraph_get(), space)
-        return self._readings[key]
-
-    def _read(self, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> SceneReading:
-        humans: dict[object, ShownHuman] = {}
-        candidates: list[tuple[bpy.types.Object, bpy.types.Collection, PosedHuman | Exception]] = []
-        bones, drawn = [np.zeros((0, 2, 3))], set[bpy.types.Object]()
-        self.error, complete, end = "", True, time.monotonic() + READING_S
-        for obj, armature, matrix, owner in human_armatures(_noting(visible_instances(depsgraph, space), drawn)):
-            if armature.show_in_front:
-                bones.append(_bones(armature, matrix))
-            try:
-                candidates.append((obj, owner, pose_of(armature, matrix, owner)))
-            except (ValueError, OSError) as error:
-                candidates.append((obj, owner, error))
-        for number, (obj, owner, pose) in enumerate(candidates, 1):
-            if drawn and not drawn.isdisjoint(owner.all_objects):
-                continue
-            try:
-                if isinstance(pose, Exception):
-                    raise pose
-                key, known = _key(pose), studio.gpu_humans().holds(pose)
-                placed = self._placed.get(key) or studio.gpu_humans().placed(pose)
-            except EarlierVersionError:
-                self.error = _EARLIER.format(owner.name)
-                continue
-            except (ValueError, OSError) as error:
-                self.error = str(error)
-                continue
-            humans[key] = ShownHuman(obj.session_uid, pose, placed)
-            if not known and number < len(candidates) and time.monotonic() > end:
-                complete = False
-                break
-        studio.gpu_humans().keep_only(human.pose for human in humans.values())
-        self._placed = {key: human.placed for key, human in humans.items()}
-        return SceneReading(humans, np.concatenate(bones), complete)
+        content = ViewContent.of(context)
+        if content not in self._readings:
+            depsgraph = context.evaluated_depsgraph_get()
+            self._readings[content] = self._reader.read(content, depsgraph, context.space_data)
+            self.error = self._readings[content].error
+        return self._readings[content]
 
     def _picture_of(self, region: bpy.types.Region) -> GpuRefinement:
         address = region.as_pointer()
-        picture = self._regions.pop(address, None) or GpuRefinement(coarsest=COARSEST, samples=1)
+        picture = self._regions.pop(address, None) or GpuRefinement(samples=1)
         self._regions[address] = picture
         while len(self._regions) > REGIONS_KEPT:
             del self._regions[next(iter(self._regions))]
@@ -266,6 +182,38 @@ class Overlay:
 
 
 overlay = Overlay()
+
+
+def _request(context: bpy.types.Context, reading: SceneReading, marcher: GpuMarcher | None) -> MarchRequest:
+    """The picture that a region shows."""
+    region, step = context.region, context.scene.primdiffusion_render.step
+    size, (window, to_view) = (region.width, region.height), (np.array(m, np.float64) for m in _matrices(context))
+    humans = list(reading.humans.values())
+    subject = np.mean([human.pose.pelvis for human in humans], 0)
+    view = view_from_matrices(window, to_view, _clip(window), size, subject)
+    key = (tuple(reading.humans), window.tobytes(), to_view.tobytes(), size, step)
+    placed = [human.placed for human in humans]
+    reliefs = [(payload.relief, boxes) for payload, boxes in placed]
+
+    def begin(view: PinholeView) -> GpuMarch:
+        return marcher.march(placed, view, step * max(round(size[0] / view.width), 1))
+
+    return MarchRequest(key, view, lambda view: ReliefPicture(reliefs, view), None if marcher is None else begin)
+
+
+def _parts(picture: GpuRefinement, seen: Part) -> Iterator[tuple[Part, GpuMarch | ReliefPicture]]:
+    """Parts of the region to draw, and the picture for each: what has come of a finer one, then the shown one."""
+    left, bottom, right, top = seen
+    edge = top
+    if (coming := picture.coming) is not None:
+        edge = min(max(1.0 - coming.done, bottom), top)
+        yield (left, edge, right, top), coming
+    yield (left, bottom, right, edge), picture.shown.picture
+
+
+def _matrices(context: bpy.types.Context) -> tuple[Matrix, Matrix]:
+    """Of the region: to the window, and to the view."""
+    return context.region_data.window_matrix, context.region_data.view_matrix
 
 
 def keep_bones_in_front(context: bpy.types.Context, bones: NDArray) -> None:
@@ -311,12 +259,13 @@ def _march_and_draw() -> Iterator[float]:
         if overlay.advance():
             overlay.undrawn = True
             yield 0.0
-            overlay.undrawn = False
+            overlay.undrawn, began = False, time.monotonic()
             for window in bpy.context.window_manager.windows:
                 for area in window.screen.areas:
                     if area.type == "VIEW_3D":
                         area.tag_redraw()
             yield 0.0
+            overlay.redrawn_in(time.monotonic() - began)
         yield TICK_S
 
 
@@ -329,37 +278,6 @@ def draw_error(context: bpy.types.Context) -> None:
     blf.color(0, 1.0, 0.6, 0.4, 1.0)
     blf.position(0, 20 * pixel, 20 * pixel, 0)
     blf.draw(0, f"PrimDiffusion: {overlay.error}")
-
-
-def _concerns_humans(changed: bpy.types.ID) -> bool:
-    """Editing a scene's other objects should not wait until all instances have been looked through."""
-    if isinstance(changed, bpy.types.Object):
-        return changed.type in ("ARMATURE", "EMPTY", "VOLUME") or BODY_MARK in changed or PROXY_MARK in changed
-    return not isinstance(changed, _UNRELATED)
-
-
-def _key(pose: PosedHuman) -> object:
-    betas = None if pose.betas is None else tuple(pose.betas)
-    return file_version(pose.file), pose.body, pose.object_to_world.tobytes(), pose.joints.tobytes(), betas
-
-
-def _noting(
-    instances: Iterable[bpy.types.DepsgraphObjectInstance], drawn: set[bpy.types.Object]
-) -> Iterator[bpy.types.DepsgraphObjectInstance]:
-    """The same instances; `drawn` gets objects by which Blender draws humans: volumes, mesh proxies, body meshes."""
-    for instance in instances:
-        obj = instance.object
-        if obj.type == "VOLUME" or PROXY_MARK in obj or BODY_MARK in obj:
-            drawn.add(obj.original)
-        yield instance
-
-
-def _bones(armature: bpy.types.Object, matrix: NDArray) -> NDArray[np.float64]:
-    """Ends [N, 2, 3] of the bones that are not hidden, in Blender's world."""
-    hidden = "hide" if bpy.app.version >= (5, 0) else "bone.hide"
-    shown = [bone for bone in armature.pose.bones if not bone.path_resolve(hidden)]
-    ends = np.array([(bone.head, bone.tail) for bone in shown], np.float64).reshape(-1, 2, 3)
-    return ends @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _in_pixels(points: NDArray, matrix: NDArray, size: tuple[int, int]) -> NDArray[np.float64]:

@@ -89,6 +89,23 @@ def view_from_matrices(
     return PinholeView(intrinsics, world_to_camera, clip, width, height, offset)
 
 
+def opengl_projection(view: PinholeView) -> NDArray[np.float64]:
+    """The matrix [4, 4] from the world, y up, to OpenGL's clip space."""
+    near = max(view.clip[0], 1e-4)
+    far = max(view.clip[1], near * 1.001)
+    half = np.array([view.width, view.height]) / 2
+    focal, middle = np.diag(view.intrinsics)[:2] / half, view.intrinsics[:2, 2] / half - 1
+    projection = np.array(
+        [
+            [focal[0], 0, middle[0], 0],
+            [0, -focal[1], -middle[1], 0],
+            [0, 0, (far + near) / (far - near), -2 * far * near / (far - near)],
+            [0, 0, 1, 0],
+        ]
+    )
+    return projection @ np.concatenate([view.world_to_camera, [[0, 0, 0, 1]]])
+
+
 def without_scale(matrix: NDArray) -> NDArray[np.float64]:
     """An object's world matrix [4, 4] with axes of unit length: a camera's own scale does not count in Blender."""
     matrix = np.array(matrix, np.float64)

@@ -16,6 +16,7 @@ from . import studio
 from .composite import PictureTextures
 from .gpu_picture import GpuPicture, GpuScene, GpuSolids
 from .gpu_refine import GpuRefinement, MarchRequest
+from .gpu_start import gpu_start
 from .picture import SceneContent, scene_content
 from .refine import Refinement, ShownPicture, ViewRequest
 from .solids import SceneSolids, changed_by, scene_solids, stored
@@ -102,33 +103,34 @@ class Viewport:
         colours = (settings.view_transform, settings.look, settings.exposure, settings.gamma)
         if shown is None or self._no_gpu or self._texture[1] is not None or colours != ("Standard", "None", 0, 1):
             return None
-        return PictureTextures(self._texture[0], shown.picture.march.depth)
+        return PictureTextures(self._texture[0], shown.picture.humans.depth)
 
     @property
     def resting(self) -> bool:
         """Whether no new picture is expected."""
-        return self._refinement.resting if self._no_gpu else self._gpu.resting
+        return self._refinement.resting if self._no_gpu else self._gpu.resting and not gpu_start.working
 
     def advance(self) -> bool:
         """Process the child's answers; True when there is something new to draw, or to march while drawing."""
-        return self._refinement.advance() if self._no_gpu else self._gpu.due
+        return self._refinement.advance() if self._no_gpu else self._gpu.due and not gpu_start.working
 
     def _march(self, picture: SceneContent, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """March for a moment. Raises ValueError, OSError or RuntimeError for what the GPU cannot draw."""
-        marcher = self._gpu_fault or studio.gpu_marcher()
-        if isinstance(marcher, str):
-            raise RuntimeError(marcher)
+        marcher = gpu_start.marcher()
+        if fault := self._gpu_fault or gpu_start.fault:
+            raise RuntimeError(fault)
         if picture.shown != "colour":
             raise ValueError("the GPU draws colours alone")
         request = _view_request(picture, context, depsgraph)
         scene = self._scene_on_gpu(picture)
         view = request.view if request.region is None else request.view.part(request.region)
         key = (request.key, self._solids_count, request.region)
-        self._gpu.want(MarchRequest(key, view, lambda view: GpuPicture(marcher, scene, view)))
-        self._no_gpu = ""
-        if self._gpu.advance():
-            shown, before = self._gpu.shown, self._texture
-            mean = before[0] if before is not None and shown.sample else None
+        begin = None if marcher is None else lambda view: GpuPicture(marcher, scene, view)
+        self._gpu.want(MarchRequest(key, view, lambda view: GpuPicture(None, scene, view), begin))
+        self._no_gpu, before = "", self._gpu.shown
+        if self._gpu.advance() and self._gpu.shown is not before:
+            shown = self._gpu.shown
+            mean = self._texture[0] if shown.sample else None
             self._texture = shown.picture.compose(mean, shown.sample), shown.request.key[-1]
 
     def _scene_on_gpu(self, picture: SceneContent) -> GpuScene:
@@ -260,7 +262,8 @@ def stop() -> None:
 
 def _tick() -> float | None:
     studio.advance()
-    if any([viewport.advance() for viewport in _viewports]):  # a list: all of them must advance
+    ready = gpu_start.advance()
+    if ready or any([viewport.advance() for viewport in _viewports]):  # a list: all of them must advance
         _redraw()
     return TICK_S if any(not viewport.resting for viewport in _viewports) else None
 

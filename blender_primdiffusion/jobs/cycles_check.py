@@ -11,6 +11,7 @@ from pathlib import Path
 import bpy
 
 from ..backend.child_variables import BLENDER, COMPUTING, passed_on
+from ..engine.who_draws import note_volumes
 from ..formats.json_files import read_json
 from ..places import own_folder
 
@@ -36,6 +37,7 @@ def volumes_are_empty() -> bool:
     if known is None and _running is None:
         _running = _start()
         bpy.app.timers.register(_follow, first_interval=_TICK_S, persistent=True)
+    note_volumes("CYCLES", bool(known))
     return bool(known)
 
 

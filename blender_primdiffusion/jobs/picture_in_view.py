@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..engine import ENGINE
+from ..engine import by_engine
 from .pictures import so_far
 from .queue import queue
 from .windows import redraw_views
@@ -50,8 +50,7 @@ class PictureInView:
         scene, space, entry = context.scene, context.space_data, queue.current
         if self._pixels is None or entry is None or scene.session_uid != entry.scene_uid or space.local_view:
             return False
-        by_engine = space.shading.type == "RENDERED" and scene.render.engine == ENGINE
-        return scene.primdiffusion_render.in_viewports and (space.overlay.show_overlays or not by_engine)
+        return scene.primdiffusion_render.in_viewports and (space.overlay.show_overlays or not by_engine(context))
 
     def corners(self, context: bpy.types.Context) -> NDArray[np.float64]:
         """The picture's corners [4, 3] in this 3D view; follows the 3D cursor."""

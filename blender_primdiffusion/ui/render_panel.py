@@ -11,6 +11,7 @@ from mathutils import Euler, Vector
 
 from ..backend.requests import sentence
 from ..engine.engine import ENGINE
+from ..engine.who_draws import Drawer, renders_volumes, who_draws
 from ..formats.requests import DENSITY_GAIN, VOXEL
 from ..jobs import cycles_check
 from ..jobs.follow import Reporting
@@ -220,21 +221,30 @@ def _plain_colours(scene: bpy.types.Scene) -> None:
     scene.view_settings.look = "None"
 
 
-SHOWN_BY = {
-    ENGINE: "Renders humans exactly, other objects with simple shading",
-    "CYCLES": "Renders humans approximately, with light and shadows",
-}
+EXACT = "Renders humans exactly, other objects with simple shading"
+APPROXIMATE = "Renders humans approximately, with light and shadows"
+UNLIT = "Renders humans approximately, with light and shadows; 3D views show them without, unless they show volumes"
 OTHER_ENGINE = "Renders humans blurred: choose an engine above"
+
+
+def how_shown(scene: bpy.types.Scene) -> str:
+    """How the scene's engine shows humans, in renders and in Rendered views."""
+    engine = scene.render.engine
+    drawer = who_draws(engine, "RENDERED", all(in_viewport(person) for person in humans(scene)))
+    if drawer is Drawer.ENGINE:
+        return EXACT
+    if engine != "CYCLES":
+        return OTHER_ENGINE
+    return UNLIT if drawer is Drawer.OVERLAY and renders_volumes(engine) else APPROXIMATE
 
 
 def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """A choice of engines for humans, and how the current one shows them."""
-    engine = scene.render.engine
+    engine, line = scene.render.engine, how_shown(scene)
     row = layout.row(align=True)
     row.operator("primdiffusion.set_up_engine", text="PrimDiffusion", depress=engine == ENGINE, icon="SHADING_RENDERED")
     row.operator("primdiffusion.set_up_cycles", text="Cycles", depress=engine == "CYCLES", icon="SHADING_TEXTURE")
-    known = engine in SHOWN_BY
-    draw_lines(layout, pgettext_iface(SHOWN_BY.get(engine, OTHER_ENGINE)), "INFO" if known else "ERROR")
+    draw_lines(layout, pgettext_iface(line), "ERROR" if line == OTHER_ENGINE else "INFO")
     if engine == "CYCLES" and cycles_check.volumes_are_empty():
         draw_lines(layout, sentence(cycles_check.FAULT), "ERROR")
 

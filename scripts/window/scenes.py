@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 import bpy
+from moving_scenes import opening, playing, turning
 from panels import show, sidebar, view
 from press import Steps, invoke, press, wait
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, cancel_all, people_file, queue_of, select, with_people
@@ -368,4 +369,7 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "languages": languages,
     "stalls": stalls,
     "redraw": redraw,
+    "opening": opening,
+    "turning": turning,
+    "playing": playing,
 }

@@ -252,14 +252,15 @@ def redraw_view() -> None:
 
 def finished_ms(draw: Callable[[], object]) -> float:
     """Milliseconds of drawing, with what the GPU has left to do after it."""
-    _finish()
+    finish()
     began = time.perf_counter()
     draw()
-    _finish()
+    finish()
     return 1000 * (time.perf_counter() - began)
 
 
-def _finish() -> None:
+def finish() -> None:
+    """Return when the GPU has drawn what it was given."""
     gpu.state.active_framebuffer_get().read_color(0, 0, 1, 1, 4, 0, "UBYTE")
 
 

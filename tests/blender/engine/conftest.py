@@ -44,9 +44,11 @@ def marcher() -> GpuMarcher:
         pytest.skip("without a window Blender has a GPU context from 5.2 on")
     try:
         gpu.init()
-        return GpuMarcher()
+        marcher = GpuMarcher()
+        list(marcher.compile())
     except (SystemError, RuntimeError) as error:
         pytest.skip(f"no GPU context: {error}")
+    return marcher
 
 
 @pytest.fixture(scope="module")

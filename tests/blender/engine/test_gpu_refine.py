@@ -1,14 +1,17 @@
-"""Pictures of the GPU come coarse while a view moves, then finer, then antialiased; a slow GPU works in slices."""
+"""A view that moves shows a whole picture at once, then finer ones, then antialiased; a slow GPU works in slices."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from blender_primdiffusion.engine.gpu_refine import (
+    REVEAL_S,
     SAMPLES,
+    SKETCH,
     SLICE_S,
     SLOW_SAMPLES,
     GpuRefinement,
@@ -28,19 +31,30 @@ class SlowGpu:
     def __init__(self, pixel_s: float, boxes: Callable[[float], int] = lambda _height: 0):
         """`boxes` by the height in the picture, from 0 at the top to 1."""
         self.now, self.pixel_s, self.boxes, self.sizes, self.longest = 0.0, pixel_s, boxes, [], 0.0
+        self.sketched: list[tuple[int, int]] = []
+        self.sketch_s = 0.01
 
     def begin(self, view: PinholeView) -> OnePass:
         self.sizes.append((view.width, view.height))
         return OnePass(self, view)
 
+    def sketch(self, view: PinholeView) -> SimpleNamespace:
+        """Its time is seen by who waits for it."""
+        self.sketched.append((view.width, view.height))
+        seconds = self.sketch_s * view.width * view.height / (VIEW.width * VIEW.height)
+        return SimpleNamespace(wait=lambda: self.wait(seconds))
+
+    def wait(self, seconds: float) -> None:
+        self.now += seconds
+
     def refine_to_the_end(self, refinement: GpuRefinement) -> list[tuple[int, int]]:
         """Coarseness and sample of the pictures that appear."""
         shown = []
-        for _ in range(1000):
+        for _ in range(2000):
             if refinement.resting:
                 return shown
             began = self.now
-            if refinement.advance():
+            if refinement.advance() and (refinement.shown.coarseness, refinement.shown.sample) not in shown:
                 shown.append((refinement.shown.coarseness, refinement.shown.sample))
             self.longest = max(self.longest, self.now - began)
             self.now += 0.02
@@ -51,6 +65,11 @@ class OnePass:
     def __init__(self, gpu: SlowGpu, view: PinholeView):
         rows = -(-view.height // 8)
         self._gpu, self._work = gpu, [8 * view.width * (1 + gpu.boxes(row / rows)) for row in range(rows)]
+        self._rows = rows
+
+    @property
+    def done(self) -> float:
+        return 1 - len(self._work) / self._rows
 
     def advance(self, work: float) -> bool:
         done = 0
@@ -64,25 +83,30 @@ class OnePass:
 
 
 def request(gpu: SlowGpu, key: object) -> MarchRequest:
-    return MarchRequest(key, VIEW, gpu.begin)
+    return MarchRequest(key, VIEW, gpu.sketch, gpu.begin)
 
 
-def test_a_picture_is_refined_and_antialiased_when_nothing_moves():
+def refined(gpu: SlowGpu, key: object = "a") -> GpuRefinement:
+    refinement = GpuRefinement(lambda: gpu.now)
+    refinement.want(request(gpu, key))
+    gpu.refine_to_the_end(refinement)
+    return refinement
+
+
+def test_a_picture_is_sketched_refined_and_antialiased_when_nothing_moves():
     gpu = SlowGpu(1e-6)
     refinement = GpuRefinement(lambda: gpu.now)
     refinement.want(request(gpu, "a"))
     shown = gpu.refine_to_the_end(refinement)
-    assert shown == [(4, 0), (2, 0), (1, 0), *((1, n) for n in range(1, SAMPLES))]
-    assert gpu.sizes[:3] == [(160, 120), (320, 240), (640, 480)]
+    assert shown == [(SKETCH, 0), (2, 0), (1, 0), *((1, n) for n in range(1, SAMPLES))]
+    assert gpu.sizes[:2] == [(320, 240), (640, 480)]
     assert gpu.longest < 2 * SLICE_S
     assert not refinement.advance()
 
 
-def test_a_fast_gpu_draws_in_full_while_the_view_moves():
+def test_a_fast_gpu_marches_in_full_while_the_view_moves():
     gpu = SlowGpu(1e-9)
-    refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, 0))
-    gpu.refine_to_the_end(refinement)
+    refinement = refined(gpu)
     for key in range(1, 4):
         refinement.want(request(gpu, key))
         assert refinement.advance()
@@ -91,26 +115,86 @@ def test_a_fast_gpu_draws_in_full_while_the_view_moves():
         gpu.now += REST_S / 2
 
 
-def test_a_slow_gpu_is_never_waited_for_and_shows_pictures_while_the_view_moves():
-    gpu = SlowGpu(2e-5)  # a coarse picture takes .4 s, a full one 6 s
+@pytest.mark.parametrize("pixel_s", [1e-9, 1e-7, 1e-6, 2e-5, 1e-3])
+def test_the_first_call_after_any_change_shows_a_whole_picture_of_the_new_view(pixel_s):
+    gpu = SlowGpu(pixel_s)
     refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, -1))
-    gpu.refine_to_the_end(refinement)
-    gpu.longest, shown = 0.0, 0
-    for key in range(40):
+    for key in range(20):
         refinement.want(request(gpu, key))
         began = gpu.now
-        shown += refinement.advance()
-        gpu.longest = max(gpu.longest, gpu.now - began)
-    assert shown > 5
-    assert gpu.longest < 0.3
+        assert refinement.advance()
+        assert gpu.now - began < 0.3
+        assert (refinement.shown.request.key, refinement.shown.sample, refinement.fresh) == (key, 0, False)
+        for _ in range(key):
+            refinement.advance()  # marching, in a pause that ends at any moment
+            gpu.now += 0.05
+
+
+def test_a_gpu_that_has_become_slow_is_noticed_at_the_first_picture():
+    gpu = SlowGpu(1e-7)
+    refinement = refined(gpu)
+    gpu.pixel_s = 2e-6
+    for key, coarseness in (("b", 1), ("c", SKETCH)):
+        refinement.want(request(gpu, key))
+        began = gpu.now
+        assert refinement.advance()
+        assert refinement.shown.coarseness == coarseness
+    assert gpu.now - began < 0.05
+
+
+def test_sketches_that_take_long_are_followed_by_ones_of_half_the_resolution():
+    gpu = SlowGpu(1e-5)
+    refinement = GpuRefinement(lambda: gpu.now)
+    for key, seconds in enumerate((0.1, 0.1, 0.05, 0.02, 0.02)):
+        gpu.sketch_s = seconds
+        refinement.want(request(gpu, key))
+        refinement.advance()
+    whole, half = (640, 480), (320, 240)
+    assert gpu.sketched == [whole, half, half, half, whole]
+
+
+def test_a_sketch_stays_while_the_gpu_cannot_march_and_is_refined_as_soon_as_it_can():
+    gpu = SlowGpu(1e-6)
+    refinement = GpuRefinement(lambda: gpu.now)
+    refinement.want(MarchRequest("a", VIEW, gpu.sketch, None))
+    assert gpu.refine_to_the_end(refinement) == [(SKETCH, 0)]
+    refinement.want(request(gpu, "a"))
+    assert not refinement.fresh
+    assert gpu.refine_to_the_end(refinement)[-1] == (1, SAMPLES - 1)
+
+
+def test_a_slow_picture_is_shown_as_far_as_it_has_come():
+    gpu = SlowGpu(1e-5)
+    refinement, come = GpuRefinement(lambda: gpu.now), []
+    refinement.want(request(gpu, "a"))
+    refinement.advance()
+    assert refinement.coming is None
+    gpu.now += REST_S
+    began = gpu.now
+    while refinement.shown.coarseness == SKETCH:
+        if refinement.advance() and refinement.coming is not None:
+            assert refinement.shown.coarseness == SKETCH, "the sketch stays below"
+            come.append((refinement.coming.done, gpu.now))
+    parts = [part for part, _ in come]
+    assert parts == sorted(set(parts))
+    assert 0 < parts[0] < 0.7
+    assert np.diff([began, *(moment for _, moment in come)]).min() >= REVEAL_S
+
+
+def test_what_antialiases_is_shown_when_it_is_complete():
+    gpu = SlowGpu(1e-5)
+    refinement = GpuRefinement(lambda: gpu.now)
+    refinement.want(request(gpu, "a"))
+    while not refinement.resting:
+        refinement.advance()
+        gpu.now += 0.02
+        if refinement.shown.coarseness == 1:
+            assert refinement.coming is None
 
 
 def test_a_human_below_empty_rows_does_not_stall_the_window():
     gpu = SlowGpu(2e-7, lambda height: 40 if height > 0.5 else 0)
-    refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, "a"))
-    gpu.refine_to_the_end(refinement)
+    refined(gpu)
     assert gpu.longest < 2 * SLICE_S
 
 
@@ -130,15 +214,17 @@ def test_a_finer_picture_is_abandoned_when_the_view_moves():
         refinement.advance()
         gpu.now += REST_S
     refinement.want(request(gpu, "b"))
+    assert refinement.coming is None
     refinement.advance()
-    assert gpu.sizes[-1] == (160, 120)
+    assert refinement.shown.request.key == "b"
+    gpu.now += REST_S
+    refinement.advance()
+    assert gpu.sizes[-1] == (320, 240)
 
 
 def test_an_equal_request_changes_nothing_and_rays_stay_in_their_pixels():
     gpu = SlowGpu(1e-6)
-    refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, "a"))
-    gpu.refine_to_the_end(refinement)
+    refinement = refined(gpu)
     refinement.want(request(gpu, "a"))
     assert refinement.resting
     assert jittered(VIEW, 0) is VIEW

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import time
 from types import SimpleNamespace
 
 import bpy
@@ -14,8 +15,9 @@ from engine_stage import cube
 from mathutils import Matrix
 
 from blender_primdiffusion.engine import overlay as module
-from blender_primdiffusion.engine import studio
+from blender_primdiffusion.engine import scene_reading, studio
 from blender_primdiffusion.engine.boxes import Boxes, boxes_of
+from blender_primdiffusion.engine.gpu_start import GpuStart
 from blender_primdiffusion.engine.overlay import Overlay
 from blender_primdiffusion.engine.view import NO_SURFACE_M
 from blender_primdiffusion.scene.attachment import show_in_viewport
@@ -71,13 +73,14 @@ def volumes_of(human) -> bpy.types.Collection:
     return next(child for child in human.children if child.name.endswith("_primitives"))
 
 
-def context(matrix=PERSPECTIVE) -> SimpleNamespace:
+def context(matrix=PERSPECTIVE, shading="SOLID", volumes=True) -> SimpleNamespace:
     """As in the draw handler of a region."""
     bpy.context.view_layer.update()
     region = SimpleNamespace(width=SIZE[0], height=SIZE[1], as_pointer=lambda: 1)
     space = SimpleNamespace(
-        local_view=None, shading=SimpleNamespace(show_xray=False, type="SOLID"), as_pointer=lambda: 2
-    )
+        local_view=None, shading=SimpleNamespace(show_xray=False, type=shading), as_pointer=lambda: 2,
+        show_object_viewport_mesh=True, show_object_viewport_volume=volumes,
+    )  # fmt: skip
     around = SimpleNamespace(window_matrix=matrix, view_matrix=LOOK_ALONG_Y)
     return SimpleNamespace(
         mode="OBJECT", region=region, space_data=space, region_data=around, scene=bpy.context.scene,
@@ -85,9 +88,9 @@ def context(matrix=PERSPECTIVE) -> SimpleNamespace:
     )  # fmt: skip
 
 
-def read(overlay):
+def read(overlay, **view):
     overlay.scene_changed()
-    return overlay.reading(context())
+    return overlay.reading(context(**view))
 
 
 def name_of(human) -> str:
@@ -98,11 +101,29 @@ def names(reading) -> list[str]:
     return sorted(map(name_of, reading.humans.values()))
 
 
-def test_humans_whose_volumes_or_meshes_viewports_show_are_not_drawn_twice(people):
-    assert names(read(people.overlay)) == ["Anna", "Bert"]
+def test_humans_whose_volumes_a_view_lights_are_left_to_its_engine(people):
+    bpy.context.scene.render.engine = "CYCLES"
+    assert names(read(people.overlay, shading="RENDERED")) == ["Anna", "Bert"]
     volumes_of(people.bert).hide_viewport = False
-    assert names(read(people.overlay)) == ["Anna"]
-    volumes_of(people.bert).hide_viewport = True
+    assert names(read(people.overlay, shading="RENDERED")) == ["Anna"]
+    assert names(read(people.overlay, shading="MATERIAL")) == ["Anna"]
+    assert names(read(people.overlay, shading="RENDERED", volumes=False)) == ["Anna", "Bert"]
+    assert names(read(people.overlay, shading="SOLID")) == ["Anna", "Bert"], "over the fog"
+    bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
+    assert names(read(people.overlay, shading="RENDERED")) == ["Anna", "Bert"]
+
+
+def test_views_of_several_shadings_do_not_share_what_they_show(people):
+    bpy.context.scene.render.engine = "CYCLES"
+    volumes_of(people.bert).hide_viewport = False
+    solid = read(people.overlay)
+    rendered = people.overlay.reading(context(shading="RENDERED"))
+    assert (names(solid), names(rendered)) == (["Anna", "Bert"], ["Anna"])
+    assert people.overlay.reading(context()) is solid
+
+
+def test_humans_whose_meshes_viewports_show_are_not_drawn_twice(people):
+    assert names(read(people.overlay)) == ["Anna", "Bert"]
     body_of(people.anna).hide_viewport = False
     assert names(read(people.overlay)) == ["Bert"]
 
@@ -128,7 +149,7 @@ def test_a_human_without_its_file_is_named_and_the_others_are_drawn(people):
     assert "Anna" in people.overlay.error
     volumes_of(people.anna).hide_viewport = False
     assert names(read(people.overlay)) == ["Bert"]
-    assert people.overlay.error == ""
+    assert people.overlay.error == "", "the fog shows her"
 
 
 def test_the_view_says_how_to_see_a_human_of_an_earlier_version(people, monkeypatch):
@@ -151,7 +172,7 @@ def test_the_view_says_how_to_see_a_human_of_an_earlier_version(people, monkeypa
 
 
 def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
-    monkeypatch.setattr(module, "READING_S", -1.0)
+    monkeypatch.setattr(scene_reading, "READING_S", -1.0)
     first = read(people.overlay)
     assert len(first.humans) == 1
     assert not first.complete
@@ -162,13 +183,22 @@ def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
     assert people.overlay.resting
 
 
-def test_shaders_are_compiled_in_steps_before_a_human_stands(addon, monkeypatch):
-    marcher, own, followed = object(), Overlay(), []
-    monkeypatch.setattr(studio, "gpu_marcher", lambda: marcher)
+def test_shaders_are_compiled_in_steps_once_the_view_rests(addon, monkeypatch):
+    marcher, own, followed, start = object(), Overlay(), [], GpuStart()
+    monkeypatch.setattr(module, "gpu_start", start)
     monkeypatch.setattr(module, "follow", lambda: followed.append(own.resting))
-    monkeypatch.setattr(own, "_starting", lambda _marcher: iter([None, None]))
+
+    def compiling():
+        yield
+        yield
+        start._marcher = marcher
+
+    monkeypatch.setattr(start, "_compiling", compiling)
     assert own.prepare() is None
     assert followed == [False]
+    own._drawn_at = time.monotonic() + 60
+    assert [own.advance() for _ in range(5)] == [False] * 5, "the view moves"
+    own._drawn_at = 0.0
     assert [own.advance() for _ in range(3)] == [False, False, True]
     assert own.prepare() is marcher
     assert own.resting
@@ -176,7 +206,7 @@ def test_shaders_are_compiled_in_steps_before_a_human_stands(addon, monkeypatch)
 
 def test_marching_and_drawing_are_steps_of_their_own(monkeypatch):
     own, news = Overlay(), [False, True, False]
-    pictures = SimpleNamespace(resting=False, advance=lambda: news.pop(0))
+    pictures = SimpleNamespace(resting=False, fresh=False, advance=lambda: news.pop(0))
     own._regions[0] = pictures
     monkeypatch.setattr(module, "overlay", own)
     steps, seen = module._march_and_draw(), []
@@ -326,17 +356,78 @@ def test_a_picture_above_the_overlays_leaves_the_bones_of_the_same_reading(peopl
     assert drawn[1] == ("picture", True)
 
 
-def test_a_gpu_that_fails_is_not_asked_again_and_the_view_says_why(people, monkeypatch):
+def drawing(people, monkeypatch, march, sketch) -> list[tuple]:
+    """Let an overlay march and sketch by these functions; the parts and pictures that it draws."""
+    start, drawn = GpuStart(), []
+    start._marcher = SimpleNamespace(march=march)
+    monkeypatch.setattr(module, "gpu_start", start)
+    monkeypatch.setattr(module, "ReliefPicture", sketch)
+    monkeypatch.setattr(module, "keep_bones_in_front", lambda *_given: None)
+    monkeypatch.setattr(module, "_look", lambda *_given: None)
+    monkeypatch.setattr(module, "draw_picture", lambda picture, _look, part: drawn.append((picture, part)))
+    monkeypatch.setattr(module, "follow", lambda: None)
+    monkeypatch.setattr(Uploads, "placed", lambda self, pose: (SimpleNamespace(relief=None), PLACED(self, pose)[1]))
+    return drawn
+
+
+PLACED = Uploads.placed
+
+
+def broken(*_given):
+    raise RuntimeError("the GPU is out of order")
+
+
+def test_a_gpu_that_fails_to_march_sketches_and_the_view_says_why(people, monkeypatch):
     asked = []
 
-    def march(*_given):
-        asked.append(1)
-        raise RuntimeError("the GPU is out of order")
+    def march(*given):
+        asked.append(given)
+        broken()
 
-    monkeypatch.setattr(studio, "gpu_marcher", lambda: SimpleNamespace(march=march))
-    people.overlay._ready = True
+    sketch = SimpleNamespace(wait=lambda: None)
+    drawn = drawing(people, monkeypatch, march, lambda *_given: sketch)
+    people.overlay.draw(context())
+    people.overlay._regions[1]._changed_at = 0.0
     for _ in range(3):
+        people.overlay.advance()
         people.overlay.draw(context())
     assert len(asked) == 1
+    assert [picture for picture, _ in drawn] == [sketch] * 4
+    assert people.overlay.error == "the GPU is out of order: humans are drawn roughly"
+    assert people.overlay.resting
+
+
+def test_a_gpu_that_can_draw_nothing_is_not_asked_again(people, monkeypatch):
+    asked = []
+
+    def sketch(*given):
+        asked.append(given)
+        broken()
+
+    assert drawing(people, monkeypatch, broken, sketch) == []
+    for _ in range(4):
+        people.overlay.draw(context())
+    assert len(asked) == 2, "once more when marching was given up"
     assert people.overlay.error.startswith("the GPU is out of order: show the volumes instead")
     assert people.overlay.resting
+
+
+def test_each_redraw_of_a_moving_view_shows_all_of_the_new_one(people, monkeypatch):
+    drawn = drawing(people, monkeypatch, broken, lambda _humans, view: SimpleNamespace(view=view, wait=lambda: None))
+    for turn in range(5):
+        view = context()
+        view.region_data.view_matrix = LOOK_ALONG_Y @ np.array(Matrix.Rotation(0.1 * turn, 4, "Z"))
+        people.overlay.draw(view)
+        assert len(drawn) == turn + 1
+    turns = {sketch.view.world_to_camera.tobytes() for sketch, _ in drawn}
+    assert len(turns) == 5
+
+
+def test_a_picture_that_comes_is_drawn_above_the_one_that_is_there(people):
+    picture = SimpleNamespace(coming=SimpleNamespace(done=0.25), shown=SimpleNamespace(picture="sketch"))
+    assert list(module._parts(picture, (0.1, 0.2, 0.6, 0.9))) == [
+        ((0.1, 0.75, 0.6, 0.9), picture.coming),
+        ((0.1, 0.2, 0.6, 0.75), "sketch"),
+    ]
+    picture.coming = None
+    assert list(module._parts(picture, (0.1, 0.2, 0.6, 0.9))) == [((0.1, 0.2, 0.6, 0.9), "sketch")]

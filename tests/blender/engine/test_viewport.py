@@ -24,7 +24,7 @@ def shown():
     """A viewport of region 7 that shows a marched picture."""
     made = Viewport()
     made.region, made._texture = 7, ("mean", None)
-    made._gpu.shown = SimpleNamespace(picture=SimpleNamespace(march=SimpleNamespace(depth="depth")))
+    made._gpu.shown = SimpleNamespace(picture=SimpleNamespace(humans=SimpleNamespace(depth="depth")))
     return made
 
 

@@ -14,13 +14,14 @@ from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion import places
+from blender_primdiffusion.engine.who_draws import note_volumes
 from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of
+from blender_primdiffusion.scene.attachment import attachment_of, show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import (
     MARK,
@@ -248,6 +249,25 @@ def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(perso
     assert bpy.app.version < (5, 0) or scene.cycles.volume_biased
     assert ops.set_up_engine() == {"FINISHED"}
     assert (scene.render.engine, scene.camera) == ("PRIMDIFFUSION", camera)
+    scene.render.engine = "CYCLES"
+
+
+def test_the_panel_says_who_draws_humans(person):
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    show_in_viewport(person, False)
+    assert render_panel.how_shown(scene) == render_panel.UNLIT
+    show_in_viewport(person, True)
+    assert render_panel.how_shown(scene) == render_panel.APPROXIMATE
+    assert "with light and shadows" in " ".join(shown(render_panel.PRIMDIFFUSION_PT_render, bpy.context))
+    show_in_viewport(person, False)
+    note_volumes("CYCLES", empty=True)
+    assert render_panel.how_shown(scene) == render_panel.APPROXIMATE, "of renders; the fault is said below"
+    note_volumes("CYCLES", empty=False)
+    assert ops.set_up_engine() == {"FINISHED"}
+    assert render_panel.how_shown(scene) == render_panel.EXACT
+    scene.render.engine = "BLENDER_WORKBENCH"
+    assert render_panel.how_shown(scene) == render_panel.OTHER_ENGINE
     scene.render.engine = "CYCLES"
 
 

@@ -31,12 +31,12 @@ def composed() -> set[str]:
     from blender_primdiffusion.jobs.remedies import _REMEDIES
     from blender_primdiffusion.motion.poses import LIBRARY
     from blender_primdiffusion.ui.attributes import CATEGORIES, menu
-    from blender_primdiffusion.ui.render_panel import OTHER_ENGINE, SHOWN_BY
+    from blender_primdiffusion.ui.render_panel import APPROXIMATE, EXACT, OTHER_ENGINE, UNLIT
     from blender_primdiffusion.ui.shape_panel import _SHOWN
     from blender_primdiffusion.ui.variations_panel import _BUILD_ALL
 
     sliders = {"Stature", "Shoulders", "Waist", "Girth"}
-    reasons = {"Set up the backend first", "Choose the other human above", *SHOWN_BY.values(), OTHER_ENGINE}
+    reasons = {"Set up the backend first", "Choose the other human above", EXACT, APPROXIMATE, UNLIT, OTHER_ENGINE}
     facts = {"Rig", "Up Axis", "Frames", "Frame Rate", "Units", "Bones", "Stride"}
     facts |= {"Volumes", "Files", "Memory once drawn"} | {name.capitalize() for name in _SHOWN}
     menus = {item[1] for name in CATEGORIES for item in menu(name)} | set(LIBRARY)

@@ -1,0 +1,157 @@
+"""Which humans a 3D view shows over what Blender draws, read from the scene as the view shows it."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Iterable, Iterator
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.human import BODY_MARK
+from ..scene.human_file import file_version
+from ..scene.proxy import PROXY_MARK
+from . import studio
+from .boxes import Boxes, EarlierVersionError
+from .gpu_march import GpuPayload
+from .picture import PosedHuman, human_armatures, pose_of
+from .solids import visible_instances
+from .who_draws import Drawer, who_draws
+
+READING_S = 0.1
+"""Time for reading the files of new humans in one go."""
+_EARLIER = (
+    "the human {!r} was made by an earlier version and its volumes are hidden: show these (in the Outliner, or tab "
+    "Output, Volumes in Viewport), edit the human, or generate it again"
+)
+_UNRELATED = (
+    bpy.types.Mesh,
+    bpy.types.Curve,
+    bpy.types.Material,
+    bpy.types.NodeTree,
+    bpy.types.Light,
+    bpy.types.Camera,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class ShownHuman:
+    """A human whom a 3D view shows."""
+
+    object_uid: int
+    """Of the armature, or of the object that instances it; a reference would not outlive undo."""
+    pose: PosedHuman
+    placed: tuple[GpuPayload, Boxes]
+
+
+@dataclasses.dataclass(frozen=True)
+class SceneReading:
+    """What a 3D view shows besides Blender's objects."""
+
+    humans: dict[object, ShownHuman]
+    """By what their pictures depend on."""
+    bones: NDArray[np.float64]
+    """Ends of the bones that are shown in front [N, 2, 3], Blender's world."""
+    complete: bool
+    """False where files had to be read, which took long enough: the next reading continues."""
+    error: str
+    """Why humans are not drawn, or not all of them."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewContent:
+    """What a 3D view shows of a scene; views with equal contents have equal readings."""
+
+    layer: int
+    """Address of the view layer."""
+    local: int
+    """Address of the space where its view is local, else 0."""
+    by_volumes: bool
+    """An engine draws humans by their volumes."""
+    types: frozenset[str]
+    """Of "mesh" and "volume" those that the view's Object Types Visibility shows."""
+
+    @classmethod
+    def of(cls, context: bpy.types.Context) -> ViewContent:
+        """Of the context's space."""
+        space = context.space_data
+        by_volumes = who_draws(context.scene.render.engine, space.shading.type, True) is Drawer.VOLUMES
+        types = frozenset(kind for kind in ("mesh", "volume") if getattr(space, f"show_object_viewport_{kind}"))
+        local = space.as_pointer() if space.local_view else 0
+        return cls(context.view_layer.as_pointer(), local, by_volumes, types)
+
+
+class SceneReader:
+    """Reads scenes; keeps what it has placed, because the next reading differs in few humans."""
+
+    def __init__(self) -> None:
+        self._placed: dict[object, tuple[GpuPayload, Boxes]] = {}
+
+    def read(self, content: ViewContent, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> SceneReading:
+        """What the space shows, whose content this is."""
+        humans: dict[object, ShownHuman] = {}
+        candidates: list[tuple[bpy.types.Object, bpy.types.Collection, PosedHuman | Exception]] = []
+        bones, noted = [np.zeros((0, 2, 3))], {kind: set[bpy.types.Object]() for kind in content.types}
+        errors, complete, end = [""], True, time.monotonic() + READING_S
+        for obj, armature, matrix, owner in human_armatures(_noting(visible_instances(depsgraph, space), noted)):
+            if armature.show_in_front:
+                bones.append(_bones(armature, matrix))
+            try:
+                candidates.append((obj, owner, pose_of(armature, matrix, owner)))
+            except (ValueError, OSError) as error:
+                candidates.append((obj, owner, error))
+        for number, (obj, owner, pose) in enumerate(candidates, 1):
+            shown = {kind for kind, found in noted.items() if found and not found.isdisjoint(owner.all_objects)}
+            if "mesh" in shown or (content.by_volumes and "volume" in shown):
+                continue
+            try:
+                if isinstance(pose, Exception):
+                    raise pose
+                key, known = _key(pose), studio.gpu_humans().holds(pose)
+                placed = self._placed.get(key) or studio.gpu_humans().placed(pose)
+            except (ValueError, OSError) as error:
+                if "volume" not in shown:  # Blender's fog shows where the human is
+                    errors.append(_EARLIER.format(owner.name) if isinstance(error, EarlierVersionError) else str(error))
+                continue
+            humans[key] = ShownHuman(obj.session_uid, pose, placed)
+            if not known and number < len(candidates) and time.monotonic() > end:
+                complete = False
+                break
+        studio.gpu_humans().keep_only(human.pose for human in humans.values())
+        self._placed = {key: human.placed for key, human in humans.items()}
+        return SceneReading(humans, np.concatenate(bones), complete, errors[-1])
+
+
+def concerns_humans(changed: bpy.types.ID) -> bool:
+    """Editing a scene's other objects should not wait until all instances have been looked through."""
+    if isinstance(changed, bpy.types.Object):
+        return changed.type in ("ARMATURE", "EMPTY", "VOLUME") or BODY_MARK in changed or PROXY_MARK in changed
+    return not isinstance(changed, _UNRELATED)
+
+
+def _key(pose: PosedHuman) -> object:
+    betas = None if pose.betas is None else tuple(pose.betas)
+    return file_version(pose.file), pose.body, pose.object_to_world.tobytes(), pose.joints.tobytes(), betas
+
+
+def _noting(
+    instances: Iterable[bpy.types.DepsgraphObjectInstance], noted: dict[str, set[bpy.types.Object]]
+) -> Iterator[bpy.types.DepsgraphObjectInstance]:
+    """The same instances; `noted`, by kind, gets what Blender may draw of humans: volumes, and as "mesh" their mesh
+    proxies and body meshes."""
+    for instance in instances:
+        obj = instance.object
+        kind = "volume" if obj.type == "VOLUME" else "mesh" if PROXY_MARK in obj or BODY_MARK in obj else ""
+        if kind in noted:
+            noted[kind].add(obj.original)
+        yield instance
+
+
+def _bones(armature: bpy.types.Object, matrix: NDArray) -> NDArray[np.float64]:
+    """Ends [N, 2, 3] of the bones that are not hidden, in Blender's world."""
+    hidden = "hide" if bpy.app.version >= (5, 0) else "bone.hide"
+    shown = [bone for bone in armature.pose.bones if not bone.path_resolve(hidden)]
+    ends = np.array([(bone.head, bone.tail) for bone in shown], np.float64).reshape(-1, 2, 3)
+    return ends @ matrix[:3, :3].T + matrix[:3, 3]

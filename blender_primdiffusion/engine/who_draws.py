@@ -1,0 +1,49 @@
+"""Who draws humans in a 3D view. Views and panels ask here; panels import it when Blender starts, without numpy."""
+
+from __future__ import annotations
+
+import enum
+
+import bpy
+
+from .engine import ENGINE
+
+WORKBENCH, EEVEE = "BLENDER_WORKBENCH", "BLENDER_EEVEE"
+_without: set[str] = {WORKBENCH}
+"""Engines that list volumes among what they draw and still show no human by them: Workbench draws a grey fog."""
+
+
+class Drawer(enum.Enum):
+    """Who draws a human in a 3D view."""
+
+    ENGINE = "the PrimDiffusion engine, into its own picture"
+    VOLUMES = "another render engine, as volumes with light and shadows"
+    OVERLAY = "this extension, over what Blender draws"
+
+
+def who_draws(engine: str, shading: str, volumes_shown: bool) -> Drawer:
+    """Who draws a human in a 3D view with this `shading.type`, while the scene has this render engine.
+
+    `volumes_shown`: the view contains the human's volumes, which new humans hide in viewports.
+    """
+    drawing = view_engine(engine, shading)
+    if drawing == ENGINE:
+        return Drawer.ENGINE
+    return Drawer.VOLUMES if volumes_shown and renders_volumes(drawing) else Drawer.OVERLAY
+
+
+def view_engine(engine: str, shading: str) -> str:
+    """The engine that draws a 3D view with this shading, in a scene with this render engine."""
+    return {"RENDERED": engine, "MATERIAL": EEVEE}.get(shading, WORKBENCH)
+
+
+def renders_volumes(engine: str) -> bool:
+    """Whether an engine lights volumes. Engines declare that as Blender's own do: their name is in COMPAT_ENGINES of
+    the panel of a volume's file (in Blender 4.5 to 5.2 Cycles, EEVEE and Hydra Storm)."""
+    panel = getattr(bpy.types, "DATA_PT_volume_file", None)
+    return engine in getattr(panel, "COMPAT_ENGINES", ()) and engine not in _without | {ENGINE}
+
+
+def note_volumes(engine: str, empty: bool) -> None:
+    """Say whether an engine draws volumes empty in this Blender, and so counts as one that renders none."""
+    (_without.add if empty else _without.discard)(engine)

@@ -1,0 +1,62 @@
+"""Who draws humans in which 3D view, and that the engines that are said to render volumes do."""
+
+from __future__ import annotations
+
+import bpy
+import pytest
+
+from blender_primdiffusion.engine import who_draws as module
+from blender_primdiffusion.engine.who_draws import Drawer, note_volumes, renders_volumes, view_engine, who_draws
+from blender_primdiffusion.jobs import cycles_check
+
+pytestmark = pytest.mark.any_blender
+EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
+SHADINGS = ("WIREFRAME", "SOLID", "MATERIAL", "RENDERED")
+
+
+@pytest.fixture(autouse=True)
+def nothing_is_known_of_this_build(monkeypatch):
+    monkeypatch.setattr(module, "_without", {module.WORKBENCH})
+
+
+def drawers(engine: str, volumes_shown: bool) -> list[Drawer]:
+    return [who_draws(engine, shading, volumes_shown) for shading in SHADINGS]
+
+
+@pytest.mark.parametrize("engine", ["CYCLES", EEVEE])
+def test_views_with_light_leave_humans_to_engines_that_render_their_volumes(addon, engine):
+    over, volumes = Drawer.OVERLAY, Drawer.VOLUMES
+    assert drawers(engine, True) == [over, over, volumes, volumes]
+    assert drawers(engine, False) == [over] * 4, "without volumes the view would be empty"
+
+
+def test_workbench_shows_a_fog_which_is_drawn_over(addon):
+    assert drawers("BLENDER_WORKBENCH", True)[3] is Drawer.OVERLAY
+    assert drawers("BLENDER_WORKBENCH", True)[2] is Drawer.VOLUMES, "Material Preview is EEVEE's"
+
+
+def test_the_engine_draws_its_own_view_and_no_other(addon):
+    assert drawers("PRIMDIFFUSION", False) == [Drawer.OVERLAY] * 3 + [Drawer.ENGINE]
+    assert who_draws("PRIMDIFFUSION", "RENDERED", True) is Drawer.ENGINE
+    assert view_engine("PRIMDIFFUSION", "SOLID") == "BLENDER_WORKBENCH"
+
+
+def test_an_engine_declares_that_it_renders_volumes_as_blenders_own_do(addon):
+    assert who_draws("SOMEBODYS", "RENDERED", True) is Drawer.OVERLAY
+    engines = bpy.types.DATA_PT_volume_file.COMPAT_ENGINES
+    engines.add("SOMEBODYS")
+    try:
+        assert who_draws("SOMEBODYS", "RENDERED", True) is Drawer.VOLUMES
+    finally:
+        engines.discard("SOMEBODYS")
+
+
+def test_where_an_engine_draws_volumes_empty_the_overlay_draws(addon, monkeypatch):
+    monkeypatch.setattr(cycles_check, "_recall", lambda: True)
+    assert cycles_check.volumes_are_empty()
+    assert who_draws("CYCLES", "RENDERED", True) is Drawer.OVERLAY
+    monkeypatch.setattr(cycles_check, "_recall", lambda: False)
+    assert not cycles_check.volumes_are_empty()
+    assert renders_volumes("CYCLES")
+    note_volumes("CYCLES", empty=True)
+    assert who_draws("CYCLES", "RENDERED", True) is Drawer.OVERLAY
