@@ -189,10 +189,12 @@ def is_there(source: Path, destination: Path) -> bool:
     return True
 
 
-def copy_file(source: Path, destination: Path, folder: Path) -> bool:
+def copy_file(source: Path, destination: Path, folder: Path, *, may_link: bool = False) -> bool:
     """Copy a file of a human to `destination` in `folder`, where it appears whole or not at all; whether it is new.
 
-    Nothing is replaced. Raises FileExistsError where the name is taken by another content, OutsideFolderError where
+    Nothing is replaced. With `may_link` the copy is a second name of the same file (a hard link) where the disk has
+    those: it takes no space, and deleting or replacing one leaves the other. Files of humans are replaced, never
+    written to. Raises FileExistsError where the name is taken by another content, OutsideFolderError where
     `destination` lies outside of `folder` or `source` is a link out of its own folder, and OSError.
     """
     check_inside(destination, folder)
@@ -203,7 +205,19 @@ def copy_file(source: Path, destination: Path, folder: Path) -> bool:
         return False
     destination.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(destination) as unfinished:
-        shutil.copyfile(source, unfinished)
+        if not (may_link and _linked(source, unfinished)):
+            shutil.copyfile(source, unfinished)
+    return True
+
+
+def _linked(source: Path, name: Path) -> bool:
+    """Give a file a second name, if its disk and the system permit it."""
+    if os.path.islink(source):
+        return False
+    try:
+        os.link(source, name)
+    except OSError:
+        return False
     return True
 
 

@@ -17,7 +17,7 @@ from ..formats.removing import remove_file
 from ..formats.whole_files import temporary_folder
 from .human import MARK, folders_of, unwritten_in
 from .human_npz import HumanNpzError, file_names, read_human, unwritten_name
-from .volumes import bake, write_error, write_file
+from .volumes import Grids, bake, is_readable, write_error, write_file
 
 _VERSIONS = ((5, 0, 0), (4, 5, 0))
 """Blender versions that write volumes differently."""
@@ -48,13 +48,18 @@ def write_unwritten(source: Path) -> Generator[None, None, None]:
     paths = [source.parent / name for name in names]
     try:
         for k, path in enumerate(paths):
-            if not path.is_file():
-                with temporary_folder(source.parent / "volume") as hidden:
-                    os.replace(hidden / write_file(grids, k, hidden, version), path)
+            if not is_readable(path):
+                write_one(grids, k, version, path)
                 yield
         remove_file(source, source.parent)
     except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
         raise write_error(source.parent, error) from error
+
+
+def write_one(grids: Grids, k: int, blender_version: tuple[int, ...], path: Path) -> None:
+    """Write a primitive's volume to `path`, where it appears whole or not at all. Raises as `volumes.write_file`."""
+    with temporary_folder(path.parent / "volume") as hidden:
+        os.replace(hidden / write_file(grids, k, hidden, blender_version), path)
 
 
 def write_all_unwritten() -> None:
