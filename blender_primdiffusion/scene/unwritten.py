@@ -7,17 +7,16 @@ and after any interruption; it is removed with the last one.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 
 from ..formats.removing import remove_file
-from ..formats.whole_files import temporary_folder
 from .human import MARK, folders_of, unwritten_in
 from .human_npz import HumanNpzError, file_names, read_human, unwritten_name
-from .volumes import Grids, bake, is_readable, write_error, write_file
+from .newer_volumes import newer_volumes, write_again
+from .volumes import bake, is_readable, write_error, write_one
 
 _VERSIONS = ((5, 0, 0), (4, 5, 0))
 """Blender versions that write volumes differently."""
@@ -56,14 +55,14 @@ def write_unwritten(source: Path) -> Generator[None, None, None]:
         raise write_error(source.parent, error) from error
 
 
-def write_one(grids: Grids, k: int, blender_version: tuple[int, ...], path: Path) -> None:
-    """Write a primitive's volume to `path`, where it appears whole or not at all. Raises as `volumes.write_file`."""
-    with temporary_folder(path.parent / "volume") as hidden:
-        os.replace(hidden / write_file(grids, k, hidden, blender_version), path)
-
-
 def write_all_unwritten() -> None:
-    """Write what `unwritten` lists, which takes seconds for each human. Raises as `write_unwritten`."""
+    """Write what `unwritten` lists, and volumes in a newer format, which takes seconds for each human.
+
+    Raises as `write_unwritten` and `newer_volumes.write_again`.
+    """
     for source in unwritten():
         for _ in write_unwritten(source):
+            pass
+    for newer in newer_volumes():
+        for _ in write_again(newer):
             pass

@@ -6,6 +6,7 @@ import ctypes
 import dataclasses
 import functools
 import hashlib
+import os
 import shutil
 import struct
 import sys
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..formats.regular_files import exists_in_its_folder, open_regular
 from ..formats.removing import OutsideFolderError, check_inside, remove_folder
-from ..formats.whole_files import publish, remove_abandoned, temporary_name
+from ..formats.whole_files import publish, remove_abandoned, temporary_folder, temporary_name
 from .human import UNWRITTEN_NPZ, VolumeWriteError, folders_of, is_there, link_error, unwritten_in, volume_path
 
 VOXELS = 8
@@ -202,6 +203,12 @@ def write_file(grids: Grids, k: int, folder: Path, blender_version: tuple[int, .
         _ALL_ACTIVE,
     )
     return name
+
+
+def write_one(grids: Grids, k: int, blender_version: tuple[int, ...], path: Path) -> None:
+    """Write a primitive's volume to `path`, where it appears whole or not at all. Raises as `write_file`."""
+    with temporary_folder(path.parent / "volume") as hidden:
+        os.replace(hidden / write_file(grids, k, hidden, blender_version), path)
 
 
 def write_vdb(
