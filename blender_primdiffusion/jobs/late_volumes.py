@@ -56,19 +56,20 @@ class LateVolumes:
             self.stop()
         if not left:
             return False
-        if self._steps is None:
-            self._source, self._steps = left[0], sources[left[0]](left[0])
+        source = left[0] if self._source is None else self._source
+        steps = sources[source](source) if self._steps is None else self._steps
+        self._source, self._steps = source, steps
         end = time.monotonic() + seconds
         try:
-            next(self._steps)
+            next(steps)
             while time.monotonic() < end:
-                next(self._steps)
+                next(steps)
         except StopIteration:
-            self._newer = [newer for newer in self._newer if newer != self._source]
+            self._newer = [newer for newer in self._newer if newer != source]
             self.notice = self.notice if self._newer else ""
             self.stop()
         except (OSError, ValueError) as error:
-            self._fail(self._source, error)
+            self._fail(source, error)
         return True
 
     def finish(self) -> None:
@@ -125,7 +126,7 @@ class LateVolumes:
             self._steps.close()
         self._source = self._steps = None
 
-    def _fail(self, source: Path, error: Exception) -> None:
+    def _fail(self, source: Path | NewerVolumes, error: Exception) -> None:
         self.stop()
         self._failed.add(source)
         self.error, self.notice = str(error), ""

@@ -14,9 +14,10 @@ from ..formats.joints import JOINT_NAMES
 from .duplicate import copy_children, copy_data, enter_scenes, redirect
 from .human import BODY_MARK, MARK, volume_path
 from .proxy import PROXY_MARK
+from .stand_in import STAND_IN
 from .surface import MARK as CARRIER_MARK
 
-_MARKS = (BODY_MARK, PROXY_MARK, CARRIER_MARK)
+_MARKS = (BODY_MARK, PROXY_MARK, CARRIER_MARK, STAND_IN)
 """Custom properties by which parts that are meshes are recognised."""
 
 
@@ -59,8 +60,7 @@ def _armatures(person: bpy.types.Collection) -> list[bpy.types.Object]:
 def _human_of(
     person: bpy.types.Collection, own: bpy.types.Object | None, armature: bpy.types.Object
 ) -> bpy.types.Collection:
-    """Make a human of `armature`, a copy of `own`, and of what was copied with it; parts that were not are copied now.
-    """
+    """Make a human of `armature`, a copy of `own`, and of what was copied with it; other parts are copied now."""
     copied = {obj for obj in person.all_objects if _follows(obj, armature)}
     by_kind = defaultdict(list)
     for obj in sorted(copied, key=lambda obj: obj.name):
@@ -89,9 +89,7 @@ def _human_of(
     return twin
 
 
-def _replace_objects(
-    collection: bpy.types.Collection, copies: dict[Any, Any], copied: set[bpy.types.Object]
-) -> None:
+def _replace_objects(collection: bpy.types.Collection, copies: dict[Any, Any], copied: set[bpy.types.Object]) -> None:
     """In a copied collection, put copies in place of originals, and keep what the user has copied."""
     before = set(collection.objects)
     for obj in before - copied:

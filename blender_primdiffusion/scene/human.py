@@ -204,14 +204,15 @@ def copy_file(source: Path, destination: Path, folder: Path, *, may_link: bool =
     if is_there(source, destination):
         return False
     destination.parent.mkdir(parents=True, exist_ok=True)
+    if may_link and _linked(source, destination):
+        return True
     with written_whole(destination) as unfinished:
-        if not (may_link and _linked(source, unfinished)):
-            shutil.copyfile(source, unfinished)
+        shutil.copyfile(source, unfinished)
     return True
 
 
 def _linked(source: Path, name: Path) -> bool:
-    """Give a file a second name, if its disk and the system permit it."""
+    """Give a file a second name, which appears at once, if its disk and the system permit it."""
     if os.path.islink(source):
         return False
     try:
@@ -288,11 +289,15 @@ def human_of(obj: bpy.types.Object | None, scene: bpy.types.Scene) -> bpy.types.
 
 
 def own_data(obj: bpy.types.Object, collection: bpy.types.Collection) -> bpy.types.ID:
-    """An object's data, copied first where objects of another human use it too (duplicates share data)."""
+    """An object's data, copied first where objects of another human use it too (duplicates share data); all objects of
+    this human that use it get the copy."""
     if obj.data.users > 1:
-        users = bpy.data.user_map(subset=[obj.data])[obj.data]
-        if any(isinstance(user, bpy.types.Object) and user not in set(collection.all_objects) for user in users):
-            obj.data = obj.data.copy()
+        users = [user for user in bpy.data.user_map(subset=[obj.data])[obj.data] if isinstance(user, bpy.types.Object)]
+        inside = set(collection.all_objects).intersection(users)
+        if len(inside) < len(users):
+            copied = obj.data.copy()
+            for user in inside:
+                user.data = copied
     return obj.data
 
 

@@ -1,8 +1,8 @@
 """Volumes that a newer Blender has written in a format that this one cannot read: written again.
 
-From the human's own file, in the same place: nothing in the .blend changes, also where it is linked, and older and newer
-Blenders can read the result. Until it is closed, Blender remembers of a path that it could not read the file, so what
-viewports read has to be written before they try.
+From the human's own file, in the same place: nothing in the .blend changes, also where it is linked, and older and
+newer Blenders can read the result. Until it is closed, Blender remembers the paths that it could not read, so files that
+viewports read have to be written before they try.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class NewerVolumes:
 def newer_volumes() -> list[NewerVolumes]:
     """What all humans of the .blend have of such volumes, without humans whose own file is missing.
 
-    Reads the headers of all volumes, some 20 ms for a human.
+    Reads the headers of all volumes, some 50 ms for a human.
     """
     formats: dict[Path, int] = {}
     every = (_newer_of(person, formats) for person in bpy.data.collections if MARK in person)
@@ -113,4 +113,3 @@ def in_a_sentence(newer: Sequence[NewerVolumes]) -> str:
         f"{count} volumes of {names:.120} are in a format of a newer Blender ({max(one.format for one in newer)}; this "
         f"one reads up to {readable_format()}): they are written again from the human's own file"
     )
-

@@ -1,4 +1,4 @@
-"""Each .blend has the files of its humans in its own folder: deleting another one, with its folder, takes nothing away."""
+"""Each .blend has the files of its humans in its own folder: deleting another one with its folder breaks nothing."""
 
 from __future__ import annotations
 
