@@ -7,7 +7,6 @@ else is changed.
 from __future__ import annotations
 
 import math
-import threading
 import time
 
 import bpy
@@ -72,8 +71,8 @@ def hold(*_: object) -> None:
 
 @persistent
 def separate_before_rendering(*_: object) -> None:
-    """Handler of render_init. With a window it runs in the render's thread, where no data may be made."""
-    if threading.current_thread() is threading.main_thread():
+    """Handler of render_init. With a window it runs in the render's thread, where no data may be made: the timer does."""
+    if bpy.app.background:
         separate()
 
 

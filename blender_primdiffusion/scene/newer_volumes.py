@@ -1,8 +1,8 @@
 """Volumes that a newer Blender has written in a format that this one cannot read: written again.
 
 From the human's own file, in the same place: nothing in the .blend changes, also where it is linked, and older and
-newer Blenders can read the result. Until it is closed, Blender remembers the paths that it could not read, so files that
-viewports read have to be written before they try.
+newer Blenders can read the result. Until it is closed, Blender remembers the paths that it could not read, so files
+that viewports read have to be written before they try.
 """
 
 from __future__ import annotations
