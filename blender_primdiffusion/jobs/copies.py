@@ -71,7 +71,7 @@ def hold(*_: object) -> None:
 
 @persistent
 def separate_before_rendering(*_: object) -> None:
-    """Handler of render_init. With a window it runs in the render's thread, where no data may be made: the timer does."""
+    """Handler of render_init. With a window it runs in the render's thread, where no data may be made."""
     if bpy.app.background:
         separate()
 
