@@ -5,14 +5,19 @@ from __future__ import annotations
 import time
 from collections.abc import Generator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 from bpy.app.handlers import persistent
 
+from ..backend.requests import sentence
 from ..engine.engine import ENGINE
-from ..places import EXTENSION
+from ..places import EXTENSION, missing_packages
 from ..scene.human import any_humans
 from .windows import in_the_way, redraw
+
+if TYPE_CHECKING:
+    from ..scene.newer_volumes import NewerVolumes
 
 ALWAYS, WHEN_RENDERING = "ALWAYS", "WHEN_RENDERING"
 """Values of the preference `volumes`."""
@@ -31,32 +36,41 @@ class LateVolumes:
     def __init__(self) -> None:
         self.error = ""
         """Why volumes could not be written; empty when they could."""
-        self._source: Path | None = None
+        self.notice = ""
+        """Which volumes are written again, and why; empty when none are."""
+        self._source: Path | NewerVolumes | None = None
         self._steps: Generator[None, None, None] | None = None
-        self._failed: set[Path] = set()
+        self._newer: list[NewerVolumes] = []
+        self._failed: set[Path | NewerVolumes] = set()
         self._ended = 0.0
 
     def work(self, seconds: float) -> bool:
         """Write for about `seconds`, one step at least; whether more is left."""
-        from ..scene.unwritten import unwritten, write_unwritten  # needs numpy
+        # needs numpy
+        from ..scene.newer_volumes import write_again
+        from ..scene.unwritten import unwritten, write_unwritten
 
         self.bring_here()
-        left = [source for source in unwritten() if source not in self._failed]
+        sources = {**dict.fromkeys(unwritten(), write_unwritten), **dict.fromkeys(self._newer, write_again)}
+        left = [source for source in sources if source not in self._failed]
         if self._source not in left:  # written by a render, or the human is gone
             self.stop()
         if not left:
             return False
-        if self._steps is None:
-            self._source, self._steps = left[0], write_unwritten(left[0])
+        source = left[0] if self._source is None else self._source
+        steps = sources[source](source) if self._steps is None else self._steps
+        self._source, self._steps = source, steps
         end = time.monotonic() + seconds
         try:
-            next(self._steps)
+            next(steps)
             while time.monotonic() < end:
-                next(self._steps)
+                next(steps)
         except StopIteration:
+            self._newer = [newer for newer in self._newer if newer != source]
+            self.notice = self.notice if self._newer else ""
             self.stop()
         except (OSError, ValueError) as error:
-            self._fail(self._source, error)
+            self._fail(source, error)
         return True
 
     def bring_here(self) -> None:
@@ -83,6 +97,27 @@ class LateVolumes:
         except (OSError, ValueError) as error:
             self.error = str(error)
             print(f"PrimDiffusion: {error}")
+        self._newer, self.notice = [], ""
+
+    def look_for_newer(self) -> None:
+        """Find volumes that only a newer Blender can read, say so once, and write at once those that viewports read."""
+        from ..scene.newer_volumes import in_a_sentence, newer_volumes, write_again  # needs numpy
+
+        known, self._newer = self._newer, newer_volumes()
+        if not self._newer:
+            self.notice = ""
+            return
+        if self._newer != known:
+            self.notice = sentence(in_a_sentence(self._newer))
+            print(f"PrimDiffusion: {self.notice}")
+        try:
+            for newer in (newer for newer in self._newer if newer.in_views):
+                for _ in write_again(newer):
+                    pass
+        except (OSError, ValueError) as error:
+            self.error, self.notice = str(error), ""
+            print(f"PrimDiffusion: {error}")
+        self._newer = newer_volumes()
 
     def forget_failures(self) -> None:
         """Try again what could not be written."""
@@ -106,10 +141,10 @@ class LateVolumes:
             self._steps.close()
         self._source = self._steps = None
 
-    def _fail(self, source: Path, error: Exception) -> None:
+    def _fail(self, source: Path | NewerVolumes, error: Exception) -> None:
         self.stop()
         self._failed.add(source)
-        self.error = str(error)
+        self.error, self.notice = str(error), ""
         print(f"PrimDiffusion: {error}")
         redraw()
 
@@ -153,6 +188,15 @@ def write_after_loading(*_: object) -> None:
     """Handler of load_post."""
     late_volumes.forget_failures()
     _bring_here()
+    write_after_importing()
+
+
+@persistent
+def write_after_importing(*_: object) -> None:
+    """Handler of blend_import_post: humans were appended or linked."""
+    _bring_here()
+    if any_humans() and not missing_packages():
+        late_volumes.look_for_newer()
     keep_writing()
 
 
@@ -171,12 +215,12 @@ def write_before_rendering(scene: bpy.types.Scene, *_: object) -> None:
 
 HANDLERS = (
     ("load_post", write_after_loading),
+    ("blend_import_post", write_after_importing),
     ("save_pre", stop_writing),
     ("save_post", write_soon),
     ("undo_post", write_soon),
     ("redo_post", write_soon),
     ("render_init", write_before_rendering),
-    *([("blend_import_post", write_soon)] if hasattr(bpy.app.handlers, "blend_import_post") else ()),
 )
 
 

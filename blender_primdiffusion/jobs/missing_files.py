@@ -86,8 +86,28 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
         collect.collect_before_saving(blend_path)
 
 
+@persistent
+def finish_saving(blend_path: str, *_: object) -> None:
+    """Handler of save_post."""
+    if any_humans():
+        from ..scene import collect  # needs numpy
+
+        collect.finish_saving(blend_path)
+
+
+@persistent
+def give_up_saving(*_: object) -> None:
+    """Handler of save_post_fail."""
+    if any_humans():
+        from ..scene import collect  # needs numpy
+
+        collect.give_up_saving()
+
+
 HANDLERS = (
     ("save_pre", collect_before_saving),
+    ("save_post", finish_saving),
+    ("save_post_fail", give_up_saving),
     ("load_post", look_after),
     ("save_post", look_after),
     ("undo_post", look_soon),

@@ -32,6 +32,7 @@ from .human import (
 )
 from .human_npz import Destination, WrittenHuman, write_now
 from .material import volume_material
+from .stand_in import build_stand_in
 
 GAP_M = 0.2
 """Between the hands of two humans in the T pose."""
@@ -92,6 +93,7 @@ def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: S
         armature.location = (0.0, 0.0, -vertices[:, 2].min())
         body = build_body_mesh(f"{label}_body", armature, vertices, human.faces, human.uv_corner, human.skin_weights)
         collection.objects.link(body)
+        collection.objects.link(build_stand_in(label, armature, body))
         primitives = bpy.data.collections.new(f"{label}_primitives")
         primitives.hide_viewport = not VOLUMES_IN_VIEWPORT
         primitives.objects.link(armature)  # the Outliner then shows the volumes inside the armature's closed row

@@ -1,11 +1,13 @@
-"""Copy files of humans beside the .blend, and find those that are no longer used.
+"""Keep the files of a .blend's humans in its own folder, and find those that are no longer used.
 
-Humans generated before the first save have their files in a temporary folder, which saving copies. Files of humans that
-were appended, or whose .blend was saved elsewhere under another name, stay where they were until Collect Files.
+Whatever is saved has all files of its humans in `humans_folder` of its own name: those from a temporary folder, from
+the .blend that it was saved from under another name, and of appended humans. So no .blend depends on another one's
+folder, except those that link humans from it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import itertools
 import os
@@ -17,7 +19,8 @@ from bpy.app.handlers import persistent
 
 from ..formats.regular_files import exists_in_its_folder, real_path
 from ..formats.removing import OutsideFolderError, check_inside, remove_file
-from .blend_values import as_shown, stored_folder, stored_name
+from ..formats.whole_files import remove_empty
+from .blend_values import as_shown, stored_folder, stored_name, stored_text
 from .body_file import BODY_FILE, BODY_NPZ, body_file, body_files, stored_body_name
 from .human import (
     HOME,
@@ -26,7 +29,6 @@ from .human import (
     PERSON,
     PERSON_FILES,
     PRIMITIVE_VDB,
-    TEMPORARY,
     UNWRITTEN_NPZ,
     VolumeWriteError,
     available_name,
@@ -40,6 +42,8 @@ from .human import (
     unwritten_in,
     volume_path,
 )
+
+from .volumes import format_of, readable_format
 
 _OURS = (PRIMITIVE_VDB, PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
 
@@ -56,28 +60,66 @@ class Collected:
     """Bytes of these files."""
 
 
-def collect_temporary_volumes(blend_path: str) -> Collected:
-    """Copy files of humans from temporary folders to the folder of `blend_path`, and point to the copies.
+@dataclasses.dataclass
+class _Changes:
+    """What collecting has changed, to be taken back where the file that is written is not the open one."""
 
-    Includes temporary folders of an earlier Blender that has crashed, and humans elsewhere whose volumes are still to
-    be written, which is done in that folder alone. Files that the .blend does not use stay, for undo. In a .blend never
-    saved, paths become absolute: Blender makes them relative when it first writes it. Raises VolumeWriteError when the
-    folder beside the .blend cannot be written.
+    paths: dict[bpy.types.Volume, str] = dataclasses.field(default_factory=dict)
+    """Paths of volumes before."""
+    names: dict[bpy.types.Collection, str | None] = dataclasses.field(default_factory=dict)
+    """Names of the humans' own files before; None where none was stored."""
+    made: list[Path] = dataclasses.field(default_factory=list)
+    """Files that did not exist before."""
+    target: Path | None = None
+    """The folder of humans in which they are."""
+
+    def remove_made(self) -> None:
+        for path in self.made:
+            with contextlib.suppress(OSError):
+                remove_file(path, path.parent)
+        if self.target is not None:
+            remove_empty([*{path.parent for path in self.made} - {self.target}, self.target])
+        self.made.clear()
+
+    def take_back(self) -> None:
+        for volume, path in self.paths.items():
+            volume.filepath = path
+        for person, name in self.names.items():
+            if name is None:
+                del person[PERSON]
+            else:
+                person[PERSON] = name
+        self.forget()
+
+    def forget(self) -> None:
+        self.paths.clear()
+        self.names.clear()
+        self.made.clear()
+
+
+_saving = _Changes()
+"""Of the file that is being saved."""
+
+
+def collect_own_files(blend_path: str) -> Collected:
+    """Copy files of humans from elsewhere to the folder of `blend_path`, and point to the copies.
+
+    Elsewhere are temporary folders, also those of an earlier Blender that has crashed, and the folders of other .blend
+    files. Missing files are left out, and those that the .blend does not use stay, for undo. In a .blend never saved,
+    paths become absolute: Blender makes them relative when it first writes it. Raises VolumeWriteError when the folder
+    beside the .blend cannot be written.
     """
-    waiting = _waiting(blend_path)
-    return _collect(
-        blend_path, {volume: path for volume, path in _local().items() if volume in waiting or _temporary(path)}
-    )
+    return _collect(blend_path, _elsewhere(humans_folder(blend_path)), _saving)
 
 
 def collect_unwritten() -> Collected:
-    """Copy files of humans elsewhere whose volumes are still to be written to the temporary folder of this Blender, and
-    point to the copies: they are written there. Linked humans are among them, in this session.
+    """Copy files of humans elsewhere whose volumes are still to be written, or written again, to the temporary folder of
+    this Blender, and point to the copies: they are written there. Linked humans are among them, in this session.
 
     Only paths of volumes change, and names of the backend's files. Raises VolumeWriteError.
     """
     waiting = _waiting(bpy.data.filepath)
-    return _collect("", waiting) if waiting else Collected(0, 0, 0)
+    return _collect("", waiting, _Changes()) if waiting else Collected(0, 0, 0)
 
 
 def collect_files() -> Collected:
@@ -88,8 +130,7 @@ def collect_files() -> Collected:
     """
     if not bpy.data.filepath:
         raise ValueError("this file was never saved: save it first, which collects the files of its humans too")
-    home = humans_folder()
-    away = {volume: path for volume, path in _local().items() if not _inside(path, home)}
+    away = _elsewhere(humans_folder())
     present = _present(away)
     gone = [path for volume, path in away.items() if volume not in present]
     if gone:
@@ -97,7 +138,7 @@ def collect_files() -> Collected:
             f"{len(gone)} volumes have lost their files, {str(gone[0])!r} among them: press Find Missing Volumes in "
             "the panel Human first"
         )
-    return _collect(bpy.data.filepath, away)
+    return _collect(bpy.data.filepath, away, _Changes())
 
 
 def store_folders() -> None:
@@ -111,18 +152,30 @@ def store_folders() -> None:
 
 @persistent
 def collect_before_saving(blend_path: str, *_: object) -> None:
-    """Handler of save_pre. After a failure, which is printed, the .blend is saved pointing to the temporary files."""
-    if not blend_path:  # the start-up file
+    """Handler of save_pre. After a failure, which is printed, the .blend is saved pointing to where the files were."""
+    _saving.forget()
+    if not os.path.isdir(os.path.dirname(blend_path)):  # the start-up file has no path; others cannot be written
         return
     for fault in ignored_values():
         print(f"PrimDiffusion: {fault}")
     try:
-        collect_temporary_volumes(blend_path)
+        collect_own_files(blend_path)
     except OSError as error:
-        print(
-            f"PrimDiffusion: volumes stay in {humans_folder('')}: they could not be copied beside the .blend ({error})"
-        )
+        print(f"PrimDiffusion: humans of this file depend on files elsewhere: {error}")
     store_folders()
+
+
+def finish_saving(blend_path: str) -> None:
+    """After saving: where a copy was written (Save Copy), the open .blend points to its own files again."""
+    if real_path(bpy.data.filepath or ".") != real_path(blend_path or "."):
+        _saving.take_back()
+    _saving.forget()
+
+
+def give_up_saving() -> None:
+    """After a .blend could not be written: everything is as it was before."""
+    _saving.remove_made()
+    _saving.take_back()
 
 
 def ignored_values() -> list[str]:
@@ -189,21 +242,35 @@ def _local() -> dict[bpy.types.Volume, Path]:
 
 
 def _waiting(blend_path: str) -> dict[bpy.types.Volume, Path]:
-    """Volumes of humans, linked ones included, that are to be written from a file in a folder that is not the own one
-    of `blend_path`; and their paths."""
+    """Volumes of humans, linked ones included, that are to be written in a folder that is not the own one of
+    `blend_path`, from a file there or since a newer Blender wrote them; and their paths."""
     found: dict[bpy.types.Volume, Path] = {}
     for person in bpy.data.collections:
-        if MARK not in person or is_own(folder := folders_of(person)[0], blend_path) or not unwritten_in(folder):
+        if MARK not in person or is_own(folder := folders_of(person)[0], blend_path):
             continue
         volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME"}
         paths = {volume: path for volume in volumes if (path := volume_path(volume)) is not None}
         beside = {volume: path for volume, path in paths.items() if path.parent == folder}
-        if not all(map(exists_in_its_folder, beside.values())):
+        missing = not all(map(exists_in_its_folder, beside.values()))
+        if (missing and unwritten_in(folder)) or _is_newer(next(iter(beside.values()), None)):
             found |= beside
     return found
 
 
-def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path]) -> Collected:
+def _is_newer(path: Path | None) -> bool:
+    """Whether only a newer Blender can read this volume; those of a human are alike."""
+    return path is not None and (format_of(path) or 0) > readable_format()
+
+
+def _elsewhere(target: Path) -> dict[bpy.types.Volume, Path]:
+    """Volumes of humans in this .blend that are not linked and whose files are not in `target`, and their paths."""
+    paths = _local()
+    outside = {folder: not _inside(folder / "file", target) for folder in {path.parent for path in paths.values()}}
+    return {volume: path for volume, path in paths.items() if outside[path.parent]}
+
+
+def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path], changes: _Changes) -> Collected:
+    """Copy the files of the volumes `away` and of their humans; what changes is added to `changes`."""
     target = humans_folder(blend_path)
     sources = _present(away)
     files = _files_by_folder(sources)
@@ -214,21 +281,22 @@ def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path]) -> Collecte
     for person in bpy.data.collections:
         if MARK in person:
             copies |= _of_person(person, moved, target, names)
-    made: list[Path] = []
+    made, changes.target = changes.made, target
     try:
         for source, destination in copies.items():
-            if not _there(source, destination) and copy_file(source, destination, target):
+            if not _there(source, destination) and copy_file(source, destination, target, may_link=True):
                 made.append(destination)
     except (OSError, OutsideFolderError) as error:
-        for path in made:
-            remove_file(path, path.parent)
+        changes.remove_made()
         raise VolumeWriteError(
             f"the files of humans could not be copied to {str(target)!r} ({error}); save the .blend in a folder with "
             "write permission and free space"
         ) from error
     for volume, path in moved.items():
+        changes.paths[volume] = volume.filepath
         volume.filepath = stored_path(path) if blend_path else str(path)
     for person, name in names.items():
+        changes.names[person] = stored_text(person, PERSON)
         person[PERSON] = name
     return Collected(len(moved), len(made), sum(path.stat().st_size for path in made))
 
@@ -239,12 +307,13 @@ def _of_person(
     target: Path,
     names: dict[bpy.types.Collection, str],
 ) -> dict[Path, Path]:
-    """Copies of the backend's and the body's file to where the human's volumes go; new names are added to `names`."""
+    """Copies of the backend's and the body's file to where the human's volumes go, or to `human.folder_of` it without
+    any; new names are added to `names`."""
     near = folders_of(person)
     volume = next((obj.data for obj in person.all_objects if obj.type == "VOLUME"), None)
-    if volume not in moved:
+    if volume not in moved if volume is not None else person.library is not None:
         return {}
-    home, copies = moved[volume].parent, {}
+    home, copies = target / bpy.path.clean_name(person.name) if volume is None else moved[volume].parent, {}
     name = person_file_name(person)
     file = next((path for path in (folder / name for folder in near) if exists_in_its_folder(path)), None)
     if file is not None and file.parent != home:
@@ -296,13 +365,6 @@ def _present(paths: Mapping[bpy.types.Volume, Path]) -> dict[bpy.types.Volume, P
     """Those volumes whose file exists or will be written."""
     later = {folder for folder in {path.parent for path in paths.values()} if unwritten_in(folder)}
     return {volume: path for volume, path in paths.items() if path.parent in later or exists_in_its_folder(path)}
-
-
-def _temporary(path: Path) -> bool:
-    """Whether a file is among the temporary files of this Blender, or of one that has crashed."""
-    return any(folder.name == TEMPORARY and folder.parent.name.startswith("blender_") for folder in path.parents) or (
-        _inside(path, humans_folder(""))
-    )
 
 
 def _inside(path: Path, folder: Path) -> bool:

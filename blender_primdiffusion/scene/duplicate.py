@@ -26,7 +26,7 @@ def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
     shared = {obj for objects in volumes_of(collection).values() for obj in objects}
     duplicate = collection.copy()
     copies: dict[Any, Any] = {collection: duplicate}
-    _copy_children(duplicate, copies)
+    copy_children(duplicate, copies)
     objects = [obj for obj in collection.all_objects if obj not in copies]
     for obj in objects:
         copies[obj] = obj.copy()
@@ -34,15 +34,29 @@ def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
         for obj in list(copy.objects):
             copy.objects.unlink(obj)
             copy.objects.link(copies[obj])
+    copy_data([obj for obj in objects if obj not in shared], copies)
     for obj in objects:
-        if obj.data is not None and obj not in shared:
-            copies[obj].data = obj.data.copy()
-        _separate(obj, copies[obj], copies)
+        _copy_action(obj, copies[obj])
+        redirect(copies[obj], copies)
+    enter_scenes(collection, duplicate, copies)
+    return duplicate
+
+
+def copy_data(objects: Iterable[bpy.types.Object], copies: dict[Any, Any]) -> None:
+    """Give the copies of these objects data of their own, shared among them as the originals' is."""
+    made: dict[Any, Any] = {}
+    for obj in objects:
+        if obj.data is not None:
+            made[obj.data] = made.get(obj.data) or obj.data.copy()
+            copies[obj].data = made[obj.data]
+
+
+def enter_scenes(collection: bpy.types.Collection, duplicate: bpy.types.Collection, copies: dict[Any, Any]) -> None:
+    """Link a duplicate wherever the original is, and name its parts."""
     for holder in _holders(collection):
         holder.children.link(duplicate)
     _name_parts(collection, duplicate, copies)
     rebuild_surface(duplicate)
-    return duplicate
 
 
 def rename_human(collection: bpy.types.Collection, name: str) -> None:
@@ -86,21 +100,25 @@ def rebuild_surface(collection: bpy.types.Collection) -> None:
             build_surface(collection)
 
 
-def _copy_children(copy: bpy.types.Collection, copies: dict[Any, Any]) -> None:
+def copy_children(copy: bpy.types.Collection, copies: dict[Any, Any]) -> None:
+    """Replace the children of a copied collection, and theirs, by copies, which are added to `copies`."""
     for child in list(copy.children):
         copy.children.unlink(child)
         copies[child] = child.copy()
         copy.children.link(copies[child])
-        _copy_children(copies[child], copies)
+        copy_children(copies[child], copies)
 
 
-def _separate(obj: bpy.types.Object, copy: bpy.types.Object, copies: dict[Any, Any]) -> None:
-    """Give the copy an action of its own, and redirect its pointers to the copies."""
+def _copy_action(obj: bpy.types.Object, copy: bpy.types.Object) -> None:
     if obj.animation_data is not None and obj.animation_data.action is not None:
         slot = obj.animation_data.action_slot
         copy.animation_data.action = obj.animation_data.action.copy()
         if slot is not None:
             copy.animation_data.action_slot = copy.animation_data.action.slots[slot.identifier]
+
+
+def redirect(copy: bpy.types.Object, copies: dict[Any, Any]) -> None:
+    """Redirect an object's pointers to the copies."""
     if copy.parent in copies:
         inverse = copy.matrix_parent_inverse.copy()
         copy.parent = copies[copy.parent]

@@ -195,10 +195,12 @@ def is_there(source: Path, destination: Path) -> bool:
     return True
 
 
-def copy_file(source: Path, destination: Path, folder: Path) -> bool:
+def copy_file(source: Path, destination: Path, folder: Path, *, may_link: bool = False) -> bool:
     """Copy a file of a human to `destination` in `folder`, where it appears whole or not at all; whether it is new.
 
-    Nothing is replaced. Raises FileExistsError where the name is taken by another content, OutsideFolderError where
+    Nothing is replaced. With `may_link` the copy is a second name of the same file (a hard link) where the disk has
+    those: it takes no space, and deleting or replacing one leaves the other. Files of humans are replaced, never
+    written to. Raises FileExistsError where the name is taken by another content, OutsideFolderError where
     `destination` lies outside of `folder` or `source` is a link out of its own folder, and OSError.
     """
     check_inside(destination, folder)
@@ -208,8 +210,21 @@ def copy_file(source: Path, destination: Path, folder: Path) -> bool:
     if is_there(source, destination):
         return False
     destination.parent.mkdir(parents=True, exist_ok=True)
+    if may_link and _linked(source, destination):
+        return True
     with written_whole(destination) as unfinished:
         shutil.copyfile(source, unfinished)
+    return True
+
+
+def _linked(source: Path, name: Path) -> bool:
+    """Give a file a second name, which appears at once, if its disk and the system permit it."""
+    if os.path.islink(source):
+        return False
+    try:
+        os.link(source, name)
+    except OSError:
+        return False
     return True
 
 
@@ -280,11 +295,15 @@ def human_of(obj: bpy.types.Object | None, scene: bpy.types.Scene) -> bpy.types.
 
 
 def own_data(obj: bpy.types.Object, collection: bpy.types.Collection) -> bpy.types.ID:
-    """An object's data, copied first where objects of another human use it too (duplicates share data)."""
+    """An object's data, copied first where objects of another human use it too (duplicates share data); all objects of
+    this human that use it get the copy."""
     if obj.data.users > 1:
-        users = bpy.data.user_map(subset=[obj.data])[obj.data]
-        if any(isinstance(user, bpy.types.Object) and user not in set(collection.all_objects) for user in users):
-            obj.data = obj.data.copy()
+        users = [user for user in bpy.data.user_map(subset=[obj.data])[obj.data] if isinstance(user, bpy.types.Object)]
+        inside = set(collection.all_objects).intersection(users)
+        if len(inside) < len(users):
+            copied = obj.data.copy()
+            for user in inside:
+                user.data = copied
     return obj.data
 
 

@@ -23,7 +23,7 @@ from ..formats.rotations import first_improper
 from .body_file import body_file_name, saved_body_file
 from .cycles import max_overlap
 from .shape import FIELDS, OPTIONAL_FIELDS, ShapeModel, faulty_field
-from .volumes import VOXELS, Grids, bake, file_name, remove_empty, staged
+from .volumes import VOXELS, Grids, bake, file_name, is_readable, remove_empty, staged
 
 FORMAT_VERSION = 2
 """The newest that is read; version 1 has no shape model."""
@@ -244,7 +244,7 @@ class WrittenHuman:
         written again, and the files in `keep` copied there under the names given. Raises VolumeWriteError.
         """
         files = {k: folder / (self.names.get(k) or file_name(self.grids, k, bpy.app.version)) for k in which}
-        absent = [] if self.later else [k for k, path in files.items() if not path.is_file()]
+        absent = [] if self.later else [k for k, path in files.items() if not is_readable(path)]
         with staged(folder) as staging:
             for _ in staging.write(self.grids, absent):
                 pass
@@ -285,7 +285,7 @@ def write_volumes(human_npz: Path, destination: Destination) -> Generator[float,
     every = file_names(grids, bpy.app.version)
     names = {k: every[k] for k in which}
     files = {k: folder / name for k, name in names.items()}
-    absent = [k for k, path in files.items() if destination.which is None or not path.is_file()]
+    absent = [k for k, path in files.items() if destination.which is None or not is_readable(path)]
     later = {unwritten_name(every): human_npz} if destination.later and absent else {}
     existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
     model = human.shape_model

@@ -7,17 +7,16 @@ and after any interruption; it is removed with the last one.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 
 from ..formats.removing import remove_file
-from ..formats.whole_files import temporary_folder
 from .human import MARK, folders_of, is_own, unwritten_in
 from .human_npz import HumanNpzError, file_names, read_human, unwritten_name
-from .volumes import bake, write_error, write_file
+from .newer_volumes import newer_volumes, write_again
+from .volumes import bake, is_readable, write_error, write_one
 
 _VERSIONS = ((5, 0, 0), (4, 5, 0))
 """Blender versions that write volumes differently."""
@@ -51,9 +50,8 @@ def write_unwritten(source: Path) -> Generator[None, None, None]:
     paths = [source.parent / name for name in names]
     try:
         for k, path in enumerate(paths):
-            if not path.is_file():
-                with temporary_folder(source.parent / "volume") as hidden:
-                    os.replace(hidden / write_file(grids, k, hidden, version), path)
+            if not is_readable(path):
+                write_one(grids, k, version, path)
                 yield
         remove_file(source, source.parent)
     except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
@@ -61,7 +59,13 @@ def write_unwritten(source: Path) -> Generator[None, None, None]:
 
 
 def write_all_unwritten() -> None:
-    """Write what `unwritten` lists, which takes seconds for each human. Raises as `write_unwritten`."""
+    """Write what `unwritten` lists, and volumes in a newer format, which takes seconds for each human.
+
+    Raises as `write_unwritten` and `newer_volumes.write_again`.
+    """
     for source in unwritten():
         for _ in write_unwritten(source):
+            pass
+    for newer in newer_volumes():
+        for _ in write_again(newer):
             pass

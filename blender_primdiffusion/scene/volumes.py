@@ -6,7 +6,9 @@ import ctypes
 import dataclasses
 import functools
 import hashlib
+import os
 import shutil
+import struct
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -17,9 +19,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.regular_files import exists_in_its_folder
+from ..formats.regular_files import exists_in_its_folder, open_regular
 from ..formats.removing import OutsideFolderError, check_inside, remove_folder
-from ..formats.whole_files import publish, remove_abandoned, temporary_name
+from ..formats.whole_files import publish, remove_abandoned, temporary_folder, temporary_name
 from .human import UNWRITTEN_NPZ, VolumeWriteError, folders_of, is_there, link_error, unwritten_in, volume_path
 
 VOXELS = 8
@@ -36,6 +38,8 @@ _ALMOST_EMPTY = 1e-4
 """Opacity per metre of the one voxel of an empty primitive: Cycles complains of grids without any value."""
 _ALL_ACTIVE = -1.0
 """A tolerance below every difference from the background, so that zeros become active voxels too."""
+LARGEST_VDB = 4 << 30
+"""Bytes of a file whose header is read; a merged human has a few hundred MB."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -201,6 +205,12 @@ def write_file(grids: Grids, k: int, folder: Path, blender_version: tuple[int, .
     return name
 
 
+def write_one(grids: Grids, k: int, blender_version: tuple[int, ...], path: Path) -> None:
+    """Write a primitive's volume to `path`, where it appears whole or not at all. Raises as `write_file`."""
+    with temporary_folder(path.parent / "volume") as hidden:
+        os.replace(hidden / write_file(grids, k, hidden, blender_version), path)
+
+
 def write_vdb(
     path: Path,
     density: NDArray,
@@ -232,6 +242,30 @@ def openvdb() -> ModuleType:
     import openvdb  # importable only after the line above
 
     return openvdb
+
+
+_HEADER = struct.Struct("<8sI")
+_MAGIC = b" BDV\0\0\0\0"
+
+
+def format_of(path: Path) -> int | None:
+    """The format version that a VDB file's header states; None for another file, or where it cannot be read."""
+    try:
+        with open_regular(path, LARGEST_VDB) as file:
+            magic, version = _HEADER.unpack(file.read(_HEADER.size))
+    except (OSError, ValueError, struct.error):
+        return None
+    return version if magic == _MAGIC else None
+
+
+def readable_format() -> int:
+    """The newest format version that this Blender's OpenVDB reads; 5.2 writes 225, and 5.0 reads up to 224."""
+    return openvdb().FILE_FORMAT_VERSION
+
+
+def is_readable(path: Path) -> bool:
+    """Whether a volume's file is there and in no newer format than this Blender's. Damage is not looked for."""
+    return exists_in_its_folder(path) and (format_of(path) or 0) <= readable_format()
 
 
 def write_error(folder: Path, error: BaseException) -> VolumeWriteError:

@@ -177,6 +177,8 @@ def draw_missing(layout: bpy.types.UILayout) -> None:
     """What is missing and what can be done about it; nothing when all files are there."""
     if late_volumes.error:
         draw_lines(layout, late_volumes.error, "ERROR")
+    if late_volumes.notice:
+        draw_lines(layout, late_volumes.notice, "INFO")
     if not state.summary:
         return
     box = layout.box()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..formats.joints import JOINT_NAMES
+from ..jobs.copies import separate
 from ..jobs.follow import Reporting
 from ..jobs.target import named_person, selected_person
 from ..scene.human import armature_of, human_of, humans
@@ -28,6 +29,7 @@ class OnPerson(Reporting):
         return found
 
     def act(self, context: bpy.types.Context) -> set[str]:
+        separate()
         return self.run(context, self.person(context))
 
     def person(self, context: bpy.types.Context) -> bpy.types.Collection:
@@ -89,6 +91,7 @@ class OnArmature(Reporting):
         return False
 
     def act(self, context: bpy.types.Context) -> set[str]:
+        separate()
         return self.on(context, target_armature(context, self.person))
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:

@@ -27,7 +27,7 @@ import sidebar
 
 from blender_primdiffusion.jobs import missing_files
 from blender_primdiffusion.places import EXTENSION
-from blender_primdiffusion.scene import attachment, merged, proxy, surface, unwritten
+from blender_primdiffusion.scene import attachment, merged, proxy, stand_in, surface, unwritten
 from blender_primdiffusion.scene.body_file import BODY_FILE
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import edit_destination, replace_person
@@ -155,6 +155,7 @@ HOLDERS: dict[str, Callable[[], Any]] = {
     proxy.PROXY_MARK: _with(proxy.PROXY_MARK),
     merged.MARK: _with(merged.MARK),
     surface.MARK: _with(surface.MARK),
+    stand_in.STAND_IN: _with(stand_in.STAND_IN),
     FACTS: lambda: bpy.data.actions["Walk"],
 }
 """What holds each custom property."""

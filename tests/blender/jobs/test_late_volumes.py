@@ -15,7 +15,7 @@ from blender_primdiffusion.jobs import late_volumes as module
 from blender_primdiffusion.jobs import windows
 from blender_primdiffusion.jobs.late_volumes import late_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
-from blender_primdiffusion.scene import unwritten
+from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import (
@@ -146,7 +146,7 @@ def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypat
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(unwritten, "write_file", full)
+    monkeypatch.setattr(volumes, "write_file", full)
     while late_volumes.work(0.0):
         pass
     assert "could not be written" in late_volumes.error

@@ -11,7 +11,7 @@ from late_volumes_stage import COUNT, STATES, advance, check_complete, generated
 
 from blender_primdiffusion.jobs.late_volumes import late_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
-from blender_primdiffusion.scene import unwritten
+from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.collect import unused
 from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import (
@@ -158,7 +158,7 @@ def test_what_failed_is_tried_again_when_the_file_is_opened(person, monkeypatch)
         raise OSError(28, "No space left on device")
 
     bpy.ops.wm.save_mainfile()
-    monkeypatch.setattr(unwritten, "write_file", full)
+    monkeypatch.setattr(volumes, "write_file", full)
     while late_volumes.work(0.0):
         pass
     monkeypatch.undo()

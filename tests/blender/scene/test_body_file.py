@@ -158,11 +158,11 @@ def test_links_where_a_save_puts_files_stay_and_lose_nothing_outside(addon, tmp_
         link.symlink_to(mine)
     copied = []
 
-    def copy_some(one, destination, folder):
+    def copy_some(one, destination, folder, **options):
         copied.append(destination)
         if full and len(copied) == len(links):
             raise OSError(errno.ENOSPC, "no space left")
-        return copy_file(one, destination, folder)
+        return copy_file(one, destination, folder, **options)
 
     monkeypatch.setattr(collect, "copy_file", copy_some)
     collect_before_saving(str(tmp_path / "new.blend"))
