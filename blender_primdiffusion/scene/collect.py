@@ -41,6 +41,7 @@ from .human import (
     unwritten_in,
     volume_path,
 )
+from .volumes import reload_volume
 
 _OURS = (PRIMITIVE_VDB, PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
 
@@ -261,6 +262,8 @@ def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path], changes: _C
     for volume, path in moved.items():
         changes.paths[volume] = volume.filepath
         volume.filepath = stored_path(path)
+        if volume.grids.error_message:  # its file was missing, and was written since
+            reload_volume(volume)
     for person, name in names.items():
         changes.names[person] = stored_text(person, PERSON)
         person[PERSON] = name
