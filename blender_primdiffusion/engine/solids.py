@@ -16,6 +16,7 @@ from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from ..scene.human import BODY_MARK
 from ..scene.proxy import PROXY_MARK
+from ..scene.stand_in import STAND_IN
 
 SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
 UNRELATED_TYPES = frozenset({"ARMATURE", "CAMERA", "VOLUME", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
@@ -122,7 +123,7 @@ def _parts(
     meshes: dict[object, tuple[NDArray, NDArray]] = {}
     for instance in visible_instances(depsgraph, space):
         obj = instance.object
-        of_human = BODY_MARK in obj or PROXY_MARK in obj
+        of_human = any(mark in obj for mark in (BODY_MARK, PROXY_MARK, STAND_IN))
         if obj.type not in SOLID_TYPES or of_human or not obj.visible_camera:
             continue
         key = (obj.data.as_pointer(), obj.original.as_pointer())

@@ -42,8 +42,7 @@ from .human import (
     unwritten_in,
     volume_path,
 )
-
-from .volumes import format_of, readable_format
+from .volumes import format_of, readable_format, reload_volume
 
 _OURS = (PRIMITIVE_VDB, PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
 
@@ -113,8 +112,8 @@ def collect_own_files(blend_path: str) -> Collected:
 
 
 def collect_unwritten() -> Collected:
-    """Copy files of humans elsewhere whose volumes are still to be written, or written again, to the temporary folder of
-    this Blender, and point to the copies: they are written there. Linked humans are among them, in this session.
+    """Copy files of humans elsewhere whose volumes are still to be written, or written again, to this Blender's temporary
+    folder, and point to the copies: they are written there. Linked humans are among them, in this session.
 
     Only paths of volumes change, and names of the backend's files. Raises VolumeWriteError.
     """
@@ -295,6 +294,8 @@ def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path], changes: _C
     for volume, path in moved.items():
         changes.paths[volume] = volume.filepath
         volume.filepath = stored_path(path) if blend_path else str(path)
+        if volume.grids.error_message:  # its file was missing, and was written since
+            reload_volume(volume)
     for person, name in names.items():
         changes.names[person] = stored_text(person, PERSON)
         person[PERSON] = name

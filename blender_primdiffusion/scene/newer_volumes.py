@@ -1,8 +1,8 @@
 """Volumes that a newer Blender has written in a format that this one cannot read: written again.
 
 From the human's own file, in the same place, so that older and newer Blenders can read the result: in folders of this
-.blend alone, to which `collect.collect_unwritten` brings humans from elsewhere. Until it is closed, Blender remembers the paths that it could not read, so files
-that viewports read have to be written before they try.
+.blend alone, to which `collect.collect_unwritten` brings humans from elsewhere. Until it is closed, Blender remembers
+the paths that it could not read, so files that viewports read have to be written before they try.
 """
 
 from __future__ import annotations

@@ -190,7 +190,7 @@ def test_a_folder_that_cannot_be_copied_is_told_once(pristine, monkeypatch, caps
     elsewhere(pristine, "named")
     before = pristine.before()
 
-    def full(*_: object) -> bool:
+    def full(*_: object, **__: object) -> bool:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(collect, "copy_file", full)
