@@ -22,6 +22,10 @@ from chaos.forks import forking  # noqa: E402
 from chaos.programs import ASSETS, makehuman  # noqa: E402
 
 
+def _report(what: str) -> None:
+    print(what, flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
@@ -35,15 +39,16 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="write the figures here")
     arguments = parser.parse_args()
     os.environ["PRIMDIFFUSION_CACHE"] = str(TESTS.parent / ".pytest_cache" / "children")
+    if makehuman() is None:
+        print(f"people and payloads are not tried: {ASSETS} names no MakeHuman asset folder", flush=True)
     with tempfile.TemporaryDirectory(prefix="primdiffusion_chaos_") as name, forking() as forks:
-        attack = Attack(Path(name), forks, arguments.seed, arguments.only)
-        if not attack.mounts:
+        try:
+            attack = Attack(Path(name), forks, arguments.seed, arguments.only)
+        except ValueError as error:
+            parser.error(str(error))
+        if "disks" in arguments.attacks and not attack.mounts:
             print("disks cannot be mounted here (root can): files are limited in size instead", flush=True)
-        if makehuman() is None:
-            print(f"people and payloads were not tried: {ASSETS} names no MakeHuman asset folder", flush=True)
-        attack.everything(
-            arguments.attacks, arguments.kills, arguments.minutes, arguments.deaths, lambda what: print(what, flush=True)
-        )
+        attack.everything(arguments.attacks, arguments.kills, arguments.minutes, arguments.deaths, _report)
     for sentence in attack.outcome.wrong:
         print(sentence)
     figures = attack.outcome.figures(arguments.attacks)
