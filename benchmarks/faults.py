@@ -1,27 +1,40 @@
 """What hostile files, kills, full disks and dead children do, and whether a seed is the same human everywhere.
 
-    python benchmarks/faults.py --json docs/results/faults.json
+    export PRIMDIFFUSION_ASSETS=DIR
+    python benchmarks/faults.py --json docs/results/faults.json --window window_out/figures.json
+    python benchmarks/faults.py --json docs/results/faults.json --parts kills    # the file's other figures are kept
 
-Runs `python -m tests.fuzz` and `python -m tests.chaos` (about an hour in all), whose figures are described there. Then
-one seed is generated on 1, 2 and 4 threads, alone and in a batch of 8: the largest difference of any number of the
-human, relative to the range of its kind. Two processes write the same seed: their files must have the same bytes.
+Each part is written as soon as it is measured, with `PART_recorded`: version, commit and date. The parts are
 
-Small files that claim much (`tests/fuzz/small_inputs.py`) are read one by one: `small_input_peak_mb` is the largest
-peak of memory, `small_input_seconds` the longest time.
-
-With --parts some of the four are measured anew, and the file's other figures are kept.
+- seed: one seed is generated on 1, 2 and 4 threads, alone and in a batch of 8: the largest difference of any number of
+  the human, relative to the range of its kind; threads: of how many numbers of threads (1, 2, 3) the files of a
+  generated human and a variant have the same bytes (`tests/backend/thread_bytes.py`)
+- small: small files that claim much are read one by one (`tests/fuzz/small_inputs.py`): the largest peak of memory and
+  the longest time
+- fuzz: damaged files for every reader; verdicts: damaged safetensors files, of which the library and the programs'
+  readers must think the same (`tests/fuzz`)
+- blends: a stranger's names and paths in a .blend: how many properties were tried, and how many files they changed
+  outside of the folder beside it (`tests/blender/blend_tampering.py`)
+- kills: of the programs in KILLED, in as many processes as there are cores, at most two; a loss is a file that is
+  half-written, gone, set back, or other than that of an undisturbed run. disks, deaths (of the extension's child) and
+  environments are `tests/chaos` too
+- window: rounds of undo and redo among timers in a real window, and crashes, from the figures of
+  `scripts/window/look.py --scenes undo_and_timers`; left out without --window
 """
 
 from __future__ import annotations
 
+import argparse
+import concurrent.futures
+import dataclasses
 import itertools
 import json
+import math
 import os
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Sequence
+from collections.abc import Callable
 from pathlib import Path
 
 import record
@@ -30,46 +43,69 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.human import Human, generate_batch
 
 ROOT = Path(__file__).resolve().parents[1]
+TESTS = ROOT / "tests"
 SEED = 7
 THREADS = (1, 2, 4)
 BATCHES = (1, 8)
-PERSON = "person.human.safetensors"
-PARTS = ("seed", "small", "fuzz", "chaos")
+KILLED = ("captures render", "captures pack", "train", "fit", "payloads", "payloads encode", "payloads pack",
+          "export .glb", "export .obj", "export .ply")  # fmt: skip
+"""Programs that write what took long, as `tests/chaos/programs.py` names them."""
 Figure = float | int | bool | str | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """Figures that are measured together."""
+
+    figures: tuple[str, ...]
+    measure: Callable[[argparse.Namespace], dict[str, Figure]]
 
 
 def main() -> None:
     parser = record.command_line(__doc__)
-    parser.add_argument("--fuzz-inputs", type=int, default=20_000)
-    parser.add_argument("--chaos-minutes", type=float, default=30.0)
+    parser.add_argument("--parts", nargs="+", choices=PARTS, help="measure only these anew; all by default")
+    parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--deaths", type=int, default=1000, help="of the child")
+    parser.add_argument("--fuzz-inputs", type=int, default=20_000)
     parser.add_argument("--steps", type=int, default=30, help="of the sampler")
-    parser.add_argument("--parts", nargs="+", choices=PARTS, default=PARTS, help="measure only these anew")
+    parser.add_argument("--window", type=Path, help="figures.json of scripts/window/look.py")
     arguments = parser.parse_args()
-    figures = {} if set(arguments.parts) == set(PARTS) else kept(arguments.json)
-    if "seed" in arguments.parts:
-        figures["threads_person_error_max"] = person_error(arguments.steps)
-        figures["same_seed_bytes_equal"] = same_bytes(arguments.steps)
-    if "small" in arguments.parts:
-        figures |= tool("tests.fuzz", "--small")
-    if "fuzz" in arguments.parts:
-        began = time.monotonic()
-        figures |= tool("tests.fuzz", "--inputs", str(arguments.fuzz_inputs))
-        figures |= tool("tests.fuzz", "--verdicts")
-        figures["fuzz_seconds"] = round(time.monotonic() - began, 1)
-    if "chaos" in arguments.parts:
-        began = time.monotonic()
-        figures |= chaos(arguments.chaos_minutes, arguments.deaths)
-        figures["chaos_seconds"] = round(time.monotonic() - began, 1)
-    record.report(figures, arguments.json)
+    if "window" in (arguments.parts or ()) and arguments.window is None:
+        parser.error("the part window takes its figures from a file: name it with --window")
+    figures = kept(arguments.json)
+    for name in arguments.parts or (name for name in PARTS if name != "window" or arguments.window):
+        print(f"{name} ...", flush=True)
+        found = PARTS[name].measure(arguments)
+        figures |= {key: found[key] for key in PARTS[name].figures} | {recorded(name): stamp()}
+        figures = {key: figures[key] for key in names() if key in figures}
+        if arguments.json is not None:
+            record.write_record(arguments.json, figures)
+    for key, value in figures.items():
+        print(key, value)
+
+
+def names() -> list[str]:
+    """All names in the file, in their order."""
+    return [key for name, part in PARTS.items() for key in (*part.figures, recorded(name))]
+
+
+def recorded(part: str) -> str:
+    """The name under which the file says when a part was measured."""
+    return f"{part}_recorded"
+
+
+def stamp() -> str:
+    """Version, commit and date of a measurement."""
+    about = record.surroundings()
+    return f"{about.get('version_primdiffusion', 'unknown')} {about['commit']} {about['date']}"
 
 
 def kept(path: Path | None) -> dict[str, Figure]:
-    """The figures of an earlier run; none without a file."""
+    """The figures of an earlier run that a part still measures; none without a file."""
     if path is None or not path.is_file():
         return {}
-    about = record.surroundings()
-    return {name: value for name, value in json.loads(path.read_text(encoding="utf-8")).items() if name not in about}
+    before = json.loads(path.read_text(encoding="utf-8"))
+    return {name: before[name] for name in names() if name in before}
 
 
 def person_error(steps: int) -> float:
@@ -104,47 +140,88 @@ def numbers(human: Human) -> dict[str, torch.Tensor]:
     return {name: tensor.double() for name, tensor in tensors.items() if tensor.max() > tensor.min()}
 
 
-def same_bytes(steps: int) -> bool:
-    """Whether two processes write the same file for a seed."""
-    with tempfile.TemporaryDirectory(prefix="primdiffusion_faults_") as name:
-        files = []
-        for number in range(2):
-            out = Path(name) / str(number)
-            words = ["generate", "--seed", str(SEED), "--steps", str(steps), "--size", "32", "--out", str(out)]
-            subprocess.run([sys.executable, "-m", "primdiffusion", *words], check=True, stdout=subprocess.DEVNULL)
-            files.append((out / PERSON).read_bytes())
-    return files[0] == files[1]
+def kills(count: int) -> dict[str, Figure]:
+    """The figures of all processes together, each with moments of its own."""
+    processes = min(os.cpu_count() or 1, 2)
+    each = ["--kills", str(math.ceil(count / processes)), "--only", *KILLED]
+    with concurrent.futures.ThreadPoolExecutor(processes) as pool:
+        seeds = range(processes)
+        found = list(pool.map(lambda seed: chaos("kills", "--seed", str(seed), *each), seeds))
+    return {name: sum(int(one[name] or 0) for one in found) for name in PARTS["kills"].figures}
 
 
-def chaos(minutes: float, deaths: int) -> dict[str, int]:
+def chaos(attack: str, *options: str) -> dict[str, Figure]:
     with tempfile.TemporaryDirectory(prefix="primdiffusion_faults_") as name:
         figures = Path(name) / "figures.json"
-        options = ["--minutes", str(minutes), "--deaths", str(deaths), "--json", str(figures)]
-        run("tests.chaos", options)
+        run("-m", "tests.chaos", "--attacks", attack, "--json", str(figures), *options)
         return json.loads(figures.read_text(encoding="utf-8"))
 
 
-def tool(module: str, *options: str) -> dict[str, int]:
-    """The figures in the last line of a module's output."""
-    return json.loads(run(module, options).strip().splitlines()[-1])
+def window(path: Path) -> dict[str, Figure]:
+    """The figures of a real window. Ends with a sentence for a file without them."""
+    found = json.loads(path.read_text(encoding="utf-8"))
+    if missing := [name for name in PARTS["window"].figures if name not in found]:
+        raise SystemExit(f"{path} has no {missing[0]}: play `scripts/window/look.py --scenes undo_and_timers`")
+    return found
 
 
-def run(module: str, options: Sequence[str]) -> str:
-    """The output of a module of the tests, which exits with 1 if it has found faults: they are figures, too."""
-    path = os.pathsep.join((str(ROOT), str(ROOT / "backend"), os.environ.get("PYTHONPATH", "")))
-    done = subprocess.run(
-        [sys.executable, "-m", module, *options],
-        cwd=ROOT,
-        env={**os.environ, "PYTHONPATH": path},
-        stdout=subprocess.PIPE,
-        text=True,
-        check=False,
-    )
+def tool(*words: str, is_shown: bool = True) -> dict[str, Figure]:
+    """The figures in the last line of JSON that a program of the tests prints."""
+    lines = [line for line in run(*words, is_shown=is_shown).splitlines() if line.startswith("{")]
+    if not lines:
+        raise SystemExit(f"{' '.join(words)} has printed no figures")
+    return json.loads(lines[-1])
+
+
+def run(*words: str, is_shown: bool = True) -> str:
+    """The output of a program of the tests, which exits with 1 if it has found faults: they are figures, too."""
+    folders = (ROOT, ROOT / "backend", TESTS, TESTS / "backend", TESTS / "contract", TESTS / "blender")
+    path = os.pathsep.join([*map(str, folders), os.environ.get("PYTHONPATH", "")])
+    with tempfile.TemporaryDirectory(prefix="primdiffusion_faults_") as settings:
+        done = subprocess.run(
+            [sys.executable, *words],
+            cwd=ROOT,
+            env={**os.environ, "PYTHONPATH": path, "BLENDER_USER_RESOURCES": settings},
+            stdout=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
     if done.returncode not in (0, 1):
-        raise SystemExit(f"{module} ended with exit code {done.returncode}: {done.stdout[-500:]}")
-    print(done.stdout, end="", flush=True)
+        raise SystemExit(f"{' '.join(words)} ended with exit code {done.returncode}: {done.stdout[-500:]}")
+    if is_shown:
+        print(done.stdout, end="", flush=True)
     return done.stdout
 
+
+PARTS: dict[str, Part] = {
+    "seed": Part(("threads_person_error_max",), lambda given: {"threads_person_error_max": person_error(given.steps)}),
+    "threads": Part(
+        ("same_bytes_threads",), lambda given: tool("tests/backend/thread_bytes.py", "--steps", str(given.steps))
+    ),
+    "small": Part(
+        ("small_inputs", "small_input_peak_mb", "small_input_seconds"), lambda _: tool("-m", "tests.fuzz", "--small")
+    ),
+    "fuzz": Part(
+        ("fuzz_inputs", "fuzz_tracebacks", "fuzz_garbage", "fuzz_hangs", "fuzz_over_500mb", "executions"),
+        lambda given: tool("-m", "tests.fuzz", "--inputs", str(given.fuzz_inputs)),
+    ),
+    "verdicts": Part(
+        ("reader_verdicts_compared", "reader_verdicts_accepted", "reader_verdicts_differ"),
+        lambda _: tool("-m", "tests.fuzz", "--verdicts"),
+    ),
+    "blends": Part(
+        ("blend_properties_tried", "files_written_outside"),
+        lambda _: tool("tests/blender/blend_tampering.py", is_shown=False),
+    ),
+    "kills": Part(("kills", "kills_lost"), lambda given: kills(given.kills)),
+    "deaths": Part(
+        ("child_deaths", "child_deaths_lost", "child_hangs"),
+        lambda given: chaos("deaths", "--deaths", str(given.deaths)),
+    ),
+    "disks": Part(("disk_full_commands", "disk_full_losses"), lambda _: chaos("disks")),
+    "environments": Part(("environments", "environments_failed"), lambda _: chaos("environments")),
+    "window": Part(("window_rounds", "window_crashes"), lambda given: window(given.window)),
+}
 
 if __name__ == "__main__":
     main()

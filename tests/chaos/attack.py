@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import random
 import time
 from collections.abc import Callable, Collection
@@ -16,6 +17,7 @@ from chaos.programs import Inputs, Program, all_programs
 from chaos.surroundings import broken_environment, entry_commands, odd_environments, try_broken, try_environments
 
 Report = Callable[[str], None]
+ATTACKS = ("environments", "disks", "deaths", "kills")
 TRIES = 4
 """At the most, until a disk becomes full in the middle of a command."""
 STOPS_EVERY = 25
@@ -39,29 +41,32 @@ class Outcome:
         """A sentence for each fault."""
         return [what for tally in (self.kills, self.disks, self.children, self.environments) for what in tally.wrong]
 
-    def figures(self) -> dict[str, int]:
-        """As docs/results/faults.json names them."""
-        return {
-            "kills": self.kills.count,
-            "kills_lost": self.kills.lost,
-            "child_deaths": self.children.count,
-            "child_deaths_lost": self.children.lost,
-            "child_hangs": self.child_hangs,
-            "disk_full_commands": len(self.filled),
-            "disk_full_losses": self.disks.lost,
-            "environments": self.environments.count,
-            "environments_failed": self.environments.lost,
+    def figures(self, attacks: Collection[str]) -> dict[str, int]:
+        """Of these attacks, as docs/results/faults.json names them."""
+        figures = {
+            "environments": {"environments": self.environments.count, "environments_failed": self.environments.lost},
+            "disks": {"disk_full_commands": len(self.filled), "disk_full_losses": self.disks.lost},
+            "deaths": {
+                "child_deaths": self.children.count,
+                "child_deaths_lost": self.children.lost,
+                "child_hangs": self.child_hangs,
+            },
+            "kills": {"kills": self.kills.count, "kills_lost": self.kills.lost},
         }
+        return {name: value for attack in attacks for name, value in figures[attack].items()}
 
 
 class Attack:
     """Attacks on programs whose own results are made once."""
 
     def __init__(self, folder: Path, forks: Forks, seed: int, names: Collection[str] = ()) -> None:
-        """`names` of the programs; all if there are none."""
+        """`names` of the programs; all if there are none. Raises ValueError for a name that no program has."""
         self._folder, self._forks, self.rng = folder, forks, random.Random(seed)
         self.inputs = Inputs(folder)
-        self.programs = [one for one in all_programs(self.inputs) if not names or one.name in names]
+        known = {one.name: one for one in all_programs(self.inputs)}
+        if unknown := [name for name in names if name not in known]:
+            raise ValueError(f"there is no program {unknown[0]!r} here: choose from {', '.join(known)}")
+        self.programs = [known[name] for name in names or known]
         self._known: dict[str, Undisturbed] = {}
         self.outcome = Outcome()
         self.mounts = can_mount(folder / "try")
@@ -104,25 +109,32 @@ class Attack:
         try_environments(chosen, odd_environments(self._folder), tally)
         try_broken(chosen, broken_environment(self._folder), tally)
 
-    def everything(self, minutes: float, deaths: int, report: Report) -> None:
-        """Environments, a full disk of every program, deaths of the child, then kills in turn until the time is over.
+    def everything(self, attacks: Collection[str], kills: int, minutes: float, deaths: int, report: Report) -> None:
+        """The chosen of ATTACKS, in their order.
 
-        Every program is killed at least once, however long it takes.
+        Programs are killed in turn, each once at least: until there are so many `kills`, or without a number, until the
+        minutes are over.
         """
         end = time.monotonic() + 60 * minutes
-        report("environments")
-        self.environments()
-        for program in self.programs:
-            report(f"a full disk: {program.name}")
-            self.fill(program)
-        report(f"{deaths} deaths of the child")
-        self.children(deaths)
-        while True:
+        if "environments" in attacks:
+            report("environments")
+            self.environments()
+        if "disks" in attacks:
             for program in self.programs:
-                report(f"kills: {program.name} ({self.outcome.kills.count} so far)")
-                self.kill(program)
-            if time.monotonic() > end:
+                report(f"a full disk: {program.name}")
+                self.fill(program)
+        if "deaths" in attacks:
+            report(f"{deaths} deaths of the child")
+            self.children(deaths)
+        if "kills" in attacks:
+            self._kill_in_turn(lambda: self.outcome.kills.count >= kills if kills else time.monotonic() > end, report)
+
+    def _kill_in_turn(self, is_over: Callable[[], bool], report: Report) -> None:
+        for turn, program in enumerate(itertools.cycle(self.programs)):
+            if turn >= len(self.programs) and is_over():
                 return
+            report(f"kills: {program.name} ({self.outcome.kills.count} so far)")
+            self.kill(program)
 
     def _undisturbed(self, program: Program) -> Undisturbed:
         if program.name not in self._known:

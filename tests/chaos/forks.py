@@ -123,13 +123,17 @@ def forking() -> Iterator[Forks]:
         forks.close()
 
 
-def random_death(rng: random.Random, whole: Ended, largest: int) -> Death:
-    """A moment between the start and the end of a run that took `whole`, whose largest file has `largest` bytes."""
+def random_death(rng: random.Random, whole: Ended, largest: int, share: float = 1.0) -> Death:
+    """A moment between the start and the end of a run that took `whole`, whose largest file has `largest` bytes.
+
+    Three of four are where files change: between two changes, as before a rename, or in the middle of a write. `share`
+    of a run is left to one that goes on from another.
+    """
     kind = rng.choice(("seconds", "operation", "operation", "size"))
     if kind == "seconds":
-        return Death(seconds=rng.uniform(0, whole.seconds))
+        return Death(seconds=rng.uniform(0, share * whole.seconds))
     if kind == "operation":
-        return Death(operation=rng.randint(1, max(whole.operations, 1)))
+        return Death(operation=rng.randint(1, max(round(share * whole.operations), 1)))
     return Death(size=round(2 ** rng.uniform(0, (largest + 1).bit_length())))
 
 
@@ -161,11 +165,22 @@ def _import_all() -> None:
     share_processors()
     lazily = ("commands.session", "commands.output", "commands.frame_drawer", "people.folder", "people.payloads",
               "people.assets", "encoder.model", "training.captured_people", "training.refine", "export.proxy",
-              "export.merged_file", "capture.dataset", "capture.sheet", "render.march")  # fmt: skip
+              "export.gaussians", "export.merged_file", "capture.dataset", "capture.sheet",
+              "render.march")  # fmt: skip
     for module in (*(path.partition(":")[0] for path, _ in COMMANDS.values()), *lazily):
         importlib.import_module(f"primdiffusion.{module}")
-    for module in ("diffuse_runs", "fit_scenes"):
+    optimisers = ("torch._dynamo", "torch.distributed.fsdp", "torch.fx.experimental.symbolic_shapes")
+    for module in ("diffuse_runs", "fit_scenes", *optimisers):
         importlib.import_module(module)
+    _use_a_kernel()
+
+
+def _use_a_kernel() -> None:
+    """Let numba set itself up."""
+    import numpy as np
+    from primdiffusion.capture.reader import Window, resample
+
+    resample(np.zeros((2, 2, 4), np.uint8), Window(0, 0, 2, 2), 1)
 
 
 def _run(

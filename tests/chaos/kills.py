@@ -9,7 +9,7 @@ from pathlib import Path
 
 from chaos.forks import Ended, Forks, random_death
 from chaos.programs import Program
-from chaos.results import differences, files_of, half_written
+from chaos.results import differences, files_of, finished, half_written, set_back
 
 MOST_IN_A_ROW = 3
 
@@ -53,11 +53,15 @@ def undisturbed(program: Program, forks: Forks, folder: Path) -> Undisturbed:
 
 
 def kill_and_repeat(whole: Undisturbed, forks: Forks, rng: random.Random, out: Path, tally: Tally) -> None:
-    """Let a program die up to MOST_IN_A_ROW times in a folder, then run it to its end and compare."""
+    """Let a program die up to MOST_IN_A_ROW times in a folder, then run it to its end and compare.
+
+    Nothing may be half-written after a death, nor may what was finished before it be gone.
+    """
     program, deaths, wrong = whole.program, [], []
     program.prepare(out)
-    for _ in range(rng.randint(1, MOST_IN_A_ROW)):
-        death = random_death(rng, whole.run, whole.largest)
+    before = finished(out, whole.folder)
+    for number in range(rng.randint(1, MOST_IN_A_ROW)):
+        death = random_death(rng, whole.run, whole.largest, 1 / (1 + number if program.resumes else 1))
         ended = program.run(forks, out, death)
         if ended.exit_code >= 0:
             if ended.exit_code:
@@ -65,14 +69,17 @@ def kill_and_repeat(whole: Undisturbed, forks: Forks, rng: random.Random, out: P
             break
         deaths.append(death)
         wrong += [f"{name} was published half-written" for name in half_written(out)]
+        now = finished(out, whole.folder)
+        wrong += set_back(before, now)
+        before = now
     if not differences(out, whole.folder):  # it died after its last write
         tally.add(len(deaths), wrong, program.name)
         shutil.rmtree(out)
         return
     ended = program.run(forks, out)
-    if ended.exit_code:
+    different = differences(out, whole.folder)
+    if ended.exit_code and different:  # otherwise it has refused to replace what was finished
         wrong.append(f"it did not go on: {ended.log[-300:]}")
-    else:
-        wrong += differences(out, whole.folder)
+    wrong += different
     tally.add(len(deaths), wrong, f"{program.name}, {deaths}")
     shutil.rmtree(out)

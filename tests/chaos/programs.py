@@ -160,8 +160,8 @@ def all_programs(given: Inputs) -> list[Program]:
             "render",
             lambda out: ["render", given.human(1), "--size", "32", "--out", out / "a.png", "--depth", out / "b.png"],
         ),
-        export(".glb"),
-        export(".obj"),
+        export(".glb", "--triangles", "500", "--texture", "64"),
+        export(".obj", "--triangles", "500", "--texture", "64"),
         export(".ply", "--gaussians", "100"),
         Program(
             "merge",

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 import torch
 from PIL import Image
+from safetensors import safe_open
 from safetensors.torch import load_file
 
 UNFINISHED = (".partial", ".primdiffusion-partial", ".writing_", ".dataset.json.")
 """Parts of the names of files and folders that are being written."""
-METRICS = "metrics.jsonl"
+METRICS, STATE, LOCK = "metrics.jsonl", "state.safetensors", ".lock"
+"""Of a training: its log, the end of the names of its states, and what its process locks."""
 TIMED = {"run.json", "config.json", "report.json"}
 """JSON files that hold times, versions or the paths of their folder."""
 
@@ -53,6 +55,30 @@ def differences(folder: Path, reference: Path) -> list[str]:
     return wrong + [f"{name} differs" for name in both if not _same(found[name], expected[name])]
 
 
+def finished(folder: Path, reference: Path) -> dict[str, int]:
+    """How far published files are: the steps of a training's state, otherwise 1 for what is as in the reference.
+
+    Without logs: their lines since the last state are written again.
+    """
+    expected, found = files_of(reference), files_of(folder)
+    return {name: _far(path, expected[name]) for name, path in found.items() if name in expected and name != METRICS}
+
+
+def set_back(before: Mapping[str, int], now: Mapping[str, int]) -> list[str]:
+    """What is less far than before."""
+    return [f"{name} was lost" for name, number in before.items() if now.get(name, 0) < number]
+
+
+def _far(path: Path, other: Path) -> int:
+    try:
+        if path.name.endswith(STATE):
+            with safe_open(path, framework="pt") as file:
+                return int(file.metadata()["step"])
+        return int(_same(path, other))
+    except Exception:  # it is half-written, which `half_written` finds
+        return 0
+
+
 def _is_whole(path: Path) -> bool:
     reader = READERS.get(path.suffix)
     try:
@@ -60,7 +86,7 @@ def _is_whole(path: Path) -> bool:
             reader(path)
     except Exception:
         return False
-    return path.stat().st_size > 0 or path.suffix in (".txt", ".jsonl")  # a list and a log may be empty
+    return path.stat().st_size > 0 or path.suffix in (".txt", ".jsonl") or path.name == LOCK  # these may be empty
 
 
 def _same(path: Path, other: Path) -> bool:

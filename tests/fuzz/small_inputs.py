@@ -15,14 +15,14 @@ import subprocess
 import sys
 import tempfile
 import time
-import zipfile
-import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 
+from fuzz.claims import COLOUR, GREY, many_scans, png, zeros
 from fuzz.run import FOLDERS, ROOT, _memory_mb
+from fuzz.small_captures import captured_view, read_rgba, read_view, small_view
 from fuzz.target import said
 
 SMALL_BYTES = 1_000_000
@@ -30,8 +30,6 @@ SMALL_BYTES = 1_000_000
 PROTECTION = 6 * 2**30
 """Bytes of data that a measured process may have: a reader without a limit must not take the machine down."""
 WAIT_S = 300.0
-COLOUR, GREY = 2, 0
-"""PNG's colour types."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,54 +128,6 @@ def _measure_here(name: str, folder: Path) -> None:
         is_user_error=sentence is not None,
     )
     print(json.dumps({"name": name, **dataclasses.asdict(about)}), flush=True)
-
-
-# --- files that are made in little memory
-
-
-def png(width: int, height: int, colour: int = COLOUR, bits: int = 8) -> bytes:
-    """A black PNG of any size."""
-    row = b"\0" * (1 + width * (3 if colour == COLOUR else 1) * bits // 8)
-    packer = zlib.compressobj(9)
-    data = b"".join([*(packer.compress(row) for _ in range(height)), packer.flush()])
-    header = struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0)
-    chunks = ((b"IHDR", header), (b"IDAT", data), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(
-        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data)) for kind, data in chunks
-    )
-
-
-def many_scans(side: int, scans: int) -> bytes:
-    """A progressive JPEG whose last scan is repeated."""
-    import io
-
-    from PIL import Image
-
-    file = io.BytesIO()
-    Image.new("L", (side, side)).save(file, "JPEG", progressive=True, quality=50)
-    data = file.getvalue()
-    last = data.rindex(b"\xff\xda")
-    return data[:-2] + data[last:-2] * scans + data[-2:]
-
-
-def zeros(path: Path, arrays: Mapping[str, tuple[str, tuple[int, ...]]], *, noise: int = 0, **small: object) -> Path:
-    """A deflated .npz with zeros of these types and shapes, and `small` arrays.
-
-    The first `noise` bytes of each are ones and zeros that do not compress, so that the file is large enough for more.
-    """
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=9) as archive:
-        for name, (kind, shape) in arrays.items():
-            header = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": shape}
-            left = int(np.prod(shape)) * np.dtype(kind).itemsize
-            with archive.open(f"{name}.npy", "w") as member:
-                np.lib.format.write_array_header_1_0(member, header)
-                left -= member.write(np.random.default_rng(0).integers(0, 2, min(noise, left), np.uint8).tobytes())
-                while left:
-                    left -= member.write(bytes(min(left, 2**20)))
-        for name, values in small.items():
-            with archive.open(f"{name}.npy", "w") as member:
-                np.lib.format.write_array(member, np.asarray(values))
-    return path
 
 
 # --- pictures
@@ -547,6 +497,16 @@ INPUTS: dict[str, SmallInput] = {
     ),
     "captured depth": SmallInput(
         picture(6470, 6470, GREY, 16), read_capture("depth"), picture(64, 64, GREY, 16), "pictures", is_read=True
+    ),
+    "captured view": SmallInput(captured_view(6400, "img", "mask", "depth", "part"), read_view, small_view, "views"),
+    "captured view just below the limit": SmallInput(
+        captured_view(5750, "img", "mask", "depth", "part"), read_view, small_view, "views", is_read=True
+    ),
+    "captured view of all passes": SmallInput(
+        captured_view(3700, "img", "mask", "depth", "normal", "part"), read_view, small_view, "views", is_read=True
+    ),
+    "captured view of colour and mask": SmallInput(
+        captured_view(6400, "img", "mask"), read_rgba, small_view, "views", is_read=True
     ),
     "motion": SmallInput(motion(("poses", "f4", (_WHOLE // 288, 72))), read_motion, small_motion, "motion"),
     "motion of bytes": SmallInput(motion(("poses", "i1", (_WHOLE // 72, 72))), read_motion, small_motion, "motion"),

@@ -143,9 +143,7 @@ def conditioning_views(
     pictures, seen = [], []
     for number in numbers:
         view = person.views[number]
-        image, mask = (person.picture(kind, frame, number) for kind in ("img", "mask"))
-        rgba = np.concatenate([image, mask[..., None]], axis=-1)
-        pictures.append(resample(rgba, full_window(view), side))
+        pictures.append(resample(person.rgba(frame, number), full_window(view), side))
         seen.append(as_camera(windowed_view(view, full_window(view), side)))
     views = Views(torch.from_numpy(np.stack(pictures)), stack(seen), person.smpl.pose(frame))
     if not views.mask.any():

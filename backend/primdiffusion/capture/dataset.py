@@ -39,6 +39,7 @@ from primdiffusion.capture.reader import (
 )
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import map_npy
+from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import LARGEST_BYTES, read_json
 from primdiffusion.formats.regular_files import read_regular
 from primdiffusion.formats.removing import check_inside
@@ -89,8 +90,7 @@ def pack_subject(subject: Subject) -> None:
         np.lib.format.write_array_header_1_0(file, header)
         for frame in range(shape[0]):
             for camera in range(shape[1]):
-                colour, mask = (subject.picture(kind, frame, camera) for kind in ("img", "mask"))
-                file.write(np.dstack([colour, mask]).tobytes())
+                file.write(subject.rgba(frame, camera).data)
     with replacing(pack_path(subject).with_suffix(".json")) as path:
         path.write_text(json.dumps({"format": PACK_FORMAT, "version": PACK_VERSION, "source": stamp}), encoding="utf-8")
 
@@ -262,14 +262,16 @@ class CaptureDataset(SampleSet[TrainingSample]):
         return np.resize(order, given), np.resize(np.roll(order, -given), wanted)
 
     def _views(self, subject: Subject, frame: int, cameras: np.ndarray, crops: np.random.Generator | None) -> Views:
-        size, pictures, seen = self.settings.size, [], []
-        for camera in cameras:
-            rgba, view = self._rgba(subject, frame, int(camera)), subject.views[camera]
-            window = full_window(view) if crops is None else _crop_around_subject(rgba, size, crops)
-            pictures.append(resample(rgba, window, size))
-            seen.append(windowed_view(view, window, size))
-        camera = stack([as_camera(view) for view in seen])
-        return Views(torch.from_numpy(np.stack(pictures)), camera, subject.smpl.pose(frame))
+        framed = [self._framed(subject, frame, int(camera), crops) for camera in cameras]
+        camera = stack([as_camera(view) for _, view in framed])
+        return Views(torch.from_numpy(np.stack([rgba for rgba, _ in framed])), camera, subject.smpl.pose(frame))
+
+    def _framed(
+        self, subject: Subject, frame: int, camera: int, crops: np.random.Generator | None
+    ) -> tuple[np.ndarray, View]:
+        rgba, view, size = self._rgba(subject, frame, camera), subject.views[camera], self.settings.size
+        window = full_window(view) if crops is None else _crop_around_subject(rgba, size, crops)
+        return resample(rgba, window, size), windowed_view(view, window, size)
 
     def _rgba(self, subject: Subject, frame: int, camera: int) -> np.ndarray:
         if subject.name not in self._packs:
@@ -277,8 +279,7 @@ class CaptureDataset(SampleSet[TrainingSample]):
         packed = self._packs[subject.name]
         if packed is not None:
             return np.asarray(packed[frame, camera])
-        image, mask = (subject.picture(kind, frame, camera) for kind in ("img", "mask"))
-        return np.concatenate([image, mask[..., None]], axis=-1)
+        return subject.rgba(frame, camera)
 
     def __getstate__(self) -> dict[str, object]:
         """Worker processes open the packs themselves."""

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-from collections.abc import Mapping
+import os
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numba
 import numpy as np
@@ -21,8 +23,9 @@ from primdiffusion.formats.arrays import all_finite
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.picture_files import DEPTH_UNIT
+from primdiffusion.formats.regular_files import open_regular
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.pictures import decoded, opened_picture, strips
+from primdiffusion.geometry.pictures import LARGEST_FILE, decoded, decoded_bytes, opened_picture, strips
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 
@@ -93,6 +96,8 @@ def _resample(rgba, left, top, across, down, linear_of_byte, byte_of_linear, out
 
 CAMERAS_FILE = "cameras.json"
 PASSES_OF_RELEASED = ("img", "mask")
+VIEW_OF_FILES = 2
+"""Times of what the largest of its files may take alone (`decoded_bytes`) that all passes of a view may take."""
 
 
 class CaptureFileError(ValueError):
@@ -141,15 +146,36 @@ class Subject:
         return as_camera(self.views[camera])
 
     def picture(self, kind: str, frame: int, camera: int) -> np.ndarray:
-        """The stored values of an image file.
+        """The stored values of an image file. Raises as `pictures`."""
+        return self.pictures((kind,), frame, camera)[kind]
+
+    def pictures(self, kinds: Sequence[str], frame: int, camera: int) -> dict[str, np.ndarray]:
+        """The stored values of image files of one view, which are limited together before any is decoded.
 
         Raises:
-            FileNotFoundError: the file is missing.
-            CaptureFileError: it is damaged, or its size is not the camera's.
+            FileNotFoundError: a file is missing.
+            CaptureFileError: one is damaged, its size is not the camera's, or all are too large for their files.
         """
-        path = capture_layout.picture_path(self.folder, kind, camera, frame)
         view = self.views[camera]
-        return read_picture(path, kind, view.width, view.height)
+        paths = {kind: capture_layout.picture_path(self.folder, kind, camera, frame) for kind in kinds}
+        with contextlib.ExitStack() as stack:
+            files = {kind: stack.enter_context(_opened(path)) for kind, path in paths.items()}
+            self._check_together(files, view)
+            return {kind: _read(file, paths[kind], kind, view.width, view.height) for kind, file in files.items()}
+
+    def rgba(self, frame: int, camera: int) -> UInt8[np.ndarray, "H W 4"]:
+        """Colour and mask of a view. Raises as `pictures`."""
+        found = self.pictures(("img", "mask"), frame, camera)
+        return np.concatenate([found["img"], found["mask"][..., None]], axis=-1)
+
+    def _check_together(self, files: Mapping[str, BinaryIO], view: View) -> None:
+        largest = max((file.seek(0, os.SEEK_END) for file in files.values()), default=0)
+        claimed = view.width * view.height * sum(_BYTES_OF_A_PIXEL.get(kind, 4) for kind in files)
+        if claimed > VIEW_OF_FILES * decoded_bytes(largest):
+            raise CaptureFileError(
+                f"{self.folder} has {len(files)} images of {view.width} x {view.height} pixels of one view, in files "
+                f"of at most {largest} bytes: render the subject again, smaller"
+            )
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -196,8 +222,8 @@ class Captures:
                 f"{camera}"
             )
         known = [kind for kind in self.passes if isinstance(kind, str) and kind in _KINDS]
-        pictures = {kind: person.picture(kind, frame, camera) for kind in known}
-        values = {kind: torch.from_numpy(_KINDS[kind](picture)) for kind, picture in pictures.items()}
+        pictures = person.pictures(known, frame, camera)
+        values = {kind: torch.from_numpy(_KINDS[kind](pictures.pop(kind))) for kind in known}  # one by one: less memory
         view = person.views[camera]
         return CapturedView(
             image=values.pop("img") if "img" in values else torch.zeros(view.height, view.width, 3, dtype=torch.uint8),
@@ -252,20 +278,36 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
         FileNotFoundError: the file is missing.
         CaptureFileError: it is damaged or has another size.
     """
+    with _opened(path) as file:
+        return _read(file, path, kind, width, height)
+
+
+def _opened(path: Path) -> BinaryIO:
+    with _named(path):
+        return open_regular(path, LARGEST_FILE)
+
+
+def _read(file: BinaryIO, path: Path, kind: str, width: int, height: int) -> np.ndarray:
+    with _named(path), opened_picture(file, bytes_each=_BYTES_OF_A_PIXEL.get(kind, 4)) as picture:
+        size = picture.size
+        if size == (width, height) and kind == "depth":
+            if len(picture.getbands()) != 1:
+                raise ValueError(f"it has {len(picture.getbands())} channels instead of one")
+            return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
+        if size == (width, height):
+            return decoded(picture, "RGB" if kind in ("img", "normal") else "L")
+    raise CaptureFileError(f"{path} has {size[0]} x {size[1]} pixels, its camera {width} x {height}: render it again")
+
+
+@contextlib.contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors of an image file, as sentences that name it."""
     try:
-        with opened_picture(path, bytes_each=_BYTES_OF_A_PIXEL.get(kind, 4)) as picture:
-            size = picture.size
-            if size == (width, height) and kind == "depth":
-                if len(picture.getbands()) != 1:
-                    raise ValueError(f"it has {len(picture.getbands())} channels instead of one")
-                return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
-            if size == (width, height):
-                return decoded(picture, "RGB" if kind in ("img", "normal") else "L")
+        yield
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
         raise CaptureFileError(f"{path} is not a complete image ({e!s:.160}): render it again") from e
-    raise CaptureFileError(f"{path} has {size[0]} x {size[1]} pixels, its camera {width} x {height}: render it again")
 
 
 def _read_views(folder: Path) -> list[View]:

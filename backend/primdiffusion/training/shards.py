@@ -30,7 +30,7 @@ from primdiffusion.diffusion.model import BETAS
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.regular_files import is_plain_path, open_regular
-from primdiffusion.formats.whole_files import staged, write_atomically, written_whole
+from primdiffusion.formats.whole_files import remove_abandoned, staged, write_atomically, written_whole
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.tensor_file import TensorFile
 from primdiffusion.training.stored_people import PersonDataset, PersonFolder, PersonVariants, attributes_of
@@ -67,6 +67,7 @@ def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iter
     if people_each < 1:
         raise ValueError(f"{people_each} humans per shard: choose 1 or more")
     if (out / INDEX).exists():
+        remove_abandoned(out)  # of a process that was killed after the index had its place
         raise ShardError(f"{out} already contains shards: choose another folder, or remove it")
     people = PersonFolder(folder)
     with staged(out, last=INDEX) as unfinished:

@@ -4,7 +4,9 @@ import json
 import os
 import pickle
 import shutil
+import struct
 import zipfile
+import zlib
 
 import numpy as np
 import pytest
@@ -289,3 +291,40 @@ def test_a_pack_is_not_written_through_a_link(root, tmp_path):
     with pytest.raises(OutsideFolderError):
         list(pack(open_captures(root)))
     assert not list((tmp_path / "elsewhere").iterdir())
+
+
+def claim_pixels(root, width, height, padding=0):
+    """Let all passes of camera 0 claim a size; nothing is in the files that could be decoded to it."""
+    path = root / capture_layout.DATASET_FILE
+    passes = ["img", "mask", "depth", "part"]
+    path.write_text(json.dumps({**json.loads(path.read_text()), "passes": passes}))
+    for kind in passes:
+        header = struct.pack(">IIBBBBB", width, height, 8, 2 if kind == "img" else 0, 0, 0, 0)
+        chunks = ((b"IHDR", header), (b"IDAT", b""))
+        content = b"".join(
+            struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+            for name, data in chunks
+        )
+        for frame in range(3):
+            picture = capture_layout.picture_path(root / NAME, kind, 0, frame)
+            picture.write_bytes(b"\x89PNG\r\n\x1a\n" + content + bytes(padding))
+
+
+def test_passes_of_a_view_are_limited_together_before_any_is_decoded(root):
+    claim_pixels(root, 6400, 6400)  # each alone would be decoded
+    with pytest.raises(CaptureFileError, match="4 images of 6400 x 6400 pixels of one view") as error:
+        open_captures(root).view(NAME, 0, 0)
+    assert str(root / NAME) in str(error.value)
+    claim_pixels(root, 6400, 6400, padding=1_500_000)
+    with pytest.raises(CaptureFileError, match="not a complete image"):
+        open_captures(root).view(NAME, 0, 0)
+    claim_pixels(root, 5700, 5700)
+    with pytest.raises(CaptureFileError, match="not a complete image"):
+        open_captures(root).view(NAME, 0, 0)
+
+
+def test_colour_and_mask_are_those_of_the_files(root):
+    subject = open_captures(root).subject(NAME)
+    rgba = subject.rgba(1, 2)
+    assert np.array_equal(rgba[..., :3], subject.picture("img", 1, 2))
+    assert np.array_equal(rgba[..., 3], subject.picture("mask", 1, 2))

@@ -1,6 +1,7 @@
 import errno
 import itertools
 import json
+import os
 import pathlib
 
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 import torch
 from diffusion_people import write_people
 from primdiffusion import tensor_file
+from primdiffusion.formats.whole_files import temporary_name
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import K
 from primdiffusion.training import shards
@@ -157,6 +159,15 @@ def test_packing_into_packed_people_is_rejected(folder, copied):
     with pytest.raises(ShardError, match="already"):
         list(pack_people(folder, copied))
     assert (copied / INDEX).read_bytes() == before
+
+
+def test_packing_again_removes_what_a_kill_left_beside_the_finished_shards(folder, copied):
+    left = temporary_name(copied / "files")
+    left = left.with_name(left.name.replace(str(os.getpid()), "9999999"))  # above any process' number
+    left.mkdir()
+    with pytest.raises(ShardError, match="already"):
+        list(pack_people(folder, copied))
+    assert not left.exists()
 
 
 def test_people_of_several_densities_are_rejected(folder, tmp_path):

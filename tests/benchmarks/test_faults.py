@@ -1,0 +1,107 @@
+"""Parts of faults.json are measured one by one, each with its own commit, and kept by the next."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+import faults
+
+NAMES = {
+    "threads_person_error_max", "same_bytes_threads", "small_input_peak_mb", "small_input_seconds", "fuzz_inputs",
+    "fuzz_tracebacks", "fuzz_garbage", "fuzz_hangs", "fuzz_over_500mb", "executions", "reader_verdicts_compared",
+    "reader_verdicts_differ", "blend_properties_tried", "files_written_outside", "kills", "kills_lost", "child_deaths",
+    "child_deaths_lost", "child_hangs", "disk_full_commands", "disk_full_losses", "environments",
+    "environments_failed", "window_rounds", "window_crashes",
+}  # fmt: skip
+
+
+@pytest.fixture
+def measure(monkeypatch, tmp_path):
+    """Run the program with parts that give a number, except one that may fail; returns what is in its file."""
+
+    def measure(number, *words, failing=""):
+        def part(name):
+            def found(_):
+                if name == failing:
+                    raise SystemExit(f"{name} failed")
+                return dict.fromkeys(faults.PARTS[name].figures, number)
+
+            return faults.Part(faults.PARTS[name].figures, found)
+
+        parts = {name: part(name) if name != "window" else faults.PARTS[name] for name in faults.PARTS}
+        with monkeypatch.context() as patch:
+            patch.setattr(faults, "PARTS", parts)
+            patch.setattr(faults, "stamp", lambda: f"stamp {number}")
+            patch.setattr(sys, "argv", ["faults.py", "--json", str(tmp_path / "faults.json"), *words])
+            if failing:
+                with pytest.raises(SystemExit, match=failing):
+                    faults.main()
+            else:
+                faults.main()
+        return json.loads((tmp_path / "faults.json").read_text())
+
+    return measure
+
+
+@pytest.fixture
+def window(tmp_path):
+    (tmp_path / "figures.json").write_text(json.dumps({"window_rounds": 100, "window_crashes": 0, "other": 1}))
+    return tmp_path / "figures.json"
+
+
+def test_every_figure_that_is_read_is_measured(measure, window):
+    found = measure(1, "--window", str(window))
+    assert set(found) >= NAMES
+    assert (found["window_rounds"], found["window_crashes"]) == (100, 0)
+    assert "other" not in found
+
+
+def test_without_a_window_its_figures_are_absent_or_kept(measure, window):
+    assert "window_rounds" not in measure(1)
+    measure(1, "--window", str(window), "--parts", "window")
+    assert measure(2)["window_rounds"] == 100
+
+
+def test_a_part_is_measured_anew_alone_and_says_when(measure, tmp_path):
+    (tmp_path / "faults.json").write_text(json.dumps({"fuzz_seconds": 3.0, "environments": 20, "commit": "old"}))
+    assert measure(1, "--parts", "kills")["environments"] == 20
+    found = measure(2, "--parts", "threads", "fuzz")
+    assert (found["kills"], found["kills_recorded"]) == (1, "stamp 1")
+    assert (found["fuzz_inputs"], found["fuzz_recorded"]) == (2, "stamp 2")
+    assert "fuzz_seconds" not in found  # nothing measures it any more
+    assert found["commit"] != "old"
+
+
+def test_a_part_that_fails_leaves_those_before_it(measure):
+    found = measure(1, failing="kills")
+    assert found["blend_properties_tried"] == 1
+    assert "kills" not in found
+
+
+def test_a_window_that_is_not_given_is_named(measure, capsys):
+    with pytest.raises(SystemExit):
+        measure(1, "--parts", "window")
+    assert "--window" in capsys.readouterr().err
+
+
+def test_kills_of_all_processes_are_added(monkeypatch):
+    asked = []
+
+    def chaos(attack, *options):
+        asked.append((attack, *options))
+        return {"kills": 150, "kills_lost": int(options[1] == "1")}
+
+    monkeypatch.setattr(faults, "chaos", chaos)
+    monkeypatch.setattr(faults.os, "cpu_count", lambda: 2)
+    assert faults.kills(300) == {"kills": 300, "kills_lost": 1}
+    assert [words[words.index("--kills") + 1] for words in asked] == ["150", "150"]
+
+
+def test_the_programs_that_are_killed_exist():
+    from chaos.programs import Inputs, all_programs
+
+    known = {program.name for program in all_programs(Inputs(Path()))}
+    assert set(faults.KILLED) - {"payloads"} <= known  # payloads: where MakeHuman's assets are
