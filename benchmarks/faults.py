@@ -54,7 +54,7 @@ def main() -> None:
         figures |= tool("tests.fuzz", "--small")
     if "fuzz" in arguments.parts:
         began = time.monotonic()
-        figures |= tool("tests.fuzz", "--inputs", str(arguments.fuzz_inputs))
+        figures |= tool("tests.fuzz", "--forget", "--inputs", str(arguments.fuzz_inputs))
         figures |= tool("tests.fuzz", "--verdicts")
         figures["fuzz_seconds"] = round(time.monotonic() - began, 1)
     if "chaos" in arguments.parts:
