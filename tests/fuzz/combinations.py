@@ -66,10 +66,13 @@ def archives(first: bytes, second: bytes, rng: Generator) -> bytes:
         return first + second
     members, others = _members(first), _members(second)
     place, (name, data) = int(rng.integers(len(members))), pick(rng, others)
+    before, after = members[:place], members[place + 1 :]
     ways = (
-        [*members, (name, data)], [*members, *others], [*members[:place], (members[place][0], data), *members[place + 1 :]],
-        [*members[:place], (name, data), *members[place + 1 :]],
-    )  # fmt: skip
+        [*members, (name, data)],
+        [*members, *others],
+        [*before, (members[place][0], data), *after],
+        [*before, (name, data), *after],
+    )
     out = io.BytesIO()
     with warnings.catch_warnings(), zipfile.ZipFile(out, "w", pick(rng, (0, zipfile.ZIP_DEFLATED))) as file:
         warnings.simplefilter("ignore")  # of a name that is there twice

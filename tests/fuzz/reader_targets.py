@@ -70,7 +70,9 @@ def read_by_both(path: Path) -> None:
 def make_requests(folder: Path) -> Path:
     """Requests of both kinds, a notification, an answer that nobody waits for, and an empty line."""
     asked = ("hello", "attributes", "cancel", "render", "fit_gain")
-    lines = [{"jsonrpc": "2.0", "id": id, "method": name, "params": served.CALLS[name]} for id, name in enumerate(asked)]
+    lines = [
+        {"jsonrpc": "2.0", "id": id, "method": name, "params": served.CALLS[name]} for id, name in enumerate(asked)
+    ]
     lines.insert(2, {"jsonrpc": "2.0", "method": "cancel", "params": {"id": 1}})
     text = [*map(json.dumps, lines), "", json.dumps({"jsonrpc": "2.0", "id": 1, "result": {}}), ""]
     (folder / "requests.json").write_text("\n".join(text), encoding="utf-8")

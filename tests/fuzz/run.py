@@ -193,7 +193,7 @@ def _serve(
     targets = [target for target in TARGETS if only in target.name][place::processes]
     os.chdir(folder)
     tried: dict[str, Tried] = {}
-    coverage, found, began = Coverage(), set(), time.process_time()
+    coverage, found = Coverage(), set()
     for number in range(first, last if targets else first):
         target = min(targets, key=lambda one: tried[one.name].seconds if one.name in tried else -1.0)
         if target.name not in tried:
@@ -201,8 +201,9 @@ def _serve(
             made = Path(folder, str(number))
             made.mkdir()
             tried[target.name] = Tried(target, target.make(made), corpus)
+            target.read(tried[target.name].path)  # what is not damaged is read; once without lines of imports
             with coverage:
-                target.read(tried[target.name].path)  # what is not damaged is read
+                target.read(tried[target.name].path)
         one = tried[target.name]
         content = one.corpus.waiting()
         if content is None:
@@ -235,7 +236,7 @@ def _serve(
 def _kind(outcome: list[str], about: str) -> tuple[str, ...]:
     """What findings with one cause have in common: the outcome, and where an error arose or what is wrong."""
     where = re.search(r"\(\w+\.py:\d+\)", about)
-    return (*outcome, where[0] if where else re.sub(r"'[^']*'|/\S+|\d+", "", about)[:60])
+    return (*outcome, where[0] if where else re.sub(r"'[^']*'|/\S+|\d+", "", about)[:150])
 
 
 def _outcome(target: Any, path: Path, coverage: Coverage | None = None) -> tuple[list[str], str]:
