@@ -13,9 +13,10 @@ PROGRAMS = tuple(f"{ROOT / name}{os.sep}" for name in ("backend", "blender_primd
 
 
 class Coverage:
-    """While it is entered, lines of the programs are noted that this thread runs."""
+    """While it is entered, lines are noted that this thread runs, of files whose paths begin as one of `programs`."""
 
-    def __init__(self) -> None:
+    def __init__(self, programs: tuple[str, ...] = PROGRAMS) -> None:
+        self._programs = programs
         self.has_news = False
         """A line was reached from a line that has never led to it, since this was last set to False."""
         self._seen: dict[CodeType, set[tuple[int, int]]] = {}
@@ -38,7 +39,7 @@ class Coverage:
         code = frame.f_code
         seen = self._seen.get(code)
         if seen is None:
-            if not code.co_filename.startswith(PROGRAMS):
+            if not code.co_filename.startswith(self._programs):
                 return None
             seen = self._seen[code] = set()
         last = 0

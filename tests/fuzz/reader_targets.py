@@ -69,9 +69,9 @@ def read_by_both(path: Path) -> None:
 
 def make_requests(folder: Path) -> Path:
     """Requests of both kinds, a notification, an answer that nobody waits for, and an empty line."""
-    asked = ("hello", "attributes", "cancel", "render", "fit_gain")
-    lines = [
-        {"jsonrpc": "2.0", "id": id, "method": name, "params": served.CALLS[name]} for id, name in enumerate(asked)
+    lines: list[dict[str, Any]] = [
+        {"jsonrpc": "2.0", "id": id, "method": name, "params": served.CALLS[name]}
+        for id, name in enumerate(("hello", "attributes", "cancel", "render", "fit_gain"))
     ]
     lines.insert(2, {"jsonrpc": "2.0", "method": "cancel", "params": {"id": 1}})
     text = [*map(json.dumps, lines), "", json.dumps({"jsonrpc": "2.0", "id": 1, "result": {}}), ""]
@@ -88,8 +88,10 @@ RESULTS: dict[str, dict[str, Any]] = {
     "merge_frames": {"files": ["a.npz"], "seconds": 1},
     "fit_gain": {"gain": 1.5, "error": 0.1, "gain_before": 1, "error_before": 0.2},
     "proxy": {"proxy": "a.npz", "texture": "a.png", "betas": [0.5] * 10, "triangles": 500, "seconds": 2.5},
-    "hello": {"name": "primdiffusion", "version": "1", "protocol": 1, "pid": 7, "python": "3.11", "executable": "python",
-              "memory_gb": 8.5, "ready": False, "problem": None, "device": None, "device_name": None},
+    "hello": {
+        "name": "primdiffusion", "version": "1", "protocol": 1, "pid": 7, "python": "3.11", "executable": "python",
+        "memory_gb": 8.5, "ready": False, "problem": None, "device": None, "device_name": None,
+    },
 }  # fmt: skip
 """Of the child, by method; the place of a method, from 1, is the id of its request."""
 

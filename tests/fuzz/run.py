@@ -174,6 +174,22 @@ class Tried:
         self.target, self.path, self.valid, self.seconds = target, path, path.read_bytes(), 0.0
         self.corpus = Corpus(self.valid, Path(corpus, corpora.folder_of(target.name)) if corpus else None)
 
+    def next_input(self, seed: int, number: int) -> bytes:
+        """One of an earlier run, or one that is made of those that have reached something new."""
+        content = self.corpus.waiting()
+        if content is not None:
+            return content
+        chosen = self.corpus.chosen(np.random.default_rng([number, seed]))
+        return damaged(self.target, chosen, seed, number, self.corpus.contents)
+
+    def learn(self, content: bytes, coverage: Coverage) -> tuple[list[str], str]:
+        """As `outcome`; the input is kept if it reaches something new and finds nothing."""
+        coverage.has_news = False
+        outcome, about = self.outcome(content, coverage)
+        if coverage.has_news and set(outcome) <= ORDINARY:
+            self.corpus.learn(content)
+        return outcome, about
+
     def outcome(self, content: bytes, coverage: Coverage | None = None) -> tuple[list[str], str]:
         """What comes of an input, as `_outcome` says."""
         self.path.write_bytes(content)
@@ -205,21 +221,16 @@ def _serve(
             with coverage:
                 target.read(tried[target.name].path)
         one = tried[target.name]
-        content = one.corpus.waiting()
-        if content is None:
-            chosen = one.corpus.chosen(np.random.default_rng([number, seed]))
-            content = damaged(target, chosen, seed, number, one.corpus.contents)
+        content = one.next_input(seed, number)
         _say(number=number, target=target.name, path=str(one.path))
-        began, coverage.has_news = time.process_time(), False
+        began = time.process_time()
         events.clear()
-        outcome, about = one.outcome(content, coverage)
+        outcome, about = one.learn(content, coverage)
         if set(outcome) & {"hangs", "over_500mb"}:  # once more alone: another program may have slowed it down
             outcome, about = one.outcome(content)
         if events or Path("CANARY").exists():
             outcome.append("executions")
             about += f" ({events})"
-        if coverage.has_news and set(outcome) <= ORDINARY:
-            one.corpus.learn(content)
         is_new = not set(outcome) <= ORDINARY and (kind := (target.name, _kind(outcome, about))) not in found
         if is_new:
             found.add(kind)
