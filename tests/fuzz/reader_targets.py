@@ -68,14 +68,11 @@ def read_by_both(path: Path) -> None:
 
 
 def make_requests(folder: Path) -> Path:
-    """Requests of both kinds, a notification, an answer that nobody waits for, and an empty line."""
-    lines: list[dict[str, Any]] = [
-        {"jsonrpc": "2.0", "id": id, "method": name, "params": served.CALLS[name]}
-        for id, name in enumerate(("hello", "attributes", "cancel", "render", "fit_gain"))
-    ]
-    lines.insert(2, {"jsonrpc": "2.0", "method": "cancel", "params": {"id": 1}})
-    text = [*map(json.dumps, lines), "", json.dumps({"jsonrpc": "2.0", "id": 1, "result": {}}), ""]
-    (folder / "requests.json").write_text("\n".join(text), encoding="utf-8")
+    """Requests, each with an empty line behind it so that it is run before the next one comes, and a notification."""
+    lines = [json.dumps({"jsonrpc": "2.0", "method": "cancel", "params": {"id": 1}})]
+    for id, name in enumerate(("hello", "attributes", "cancel", "render", "fit_gain")):
+        lines += [json.dumps({"jsonrpc": "2.0", "id": id, "method": name, "params": served.CALLS[name]}), ""]
+    (folder / "requests.json").write_text("\n".join(lines), encoding="utf-8")
     return folder / "requests.json"
 
 
