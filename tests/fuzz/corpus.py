@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import lzma
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -70,13 +71,13 @@ class Corpus:
                 keep(self._folder, content, "")
 
 
-def shrunk(content: bytes, is_same: Callable[[bytes], bool], tries: int = 200) -> bytes:
-    """The content without pieces that a finding does not need."""
-    size = len(content) // 2
-    while size and tries > 0:
+def shrunk(content: bytes, is_same: Callable[[bytes], bool], seconds: float = 5.0) -> bytes:
+    """The content without pieces that a finding does not need, as far as `seconds` of work allow."""
+    size, end = len(content) // 2, time.process_time() + seconds
+    while size and time.process_time() < end:
         for begin in range(0, len(content), size):
-            tries -= 1
-            if tries and is_same(shorter := content[:begin] + content[begin + size :]):
+            shorter = content[:begin] + content[begin + size :]
+            if time.process_time() < end and is_same(shorter):
                 content = shorter
                 break
         else:

@@ -244,8 +244,11 @@ def _serve(
 
 
 def _kind(outcome: list[str], about: str) -> tuple[str, ...]:
-    """What findings with one cause have in common: the outcome, and where an error arose or what is wrong."""
-    where = re.search(r"\(\w+\.py:\d+\)", about)
+    """What findings with one cause have in common: the outcome, and where an error arose or what is wrong.
+
+    Of an error within a request, the server tells the text alone.
+    """
+    where = None if "defect in the backend" in about else re.search(r"\(\w+\.py:\d+\)", about)
     return (*outcome, where[0] if where else re.sub(r"'[^']*'|/\S+|\d+", "", about)[:150])
 
 
@@ -324,7 +327,7 @@ if __name__ == "__main__":
     import torch
 
     torch.set_num_threads(1)
-    resource.setrlimit(resource.RLIMIT_DATA, (8 * 2**30,) * 2)
+    resource.setrlimit(resource.RLIMIT_DATA, (8 * 2**30, 8 * 2**30))
     import bpy  # noqa: F401  before the rest, which it would otherwise load anew
 
     _serve(**json.loads(sys.argv[1]))
