@@ -22,7 +22,7 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, help="how long; otherwise --inputs decides")
     parser.add_argument("--inputs", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="part of the name of a kind of input")
+    parser.add_argument("--only", nargs="+", default=[""], help="parts of names of kinds of input")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--forget", action="store_true", help=f"use and keep nothing in {CORPUS.name}")
     parser.add_argument("--verdicts", action="store_true", help="only compare readers of safetensors files")
@@ -40,7 +40,7 @@ def main() -> None:
         corpus=None if arguments.forget else CORPUS,
     )  # fmt: skip
     if not report.counts["inputs"]:
-        sys.exit(f"no input was tried: is there a kind of input whose name contains {arguments.only!r}?")
+        sys.exit(f"no input was tried: is there a kind of input whose name contains {' or '.join(arguments.only)}?")
     inputs, lines, findings = report.counts["inputs"], len(report.lines), len(report.findings)
     print(f"{inputs} inputs tried, {lines} lines of the programs reached, {findings} findings")
     print(json.dumps(report.figures()))

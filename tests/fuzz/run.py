@@ -66,19 +66,20 @@ class Report:
 
 
 def run(
-    seed: int, inputs: int, *, minutes: float | None = None, only: str = "", processes: int = 1,
+    seed: int, inputs: int, *, minutes: float | None = None, only: Sequence[str] = ("",), processes: int = 1,
     corpus: Path | None = None,
 ) -> Report:  # fmt: skip
     """Try `inputs` damaged inputs, or as many as fit into `minutes`; a process that hangs or dies is replaced.
 
-    Kinds of inputs are shared out among the processes. What reaches new lines is kept in the folder `corpus`, if given.
+    Kinds of inputs, those whose names contain one of `only`, are shared out among the processes. What reaches new lines
+    is kept in the folder `corpus`, if given.
     """
     report, end = Report(), None if minutes is None else time.monotonic() + 60 * minutes
 
     def work(place: int) -> None:
         number, last = 0, 10**9 if end is not None else -(-inputs // processes)
         while number < last and (end is None or time.monotonic() < end):
-            options = {"seed": seed, "only": only, "place": place, "processes": processes, "last": last}
+            options = {"seed": seed, "only": list(only), "place": place, "processes": processes, "last": last}
             number = _run_child(report, {**options, "first": number, "corpus": corpus and str(corpus)}, end)
 
     with concurrent.futures.ThreadPoolExecutor(processes) as pool:
@@ -199,13 +200,13 @@ class Tried:
 
 
 def _serve(
-    seed: int, only: str, place: int, processes: int, first: int, last: int, corpus: str | None, folder: str
+    seed: int, only: Sequence[str], place: int, processes: int, first: int, last: int, corpus: str | None, folder: str
 ) -> None:
     from fuzz.targets import TARGETS
 
     events: list[str] = []
     sys.addaudithook(lambda event, _: events.append(event) if event in PROGRAMS else None)
-    targets = [target for target in TARGETS if only in target.name][place::processes]
+    targets = [target for target in TARGETS if any(part in target.name for part in only)][place::processes]
     os.chdir(folder)
     tried: dict[str, Tried] = {}
     coverage, found = Coverage(), set()
