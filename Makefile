@@ -73,7 +73,7 @@ endif
 test-all: $(READY_TO_TEST)
 	$(BIN)/python -m pytest -m "not gpu" $(TEST_ARGS)
 
-## fuzz: feed damaged files and messages to every reader for MINUTES=30; see tests/fuzz
+## fuzz: feed damaged files and messages to every reader for MINUTES=30, guided by coverage; see tests/fuzz
 fuzz: $(READY_TO_TEST)
 	$(ONE_THREAD) $(BIN)/python -m tests.fuzz --minutes $(MINUTES)
 

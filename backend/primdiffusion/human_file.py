@@ -16,10 +16,8 @@ bits (see `formats.compact_human`).
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NoReturn
 
 import numpy as np
 import torch
@@ -30,8 +28,8 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.diffusion.fixed_threads import GRID_THREADS, fixed_threads
 from primdiffusion.formats import compact_human
 from primdiffusion.formats.arrays import write_stored
+from primdiffusion.formats.human_metadata import check_provenance, provenance_of, version_fault
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.json_files import LARGEST_INTEGER, parse_message
 from primdiffusion.formats.regular_files import TooLargeError
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, body_of
@@ -50,6 +48,10 @@ LARGEST_FILE = 256 * 2**20
 _FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
 """Tensors of a .human.safetensors file."""
+_EXTENTS = {"rest_half_extent": (K, 3)}
+"""Those of a human on a body of the user's files."""
+_KNOWN = (*SHAPES, *_EXTENTS)
+"""Whatever else a file holds, such as a motion, is not read."""
 
 
 class HumanFileError(ValueError):
@@ -66,7 +68,7 @@ def save_human(path: str | Path, human: Human, *, compact: bool = False) -> None
     Raises ValueError for NaN, betas out of range and a provenance that is not JSON; OSError.
     """
     _check_values(human.validate())
-    _check_provenance(human.provenance)
+    check_provenance(human.provenance)
     payload = human.payload
     tensors = {"rgb": payload.rgb, "density": payload.density, "delta_scale": payload.delta_scale, "betas": human.betas}
     tensors = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
@@ -100,7 +102,8 @@ def load_human(path: str | Path) -> Human:
     if not path.is_file():
         raise FileNotFoundError(f"there is no human file {path}: check the path, or generate a human")
     try:
-        tensors, metadata = tensor_file.read(path, LARGEST_FILE)
+        file = tensor_file.opened(path, LARGEST_FILE)
+        tensors, metadata = file.finite_tensors(_KNOWN), file.metadata
     except TooLargeError:
         raise
     except (ValueError, OSError) as e:
@@ -112,7 +115,7 @@ def load_human(path: str | Path) -> Human:
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
     try:
         body_setup = _body_setup(path, metadata, tensors) if "body" in metadata else None
-        human = Human(payload, tensors["betas"], _provenance(metadata), body_setup).validate()
+        human = Human(payload, tensors["betas"], provenance_of(metadata), body_setup).validate()
         _check_values(human)
     except BodySetupError as e:
         raise HumanFileError(f"{path}: {e}") from e
@@ -124,16 +127,8 @@ def load_human(path: str | Path) -> Human:
 def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
     if metadata.get("format") != FORMAT:
         raise NoPersonError(f"{path} is a safetensors file without a human: choose a .human.safetensors file")
-    version = metadata.get("format_version", "")
-    if not (version.isascii() and version.isdecimal() and len(version) <= 9) or int(version) < 1:
-        raise HumanFileError(
-            f"{path} does not contain a valid human (format version {version!r:.9}): generate it again"
-        )
-    if int(version) > compact_human.FORMAT_VERSION:
-        raise HumanFileError(
-            f"{path} was written by a newer PrimDiffusion (format {version}, this one reads up to "
-            f"{compact_human.FORMAT_VERSION}): update it"
-        )
+    if fault := version_fault(metadata):
+        raise HumanFileError(f"{path} {fault}")
 
 
 def _body_setup(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, torch.Tensor]) -> BodySetup:
@@ -154,13 +149,19 @@ def _expanded(path: Path, tensors: dict[str, torch.Tensor], metadata: Mapping[st
 
 
 def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
-    for name, shape in SHAPES.items():
+    for name, shape in {**SHAPES, **_EXTENTS}.items():
         if name not in tensors:
+            if name in _EXTENTS:
+                continue
             raise HumanFileError(f"{path} does not contain a valid human ({name} is missing): generate it again")
         if tuple(tensors[name].shape) != shape or tensors[name].dtype not in _FLOATS:
             given = f"{tensors[name].dtype} {tuple(tensors[name].shape)}"
             raise HumanFileError(
                 f"{path} does not contain a valid human ({name} is {given}, not {shape}): generate it again"
+            )
+        if name in _EXTENTS and float(tensors[name].abs().max()) > compact_human.LARGEST_VALUE:
+            raise HumanFileError(
+                f"{path} does not contain a valid human ({name} holds impossible values): generate it again"
             )
 
 
@@ -174,64 +175,6 @@ def _check_values(human: Human) -> None:
             f"the largest beta is {largest:.3g}, but bodies are only valid up to {LARGEST_BETA:g}: "
             "choose smaller betas, or generate the human again"
         )
-
-
-def _provenance(metadata: Mapping[str, str]) -> dict[str, Any]:
-    try:
-        provenance = parse_message(metadata.get("provenance", ""))
-    except ValueError as e:
-        raise ValueError(f"its provenance is not JSON ({e!s:.100}): generate the human again") from e
-    _check_provenance(provenance)
-    return provenance
-
-
-_KINDS: dict[str, tuple[str, Any]] = {
-    "seed": ("an integer", int),
-    "steps": ("an integer", int),
-    "sampler": ("a string", str),
-    "guidance": ("a number", (int, float)),
-    "checkpoint": ("a string", str),
-    "checkpoint_sha256": ("a string", str),
-    "full_density": ("a number", (int, float)),
-    "version": ("a string", str),
-}
-
-
-def _check_provenance(provenance: Any) -> None:
-    """Raise ValueError, naming the entry, for one of a wrong type."""
-    if not isinstance(provenance, Mapping):
-        raise ValueError(f"its provenance is {provenance!r:.60}, not a JSON object: generate the human again")
-    for name, (wanted, kind) in _KINDS.items():
-        if name in provenance and not _is(provenance[name], kind):
-            _reject(name, provenance[name], wanted)
-    _check_attributes("attributes", provenance.get("attributes", {}))
-    if not provenance.get("full_density", 1) > 0:
-        _reject("full_density", provenance["full_density"], "above zero")
-    edits = provenance.get("edits", [])
-    if not isinstance(edits, list):
-        _reject("edits", edits, "a list of objects")
-    for edit in edits:
-        if not isinstance(edit, Mapping) or not _is(edit.get("edit"), str):
-            _reject("edits", edit, 'objects with a name "edit"')
-
-
-def _check_attributes(name: str, attributes: Any) -> None:
-    wanted = "an object of strings and numbers"
-    if not isinstance(attributes, Mapping):
-        _reject(name, attributes, wanted)
-    for value in attributes.values():
-        if not _is(value, (str, int, float)):
-            _reject(name, value, wanted)
-
-
-def _is(value: Any, kind: Any) -> bool:
-    if isinstance(value, bool) or (isinstance(value, float) and not math.isfinite(value)):
-        return False
-    return isinstance(value, kind) and not (isinstance(value, int) and abs(value) > LARGEST_INTEGER)
-
-
-def _reject(name: str, value: Any, wanted: str) -> NoReturn:
-    raise ValueError(f"{name!r} of its provenance is {value!r:.60}, not {wanted}: generate the human again")
 
 
 @fixed_threads(GRID_THREADS)

@@ -6,7 +6,7 @@ import hashlib
 import io
 import json
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -101,9 +101,12 @@ class TensorFile:
             values = values.clone()  # kernels may rely on addresses that are multiples of the size
         return values.view(kind).reshape(stored.shape)
 
-    def finite_tensors(self) -> dict[str, Tensor]:
-        """All tensors. Raises TensorFileError for numbers that are not finite or above LARGEST_NUMBER."""
-        tensors = {name: self.tensor(name) for name in self._layout.tensors}
+    def finite_tensors(self, names: Container[str] | None = None) -> dict[str, Tensor]:
+        """All tensors, or those of `names`.
+
+        Raises TensorFileError for numbers that are not finite or above LARGEST_NUMBER.
+        """
+        tensors = {name: self.tensor(name) for name in self._layout.tensors if names is None or name in names}
         for name, values in tensors.items():
             if not ((values >= -LARGEST_NUMBER) & (values <= LARGEST_NUMBER)).all():
                 raise TensorFileError(f"{name!r:.60} holds NaN or infinite values, or numbers above {LARGEST_NUMBER:g}")

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import read_arrays
 from ..formats.body_layout import half_extents, read_layout, stencils
+from ..formats.human_metadata import provenance_of
 from ..formats.joints import JOINT_NAMES, PARENTS
-from ..formats.json_files import parse_json
 from ..places import body_data
 from ..scene.human import LARGEST_BETA, NPZ_FILE, PERSON_FILE
 from ..scene.human_file import HumanTensors, payload_in, read_tensors, with_motion, write_tensors
@@ -57,13 +57,13 @@ def arrays_in(human: HumanTensors, name: str) -> dict[str, Any]:
     if np.abs(payload.betas).max() > LARGEST_BETA:
         raise ValueError(f"{name!r} is damaged (betas above {LARGEST_BETA}); generate the human again")
     try:
-        parse_json(provenance := human.metadata["provenance"])
-    except (KeyError, ValueError) as error:
-        raise ValueError(f"{name!r} is damaged (its provenance is no JSON); generate the human again") from error
+        provenance_of(human.metadata)
+    except ValueError as error:
+        raise ValueError(f"{name!r} is damaged: {error}") from error
     rest = model.rest(payload.betas)
     return {
         "format_version": np.int64(FORMAT_VERSION),
-        "meta": np.array(provenance),
+        "meta": np.array(human.metadata["provenance"]),
         "joint_names": np.array(JOINT_NAMES),
         "parents": np.array(PARENTS),
         "betas": payload.betas,

@@ -112,8 +112,8 @@ def collect_own_files(blend_path: str) -> Collected:
 
 
 def collect_unwritten() -> Collected:
-    """Copy files of humans elsewhere whose volumes are still to be written, or written again, to this Blender's temporary
-    folder, and point to the copies: they are written there. Linked humans are among them, in this session.
+    """Copy files of humans elsewhere, whose volumes are still to be written or written again, to the temporary folder
+    of this Blender, and point to the copies: they are written there. Linked humans are among them, in this session.
 
     Only paths of volumes change, and names of the backend's files. Raises VolumeWriteError.
     """

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from ..formats import compact_human
 from ..formats.arrays import all_finite, check_shapes
+from ..formats.human_metadata import version_fault
 from ..formats.json_files import parse_json
 from ..formats.regular_files import read_regular
 from ..formats.rotations import first_improper, improper_text
@@ -28,8 +29,7 @@ _METADATA = "__metadata__"
 _MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
 _EIGHT_BIT = ("rgb", "density")
 """Arrays that compact files hold in eight bits."""
-_FLOATS = ("F64", "F32", "F16")
-_FORMAT_VERSIONS = ("1", "2", "3")
+_FLOATS = ("F64", "F32", "F16", "BF16")
 _PAYLOAD: dict[str, tuple[int | str, ...]] = {
     "rgb": ("K", 3, 8, 8, 8), "density": ("K", 8, 8, 8), "delta_scale": ("K", 3), "betas": (BETA_COUNT,),
     "rest_half_extent": ("K", 3),
@@ -111,8 +111,8 @@ def read_payload(path: Path) -> HumanPayload:
 
 def payload_in(human: HumanTensors, name: str) -> HumanPayload:
     """As `read_payload`, of a file of this name that was read."""
-    if human.metadata.get("format_version") not in _FORMAT_VERSIONS:
-        raise ValueError(f"{name!r} was written by a newer PrimDiffusion: update it")
+    if fault := version_fault(human.metadata):
+        raise ValueError(f"{name!r} {fault}")
     shapes = {field: shape for field, shape in _PAYLOAD.items() if field in human.arrays or field != "rest_half_extent"}
     try:
         stored = expanded(human).arrays
@@ -244,5 +244,6 @@ def _stored(array: NDArray[np.float32]) -> tuple[str, tuple[int, ...], bytes | m
 
 
 def _loaded(dtype: str, shape: tuple[int, ...], raw: bytes | memoryview) -> NDArray:
-    """An array as a view of its bytes."""
-    return np.frombuffer(raw, DTYPES[dtype]).reshape(shape)
+    """An array as a view of its bytes; of bfloat16, which numpy does not have, as float32."""
+    array = np.frombuffer(raw, DTYPES[dtype]).reshape(shape)
+    return (array.astype("<u4") << 16).view("<f4") if dtype == "BF16" else array

@@ -2,14 +2,19 @@
 
 import argparse
 import json
+import os
 import sys
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fuzz.run import FINDINGS, run
+from fuzz.corpus import CASES
+from fuzz.run import ROOT, run
 from fuzz.small_inputs import figures
 from fuzz.verdicts import compare
+
+CORPUS = ROOT / "fuzz_out"
+"""What runs have learned."""
 
 
 def main() -> None:
@@ -17,7 +22,9 @@ def main() -> None:
     parser.add_argument("--minutes", type=float, help="how long; otherwise --inputs decides")
     parser.add_argument("--inputs", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--only", default="", help="part of the name of a kind of input")
+    parser.add_argument("--only", nargs="+", default=[""], help="parts of names of kinds of input")
+    parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--forget", action="store_true", help=f"use and keep nothing in {CORPUS.name}")
     parser.add_argument("--verdicts", action="store_true", help="only compare readers of safetensors files")
     parser.add_argument("--small", action="store_true", help="only measure small files that claim much")
     arguments = parser.parse_args()
@@ -28,10 +35,17 @@ def main() -> None:
     if arguments.small:
         print(json.dumps(figures()))
         return
-    report = run(arguments.seed, arguments.inputs, minutes=arguments.minutes, only=arguments.only)
+    report = run(
+        arguments.seed, arguments.inputs, minutes=arguments.minutes, only=arguments.only, processes=arguments.processes,
+        corpus=None if arguments.forget else CORPUS,
+    )  # fmt: skip
+    if not report.counts["inputs"]:
+        sys.exit(f"no input was tried: is there a kind of input whose name contains {' or '.join(arguments.only)}?")
+    inputs, lines, findings = report.counts["inputs"], len(report.lines), len(report.findings)
+    print(f"{inputs} inputs tried, {lines} lines of the programs reached, {findings} findings")
     print(json.dumps(report.figures()))
     if report.findings:
-        sys.exit(f"{len(report.findings)} findings: their inputs are in {FINDINGS}")
+        sys.exit(f"the inputs of findings are in {CASES}: mend what they show, and keep them")
 
 
 if __name__ == "__main__":

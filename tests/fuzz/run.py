@@ -1,7 +1,11 @@
-"""Feed damaged files to their readers, in a process that is watched, and count what comes of it."""
+"""Feed damaged files to their readers, in processes that are watched, and count what comes of it.
+
+An input that reaches lines of the programs in a new order is kept, and others are made from it (`coverage`, `corpus`).
+"""
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import dataclasses
 import json
@@ -14,11 +18,18 @@ import tempfile
 import time
 import traceback
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
+
+from fuzz import corpus as corpora
+from fuzz.combinations import combined
+from fuzz.corpus import CASES, Corpus
+from fuzz.coverage import ROOT, Coverage
+from fuzz.mutations import pick
 
 LONGEST_SENTENCE = 300
 """Characters without the folder of the file, which is the user's."""
@@ -27,23 +38,26 @@ LONGEST_TOTAL_CPU_S, LONGEST_WALL_S = 30.0, 180.0
 MOST_MEMORY_MB = 500.0
 PROGRAMS = ("os.system", "os.exec", "os.posix_spawn", "os.spawn", "subprocess.Popen", "pty.spawn", "socket.connect")
 """Audit events of code that a file has made run."""
-ROOT = Path(__file__).resolve().parents[2]
 FOLDERS = (ROOT / "tests", *(ROOT / "tests" / name for name in ("backend", "blender", "contract")), ROOT)
-FINDINGS = ROOT / "fuzz_out"
-"""Failing inputs are kept here."""
+_IN_MEMORY = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
+"""A folder in which files are written and read faster than on a disk; None for the usual one."""
+ORDINARY = {"read", "sentences"}
+"""Outcomes that are no findings."""
 
 
 @dataclasses.dataclass
 class Report:
-    """Counts, and a line for each finding."""
+    """Counts, a line for each finding, and the lines of the programs that were reached."""
 
     counts: Counter[str] = dataclasses.field(default_factory=Counter)
     findings: list[str] = dataclasses.field(default_factory=list)
+    lines: set[str] = dataclasses.field(default_factory=set)
 
-    def find(self, what: str) -> None:
-        """Keep a finding, and print it."""
-        self.findings.append(what)
-        print(what, flush=True)
+    def find(self, outcome: str, what: str) -> None:
+        """Count a finding, and print it."""
+        self.counts[outcome] += 1
+        self.findings.append(f"{outcome}: {what}")
+        print(self.findings[-1], flush=True)
 
     def figures(self) -> dict[str, int]:
         """As benchmarks/faults.py records them."""
@@ -51,64 +65,102 @@ class Report:
         return {**{f"fuzz_{name}": self.counts[name] for name in names}, "executions": self.counts["executions"]}
 
 
-def run(seed: int, inputs: int, *, minutes: float | None = None, only: str = "") -> Report:
-    """Try `inputs` damaged inputs, or as many as fit into `minutes`; a process that hangs or dies is replaced."""
-    report, number, end = Report(), 0, None if minutes is None else time.monotonic() + 60 * minutes
-    while (number < inputs) if end is None else (time.monotonic() < end):
-        number = _run_child(report, seed, number, inputs if end is None else number + 1_000_000, end, only)
+def run(
+    seed: int, inputs: int, *, minutes: float | None = None, only: Sequence[str] = ("",), processes: int = 1,
+    corpus: Path | None = None,
+) -> Report:  # fmt: skip
+    """Try `inputs` damaged inputs, or as many as fit into `minutes`; a process that hangs or dies is replaced.
+
+    Kinds of inputs, those whose names contain one of `only`, are shared out among the processes. What reaches new lines
+    is kept in the folder `corpus`, if given.
+    """
+    report, end = Report(), None if minutes is None else time.monotonic() + 60 * minutes
+
+    def work(place: int) -> None:
+        number, last = 0, 10**9 if end is not None else -(-inputs // processes)
+        while number < last and (end is None or time.monotonic() < end):
+            options = {"seed": seed, "only": list(only), "place": place, "processes": processes, "last": last}
+            number = _run_child(report, {**options, "first": number, "corpus": corpus and str(corpus)}, end)
+
+    with concurrent.futures.ThreadPoolExecutor(processes) as pool:
+        list(pool.map(work, range(processes)))
     return report
 
 
-def _run_child(report: Report, seed: int, first: int, last: int, end: float | None, only: str) -> int:
+def _run_child(report: Report, options: dict[str, Any], end: float | None) -> int:
     """Run one process from input `first` on; returns the number of the input to go on with."""
-    line = [sys.executable, "-m", "fuzz.run", str(seed), str(first), str(last), only]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*FOLDERS, ROOT / "backend")))}
-    now = first
-    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as child:
-        assert child.stdout is not None
-        os.set_blocking(child.stdout.fileno(), False)
-        heard, worked, rest = time.monotonic(), 0.0, b""
-        loads = True  # torch and bpy, or what is not damaged
-        while True:
-            text = child.stdout.read() or b""
-            *lines, rest = (rest + text).split(b"\n")
-            for message in map(json.loads, lines):
-                heard, worked, loads = time.monotonic(), _cpu_s(child.pid), "loads" in message
-                now = message["number"]
-                if "outcome" in message:
-                    now += 1
-                    report.counts["inputs"] += 1
-                    _note(report, message)
-            over = end is not None and time.monotonic() > end
-            silent = time.monotonic() - heard > LONGEST_WALL_S * (1 + loads)
-            if over or silent or child.poll() is not None:
-                break
-            if not loads and _cpu_s(child.pid) - worked > LONGEST_TOTAL_CPU_S:
-                break
-            time.sleep(0.05)
-        ended = child.poll()
-        child.kill()
-    if over or ended == 0:
-        return now
-    if loads and ended is not None:
-        raise RuntimeError(f"input {now}: the process ended ({ended}) before a damaged file was read")
-    report.counts["inputs"] += 1
-    outcome = "hangs" if ended is None else "tracebacks"
-    report.counts[outcome] += 1
-    report.find(f"{outcome}: seed {seed}, input {now}{f' of {only}' if only else ''}: the process ended ({ended})")
+    with tempfile.TemporaryDirectory(prefix="primdiffusion_fuzz_", dir=_IN_MEMORY) as folder:
+        line = [sys.executable, "-m", "fuzz.run", json.dumps({**options, "folder": folder})]
+        with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, env=environment) as child:
+            try:
+                ended, now, reading = _listen(report, child, options["first"], end)
+            finally:
+                child.kill()
+        if ended == 0:
+            return options["last"]
+        if ended == "over":
+            return now
+        if reading is None:
+            raise RuntimeError(f"input {now}: the process ended ({ended}) before a damaged file was read")
+        report.counts["inputs"] += 1
+        case = corpora.keep(CASES / corpora.folder_of(reading["target"]), Path(reading["path"]).read_bytes(), ".dat")
+        outcome = "hangs" if ended is None else "tracebacks"
+        report.find(outcome, f"{reading['target']}: the process ended ({ended}): {case.relative_to(CASES)}")
     return now + 1
+
+
+def _listen(
+    report: Report, child: subprocess.Popen[bytes], now: int, end: float | None
+) -> tuple[int | str | None, int, dict[str, Any] | None]:
+    """Read messages until the process ends, has to be ended (None) or the time is "over".
+
+    Also the number of the input to go on with, and the message before that input was read, None before the first one.
+    """
+    assert child.stdout is not None
+    os.set_blocking(child.stdout.fileno(), False)
+    heard, worked, rest = time.monotonic(), 0.0, b""
+    reading = None  # while it loads torch and bpy, or what is not damaged
+    while True:
+        ended = child.poll()
+        text = child.stdout.read() or b""
+        *lines, rest = (rest + text).split(b"\n")
+        for message in map(json.loads, lines):
+            heard, worked = time.monotonic(), _cpu_s(child.pid)
+            now = message["number"]
+            if "path" in message:
+                reading = message
+            elif "outcome" not in message:
+                reading = None
+            else:
+                now += 1
+                report.counts["inputs"] += 1
+                report.lines.update(message["lines"])
+                _note(report, message)
+        if ended is not None:
+            return ended, now, reading
+        if end is not None and time.monotonic() > end:
+            return "over", now, reading
+        if time.monotonic() - heard > LONGEST_WALL_S * (1 + (reading is None)):
+            return None, now, reading
+        if reading is not None and _cpu_s(child.pid) - worked > LONGEST_TOTAL_CPU_S:
+            return None, now, reading
+        time.sleep(0.05)
 
 
 def _note(report: Report, message: dict[str, Any]) -> None:
     for outcome in message["outcome"]:
-        report.counts[outcome] += 1
-        if outcome not in ("read", "sentences"):
-            report.find(f"{outcome}: {message['what']}")
+        if outcome in ORDINARY:
+            report.counts[outcome] += 1
+        elif message["is_new"]:
+            report.find(outcome, message["what"])
 
 
-def damaged(target: Any, content: bytes, seed: int, number: int) -> bytes:
-    """Input `number` of a target: the same for the same seed."""
+def damaged(target: Any, content: bytes, seed: int, number: int, others: Sequence[bytes] = ()) -> bytes:
+    """Input `number` of a target, in part also one of `others`: the same for the same seed."""
     rng = np.random.default_rng([seed, number])
+    if others and rng.random() < 0.25:
+        content = combined(content, pick(rng, others), rng)
     for _ in range(1 + int(rng.random() < 0.2)):
         mutation = target.mutations[int(rng.integers(len(target.mutations)))]
         try:
@@ -118,47 +170,90 @@ def damaged(target: Any, content: bytes, seed: int, number: int) -> bytes:
     return content
 
 
-def _serve(seed: int, first: int, last: int, only: str) -> None:
-    from fuzz.target import in_turn
+class Tried:
+    """A kind of input that is being tried: its corpus, and the time that its inputs have taken."""
+
+    def __init__(self, target: Any, path: Path, corpus: str | None) -> None:
+        self.target, self.path, self.seconds = target, path, 0.0
+        self.corpus = Corpus(path.read_bytes(), Path(corpus, corpora.folder_of(target.name)) if corpus else None)
+
+    def next_input(self, seed: int, number: int) -> bytes:
+        """One of an earlier run, or one that is made of those that have reached something new."""
+        content = self.corpus.waiting()
+        if content is not None:
+            return content
+        chosen = self.corpus.chosen(np.random.default_rng([number, seed]))
+        return damaged(self.target, chosen, seed, number, self.corpus.contents)
+
+    def learn(self, content: bytes, coverage: Coverage) -> tuple[list[str], str]:
+        """As `outcome`; the input is kept if it reaches something new and finds nothing."""
+        coverage.has_news = False
+        outcome, about = self.outcome(content, coverage)
+        if coverage.has_news and set(outcome) <= ORDINARY:
+            self.corpus.learn(content)
+        return outcome, about
+
+    def outcome(self, content: bytes, coverage: Coverage | None = None) -> tuple[list[str], str]:
+        """What comes of an input, as `_outcome` says."""
+        self.path.write_bytes(content)
+        return _outcome(self.target, self.path, coverage)
+
+
+def _serve(
+    seed: int, only: Sequence[str], place: int, processes: int, first: int, last: int, corpus: str | None, folder: str
+) -> None:
     from fuzz.targets import TARGETS
 
     events: list[str] = []
     sys.addaudithook(lambda event, _: events.append(event) if event in PROGRAMS else None)
-    targets = in_turn([target for target in TARGETS if only in target.name])
-    with tempfile.TemporaryDirectory() as temporary:
-        os.chdir(temporary)
-        valid: dict[str, tuple[Path, bytes]] = {}
-        for number in range(first, last):
-            target = targets[number % len(targets)]
-            if target.name not in valid:
-                _say(number=number, loads=True)
-                folder = Path(temporary, str(number))
-                folder.mkdir()
-                path = target.make(folder)
-                target.read(path)  # what is not damaged is read
-                valid[target.name] = path, path.read_bytes()
-            path, content = valid[target.name]
-            _say(number=number)
-            path.write_bytes(damaged(target, content, seed, number))
-            what = f"{target.name}, seed {seed}, input {number}"
-            events.clear()
-            outcome, about = _outcome(target, path)
-            if set(outcome) & {"hangs", "over_500mb"}:  # once more alone: another program may have slowed it down
-                outcome, about = _outcome(target, path)
-            if events or Path("CANARY").exists():
-                outcome.append("executions")
-                about += f" ({events})"
-            what += f": {about}"
-            if set(outcome) - {"read", "sentences"}:
-                FINDINGS.mkdir(exist_ok=True)
-                (FINDINGS / f"{target.name.replace(' ', '_')}_{seed}_{number}{path.suffix}").write_bytes(
-                    path.read_bytes()
-                )
-            path.write_bytes(content)
-            _say(number=number, outcome=outcome, what=what)
+    targets = [target for target in TARGETS if any(part in target.name for part in only)][place::processes]
+    os.chdir(folder)
+    tried: dict[str, Tried] = {}
+    coverage, found = Coverage(), set()
+    for number in range(first, last if targets else first):
+        target = min(targets, key=lambda one: tried[one.name].seconds if one.name in tried else -1.0)
+        if target.name not in tried:
+            _say(number=number, loads=True)
+            made = Path(folder, str(number))
+            made.mkdir()
+            tried[target.name] = Tried(target, target.make(made), corpus)
+            target.read(tried[target.name].path)  # what is not damaged is read; once without lines of imports
+            with coverage:
+                target.read(tried[target.name].path)
+        one = tried[target.name]
+        content = one.next_input(seed, number)
+        _say(number=number, target=target.name, path=str(one.path))
+        began = time.process_time()
+        events.clear()
+        outcome, about = one.learn(content, coverage)
+        if set(outcome) & {"hangs", "over_500mb"}:  # once more alone: another program may have slowed it down
+            outcome, about = one.outcome(content)
+        if events or Path("CANARY").exists():
+            outcome.append("executions")
+            about += f" ({events})"
+        is_new = not set(outcome) <= ORDINARY and (kind := (target.name, _kind(outcome, about))) not in found
+        if is_new:
+            found.add(kind)
+            if set(outcome) <= {"tracebacks", "garbage"}:
+                content = corpora.shrunk(content, lambda less: _kind(*one.outcome(less)) == kind[1])  # noqa: B023
+            case = corpora.keep(CASES / corpora.folder_of(target.name), content, one.path.suffix)
+            about = f"{about} [{case.relative_to(CASES)}]"
+        lines = coverage.new_lines() if coverage.has_news else []
+        one.seconds += time.process_time() - began
+        what = f"{target.name}, seed {seed}, input {number}: {about}"
+        _say(number=number, outcome=outcome, what=what, is_new=is_new, lines=lines)
 
 
-def _outcome(target: Any, path: Path) -> tuple[list[str], str]:
+def _kind(outcome: list[str], about: str) -> tuple[str, ...]:
+    """What findings with one cause have in common: the outcome, and where an error arose or what is wrong.
+
+    Of an error within a request, the server tells the text alone.
+    """
+    where = None if "defect in the backend" in about else re.search(r"\(\w+\.py:\d+\)", about)
+    return (*outcome, where[0] if where else re.sub(r"'[^']*'|/\S+|\d+", "", about)[:150])
+
+
+def _outcome(target: Any, path: Path, coverage: Coverage | None = None) -> tuple[list[str], str]:
     """What came of reading a damaged file, and more about it."""
     from fuzz.target import Garbage, said
 
@@ -167,7 +262,8 @@ def _outcome(target: Any, path: Path) -> tuple[list[str], str]:
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
     try:
-        target.read(path)
+        with coverage or contextlib.nullcontext():
+            target.read(path)
     except Garbage as error:
         outcome, about = ["garbage"], str(error)
     except Exception as error:
@@ -232,7 +328,7 @@ if __name__ == "__main__":
     import torch
 
     torch.set_num_threads(1)
-    resource.setrlimit(resource.RLIMIT_DATA, (8 * 2**30,) * 2)
+    resource.setrlimit(resource.RLIMIT_DATA, (8 * 2**30, 8 * 2**30))
     import bpy  # noqa: F401  before the rest, which it would otherwise load anew
 
-    _serve(int(sys.argv[1]), int(sys.argv[2]), int(sys.argv[3]), sys.argv[4])
+    _serve(**json.loads(sys.argv[1]))

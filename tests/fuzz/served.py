@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import io
-import itertools
 import json
 import os
 import shutil
@@ -166,30 +166,38 @@ def place() -> Path:
     return folder
 
 
-def answers(line: bytes) -> Iterator[dict[str, Any]]:
-    """What the server sends after a line, and after having run the request in it."""
+class Lines(io.BytesIO):
+    """The input of a server that runs the requests it has taken whenever an empty line comes, and at the end."""
+
+    server: Any
+
+    def readline(self, size: int | None = -1, /) -> bytes:
+        line = super().readline(size)
+        if not line.strip() and not self.server._queue.empty():
+            self.server._run_request(session(), self.server._queue.get())
+        return line
+
+
+def answers(content: bytes) -> list[dict[str, Any]]:
+    """What the server answers to lines, and after having run the requests in them."""
     from primdiffusion.serve.rpc import Wire
     from primdiffusion.serve.server import Server
 
-    sent = io.BytesIO()
-    server: Any = Server(io.BytesIO(), Wire(sent))
+    sent, lines = io.BytesIO(), Lines(content)
+    lines.server = server = Server(lines, Wire(sent))
     server._end = lambda: None  # which would end this process
-    server._dispatch(line)
-    if not server._queue.empty():
-        server._run_request(session(), server._queue.get())
-    return map(json.loads, sent.getvalue().splitlines())
+    server._read()
+    return [message for message in map(json.loads, sent.getvalue().splitlines()) if "method" not in message]
 
 
-def read_call(path: Path) -> None:
-    """Raises the error that the child answers as an RpcError, Garbage for no answer or two, and for a user's file that
-    is changed."""
-    from primdiffusion.serve.rpc import INTERNAL_ERROR, RpcError
-
-    line, before, folder = contained(path.read_bytes()), Path.cwd(), place()
+@contextlib.contextmanager
+def in_place() -> Iterator[None]:
+    """In the folder with the inputs, whose files stay as they are. Raises Garbage for a user's file that is changed."""
+    before, folder = Path.cwd(), place()
     os.chdir(folder)
     Path(OUT).mkdir(exist_ok=True)
     try:
-        found = [message for message in answers(line.replace(b"\n", b" ")) if "method" not in message]
+        yield
         if (folder / "taken" / "kept.txt").read_text(encoding="utf-8") != "a user's file":
             raise Garbage("a user's file was changed")
         if left := [name for name in os.listdir(folder) if "partial" in name]:
@@ -200,24 +208,53 @@ def read_call(path: Path) -> None:
         for name in BAD_OUTPUTS:
             if isinstance(name, str) and name.startswith("n"):
                 shutil.rmtree(folder / name, ignore_errors=True)
-        for made in itertools.chain((folder / "taken").iterdir()):
+        for made in (folder / "taken").iterdir():
             if made.name != "kept.txt":
                 shutil.rmtree(made, ignore_errors=True) if made.is_dir() else made.unlink()
-    if len(found) > 1 or (not found and b'"id"' in line):
-        raise Garbage(f"{len(found)} answers")
-    for message in found:
-        if "error" in message:
-            error = message["error"]
-            if error["code"] == INTERNAL_ERROR:
-                raise AssertionError(error["message"])
-            remedy = (error.get("data") or {}).get("remedy", "")
-            raise RpcError(error["code"], f"{error['message']}: {remedy}" if remedy else error["message"])
+
+
+def read_call(path: Path) -> None:
+    """Raises as `read_lines`."""
+    line = contained(path.read_bytes()).replace(b"\n", b" ")
+    with in_place():
+        _check(line, answers(line))
+
+
+def read_lines(path: Path) -> None:
+    """Raises the last error that the child answers as an RpcError, Garbage for too many or too few answers and for a
+    user's file that is changed."""
+    content = b"\n".join(map(contained, path.read_bytes().split(b"\n")))
+    with in_place():
+        _check(content, answers(content))
+
+
+def _check(content: bytes, found: list[dict[str, Any]]) -> None:
+    from primdiffusion.serve.rpc import INTERNAL_ERROR, RpcError
+
+    expected = sum(map(_is_answered, content.split(b"\n")))
+    if len(found) != expected:
+        raise Garbage(f"{len(found)} answers instead of {expected}")
+    errors = [message["error"] for message in found if "error" in message]
+    for error in sorted(errors, key=lambda error: error["code"] == INTERNAL_ERROR)[-1:]:
+        if error["code"] == INTERNAL_ERROR:
+            raise AssertionError(error["message"])
+        remedy = (error.get("data") or {}).get("remedy", "")
+        raise RpcError(error["code"], f"{error['message']}: {remedy}" if remedy else error["message"])
+
+
+def _is_answered(line: bytes) -> bool:
+    from primdiffusion.serve.rpc import MalformedRequest, parse_request
+
+    try:
+        return bool(line.strip()) and parse_request(line).wants_response
+    except MalformedRequest:
+        return True
 
 
 TARGETS = tuple(
     Target(
         f"request {method}", call(method, params), (*[parameter] * 5, mutations.flip, mutations.truncate), read_call,
-        is_file=False, seconds=LONGEST_S, slow=True,
+        is_file=False, seconds=LONGEST_S,
     )
     for method, params in CALLS.items()
 )  # fmt: skip

@@ -33,13 +33,6 @@ class Target:
     """A file of the user's, which a sentence about it names; otherwise a message."""
     seconds: float = 2.0
     """Of the processor, at the most."""
-    slow: bool = False
-    """Tried once while other kinds are tried four times."""
-
-
-def in_turn(targets: Sequence[Target]) -> list[Target]:
-    """The order in which kinds are tried."""
-    return [target for turn in range(4) for target in targets if turn == 0 or not target.slow]
 
 
 def finite(*values: Any) -> None:

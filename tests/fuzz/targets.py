@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from fuzz import data_targets, extension_targets, mutations, served
+from fuzz import data_targets, extension_targets, mutations, reader_targets, served
 from fuzz.target import Garbage, Target, finite, finite_members, said
 
 # --- humans and models
@@ -363,42 +363,6 @@ def read_merged(path: Path) -> None:
     finite_members(grid)
 
 
-# --- messages
-
-
-def make_answer(folder: Path) -> Path:
-    message = {
-        "jsonrpc": "2.0", "method": "progress",
-        "params": {"id": 1, "stage": "sample", "step": 1, "total": 4, "eta_s": 0.5, "picture": None},
-    }  # fmt: skip
-    (folder / "answer.json").write_text(json.dumps(message))
-    return folder / "answer.json"
-
-
-def make_sheet(folder: Path) -> Path:
-    people = [{"seed": 3, "human": "a.npz", "person": "a.human", "picture": "a.png"}]
-    (folder / "answer.json").write_text(json.dumps({"id": 1, "result": {"people": people, "seconds": 0.1}}))
-    return folder / "answer.json"
-
-
-def read_answer(path: Path) -> None:
-    """As requests and jobs use what is in it."""
-    from blender_primdiffusion.backend.messages import fault_of, parsed
-
-    message = parsed(path.read_bytes())
-    if message is None or fault_of(message, {1: "variations"}) is not None:
-        return
-    params = message.get("params") or {}
-    if message.get("method") == "progress":
-        f"{params['stage'].capitalize()} {params['step'] / max(params['total'], 1):.0%}".encode()
-        Path(params.get("picture") or "x").exists()
-    elif "result" in message and "method" not in message and "error" not in message:
-        f"{message['result']['seconds']:.1f}"
-        for person in message["result"]["people"]:
-            int(person["seed"])
-            [Path(person[name]).exists() for name in ("human", "person", "picture")]
-
-
 TARGETS = (
     Target("human", make_human, mutations.SAFETENSORS, read_human),
     Target("compact human", make_compact, mutations.SAFETENSORS, read_human),
@@ -422,9 +386,8 @@ TARGETS = (
     Target("obj", make_obj, mutations.TEXT, read_proxy),
     Target("picture", make_picture, mutations.PLAIN, read_picture),
     Target("merged grid", make_grid, mutations.NPZ, read_merged),
-    Target("child's message", make_answer, mutations.JSON, read_answer, is_file=False),
-    Target("child's result", make_sheet, mutations.JSON, read_answer, is_file=False),
     *data_targets.TARGETS,
     *extension_targets.TARGETS,
+    *reader_targets.TARGETS,
     *served.TARGETS,
 )

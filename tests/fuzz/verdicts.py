@@ -23,6 +23,7 @@ import safetensors
 import torch
 from numpy.random import Generator
 from primdiffusion import tensor_file
+from primdiffusion.formats.json_files import Pairs
 from primdiffusion.formats.tensor_layout import (
     DTYPES,
     LONGEST_HEADER,
@@ -102,6 +103,25 @@ class Draft:
         parts = (f"{name}:{value if isinstance(value, str) else _object(value)}" for name, value in self.entries)
         header = self.before + ("{" + ",".join(parts) + "}").encode("utf-8", "surrogatepass") + self.after
         return ((len(header) + self.length_error) % 2**64).to_bytes(8, "little") + header + self.data
+
+
+def drafted(content: bytes) -> Draft:
+    """The parts of a file that is not damaged too much. Raises ValueError, TypeError."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    tree = json.loads(content[8:end], object_pairs_hook=Pairs)
+
+    def fields_of(value: Any) -> list[tuple[str, str]] | str:
+        return [(json.dumps(k), _text(v)) for k, v in value] if isinstance(value, Pairs) else _text(value)
+
+    entries = [(json.dumps(name), _text(v) if name == "__metadata__" else fields_of(v)) for name, v in tree]
+    return Draft(entries, content[end:])
+
+
+def _text(value: Any) -> str:
+    """The JSON of a value whose objects are Pairs."""
+    if isinstance(value, Pairs):
+        return _object([(json.dumps(name), _text(inner)) for name, inner in value])
+    return "[" + ",".join(map(_text, value)) + "]" if isinstance(value, list) else json.dumps(value)
 
 
 def _object(fields: list[tuple[str, str]]) -> str:

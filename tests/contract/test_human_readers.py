@@ -1,0 +1,60 @@
+"""Both programs' readers of .human files accept the same files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from fuzz.reader_targets import read_by_both
+from primdiffusion import tensor_file
+from primdiffusion.human import generate
+from primdiffusion.human_file import save_human
+from tiny_model import tiny_model
+
+Tensors = dict[str, torch.Tensor]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("human") / "a.human"
+    save_human(path, generate(tiny_model(), seed=3, steps=2))
+    return path
+
+
+def version(text: str) -> Callable[[Tensors, dict[str, str]], object]:
+    return lambda _, metadata: metadata.update(format_version=text)
+
+
+def provenance(text: str) -> Callable[[Tensors, dict[str, str]], object]:
+    return lambda _, metadata: metadata.update(provenance=text)
+
+
+@pytest.mark.parametrize(
+    ("change", "is_read"),
+    [
+        (version("01"), True),
+        (version("4"), False),
+        (version(""), False),
+        (provenance('{"seed": "seven"}'), False),
+        (provenance('{"unknown": NaN}'), False),
+        (provenance(json.dumps("\0")), False),
+        (lambda tensors, _: tensors.update(rgb=tensors["rgb"].bfloat16()), True),
+        (lambda tensors, _: tensors.update(unknown=torch.full((2,), torch.nan)), True),
+        (lambda tensors, _: tensors.update(rest_half_extent=torch.ones(3)), False),
+        (lambda tensors, _: tensors.update(rest_half_extent=torch.full((1024, 3), 1e6)), False),
+        (lambda tensors, _: tensors.update(betas=torch.full((10,), 5.5)), False),
+    ],
+)
+def test_both_readers_give_one_verdict(whole, tmp_path, change, is_read):
+    tensors, metadata = tensor_file.read(whole)
+    change(tensors, metadata)
+    path = tmp_path / "a.human"
+    path.write_bytes(tensor_file.save(tensors, metadata))
+    if is_read:
+        read_by_both(path)
+    else:
+        with pytest.raises(ValueError, match=r"a\.human"):  # Garbage, of one reader alone, is no ValueError
+            read_by_both(path)
