@@ -44,10 +44,11 @@ from record import command_line, report
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.build import build_written, next_folder, stand_at_cursor
+from blender_primdiffusion.scene.build import build_written, next_folder
 from blender_primdiffusion.scene.edit import select_human
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.human_npz import Destination, WrittenHuman, write_volumes
+from blender_primdiffusion.scene.place import stand_at_cursor
 from blender_primdiffusion.scene.unwritten import unwritten, write_unwritten
 
 FRAMES = 60
