@@ -1,10 +1,11 @@
 """What a user meets first: how soon a generated human of 1024 volumes stands, and what it then costs Blender.
 
-    python scripts/window/look.py --blender blender --scenes stalls redraw opening turning playing --out one
-    (twice more, into two and three)
+    python scripts/window/look.py --blender blender --out one \\
+        --scenes stalls redraw visible_humans opening turning playing    # twice more, into two and three
+    python scripts/window/look.py --blender blender --scenes undo_and_timers --out undo
     python benchmarks/viewport.py --blender blender --json viewport.json
     python benchmarks/first_sight.py --json docs/results/first_sight.json \\
-        --window one/figures.json two/figures.json three/figures.json viewport.json
+        --window one/figures.json two/figures.json three/figures.json undo/figures.json viewport.json
 
 Measured without a window, which adds its redraws: the seconds from the child's answer until the human stands
 (stand_seconds) and the longest step of these without a pause; the seconds in which its volumes are written afterwards;
@@ -22,8 +23,10 @@ own functions; redraw_ratio a redraw in Solid with a hidden human against an emp
 open_to_visible_seconds from the moment when Blender has read a .blend (open_seconds_window) until its human is in view
 for the first time in this Blender; coarse_after_stop_seconds from the last turn of a view until a whole picture of it
 is drawn, the slowest of four; orbit_ratio_1 a redraw of a turning view with a human against an empty scene's,
-playback_ratio_2 a frame of two walking humans with its redraw likewise; window_load the machine's load before. Without
-`--window`, those that the JSON file has already are kept.
+playback_ratio_2 a frame of two walking humans with its redraw likewise; window_load the machine's load before.
+first_human_visible_share and second_human_visible_share are of the pixels of the first two humans in Blender's factory
+scene, those that neither other objects nor panels hide; window_rounds and window_crashes of undo and redo among timers
+that change data. Without `--window`, those that the JSON file has already are kept.
 """
 
 from __future__ import annotations
@@ -50,10 +53,11 @@ from record import command_line, report
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.build import build_written, next_folder, stand_at_cursor
+from blender_primdiffusion.scene.build import build_written, next_folder
 from blender_primdiffusion.scene.edit import select_human
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.human_npz import Destination, WrittenHuman, write_volumes
+from blender_primdiffusion.scene.place import stand_at_cursor
 from blender_primdiffusion.scene.unwritten import unwritten, write_unwritten
 
 FRAMES = 60
@@ -79,6 +83,10 @@ WINDOW = (
     "orbit_ratio_1",
     "playback_empty_ms",
     "playback_ratio_2",
+    "first_human_visible_share",
+    "second_human_visible_share",
+    "window_rounds",
+    "window_crashes",
     "viewport_error_999",
     "viewport_ms_1080p_gpu",
 )
@@ -105,7 +113,7 @@ def in_window(records: list[dict]) -> dict[str, float | str | None]:
         if values and isinstance(values[0], str):
             found[name] = values[0]
         elif values:
-            worst = "longest" in name or name == "coarse_after_stop_seconds"
+            worst = "longest" in name or name in ("coarse_after_stop_seconds", "window_crashes")
             found[name] = max(values) if worst else statistics.median(values)
     return found
 

@@ -53,7 +53,8 @@ class SceneReading:
     humans: dict[object, ShownHuman]
     """By what their pictures depend on."""
     bones: NDArray[np.float64]
-    """Ends of the bones that are shown in front [N, 2, 3], Blender's world."""
+    """Ends of the bones that are shown in front [N, 2, 3], Blender's world: of armatures that are posed or edited, and
+    of those that the user wants in front."""
     complete: bool
     """False where files had to be read, which took long enough: the next reading continues."""
     error: str
@@ -96,7 +97,7 @@ class SceneReader:
         bones, noted = [np.zeros((0, 2, 3))], {kind: set[bpy.types.Object]() for kind in content.types}
         errors, complete, end = [""], True, time.monotonic() + READING_S
         for obj, armature, matrix, owner in human_armatures(_noting(visible_instances(depsgraph, space), noted)):
-            if armature.show_in_front:
+            if armature.show_in_front or armature.original.mode != "OBJECT":
                 bones.append(_bones(armature, matrix))
             try:
                 candidates.append((obj, owner, pose_of(armature, matrix, owner)))

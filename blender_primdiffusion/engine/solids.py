@@ -14,11 +14,8 @@ from numpy.typing import NDArray
 from ..formats.removing import remove_file
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
-from ..scene.human import BODY_MARK
-from ..scene.proxy import PROXY_MARK
-from ..scene.stand_in import STAND_IN
+from ..scene.triangles import is_solid, triangles_of
 
-SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
 UNRELATED_TYPES = frozenset({"ARMATURE", "CAMERA", "VOLUME", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
 """Types of objects that are no solids; their children report changes of their own."""
 _SOLID_DATA = (
@@ -123,8 +120,7 @@ def _parts(
     meshes: dict[object, tuple[NDArray, NDArray]] = {}
     for instance in visible_instances(depsgraph, space):
         obj = instance.object
-        of_human = any(mark in obj for mark in (BODY_MARK, PROXY_MARK, STAND_IN))
-        if obj.type not in SOLID_TYPES or of_human or not obj.visible_camera:
+        if not is_solid(obj) or not obj.visible_camera:
             continue
         key = (obj.data.as_pointer(), obj.original.as_pointer())
         if key not in meshes:
@@ -143,22 +139,11 @@ def _parts(
 
 def _triangles(obj: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Corners [F, 3, 3] in the object's space and colours [F, 3] of an evaluated object."""
-    mesh = obj.data if obj.type == "MESH" else obj.to_mesh()
-    if mesh is None:
+    vertices, triangles, slots = triangles_of(obj)
+    if len(triangles) == 0:
         return np.zeros((0, 3, 3)), np.zeros((0, 3), np.float32)
-    try:
-        mesh.calc_loop_triangles()
-        vertices = np.empty((len(mesh.vertices), 3), np.float32)
-        mesh.vertices.foreach_get("co", vertices.ravel())
-        triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
-        mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
-        index = np.empty(len(triangles), np.int32)
-        mesh.loop_triangles.foreach_get("material_index", index)
-    finally:
-        if obj.type != "MESH":
-            obj.to_mesh_clear()
     colours = [
         base_colour(slot.material) if slot.material else tuple(obj.color)[:3] for slot in obj.material_slots
     ] or [tuple(obj.color)[:3]]
     palette = np.array(colours, np.float32)
-    return vertices[triangles].astype(np.float64), palette[np.minimum(index, len(palette) - 1)]
+    return vertices[triangles].astype(np.float64), palette[np.minimum(slots, len(palette) - 1)]

@@ -11,14 +11,15 @@ from typing import Any
 import bpy
 
 from ..backend.requests import sentence
-from ..scene.build import build_written, next_folder, stand_at_cursor
+from ..scene.build import build_written, next_folder
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import select_human
 from ..scene.human import armature_of, humans
 from ..scene.human_npz import Destination, write_now
+from ..scene.place import stand_at_cursor
 from .follow import building
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
-from .windows import bring_into_view
+from .views import bring_into_view, eye
 
 FIRST_HUMAN_SHARE = 0.25
 """Of a view's height: a scene's first human is framed where no view shows it taller."""
@@ -27,7 +28,7 @@ FIRST_HUMAN_SHARE = 0.25
 def build_person(
     context: bpy.types.Context, result: dict[str, Any], made: str, name: str = "Human"
 ) -> tuple[bpy.types.Collection, str]:
-    """Build the human of the child's `result`; returns the collection and the message ("Generated in 1.2 s, ...").
+    """Build the human of the child's `result`; returns the collection and the message ("Generated in 1.2 s.").
 
     Raises as `build_human` does, and then leaves nothing.
     """
@@ -35,16 +36,16 @@ def build_person(
     human = Path(result["human"])
     written = building.take(human) or write_now(human, Destination(next_folder(name)))
     collection = build_written(context, written, name, keep)
-    stand_at_cursor(context, collection)
-    context.view_layer.update()  # which does not hold the human before
+    stand_at_cursor(context, collection, eye())
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, collection)
-        first = len(humans(context.scene)) == 1
-        bring_into_view(armature_of(collection), FIRST_HUMAN_SHARE if first else 0.0)
+        others = [human for human in humans(context.scene) if human != collection]
+        bones = [obj for human in others for obj in human.objects if obj.type == "ARMATURE"]
+        bring_into_view(armature_of(collection), 0.0 if others else FIRST_HUMAN_SHARE, bones)
     warnings = list(result.get("warnings", ()))
     if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)
-    notice = f"{made} in {result['seconds']:.1f} s, built in {time.monotonic() - written.began:.1f} s"
+    notice = f"{made} in {result['seconds'] + time.monotonic() - written.began:.1f} s"
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])
 
 

@@ -58,11 +58,12 @@ class PictureInView:
         import numpy as np
 
         from ..engine.billboard import corners, figure_of
-        from ..scene.build import next_place
+        from ..scene.place import next_place
+        from .views import eye
 
         cursor = tuple(context.scene.cursor.location)
         if cursor != self._cursor:
-            self._cursor, self._place = cursor, next_place(context.scene)
+            self._cursor, self._place = cursor, next_place(context, eye())
         to_view = np.array(context.region_data.view_matrix, np.float64)
         return corners(self._place, to_view, figure_of(self._pixels[..., 3]))
 

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 
 import bpy
 from bpy.app.handlers import persistent
-from mathutils import Matrix, Vector
 
 _IN_THE_WAY = {"UNDO", "BLOCKING", "GRAB_CURSOR", "GRAB_CURSOR_X", "GRAB_CURSOR_Y"}
 """Options of modal operators that block the scene or the mouse; others (screencasts) may run for ever."""
@@ -101,30 +100,3 @@ def _redraw_regions(kind: str) -> None:
             for region in area.regions if area.type == "VIEW_3D" else ():
                 if region.type == kind:
                     region.tag_redraw()
-
-
-def bring_into_view(obj: bpy.types.Object, least: float) -> None:
-    """Turn the first 3D viewport to the selection, unless one shows `obj` on more than the share `least` of its height,
-    or looks through a camera."""
-    if bpy.app.background:
-        return
-    windows = bpy.context.window_manager.windows
-    areas = [(window, area) for window in windows for area in window.screen.areas if area.type == "VIEW_3D"]
-    views = [area.spaces.active.region_3d for _, area in areas]
-    cameras = any(view.view_perspective == "CAMERA" for view in views)
-    if areas and not cameras and max(share_of_height(view.perspective_matrix, obj) for view in views) <= least:
-        window, area = areas[0]
-        region = next(region for region in area.regions if region.type == "WINDOW")
-        with bpy.context.temp_override(window=window, area=area, region=region):
-            bpy.context.view_layer.update()
-            bpy.ops.view3d.view_selected()
-
-
-def share_of_height(perspective: Matrix, obj: bpy.types.Object) -> float:
-    """The share of a view's height that an object's bounding box takes; 0 where its middle is not in the view."""
-    corners = [perspective @ (obj.matrix_world @ Vector(corner)).to_4d() for corner in obj.bound_box]
-    if min(corner.w for corner in corners) <= 0:
-        return 0.0
-    x, y = ([corner[axis] / corner.w for corner in corners] for axis in (0, 1))
-    inside = all(abs(min(values) + max(values)) < 2 for values in (x, y))
-    return (max(y) - min(y)) / 2 if inside else 0.0

@@ -58,7 +58,6 @@ def build_armature(name: str, joints: NDArray) -> bpy.types.Object:
             if PARENTS[index] >= 0:
                 bone.parent = data.edit_bones[JOINT_NAMES[PARENTS[index]]]
     data.display_type = "STICK"
-    armature.show_in_front = True
     for bone in armature.pose.bones:
         bone.rotation_mode = "QUATERNION"
     return armature

@@ -23,10 +23,8 @@ from .human import (
     HOME,
     MARK,
     PERSON,
-    armature_of,
     available_name,
     folder_of,
-    humans,
     humans_folder,
     stored_path,
 )
@@ -34,12 +32,6 @@ from .human_npz import Destination, WrittenHuman, write_now
 from .material import volume_material
 from .stand_in import build_stand_in
 
-GAP_M = 0.2
-"""Between the hands of two humans in the T pose."""
-_FLESH_M = 0.1
-"""Around bones."""
-_NEW_FOOTPRINT = np.array([[-0.97, -0.3], [0.97, 0.12]])
-"""As `_footprint`, of a new human of medium height at the world's origin."""
 _NAME_LENGTH = 40
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
@@ -274,56 +266,3 @@ def hide_relationship_lines() -> None:
             for space in area.spaces:
                 if space.type == "VIEW_3D":
                     space.overlay.show_relationship_lines = False
-
-
-def stand_at_cursor(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
-    """Move a new human from the world's origin to the 3D cursor, or beside others there."""
-    armature_of(collection).location += context.scene.cursor.location
-    stand_beside_others(context, collection)
-
-
-def stand_beside_others(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
-    """Move a new human along the world's x axis, as little as needed to stand clear of the scene's other humans.
-
-    Compares the bones as posed, so it evaluates the scene if there are others. Raises ValueError as `armature_of`.
-    """
-    armature, others = armature_of(collection), _armatures(context.scene, collection)
-    if others:
-        context.view_layer.update()
-        armature.location.x += _shift(_footprint(armature), [_footprint(other) for other in others])
-
-
-def next_place(scene: bpy.types.Scene) -> NDArray[np.float64]:
-    """Where `stand_at_cursor` will put the soles of a human of medium height that is still to be built [3], metres."""
-    place = np.array(scene.cursor.location, np.float64)
-    place[0] += _shift(_NEW_FOOTPRINT + place[:2], [_footprint(other) for other in _armatures(scene)])
-    return place
-
-
-def _armatures(scene: bpy.types.Scene, but: bpy.types.Collection | None = None) -> list[bpy.types.Object]:
-    """Of the scene's humans except `but`, where they have bones."""
-    found = [obj for human in humans(scene) if human != but for obj in human.objects if obj.type == "ARMATURE"]
-    return [armature for armature in found if armature.data.bones]
-
-
-def _shift(own: NDArray[np.float64], others: list[NDArray[np.float64]]) -> float:
-    """The smallest move in x, metres, after which the rectangle `own` is GAP_M or more from all others; prefers +x."""
-    candidates = [0.0]
-    for other in others:
-        candidates += [other[1, 0] + GAP_M - own[0, 0], other[0, 0] - GAP_M - own[1, 0]]
-    free = [x for x in candidates if not any(_too_close(own + np.array([x, 0.0]), other) for other in others)]
-    return min(free, key=lambda x: (round(abs(x), 6), x < 0))  # beyond the outermost there is always room
-
-
-def _too_close(first: NDArray[np.float64], second: NDArray[np.float64]) -> bool:
-    """Whether two rectangles are nearer than GAP_M in x while they overlap in y."""
-    gap = np.array([GAP_M - 1e-6, 0.0])
-    return bool(((first[0] < second[1] + gap) & (second[0] < first[1] + gap)).all())
-
-
-def _footprint(armature: bpy.types.Object) -> NDArray[np.float64]:
-    """Lowest and highest x and y in the world [2, 2] of the bones as posed, with a margin for flesh."""
-    to_world = np.array(armature.matrix_world)
-    bones = [(bone.head, bone.tail) for bone in armature.pose.bones]
-    ends = np.array(bones, np.float64).reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
-    return np.array([ends.min(0)[:2] - _FLESH_M, ends.max(0)[:2] + _FLESH_M])

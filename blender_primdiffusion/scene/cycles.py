@@ -154,8 +154,8 @@ def overlap_warning(collection: bpy.types.Collection) -> str | None:
     if most <= CYCLES_LIMIT:
         return None
     return (
-        f"up to {most} volumes of {collection.name!r} overlap at a point and Cycles draws only {CYCLES_LIMIT}; "
-        "render with PrimDiffusion (Exact)"
+        f"Cycles leaves out parts of {collection.name!r}, where {most} volumes overlap and it draws only "
+        f"{CYCLES_LIMIT}; render with PrimDiffusion (Exact)"
     )
 
 

@@ -22,7 +22,7 @@ from .backend_state import draw_set_up
 from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
 from .manual import draw_manual_button
 from .presets import read_preset
-from .render_panel import draw_engines
+from .render_panel import draw_next_step
 from .translations import CONTEXT
 
 LARGEST_SEED = 2**31 - 1
@@ -309,8 +309,8 @@ class PRIMDIFFUSION_PT_generate(SidebarPanel, bpy.types.Panel):
         draw_job(layout, "generate", "primdiffusion.generate", "OUTLINER_OB_ARMATURE", reason)
         if queue.child_message:
             draw_lines(layout, sentence(device_line()), "ERROR")
-        if humans(context.scene):
-            draw_engines(layout, context.scene)
+        if humans(context.scene) and not queue.busy:
+            draw_next_step(layout, context.scene)
 
 
 class PRIMDIFFUSION_PT_attributes(SidebarPanel, bpy.types.Panel):

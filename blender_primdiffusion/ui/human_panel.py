@@ -233,9 +233,9 @@ class PRIMDIFFUSION_OT_duplicate_human(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         # needs numpy
-        from ..scene.build import stand_beside_others
         from ..scene.duplicate import duplicate_human
         from ..scene.edit import leave_mode, select_human
+        from ..scene.place import stand_beside_others
 
         check_editable(person)
         leave_mode(context)

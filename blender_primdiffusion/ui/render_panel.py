@@ -238,13 +238,29 @@ def how_shown(scene: bpy.types.Scene) -> str:
     return UNLIT if drawer is Drawer.OVERLAY and renders_volumes(engine) else APPROXIMATE
 
 
+def draw_next_step(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
+    """The button that leads to a picture: an engine that shows humans as they are, a camera, the render."""
+    engine = scene.render.engine
+    if engine not in (ENGINE, "CYCLES"):
+        layout.operator("primdiffusion.set_up_engine", text="Switch to PrimDiffusion Engine", icon="SHADING_RENDERED")
+    elif scene.camera is None:
+        layout.operator("primdiffusion.add_camera", icon="CAMERA_DATA")
+    else:
+        layout.operator("render.render", text="Render Image", icon="RENDER_STILL")
+    _draw_fault(layout, engine)
+
+
 def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """A choice of engines for humans, and how the current one shows them."""
     engine, line = scene.render.engine, how_shown(scene)
     row = layout.row(align=True)
     row.operator("primdiffusion.set_up_engine", text="PrimDiffusion", depress=engine == ENGINE, icon="SHADING_RENDERED")
     row.operator("primdiffusion.set_up_cycles", text="Cycles", depress=engine == "CYCLES", icon="SHADING_TEXTURE")
-    draw_lines(layout, pgettext_iface(line), "ERROR" if line == OTHER_ENGINE else "INFO")
+    draw_lines(layout, pgettext_iface(line), "INFO")
+    _draw_fault(layout, engine)
+
+
+def _draw_fault(layout: bpy.types.UILayout, engine: str) -> None:
     if engine == "CYCLES" and cycles_check.volumes_are_empty():
         draw_lines(layout, sentence(cycles_check.FAULT), "ERROR")
 
@@ -322,14 +338,14 @@ class PRIMDIFFUSION_PT_cycles_look(_OfPerson, bpy.types.Panel):
     bl_label = "Look in Cycles"
 
     def draw_person(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
-        from ..scene.cycles import overlap_warning  # numpy, which Blender starts without
+        from ..scene.cycles import overlap_warning_in  # numpy, which Blender starts without
 
         if density_gain(person) is None:
             draw_lines(self.layout, "The human's material has no node Density Gain", "INFO")
         else:
             self.layout.prop(person, "primdiffusion_density_gain")
         draw_job(self.layout, "fit_gain", "primdiffusion.fit_density_gain", "MOD_OPACITY")
-        warning = overlap_warning(person)
+        warning = overlap_warning_in(context.scene, person)
         if warning is not None and attachment_of(person) != "MERGED":
             draw_lines(self.layout, sentence(f"{warning}, or merge the human"), "ERROR")
 

@@ -233,7 +233,9 @@ def _targets(index: int) -> list[Variation]:
 
 def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Collection], str]:
     """The humans built, and what went wrong with the next one in a sentence; empty for nothing."""
-    from ..scene.build import build_human, stand_at_cursor  # needs numpy
+    # needs numpy
+    from ..scene.build import build_human
+    from ..scene.place import stand_at_cursor
 
     built: list[bpy.types.Collection] = []
     context.window_manager.progress_begin(0, len(wanted))

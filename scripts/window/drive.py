@@ -1,8 +1,9 @@
 """Runs inside Blender's window: installs the zip, then plays the scenes of `scenes.py` from a timer, step by step.
 
 A scene is a generator. It yields seconds to wait, the name of a screenshot to take, or an input:
-{"point": [x, y], "click": True}, {"point": [x, y], "drag": [dx, dy]} or {"key": "Escape", "times": 1}; or figures to
-be written to a file: {"figures": {name: value}}.
+{"point": [x, y], "click": True}, {"point": [x, y], "drag": [dx, dy]} or {"key": "Escape", "times": 1}; figures to be
+written to a file: {"figures": {name: value}}; or {"pixels that differ": [name, name], "boxes": [...]}, which gets their
+number between two screenshots, for each box [left, top, right, bottom].
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ import json
 import os
 import sys
 import traceback
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from importlib import import_module
 from pathlib import Path
 
@@ -44,12 +45,18 @@ def play() -> Iterator[float]:
             FAILED.append(name)
 
 
-def perform(steps: Iterator) -> Iterator[float]:
-    for step in steps:
+def perform(steps: Generator) -> Iterator[float]:
+    answer = None
+    while True:
+        try:
+            step = steps.send(answer)
+        except StopIteration:
+            return
+        answer = None
         if isinstance(step, str):
             yield from photograph(step)
         elif isinstance(step, dict):
-            yield from ask(step)
+            answer = yield from ask(step)
         else:
             yield step
 
@@ -87,13 +94,19 @@ def where() -> dict[str, list[int]]:
     return boxes
 
 
-def ask(what: dict) -> Iterator[float]:
-    """Send a request and wait until it is done."""
+def ask(what: dict) -> Generator[float, None, object]:
+    """Send a request and wait until it is done; returns the answer, if there is one."""
     request = Path(REQUEST)
     request.with_suffix(".part").write_text(json.dumps(what))
     request.with_suffix(".part").rename(request)
     while request.exists():
         yield 0.1
+    answer = request.with_suffix(".answer")
+    if not answer.exists():
+        return None
+    found = json.loads(answer.read_text())
+    answer.unlink()
+    return found
 
 
 STEPS = play()

@@ -15,6 +15,7 @@ import argparse
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -27,6 +28,8 @@ REQUEST = "request"
 """File in which drive.py requests a screenshot, a click or a key."""
 FIGURES = "figures.json"
 """What scenes have measured, beside the pictures; for `benchmarks/first_sight.py --window`."""
+VISIBLY = "4%"
+"""Of the range of values: smaller differences come from dithering."""
 _QUIET = "import bpy; bpy.context.preferences.view.show_splash = False; bpy.ops.wm.save_userpref()"
 """At its first start, Blender would show the splash screen with its quick set-up over everything."""
 
@@ -58,14 +61,16 @@ def serve(blender: subprocess.Popen, scratch: Path, out: Path, display: str, tim
             blender.kill()
             print(f"Blender was ended after {time_s:.0f} s", file=sys.stderr)
         if request.is_file():
-            do(json.loads(request.read_text()), out, display)
+            answer = do(json.loads(request.read_text()), out, display)
+            if answer is not None:
+                request.with_suffix(".answer").write_text(json.dumps(answer))
             request.unlink()
         time.sleep(0.05)
     return blender.returncode
 
 
-def do(request: dict, out: Path, display: str) -> None:
-    """Take a screenshot, note figures, click, drag, or press a key.
+def do(request: dict, out: Path, display: str) -> list[int] | None:
+    """Take a screenshot, note figures, click, drag, press a key, or compare screenshots; returns an answer, if any.
 
     Blender's own screenshots are black with software OpenGL.
     """
@@ -77,10 +82,7 @@ def do(request: dict, out: Path, display: str) -> None:
         path.with_suffix(".json").write_text(json.dumps(request["where"]))
         print(f"saved {path.name}", flush=True)
     if "figures" in request:
-        path = out / FIGURES
-        before = json.loads(path.read_text()) if path.is_file() else {}
-        path.write_text(json.dumps({**before, **request["figures"]}, indent=2) + "\n")
-        print(request["figures"], flush=True)
+        note(request["figures"], out)
     if "point" in request:
         x, y = map(str, request["point"])
         subprocess.run([*hand, "mousemove", x, y], check=True, env=environment)
@@ -99,6 +101,28 @@ def do(request: dict, out: Path, display: str) -> None:
     if "key" in request:
         times = ["--delay", "2", "--repeat", str(request.get("times", 1)), "--repeat-delay", "2"]
         subprocess.run([*hand, "key", *times, request["key"]], check=True, env=environment)
+    if "pixels that differ" in request:
+        one, other = (out / f"{name}.png" for name in request["pixels that differ"])
+        return [differing(one, other, *box) for box in request["boxes"]]
+    return None
+
+
+def note(figures: dict, out: Path) -> None:
+    """Add to the file of figures."""
+    path = out / FIGURES
+    before = json.loads(path.read_text()) if path.is_file() else {}
+    path.write_text(json.dumps({**before, **figures}, indent=2) + "\n")
+    print(figures, flush=True)
+
+
+def differing(one: Path, other: Path, left: int, top: int, right: int, bottom: int) -> int:
+    """How many pixels of a box differ visibly between two pictures."""
+    box = f"[{right - left}x{bottom - top}+{left}+{top}]"
+    command = ["compare", "-metric", "AE", "-fuzz", VISIBLY, f"{one}{box}", f"{other}{box}", "null:"]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)  # it exits 1 where pictures differ
+    if found.returncode > 1:
+        raise RuntimeError(found.stderr)
+    return int(float(found.stderr.split()[0]))
 
 
 def main() -> int:
@@ -125,7 +149,9 @@ def main() -> int:
         command = [*program, "--gpu-backend", "opengl", "--window-geometry", "0", "0", *options.size.split("x")]
         command += ["--python-exit-code", "1", "--python", str(HERE / "drive.py"), "--"]
         command += [str(archive), str(scratch / REQUEST), str(options.python), *options.scenes]
-        return serve(subprocess.Popen(command, env=environment), scratch, options.out, display, options.time)
+        code = serve(subprocess.Popen(command, env=environment), scratch, options.out, display, options.time)
+        note({"window_crashes": int(code < 0 and code != -signal.SIGKILL)}, options.out)
+        return code
     finally:
         screen.terminate()
         shutil.rmtree(scratch, ignore_errors=True)

@@ -78,7 +78,8 @@ def wide_view() -> None:
     space.overlay.show_bones = False
     region = space.region_3d
     region.view_perspective = "PERSP"
-    region.view_location = Vector((0.25, 0.0, 0.85))
+    first = next((obj for obj in bpy.context.scene.objects if obj.type == "ARMATURE"), None)
+    region.view_location = Vector((0.25, first.location.y if first else 0.0, 0.85))
     region.view_rotation = Euler((1.5, 0.0, 0.35)).to_quaternion()
     region.view_distance = 3.6
     space.overlay.show_floor = True

@@ -17,6 +17,7 @@ from panels import show, sidebar, view
 from press import Steps, invoke, press, wait
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, cancel_all, people_file, queue_of, select, with_people
 from view_scenes import denoising_in_view, dragging, redraw, rendered, rendered_view, shadings, stalls
+from visible_scene import visible_humans
 
 
 def set_up(module: str, python: str) -> Steps:
@@ -61,7 +62,6 @@ def first_human(module: str, python: str) -> Steps:
     yield from wait(lambda: not queue.busy, 240)
     yield 4.0
     yield "first_solid"
-    bpy.ops.wm.save_as_mainfile(filepath=str(people_file(module)))
     yield from rendered_view()
     yield "first_person"
     for tab in ("Human", "Output", "Captures"):
@@ -352,6 +352,7 @@ GENERATE_BUTTON_PX = 118
 SCENES: dict[str, Callable[[str, str], Steps]] = {
     "set_up": set_up,
     "first_human": first_human,
+    "visible_humans": visible_humans,
     "generate": generate,
     "variations": variations,
     "human": human,

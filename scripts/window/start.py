@@ -1,4 +1,4 @@
-"""Initial states of scenes: an empty file, people in it, one of them selected, no job running."""
+"""Initial states of scenes: Blender's factory scene, people in an empty one, one of them selected, no job running."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ FIRST_SEED, SECOND_SEED = 3, 53
 
 
 def begin(module: str, python: str) -> Steps:
+    """As Blender starts: a cube, a light and a camera."""
     bpy.ops.wm.read_homefile(use_factory_startup=True)
     yield 1.5
     bpy.context.preferences.addons[module].preferences.backend_python = python
-    for obj in list(bpy.data.objects):
-        if obj.type == "MESH":
-            bpy.data.objects.remove(obj)
 
 
 def with_people(module: str, python: str, *seeds: int) -> Steps:
-    """A file with these people; they are generated once."""
+    """A file with these people and nothing solid, to which scenes add what they need; they are generated once."""
     yield from begin(module, python)
+    bpy.data.objects.remove(bpy.data.objects["Cube"])
     path = people_file(module, len(seeds))
     if path.is_file():
         bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)

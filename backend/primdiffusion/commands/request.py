@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import dataclasses
+import itertools
 import math
 import os
+import statistics
 import time
 import types
 import typing
@@ -176,18 +179,29 @@ Attributes = Annotated[
 """Attributes of a human: an object in JSON, NAME=VALUE arguments on the command line."""
 
 
+_PACED_BY = 10
+"""Steps."""
+_UNUSUAL = 3.0
+"""Times the median: previews make a step longer, but less so."""
+
+
 class Pace:
-    """Estimates the time left from all steps but the first, which warms up."""
+    """Estimates the time left from the last steps, without the first and those that take far longer than most: they
+    load and compile."""
 
     def __init__(self) -> None:
-        self._times: list[float] = []
+        self._times: collections.deque[float] = collections.deque(maxlen=_PACED_BY + 1)
 
     def left(self, done: int, total: int) -> float | None:
-        """Return the seconds until `total`; call it after each step. None after the first."""
+        """Return the seconds until `total`; call it after each step. None after the first two, unless it is 0."""
         self._times.append(time.perf_counter())
-        if len(self._times) < 2:
+        if done >= total:
+            return 0.0
+        if len(self._times) < 3:
             return None
-        return round((self._times[-1] - self._times[0]) / (len(self._times) - 1) * (total - done), 3)
+        steps = [after - before for before, after in itertools.pairwise(self._times)]
+        usual = [step for step in steps if step <= _UNUSUAL * statistics.median_low(steps)]
+        return round(statistics.mean(usual) * (total - done), 3)
 
 
 def step_reporter(

@@ -6,10 +6,11 @@ from pathlib import Path
 from typing import Literal
 
 import pytest
+from primdiffusion.commands import request as module
 from primdiffusion.commands.export import GaussiansRequest
 from primdiffusion.commands.merge import MergeRequest
 from primdiffusion.commands.render import RenderRequest
-from primdiffusion.commands.request import ParameterError, read_request
+from primdiffusion.commands.request import Pace, ParameterError, read_request
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,3 +83,32 @@ def test_a_wrong_parameter_is_named(params, named):
 def test_a_human_is_no_output(request_for):
     with pytest.raises(ValueError, match="none of the extensions"):
         request_for(Path("anna.human.safetensors")).check()
+
+
+def paced(monkeypatch, steps: list[float]) -> list[float | None]:
+    """Estimates after steps of these seconds."""
+    now, pace, found = 0.0, Pace(), []
+    for done, step in enumerate(steps, 1):
+        now += step
+        monkeypatch.setattr(module.time, "perf_counter", lambda now=now: now)
+        found.append(pace.left(done, len(steps)))
+    return found
+
+
+def test_the_time_left_leaves_out_loading_and_compiling(monkeypatch):
+    steps = [90.0, 4.0, 60.0, 4.0, 5.0, *([4.0] * 25)]  # the marcher is compiled for a preview in the third
+    found = paced(monkeypatch, steps)
+    assert found[:2] == [None, None]
+    for done in range(3, len(steps)):
+        assert found[done - 1] == pytest.approx(sum(steps[done:]), rel=0.15)
+    assert found[-1] == 0
+
+
+def test_the_time_left_follows_a_machine_that_becomes_slow(monkeypatch):
+    found = paced(monkeypatch, [1.0] * 20 + [10.0] * 20)
+    assert found[18] == pytest.approx(21)
+    assert found[30] == pytest.approx(90)
+
+
+def test_a_single_step_leaves_nothing_to_wait_for(monkeypatch):
+    assert paced(monkeypatch, [30.0]) == [0]

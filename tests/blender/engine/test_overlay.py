@@ -239,7 +239,7 @@ def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
 def test_bones_in_front_stay_visible_unless_hidden(people):
     armature = armature_of(people.anna)
     armature.matrix_world = Matrix.Translation((2, 3, 4)) @ Matrix.Scale(2, 4)
-    armature_of(people.bert).show_in_front = False
+    armature.show_in_front = True
     bone = armature.pose.bones["head"]
     head = armature.matrix_world @ bone.head
     bones = read(people.overlay).bones
@@ -248,6 +248,18 @@ def test_bones_in_front_stay_visible_unless_hidden(people):
     (bone if bpy.app.version >= (5, 0) else bone.bone).hide = True
     bones = read(people.overlay).bones
     assert bones.shape == (23, 2, 3)
+
+
+@pytest.mark.parametrize("mode", ["POSE", "EDIT"])
+def test_bones_are_in_front_while_they_are_posed_or_edited(people, mode):
+    armature = armature_of(people.anna)
+    assert read(people.overlay).bones.shape == (0, 2, 3)
+    bpy.context.view_layer.objects.active = armature
+    bpy.ops.object.mode_set(mode=mode)
+    assert read(people.overlay).bones.shape == (24, 2, 3)
+    bpy.ops.object.mode_set(mode="OBJECT")
+    assert read(people.overlay).bones.shape == (0, 2, 3)
+    assert not armature.show_in_front, "the user's own setting stays"
 
 
 @pytest.mark.parametrize("matrix", [PERSPECTIVE, PARALLEL], ids=["perspective", "parallel"])

@@ -49,11 +49,12 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
 
 def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
     asked = []
-    monkeypatch.setattr(generate, "bring_into_view", lambda obj, least: asked.append((obj, least)))
+    monkeypatch.setattr(generate, "bring_into_view", lambda *given: asked.append(given))
     for seed in (7, 8):
         bpy.ops.primdiffusion.generate(seed=seed, steps=1)
     first, second = humans(addon.scene)
-    assert asked == [(armature_of(first), generate.FIRST_HUMAN_SHARE), (armature_of(second), 0.0)]
+    bones = [armature_of(human) for human in (first, second)]
+    assert asked == [(bones[0], generate.FIRST_HUMAN_SHARE, []), (bones[1], 0.0, bones[:1])]
 
 
 def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):
@@ -121,7 +122,7 @@ def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_resul
     ask(addon, 7, 2)
     drive()
     assert len(humans(addon.scene)) == 1
-    assert any("built in" in text for text in panel_texts(addon))
+    assert any("Generated in" in text for text in panel_texts(addon))
 
 
 def test_cancel_ends_the_job_and_adds_nothing(addon):

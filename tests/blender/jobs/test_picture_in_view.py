@@ -35,7 +35,12 @@ def context(shading="SOLID", overlays=True, local_view=None) -> SimpleNamespace:
         shading=SimpleNamespace(type=shading),
         overlay=SimpleNamespace(show_overlays=overlays),
     )
-    return SimpleNamespace(scene=bpy.context.scene, space_data=space, region_data=SimpleNamespace(view_matrix=LEVEL))
+    return SimpleNamespace(
+        scene=bpy.context.scene,
+        space_data=space,
+        region_data=SimpleNamespace(view_matrix=LEVEL),
+        evaluated_depsgraph_get=bpy.context.evaluated_depsgraph_get,
+    )
 
 
 def shown() -> bool:
@@ -126,6 +131,10 @@ def test_a_picture_is_uploaded_once_and_drawn_where_the_human_will_stand(denoisi
     bpy.context.scene.cursor.location = (0.5, 0, 0)
     picture_in_view.draw(context())
     assert drawn[2].mean(0)[0] > 1.5, "beside the human there"
+    bpy.ops.mesh.primitive_cube_add(location=(0.5, 0, 0))
+    bpy.context.scene.cursor.location = (0.501, 0, 0)
+    picture_in_view.draw(context())
+    assert drawn[3].mean(0)[1] < -1, "in front of the cube there"
 
 
 def test_edits_show_no_picture_in_the_views(denoising, monkeypatch):

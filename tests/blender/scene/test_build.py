@@ -15,7 +15,7 @@ from oracle import TOLERANCE_M, blended_frames, evaluated_matrices
 
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.build import attach_volumes, build_human, stand_at_cursor
+from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
 from blender_primdiffusion.scene.cycles import overlap_warning, overlap_warning_in
 from blender_primdiffusion.scene.human import MARK, VolumeWriteError, armature_of, folder_of, humans, remove_human
@@ -222,17 +222,3 @@ def test_building_from_edit_mode_works(saved_scene, tmp_path):
     bpy.ops.object.mode_set(mode="EDIT")
     collection = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
     assert armature_of(collection).mode == "OBJECT"
-
-
-def test_the_place_of_the_next_human_is_foreseen(saved_scene, tmp_path):
-    source, cursor = synthetic.write(tmp_path / "human.npz", 4), saved_scene.scene.cursor
-    for location in ((1.0, -2.0, 0.3), (1.0, -2.0, 0.3), (0.2, -2.0, 0.0)):
-        cursor.location = location
-        expected = build.next_place(saved_scene.scene)
-        collection = build_human(saved_scene, source)
-        soles = armature_of(collection).location.copy()
-        stand_at_cursor(saved_scene, collection)
-        moved = armature_of(collection).location - soles
-        np.testing.assert_allclose(expected, moved, atol=0.25)  # the synthetic human's arms are shorter
-        assert expected[1:] == pytest.approx(location[1:])
-        bpy.context.view_layer.update()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import random
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
@@ -12,13 +13,15 @@ from unittest.mock import MagicMock
 import bpy
 import numpy as np
 import pytest
-from jobs_driven import drive, shown
+from jobs_driven import drive, notice_of, shown
 
+from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.build import GAP_M
+from blender_primdiffusion.scene import cycles
 from blender_primdiffusion.scene.cycles import posed_extent
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
-from blender_primdiffusion.ui import generate_panel
+from blender_primdiffusion.scene.place import GAP_M
+from blender_primdiffusion.ui import generate_panel, render_panel
 
 FAILS = 2
 """A seed that the fake child takes as an order."""
@@ -194,14 +197,56 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
 
 
 @pytest.mark.parametrize(
+    ("engine", "camera", "button"),
+    [
+        ("PRIMDIFFUSION", True, "render.render"),
+        ("CYCLES", True, "render.render"),
+        ("PRIMDIFFUSION", False, "primdiffusion.add_camera"),
+        ("BLENDER_WORKBENCH", True, "primdiffusion.set_up_engine"),
+    ],
+)
+def test_after_success_the_panel_has_one_line_and_the_button_of_the_next_step(addon, engine, camera, button):
+    scene, panel = addon.scene, generate_panel.PRIMDIFFUSION_PT_generate
+    scene.render.engine = engine
+    if camera:
+        scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
+    before = shown(panel, addon)
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    line, last = shown(panel, addon)[len(before) :]
+    assert re.fullmatch(r"Generated in [0-9.]+ s\.", line)
+    assert last == button
+
+
+def test_the_fault_of_some_builds_of_cycles_is_named_where_cycles_is_chosen_alone(addon, monkeypatch):
+    monkeypatch.setattr(render_panel.cycles_check, "volumes_are_empty", lambda: True)
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    for engine, named in (("CYCLES", True), ("PRIMDIFFUSION", False), ("BLENDER_WORKBENCH", False)):
+        addon.scene.render.engine = engine
+        texts = " ".join(shown(generate_panel.PRIMDIFFUSION_PT_generate, addon))
+        assert ("draws volumes empty" in texts) == named
+
+
+def test_limits_of_cycles_are_named_in_the_result_where_cycles_is_chosen_alone(addon, monkeypatch):
+    monkeypatch.setattr(cycles, "current_overlap", lambda _: 37)
+    for engine, named in (("BLENDER_WORKBENCH", False), ("CYCLES", True)):
+        addon.scene.render.engine = engine
+        bpy.ops.primdiffusion.generate(seed=7, steps=1)
+        assert ("Cycles leaves out parts of" in notice_of("generate")) == named
+
+
+def test_the_next_step_waits_until_no_job_is_running(addon):
+    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    queue.add(addon, GenerateJob(4, 5))
+    texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
+    assert "primdiffusion.set_up_engine" not in texts
+
+
+@pytest.mark.parametrize(
     ("engine", "line"),
     [("PRIMDIFFUSION", "humans exactly"), ("CYCLES", "approximately"), ("BLENDER_WORKBENCH", "choose an engine above")],
 )
-def test_beside_the_result_an_engine_is_chosen_and_a_line_says_how_it_shows_humans(addon, engine, line):
-    panel, choice = generate_panel.PRIMDIFFUSION_PT_generate, "primdiffusion.set_up_engine"
-    assert choice not in shown(panel, addon)
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+def test_the_output_tab_offers_both_engines_and_a_line_says_how_the_chosen_one_shows_humans(addon, engine, line):
     addon.scene.render.engine = engine
-    texts = shown(panel, addon)
-    assert {choice, "primdiffusion.set_up_cycles"} <= set(texts)
+    texts = shown(render_panel.PRIMDIFFUSION_PT_render, addon)
+    assert {"primdiffusion.set_up_engine", "primdiffusion.set_up_cycles"} <= set(texts)
     assert line in " ".join(texts)

@@ -231,7 +231,10 @@ def test_panels_show_modes_warnings_and_memory(person):
     assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 3
     ops.unmerge()
     person[MARK] = person[MARK].replace('"most_overlapping": ', '"most_overlapping": 9')
-    assert "volumes of 'Human' overlap" in drawn(render_panel.PRIMDIFFUSION_PT_cycles_look, context).replace(" | ", " ")
+    context.scene.render.engine = "CYCLES"
+    assert "volumes overlap" in drawn(render_panel.PRIMDIFFUSION_PT_cycles_look, context).replace(" | ", " ")
+    context.scene.render.engine = "PRIMDIFFUSION"
+    assert "overlap" not in drawn(render_panel.PRIMDIFFUSION_PT_cycles_look, context), "of no interest to this engine"
     assert "MB" in drawn(render_panel.PRIMDIFFUSION_PT_memory, context)
     assert "primdiffusion.set_up_cycles" in shown(render_panel.PRIMDIFFUSION_PT_render, context)
 
