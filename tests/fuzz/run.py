@@ -52,6 +52,8 @@ class Report:
     counts: Counter[str] = dataclasses.field(default_factory=Counter)
     findings: list[str] = dataclasses.field(default_factory=list)
     lines: set[str] = dataclasses.field(default_factory=set)
+    causes: set[tuple[str, ...]] = dataclasses.field(default_factory=set)
+    """Of findings, each of which is counted and kept once."""
 
     def find(self, outcome: str, what: str) -> None:
         """Count a finding, and print it."""
@@ -80,7 +82,8 @@ def run(
         number, last = 0, 10**9 if end is not None else -(-inputs // processes)
         while number < last and (end is None or time.monotonic() < end):
             options = {"seed": seed, "only": list(only), "place": place, "processes": processes, "last": last}
-            number = _run_child(report, {**options, "first": number, "corpus": corpus and str(corpus)}, end)
+            options |= {"first": number, "corpus": corpus and str(corpus), "found": list(report.causes)}
+            number = _run_child(report, options, end)
 
     with concurrent.futures.ThreadPoolExecutor(processes) as pool:
         list(pool.map(work, range(processes)))
@@ -104,9 +107,12 @@ def _run_child(report: Report, options: dict[str, Any], end: float | None) -> in
         if reading is None:
             raise RuntimeError(f"input {now}: the process ended ({ended}) before a damaged file was read")
         report.counts["inputs"] += 1
-        case = corpora.keep(CASES / corpora.folder_of(reading["target"]), Path(reading["path"]).read_bytes(), ".dat")
-        outcome = "hangs" if ended is None else "tracebacks"
-        report.find(outcome, f"{reading['target']}: the process ended ({ended}): {case.relative_to(CASES)}")
+        if (cause := (reading["target"], f"ended ({ended})")) not in report.causes:
+            report.causes.add(cause)
+            path = Path(reading["path"])
+            case = corpora.keep(CASES / corpora.folder_of(cause[0]), path.read_bytes(), path.suffix)
+            outcome = "hangs" if ended is None else "tracebacks"
+            report.find(outcome, f"{cause[0]}: the process {cause[1]} [{case.relative_to(CASES)}]")
     return now + 1
 
 
@@ -153,6 +159,7 @@ def _note(report: Report, message: dict[str, Any]) -> None:
         if outcome in ORDINARY:
             report.counts[outcome] += 1
         elif message["is_new"]:
+            report.causes.add(tuple(message["cause"]))
             report.find(outcome, message["what"])
 
 
@@ -200,8 +207,9 @@ class Tried:
 
 
 def _serve(
-    seed: int, only: Sequence[str], place: int, processes: int, first: int, last: int, corpus: str | None, folder: str
-) -> None:
+    seed: int, only: Sequence[str], place: int, processes: int, first: int, last: int, corpus: str | None, folder: str,
+    found: Sequence[Sequence[str]],
+) -> None:  # fmt: skip
     from fuzz.targets import TARGETS
 
     events: list[str] = []
@@ -209,7 +217,7 @@ def _serve(
     targets = [target for target in TARGETS if any(part in target.name for part in only)][place::processes]
     os.chdir(folder)
     tried: dict[str, Tried] = {}
-    coverage, found = Coverage(), set()
+    coverage, causes = Coverage(), set(map(tuple, found))
     for number in range(first, last if targets else first):
         target = min(targets, key=lambda one: tried[one.name].seconds if one.name in tried else -1.0)
         if target.name not in tried:
@@ -231,26 +239,28 @@ def _serve(
         if events or Path("CANARY").exists():
             outcome.append("executions")
             about += f" ({events})"
-        is_new = not set(outcome) <= ORDINARY and (kind := (target.name, _kind(outcome, about))) not in found
+        cause = _cause(one, outcome, about)
+        is_new = not set(outcome) <= ORDINARY and cause not in causes
         if is_new:
-            found.add(kind)
+            causes.add(cause)
             if set(outcome) <= {"tracebacks", "garbage"}:
-                content = corpora.shrunk(content, lambda less: _kind(*one.outcome(less)) == kind[1])  # noqa: B023
+                content = corpora.shrunk(content, lambda less: _cause(one, *one.outcome(less)) == cause)  # noqa: B023
             case = corpora.keep(CASES / corpora.folder_of(target.name), content, one.path.suffix)
             about = f"{about} [{case.relative_to(CASES)}]"
         lines = coverage.new_lines() if coverage.has_news else []
         one.seconds += time.process_time() - began
         what = f"{target.name}, seed {seed}, input {number}: {about}"
-        _say(number=number, outcome=outcome, what=what, is_new=is_new, lines=lines)
+        _say(number=number, outcome=outcome, what=what, is_new=is_new, cause=cause, lines=lines)
 
 
-def _kind(outcome: list[str], about: str) -> tuple[str, ...]:
-    """What findings with one cause have in common: the outcome, and where an error arose or what is wrong.
-
-    Of an error within a request, the server tells the text alone.
+def _cause(one: Tried, outcome: list[str], about: str) -> tuple[str, ...]:
+    """What findings with one cause have in common: where an error arose, or what is wrong. Of an error within a request
+    the server tells the text alone.
     """
+    if set(outcome) & {"hangs", "over_500mb"}:
+        return one.target.name, outcome[-1]
     where = None if "defect in the backend" in about else re.search(r"\(\w+\.py:\d+\)", about)
-    return (*outcome, where[0] if where else re.sub(r"'[^']*'|/\S+|\d+", "", about)[:150])
+    return one.target.name, *outcome, where[0] if where else re.sub(r"'[^']*'|/\S+|\d+", "", about)[:150]
 
 
 def _outcome(target: Any, path: Path, coverage: Coverage | None = None) -> tuple[list[str], str]:
