@@ -12,6 +12,8 @@ from start import FIRST_SEED, SECOND_SEED, armatures, begin, queue_of
 
 _WIDER = 3
 """Times as wide: a view in which the parts of a human outside of the region are seen as well."""
+_BACKGROUND = {"background_type": "VIEWPORT", "background_color": (1.0, 0.0, 1.0)}
+"""Unlike any human."""
 _MOST_S = 240.0
 
 
@@ -43,6 +45,9 @@ def visible_share(module: str, name: str, armature: bpy.types.Object) -> Steps:
     shown = {"show_text": False, "show_bones": False, "show_object_origins": False, "show_outline_selected": False}
     before = {overlay: getattr(space.overlay, overlay) for overlay in shown}
     set_all(space.overlay, shown)
+    shading = {name: getattr(space.shading, name) for name in ("background_type", "background_color")}
+    shading["background_color"] = tuple(shading["background_color"])
+    set_all(space.shading, _BACKGROUND)
     box = on_screen(region)
     (visible,) = yield from changed_pixels(module, name, armature, [box])
     size, lens = (region.width, region.height), space.lens
@@ -69,6 +74,7 @@ def visible_share(module: str, name: str, armature: bpy.types.Object) -> Steps:
         obj.hide_set(False)
     set_all(space, were)
     set_all(space.overlay, before)
+    set_all(space.shading, dict(reversed(shading.items())))
     print(f"{name}: {visible=} {whole=} {inside=} {all_of_it=}", flush=True)
     return min(visible / whole, 1.0) * inside / all_of_it
 
@@ -100,7 +106,7 @@ def at_rest(module: str) -> Steps:
     yield 1.0
 
 
-def set_all(holder: object, settings: dict[str, bool]) -> None:
+def set_all(holder: object, settings: dict[str, object]) -> None:
     for name, value in settings.items():
         setattr(holder, name, value)
 

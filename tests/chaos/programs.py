@@ -33,7 +33,7 @@ class Program:
     arguments: Callable[[Path], Words]
     """Of an output folder, which exists."""
     small: str = ""
-    """The test module whose `make_small` it needs."""
+    """The module of tests whose `make_small` it needs."""
     copied: Callable[[], Path] | None = None
     """Returns a folder that the command works in, copied to the output folder first."""
     resumes: bool = False
@@ -131,10 +131,11 @@ def all_programs(given: Inputs) -> list[Program]:
     def edit(command: str, options: Callable[[], Words]) -> Program:
         return Program(command, lambda out: [command, *options(), *given.sampled, "--out", out / "new"])
 
-    def export(ending: str, *options: str) -> Program:
-        return Program(
-            f"export {ending}", lambda out: ["export", given.human(1), *options, "--out", out / f"human{ending}"]
-        )
+    def export(ending: str, *options: str, small: str = "") -> Program:
+        def words(out: Path) -> Words:
+            return ["export", given.human(1), *options, "--out", out / f"human{ending}"]
+
+        return Program(f"export {ending}", words, small=small)
 
     return [
         Program(
@@ -160,8 +161,8 @@ def all_programs(given: Inputs) -> list[Program]:
             "render",
             lambda out: ["render", given.human(1), "--size", "32", "--out", out / "a.png", "--depth", out / "b.png"],
         ),
-        export(".glb", "--triangles", "500", "--texture", "64"),
-        export(".obj", "--triangles", "500", "--texture", "64"),
+        export(".glb", "--triangles", "500", "--texture", "64", small="chaos.small_exports"),
+        export(".obj", "--triangles", "500", "--texture", "64", small="chaos.small_exports"),
         export(".ply", "--gaussians", "100"),
         Program(
             "merge",
