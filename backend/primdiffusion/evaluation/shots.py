@@ -181,14 +181,14 @@ def _over_white(picture: Image.Image) -> tuple[Float[Tensor, "s s 4"], bool]:
     The bicubic filter with antialiasing is separable: strips of rows are shrunk in width, and what they give in height.
     A whole picture in float32 would take gigabytes.
     """
-    narrow, has_alpha = [], False
-    for _, strip in strips(picture, STRIP_PIXELS):
+    narrow, has_alpha = torch.empty(picture.height, SIDE, 4), False
+    for top, strip in strips(picture, STRIP_PIXELS):
         rgba = np.asarray(strip.convert("RGBA"))
         has_alpha = has_alpha or int(rgba[..., 3].min()) < 255
         values = torch.from_numpy(rgba.astype(np.float32)) / 255
         values[..., :3] = values[..., :3] * values[..., 3:] + (1 - values[..., 3:])
-        narrow.append(_resized(values, (len(values), SIDE)))
-    return _resized(torch.cat(narrow), (SIDE, SIDE)).clamp(0, 1), has_alpha
+        narrow[top : top + len(values)] = _resized(values, (len(values), SIDE))
+    return _resized(narrow, (SIDE, SIDE)).clamp(0, 1), has_alpha
 
 
 def _resized(values: Float[Tensor, "h w c"], size: tuple[int, int]) -> Float[Tensor, "h2 w2 c"]:
