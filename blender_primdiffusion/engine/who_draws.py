@@ -8,7 +8,8 @@ import bpy
 
 from .engine import ENGINE
 
-WORKBENCH, EEVEE = "BLENDER_WORKBENCH", "BLENDER_EEVEE"
+WORKBENCH = "BLENDER_WORKBENCH"
+EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
 _without: set[str] = {WORKBENCH}
 """Engines that list volumes among what they draw and still show no human by them: Workbench draws a grey fog."""
 
