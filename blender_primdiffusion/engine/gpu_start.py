@@ -1,4 +1,4 @@
-"""The GPU made ready to march, in steps that each stall the window for a moment: reliefs are drawn meanwhile."""
+"""The GPU made ready to march, in steps that each stall the window for a moment: until then reliefs are drawn."""
 
 from __future__ import annotations
 

@@ -18,6 +18,10 @@ _JOBS = {"RENDER": "the render", "OBJECT_BAKE": "the bake"}
 UNDO_REST_S = 0.5
 """Steps of undo and redo follow each other faster than this while a key is held or pressed again and again."""
 _last_undo = -math.inf
+_looked_at = -math.inf
+"""The last undo when `_look_for_more` was called."""
+_more_may_wait = False
+"""Further steps may wait in Blender's queue."""
 
 
 def in_the_way() -> str:
@@ -32,7 +36,7 @@ def in_the_way() -> str:
     for job, name in _JOBS.items():
         if bpy.app.is_job_running(job):
             return name
-    if time.monotonic() - _last_undo < UNDO_REST_S:
+    if _more_may_wait or time.monotonic() - _last_undo < UNDO_REST_S:
         return "undo"
     windows = bpy.context.window_manager.windows
     for modal in (modal for window in windows for modal in window.modal_operators):
@@ -44,15 +48,32 @@ def in_the_way() -> str:
 @persistent
 def note_undo(*_: object) -> None:
     """Handler of undo_post and redo_post: further steps may follow."""
-    global _last_undo
+    global _last_undo, _more_may_wait
     _last_undo = time.monotonic()
+    if not bpy.app.background:
+        _more_may_wait = True
+        if not bpy.app.timers.is_registered(_look_for_more):
+            bpy.app.timers.register(_look_for_more, first_interval=UNDO_REST_S, persistent=True)
+
+
+def _look_for_more() -> float | None:
+    """The timer: over when no step came between two calls.
+
+    Of the steps that wait, Blender handles one, redraws, which may take longer than UNDO_REST_S, and calls timers.
+    """
+    global _looked_at, _more_may_wait
+    if _looked_at != _last_undo:
+        _looked_at = _last_undo
+        return UNDO_REST_S
+    _more_may_wait = False
+    return None
 
 
 @persistent
 def forget_undo(*_: object) -> None:
     """Handler of load_pre: another file has its own steps."""
-    global _last_undo
-    _last_undo = -math.inf
+    global _last_undo, _more_may_wait
+    _last_undo, _more_may_wait = -math.inf, False
 
 
 HANDLERS = (("undo_post", note_undo), ("redo_post", note_undo), ("load_pre", forget_undo))

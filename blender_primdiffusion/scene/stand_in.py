@@ -12,7 +12,7 @@ import bpy
 STAND_IN = "primdiffusion_stand_in"
 """Custom property of such an object."""
 PRESENT = "primdiffusion_present"
-"""Property of scenes while the extension is enabled; nobody sets it."""
+"""Property of scenes while the extension is enabled; its value is never set."""
 _LABEL = "needs_PrimDiffusion"
 
 PROPERTIES = (

@@ -9,6 +9,7 @@ import bpy
 from press import Steps, press, wait
 
 FIRST_SEED, SECOND_SEED = 3, 53
+_MOST_S = 1500.0
 
 
 def begin(module: str, python: str) -> Steps:
@@ -28,7 +29,11 @@ def with_people(module: str, python: str, *seeds: int) -> Steps:
     else:
         for seed in seeds:
             press("primdiffusion.generate", seed=seed)
-        yield from wait(lambda: not queue_of(module).busy, 400)
+        yield from wait(lambda: not queue_of(module).busy, _MOST_S)
+        if len(armatures()) < len(seeds):
+            last = queue_of(module).last
+            why = last.sentence if last is not None and last.sentence else f"not within {_MOST_S:.0f} s"
+            raise RuntimeError(f"the humans were not generated: {why}")
         bpy.ops.wm.save_as_mainfile(filepath=str(path))
     yield 1.0
     select(armatures()[0])

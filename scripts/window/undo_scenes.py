@@ -44,9 +44,12 @@ def undo_and_timers(module: str, python: str) -> Steps:
         yield {"point": _middle_of_the_view()}
         yield {"key": "ctrl+z", "times": KEYS}
         yield {"key": "ctrl+shift+z", "times": KEYS}
-        yield from wait(lambda: not queue_of(module).busy and bool(added), 60)  # noqa: B023 - used in this round alone
+        yield from wait(lambda: not queue_of(module).busy and bool(added), 300)  # noqa: B023 - used in this round alone
         if queue_of(module).busy or not added:
-            raise RuntimeError(f"round {number}: the result or the motion did not arrive within a minute")
+            yield "undo_and_timers_waiting"
+            blocker = import_module(f"{module}.jobs.windows").in_the_way() or "nothing"
+            states = f"result: {not queue_of(module).busy}, motion: {bool(added)}, in the way: {blocker}"
+            raise RuntimeError(f"round {number}: not there within five minutes ({states})")
         _check(module, number)
         yield {"key": "ctrl+z", "times": KEYS}
         yield 0.5

@@ -1,4 +1,4 @@
-"""What is no regular file in place of any input is rejected in a sentence, and nobody waits for it.
+"""What is no regular file in place of any input is rejected in a sentence, without waiting for it.
 
 `MODULES` lists every module of both programs that reads a file, with the kinds of files that try it.
 """

@@ -48,7 +48,7 @@ def check_regular(path: str | Path) -> os.stat_result:
 class FileContent:
     """A regular file as it was when it was read. Readers take it in place of its path, which it is printed as.
 
-    So what was checked, by its hash for instance, is what is used, whatever happens to the file meanwhile.
+    So what was checked, by its hash for instance, is what is used, even if the file changes in between.
     """
 
     path: Path
@@ -95,8 +95,8 @@ def open_regular(path: str | Path | FileContent, limit: int) -> io.BufferedReade
 def private_content(file: io.BufferedReader | io.BytesIO) -> mmap.mmap | bytearray:
     """Return the content of an open file, so that what is written there stays in memory; the file may be closed then.
 
-    Up to COPIED_BYTES it is a copy, which nobody else can change. A larger file is mapped: a program that overwrites it
-    meanwhile changes the numbers, and one that cuts it short ends this process. Raises OSError, also for lack of
+    Up to COPIED_BYTES it is a copy, which no other program can change. A larger file is mapped: a program that
+    overwrites it changes the numbers, and one that cuts it short ends this process. Raises OSError, also for lack of
     memory, and ValueError for a file that is empty now.
     """
     if isinstance(file, io.BytesIO):

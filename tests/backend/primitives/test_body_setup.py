@@ -1,4 +1,4 @@
-"""A body's files are read once: what was hashed is what is loaded, whatever happens to the files meanwhile."""
+"""A body's files are read once: what was hashed is what is loaded, even if the files change in between."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def overwrite(path, content):
     os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
-def meanwhile(monkeypatch, change):
+def after_hashing(monkeypatch, change):
     """Have `change` happen after the files were read and hashed, and before they are loaded."""
     load = module.load_body
 
@@ -88,14 +88,14 @@ def test_what_was_hashed_is_loaded_after_the_files_have_changed(files, monkeypat
             overwrite(path, shuffled(path.read_bytes()))
         (folder / NAMES[1]).write_text("f 1/1 2/2 3/3\n")
 
-    meanwhile(monkeypatch, change)
+    after_hashing(monkeypatch, change)
     assert found(folder, fingerprints, setup).body.template.equal(setup.body.template)
 
 
 def test_what_is_recorded_of_a_new_body_is_what_was_loaded(files, monkeypatch):
     folder, fingerprints, setup = files
     smpl, uv = (folder / name for name in NAMES)
-    meanwhile(monkeypatch, lambda: overwrite(smpl, shuffled(smpl.read_bytes())))
+    after_hashing(monkeypatch, lambda: overwrite(smpl, shuffled(smpl.read_bytes())))
     made = body_setup_from_files(smpl, (uv,))
     assert made.body.template.equal(setup.body.template)
     assert made.files.smpl.sha256 == fingerprints.smpl.sha256 != hashlib.sha256(smpl.read_bytes()).hexdigest()

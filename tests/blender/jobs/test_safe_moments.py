@@ -118,6 +118,21 @@ def test_nothing_is_changed_within_a_modal_operator(addon, monkeypatch):
     assert len(humans(bpy.context.scene)) == 1
 
 
+def test_steps_that_wait_behind_slow_redraws_are_waited_for(addon, resting_at_once, monkeypatch):
+    timers = SimpleNamespace(register=lambda *_, **__: None, is_registered=lambda _: True)
+    app = SimpleNamespace(background=False, timers=timers, is_job_running=lambda _kind: False)
+    monkeypatch.setattr(windows, "bpy", SimpleNamespace(app=app, context=bpy.context))
+    for _ in range(3):
+        windows.note_undo()
+        assert windows._look_for_more() is not None, "the timer between this step and the next"
+        assert windows.in_the_way() == "undo"
+    assert windows._look_for_more() is None
+    assert windows.in_the_way() == ""
+    windows.note_undo()
+    windows.forget_undo()
+    assert windows.in_the_way() == "", "another file"
+
+
 def test_another_file_does_not_wait_for_the_undo_of_the_last_one(addon, monkeypatch):
     monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
     steps("one", "two")
