@@ -168,8 +168,16 @@ def keep_writing() -> None:
 
 
 def _bring_here() -> None:
-    if any_humans():
+    if any_humans() and not missing_packages():
         late_volumes.bring_here()
+
+
+def _bring_here_soon() -> float | None:
+    """The timer: paths of volumes change, which must not happen while steps of undo wait."""
+    if in_the_way():
+        return BLOCKED_S
+    _bring_here()
+    return None
 
 
 def _tick() -> float | None:
@@ -178,8 +186,11 @@ def _tick() -> float | None:
 
 @persistent
 def write_soon(*_: object) -> None:
-    """Handler of save_post, undo_post, redo_post and blend_import_post, after which other files may be wanted."""
-    _bring_here()
+    """Handler of save_post, undo_post and redo_post, after which other files may be wanted."""
+    if bpy.app.background:
+        _bring_here()
+    elif not bpy.app.timers.is_registered(_bring_here_soon):
+        bpy.app.timers.register(_bring_here_soon, persistent=True)
     keep_writing()
 
 
@@ -187,7 +198,6 @@ def write_soon(*_: object) -> None:
 def write_after_loading(*_: object) -> None:
     """Handler of load_post."""
     late_volumes.forget_failures()
-    _bring_here()
     write_after_importing()
 
 
@@ -225,7 +235,8 @@ HANDLERS = (
 
 
 def unregister() -> None:
-    """Stop the timer."""
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
+    """Stop the timers."""
+    for timer in (_tick, _bring_here_soon):
+        if bpy.app.timers.is_registered(timer):
+            bpy.app.timers.unregister(timer)
     late_volumes.stop()

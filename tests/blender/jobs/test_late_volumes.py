@@ -196,3 +196,15 @@ def test_several_humans_are_written_one_after_another(hidden):
         assert time.monotonic() - began < 60
     for person in people:
         check_complete(person)
+
+
+def test_paths_change_after_undo_only_once_it_rests(person, monkeypatch):
+    brought = []
+    monkeypatch.setattr(late_volumes, "bring_here", lambda: brought.append(True))
+    monkeypatch.setattr(windows, "_last_undo", time.monotonic())
+    monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
+    assert module._bring_here_soon() == module.BLOCKED_S
+    assert not brought
+    monkeypatch.setattr(windows, "_last_undo", -math.inf)
+    assert module._bring_here_soon() is None
+    assert brought
