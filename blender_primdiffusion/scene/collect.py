@@ -312,7 +312,8 @@ def _of_person(
     any; new names are added to `names`."""
     near = folders_of(person)
     volume = next((obj.data for obj in person.all_objects if obj.type == "VOLUME"), None)
-    if volume not in moved if volume is not None else person.library is not None:
+    stays = person.library is not None if volume is None else volume not in moved
+    if stays:
         return {}
     home, copies = target / bpy.path.clean_name(person.name) if volume is None else moved[volume].parent, {}
     name = person_file_name(person)
