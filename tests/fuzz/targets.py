@@ -72,7 +72,8 @@ def make_checkpoint(folder: Path) -> Path:
 
 
 def read_checkpoint(path: Path) -> None:
-    from primdiffusion.diffusion.checkpoint import load_checkpoint, model_card
+    from primdiffusion.diffusion.checkpoint import load_checkpoint
+    from primdiffusion.diffusion.model_card import model_card
     from primdiffusion.human import generate
 
     model = load_checkpoint(path)

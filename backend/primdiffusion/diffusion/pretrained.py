@@ -14,12 +14,12 @@ from primdiffusion.diffusion.checkpoint import (
     FORMAT,
     CheckpointError,
     load_checkpoint,
-    model_card,
     read_card,
     read_metadata,
     save_checkpoint,
 )
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.schedule import schedule_name
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import read_regular

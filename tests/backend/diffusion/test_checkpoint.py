@@ -9,12 +9,12 @@ from primdiffusion.diffusion.checkpoint import (
     CheckpointError,
     default_checkpoint,
     load_checkpoint,
-    model_card,
     read_card,
     save_checkpoint,
 )
 from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES, WholeSlab
 from primdiffusion.diffusion.model import DiffusionModel, sample
+from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from safetensors import safe_open

@@ -5,8 +5,9 @@ import json
 
 import pytest
 import torch
-from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint, model_card, read_card
+from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint, read_card
 from primdiffusion.diffusion.model import DiffusionModel, sample
+from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.schedule import linear
 from tiny_model import save_tiny_checkpoint, tiny_model
 

@@ -9,10 +9,11 @@ import pytest
 import torch
 from diffuse_runs import make_small
 from diffusion_people import small_model, write_people
-from primdiffusion.diffusion.checkpoint import load_checkpoint, model_card, read_card, save_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint, read_card, save_checkpoint
 from primdiffusion.diffusion.codec import cells_from_voxels
 from primdiffusion.diffusion.detail import DetailCodec, DetailConfig
 from primdiffusion.diffusion.model import sample
+from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.training.config import CodecConfig, PhaseConfig
 from primdiffusion.training.detail import DetailTrainingConfig, train_detail
 from primdiffusion.training.stored_people import read_person

@@ -16,7 +16,8 @@ import torch
 from diffuse_runs import DEFAULT_FILES, TINY_UNET, child_environment, logged, make_small, rows, settings
 from diffusion_people import write_people
 from PIL import Image
-from primdiffusion.diffusion.checkpoint import load_checkpoint, model_card
+from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.failures import describe
 from primdiffusion.human import generate
 from primdiffusion.training import phase, slabs
