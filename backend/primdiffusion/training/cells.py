@@ -99,7 +99,7 @@ def _encoded(
     """Latents to train on and held-out ones."""
     latents, unseen = (encode_people(people, indices, codec, vocabulary) for indices in (train, held))
     if more is not None:
-        latents = latents.and_blurred(encode_people(more, range(len(more.names)), codec, vocabulary))
+        latents = latents.and_blurred(encode_people(more, range(len(more.names)), codec, vocabulary), codec)
     return latents, unseen
 
 

@@ -11,11 +11,8 @@ from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.training.config import PriorConfig
-from primdiffusion.training.latents import LatentSet
+from primdiffusion.training.latents import CHUNK, LatentSet
 from primdiffusion.training.mixture import fit_mixture
-
-CHUNK = 256
-"""Samples whose latents are in float32 at once."""
 
 
 def fit_prior(
