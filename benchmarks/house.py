@@ -9,12 +9,10 @@ The source is parsed, never imported. The items counted are printed above the fi
 from __future__ import annotations
 
 import ast
-import io
 import json
 import subprocess
 import sys
 import tempfile
-import tokenize
 from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -29,8 +27,6 @@ TESTS = {"backend": ROOT / "tests" / "backend", "extension": ROOT / "tests" / "b
 SUITE = ROOT / "docs" / "results" / "suite.json"
 THREAD_MODULES = {"threading", "_thread", "concurrent.futures", "multiprocessing"}
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
-NO_REASON = ("noqa", "type:", "fmt:", "pyright:")
-"""Comments for tools, not for readers."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +34,6 @@ class Import:
     targets: tuple[str, ...]
     """Dotted names; `from a import b` gives a.b, which may be a module or a name defined in a."""
     first_line: int
-    last_line: int
     in_function: bool
 
 
@@ -118,7 +113,7 @@ def sizes(modules: list[Module]) -> dict[str, float | None]:
 
 
 def import_circles(modules: list[Module]) -> list[str]:
-    """Groups of modules that import each other at module level, in functions or under `if TYPE_CHECKING`.
+    """Groups of modules that import each other: at module level, in functions, by `importlib`, for type checking.
 
     Parent packages that an import loads on its way to a module are not counted.
     """
@@ -132,18 +127,13 @@ def import_circles(modules: list[Module]) -> list[str]:
 
 
 def hidden_imports(modules: list[Module]) -> list[str]:
-    """Imports in functions without an explaining comment beside or above them, or above the group they belong to."""
-    found = []
-    for module in modules:
-        comments = _comments(module.source)
-        explained_line = -1
-        for each in sorted((i for i in module.imports if i.in_function), key=lambda i: i.first_line):
-            above = comments.get(each.first_line - 1, (True, False)) == (False, True)
-            if above or explained_line == each.first_line - 1:
-                explained_line = each.last_line
-            elif not any(line in comments for line in range(each.first_line, each.last_line + 1)):
-                found.append(f"{module.path.relative_to(ROOT)}:{each.first_line} {', '.join(each.targets)}")
-    return found
+    """Imports in functions, whatever a comment says of them; `importlib.import_module` counts too."""
+    return [
+        f"{module.path.relative_to(ROOT)}:{each.first_line} {', '.join(each.targets)}"
+        for module in modules
+        for each in sorted(module.imports, key=lambda each: each.first_line)
+        if each.in_function
+    ]
 
 
 def threads_in_extension(modules: list[Module]) -> list[str]:
@@ -199,10 +189,13 @@ def walk() -> Mapping[str, float | None]:
 def _imports(tree: ast.AST, package: str, in_function: bool = False) -> Iterator[Import]:
     for node in ast.iter_child_nodes(tree):
         if isinstance(node, ast.Import | ast.ImportFrom):
-            targets = tuple(_targets(node, package))
-            yield Import(targets, node.lineno, node.end_lineno or node.lineno, in_function)
-        else:
-            yield from _imports(node, package, in_function or isinstance(node, FUNCTIONS))
+            yield Import(tuple(_targets(node, package)), node.lineno, in_function)
+            continue
+        if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module"):
+            name = node.args[0]
+            target = name.value if isinstance(name, ast.Constant) else ast.unparse(name)
+            yield Import((str(target),), node.lineno, in_function)
+        yield from _imports(node, package, in_function or isinstance(node, FUNCTIONS))
 
 
 def _targets(node: ast.Import | ast.ImportFrom, package: str) -> Iterator[str]:
@@ -212,18 +205,6 @@ def _targets(node: ast.Import | ast.ImportFrom, package: str) -> Iterator[str]:
     parents = package.split(".")[: len(package.split(".")) - node.level + 1] if node.level else []
     origin = ".".join([*parents, *([node.module] if node.module else [])])
     yield from (f"{origin}.{alias.name}" for alias in node.names)
-
-
-def _comments(source: str) -> dict[int, tuple[bool, bool]]:
-    """Lines with a comment for readers -> (code before it, True)."""
-    found = {}
-    for token in tokenize.generate_tokens(io.StringIO(source).readline):
-        words = token.string.lstrip("# ")
-        if token.type == tokenize.COMMENT:
-            reason = words.partition("  ")[2] if words.startswith(NO_REASON) else words
-            if reason:
-                found[token.start[0]] = (bool(token.line[: token.start[1]].strip()), True)
-    return found
 
 
 def _circles(graph: Mapping[str, set[str]]) -> list[set[str]]:

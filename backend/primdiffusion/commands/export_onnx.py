@@ -26,13 +26,13 @@ class ExportOnnx:
             raise ValueError(f"out is {self.out}: give a name that ends in .onnx")
 
     def export(self) -> None:
-        """Export, and print the path. Raises as `from_pretrained` and `export_denoiser`."""
+        """Export, and print the path. Raises as `load_pretrained` and `export_denoiser`."""
         # torch is loaded late
         from primdiffusion.diffusion.checkpoint import default_checkpoint
-        from primdiffusion.diffusion.model import DiffusionModel
+        from primdiffusion.diffusion.pretrained import load_pretrained
         from primdiffusion.export.denoiser_onnx import export_denoiser
 
-        export_denoiser(self.out, DiffusionModel.from_pretrained(self.checkpoint or default_checkpoint()))
+        export_denoiser(self.out, load_pretrained(self.checkpoint or default_checkpoint()))
         print(self.out)
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -75,22 +73,6 @@ class DiffusionModel:
     """Descending t that a sampler visits, from the schedule's length and the number of steps."""
     body_setup: BodySetup | None = None
     """Body and anchors of the humans it generates; None is the default body."""
-
-    @classmethod
-    def from_pretrained(cls, path: Path | str, device: torch.device | str = "cpu") -> DiffusionModel:
-        """Load a model from a checkpoint, a folder of `save_pretrained`, or a repository in a local hub cache.
-
-        Downloads nothing. Raises FileNotFoundError without such a file or folder, and CheckpointError (a ValueError)
-        for a folder without a model, several snapshots without a main branch, or a damaged checkpoint.
-        """
-        return _pretrained().load_pretrained(path, device)
-
-    def save_pretrained(self, folder: Path | str) -> Path:
-        """Write model.safetensors, config.json and README.md (the model card), all or none; returns the folder.
-
-        Raises ValueError for a model imported from the released weights, and OSError.
-        """
-        return _pretrained().save_pretrained(self, folder)
 
     @property
     def device(self) -> torch.device:
@@ -181,10 +163,6 @@ class DiffusionModel:
             coefficients, _ = self.denoiser.prior.split(x0)
             features = (coefficients / self.denoiser.component_std)[:, :wanted]
         return self.shapes.sample(features, [seeded(seed) for seed in seeds])
-
-
-def _pretrained() -> Any:
-    return importlib.import_module("primdiffusion.diffusion.pretrained")  # late: it imports this module
 
 
 def sample(

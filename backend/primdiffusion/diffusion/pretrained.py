@@ -33,7 +33,8 @@ _LICENCE = re.compile(r"[A-Za-z0-9.+-]+", re.ASCII)
 def load_pretrained(path: Path | str, device: torch.device | str = "cpu") -> DiffusionModel:
     """Load a model from a checkpoint, a folder of `save_pretrained`, or a repository in a local hub cache.
 
-    Errors as in `load_checkpoint`; CheckpointError also for a folder without a model.
+    Downloads nothing. Errors as in `load_checkpoint`; FileNotFoundError also without such a folder, CheckpointError for
+    a folder without a model or with several snapshots and no main branch.
     """
     path = Path(path)
     if not path.exists():

@@ -6,8 +6,9 @@ import json
 import pytest
 import torch
 from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint, read_card
-from primdiffusion.diffusion.model import DiffusionModel, sample
+from primdiffusion.diffusion.model import sample
 from primdiffusion.diffusion.model_card import model_card
+from primdiffusion.diffusion.pretrained import load_pretrained, save_pretrained
 from primdiffusion.diffusion.schedule import linear
 from tiny_model import save_tiny_checkpoint, tiny_model
 
@@ -33,9 +34,9 @@ def hub(folder, *commits, main=None):
 
 def test_a_saved_folder_loads_as_the_same_model(tmp_path):
     loaded = load_checkpoint(save_tiny_checkpoint(tmp_path / "tiny.safetensors"))
-    folder = loaded.save_pretrained(tmp_path / "folder")
+    folder = save_pretrained(loaded, tmp_path / "folder")
     assert sorted(path.name for path in folder.iterdir()) == ["README.md", "config.json", "model.safetensors"]
-    again = DiffusionModel.from_pretrained(folder)
+    again = load_pretrained(folder)
     assert torch.equal(drawn(again), drawn(loaded))
     assert again.vocabulary == loaded.vocabulary
     config = json.loads((folder / "config.json").read_text())
@@ -46,7 +47,7 @@ def test_a_saved_folder_loads_as_the_same_model(tmp_path):
 
 
 def test_the_readme_is_the_card_of_the_default_checkpoint(tmp_path):
-    folder = load_checkpoint().save_pretrained(tmp_path / "default")
+    folder = save_pretrained(load_checkpoint(), tmp_path / "default")
     card = (folder / "README.md").read_text()
     assert "license: cc0-1.0" in card
     assert card.split("---\n", 2)[2].split("sha256")[0] == model_card(read_card()).split("sha256")[0]
@@ -54,9 +55,9 @@ def test_the_readme_is_the_card_of_the_default_checkpoint(tmp_path):
 
 @pytest.mark.parametrize(("commits", "main"), [((COMMIT, "other"), COMMIT + "\n"), ((COMMIT,), None)])
 def test_a_repository_of_a_hub_cache_loads_its_main_or_only_snapshot(tmp_path, commits, main):
-    model = DiffusionModel.from_pretrained(hub(tmp_path / "models--us--tiny", *commits, main=main))
+    model = load_pretrained(hub(tmp_path / "models--us--tiny", *commits, main=main))
     assert model.card["name"] == "tiny"
-    assert DiffusionModel.from_pretrained(tmp_path / "models--us--tiny" / "snapshots" / COMMIT).card == model.card
+    assert load_pretrained(tmp_path / "models--us--tiny" / "snapshots" / COMMIT).card == model.card
 
 
 @pytest.mark.parametrize(
@@ -69,12 +70,12 @@ def test_a_repository_of_a_hub_cache_loads_its_main_or_only_snapshot(tmp_path, c
 )
 def test_a_folder_without_one_model_is_refused(tmp_path, commits, main, word):
     with pytest.raises(CheckpointError, match=word):
-        DiffusionModel.from_pretrained(hub(tmp_path / "models--us--tiny", *commits, main=main))
+        load_pretrained(hub(tmp_path / "models--us--tiny", *commits, main=main))
 
 
 def test_a_name_on_the_hub_is_not_downloaded():
     with pytest.raises(FileNotFoundError, match="hf download"):
-        DiffusionModel.from_pretrained("owner/name")
+        load_pretrained("owner/name")
 
 
 def test_models_that_a_folder_cannot_hold_are_refused_and_leave_nothing(tmp_path):
@@ -83,5 +84,5 @@ def test_models_that_a_folder_cannot_hold_are_refused_and_leave_nothing(tmp_path
     imported = dataclasses.replace(tiny_model(), body_setup=object())
     for model, word in ((unnamed, "no name"), (imported, "your body file")):
         with pytest.raises(ValueError, match=word):
-            model.save_pretrained(tmp_path / "folder")
+            save_pretrained(model, tmp_path / "folder")
     assert not (tmp_path / "folder").exists()
