@@ -40,6 +40,18 @@ def installed_backend() -> Path | None:
     return Path(found) if found else None
 
 
+def backend_is_named() -> bool:
+    """Whether there is a backend to try. The viewer has none until the user has installed one."""
+    if backend_module_path() is not None:
+        return True
+    own = environment.own_python_has_backend()
+    try:
+        named = environment.candidates(preference("backend_python"), None, installed_backend(), own_python=own)
+        return next(named, None) is not None
+    except environment.BackendNotFound:
+        return True  # a wrong preference: trying says what is wrong
+
+
 def body_data(name: str) -> Path:
     """body.npz or layout.npz of the default body, which every build has. Raises FileNotFoundError."""
     root = Path(__file__).resolve().parent

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 
+from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import in_words, sentence
-from ..places import missing_packages
+from ..places import backend_is_named, missing_packages
 from .late_volumes import keep_writing
 from .memory import release_when_idle
 from .picture_in_view import follow_picture
@@ -194,8 +195,11 @@ class Reporting:
 def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -> set[str]:
     """Queue `job` for the scene of `context`; with a window a timer follows it, in background mode this waits.
 
-    A job whose result could not be shown is rejected.
+    A job whose result could not be shown is rejected, and one that needs a backend where there is none.
     """
+    if type(job).result_here is Job.result_here and not backend_is_named():
+        operator.report({"ERROR"}, sentence(NOT_INSTALLED))
+        return {"CANCELLED"}
     if job.undo and (lacking := missing_packages()):
         operator.report({"ERROR"}, sentence(lacking))
         return {"CANCELLED"}

@@ -13,7 +13,7 @@ from ..jobs.follow import building, in_the_way
 from ..jobs.pictures import so_far
 from ..jobs.queue import JobOutcome, queue
 from ..jobs.remedies import remedy_for
-from ..places import EXTENSION
+from ..places import EXTENSION, backend_is_named
 from .manual import draw_manual_button
 
 CREATE, HUMAN, OUTPUT, CAPTURES = (f"PrimDiffusion {task}" for task in ("Create", "Human", "Output", "Captures"))
@@ -39,6 +39,14 @@ class SidebarPanel:
     def draw_header_preset(self, _context: bpy.types.Context) -> None:
         if self.manual_page:
             draw_manual_button(self.layout, self.manual_page, self.manual_section)
+
+
+class BackendPanel(SidebarPanel):
+    """A panel of what only the backend can do: the viewer shows it once the user has installed one."""
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return backend_is_named()
 
 
 def property_columns(layout: bpy.types.UILayout) -> bpy.types.UILayout:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..jobs.target import selected_person
+from ..places import INSTALLS_BACKEND
 from . import gallery
 from .drawing import OUTPUT, SidebarPanel, draw_job, draw_lines, property_columns
 
@@ -29,12 +30,11 @@ class PRIMDIFFUSION_PT_from_file(SidebarPanel, bpy.types.Panel):
 
     bl_label = "From File"
     bl_order = 2
-    bl_options = set() if gallery.items() else {"DEFAULT_CLOSED"}
+    bl_options = {"DEFAULT_CLOSED"} if INSTALLS_BACKEND else set()
     manual_page, manual_section = "export", "human-files"
 
     def draw(self, _context: bpy.types.Context) -> None:
-        if gallery.items():
-            self.layout.operator_menu_enum("primdiffusion.add_from_gallery", "human", icon="COMMUNITY")
+        gallery.draw_samples(self.layout)
         draw_job(self.layout, "import_human", "primdiffusion.import_human", "IMPORT")
 
 

@@ -1,4 +1,4 @@
-"""Add from Gallery: the humans that come with the extension, in builds that have any."""
+"""Add Sample Human: the humans that come with the extension, which need no backend."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class PRIMDIFFUSION_OT_add_from_gallery(Reporting, bpy.types.Operator):
     """Add a human that comes with the extension, at the 3D cursor; its data are in the public domain (CC0)"""
 
     bl_idname = "primdiffusion.add_from_gallery"
-    bl_label = "Add from Gallery"
+    bl_label = "Add Sample Human"
 
     human: bpy.props.EnumProperty(
         name="Human", description="Which human of the gallery", items=_items, options={"SKIP_SAVE"}
@@ -38,3 +38,11 @@ class PRIMDIFFUSION_OT_add_from_gallery(Reporting, bpy.types.Operator):
         if not self.human:
             raise ValueError("this build of the extension has no gallery: choose Import Human File")
         return submit(self, context, ImportHumanJob(str(FOLDER / self.human)))
+
+
+def draw_samples(layout: bpy.types.UILayout) -> None:
+    """The button, or a menu of several."""
+    if len(items()) > 1:
+        layout.operator_menu_enum("primdiffusion.add_from_gallery", "human", icon="COMMUNITY")
+    elif items():
+        layout.operator("primdiffusion.add_from_gallery", icon="COMMUNITY").human = items()[0][0]

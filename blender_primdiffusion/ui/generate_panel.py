@@ -19,7 +19,8 @@ from ..jobs.queue import queue
 from ..scene.human import humans
 from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
 from .backend_state import draw_set_up
-from .drawing import SidebarPanel, draw_job, draw_lines, property_columns
+from .drawing import BackendPanel, SidebarPanel, draw_job, draw_lines, property_columns
+from .gallery import draw_samples
 from .manual import draw_manual_button
 from .presets import read_preset
 from .render_panel import draw_next_step
@@ -282,7 +283,7 @@ def _queued_seeds() -> set[int]:
     return {entry.job.seed for entry in queue.queued if entry.job.kind == "generate"}
 
 
-class PRIMDIFFUSION_PT_generate(SidebarPanel, bpy.types.Panel):
+class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
     """Seed, quality, Generate; progress and errors."""
 
     bl_label = "Generate"
@@ -294,7 +295,10 @@ class PRIMDIFFUSION_PT_generate(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = property_columns(self.layout), context.scene.primdiffusion
-        reason = "" if draw_set_up(layout) else "Set up the backend first"
+        ready = draw_set_up(layout)
+        if not ready:
+            draw_samples(layout)
+        reason = "" if ready else "Set up the backend first"
         column = layout.column()
         row = column.row(align=True)
         row.prop(settings, "seed")

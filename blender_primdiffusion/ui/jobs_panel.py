@@ -18,7 +18,7 @@ from ..jobs.picture_in_view import follow_picture
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
-from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
+from .drawing import BackendPanel, SidebarPanel, draw_ended, draw_lines, draw_queue
 
 TEXT = "PrimDiffusion Diagnostics"
 _LOG_LINES = 60
@@ -188,7 +188,7 @@ class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
         draw_ended(self.layout)
 
 
-class PRIMDIFFUSION_PT_backend(SidebarPanel, bpy.types.Panel):
+class PRIMDIFFUSION_PT_backend(BackendPanel, bpy.types.Panel):
     """What computes, and what to do when it does not."""
 
     bl_label = "Backend"

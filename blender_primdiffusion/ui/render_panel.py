@@ -16,6 +16,7 @@ from ..formats.requests import DENSITY_GAIN, VOXEL
 from ..jobs import cycles_check
 from ..jobs.follow import Reporting
 from ..jobs.target import selected_person
+from ..places import backend_is_named
 from ..scene.attachment import MODES, attachment_of, in_viewport
 from ..scene.human import human_of, humans
 from ..scene.material import density_gain, set_density_gain
@@ -162,6 +163,12 @@ class PRIMDIFFUSION_OT_set_up_engine(bpy.types.Operator):
     bl_label = "PrimDiffusion (Exact)"
     bl_options = {"UNDO"}
 
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if not backend_is_named():
+            cls.poll_message_set("Rendering with it needs the backend; name yours in the extension's preferences")
+        return backend_is_named()
+
     def execute(self, context: bpy.types.Context) -> set[str]:
         context.scene.render.engine = ENGINE
         _plain_colours(context.scene)
@@ -241,7 +248,9 @@ def how_shown(scene: bpy.types.Scene) -> str:
 def draw_next_step(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """The button that leads to a picture: an engine that shows humans as they are, a camera, the render."""
     engine = scene.render.engine
-    if engine not in (ENGINE, "CYCLES"):
+    if engine not in (ENGINE, "CYCLES") and not backend_is_named():
+        layout.operator("primdiffusion.set_up_cycles", text="Switch to Cycles", icon="SHADING_TEXTURE")
+    elif engine not in (ENGINE, "CYCLES"):
         layout.operator("primdiffusion.set_up_engine", text="Switch to PrimDiffusion Engine", icon="SHADING_RENDERED")
     elif scene.camera is None:
         layout.operator("primdiffusion.add_camera", icon="CAMERA_DATA")

@@ -17,7 +17,7 @@ from ..jobs.late_volumes import keep_writing
 from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
-from .drawing import SidebarPanel, draw_job, property_columns, row_unless
+from .drawing import BackendPanel, draw_job, property_columns, row_unless
 from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed
 
 if TYPE_CHECKING:
@@ -267,7 +267,7 @@ _UNIT_PX = 20
 """Of Blender's interface at a scale of 1: what `template_icon` counts in."""
 
 
-class PRIMDIFFUSION_PT_variations(SidebarPanel, bpy.types.Panel):
+class PRIMDIFFUSION_PT_variations(BackendPanel, bpy.types.Panel):
     """Humans to choose from."""
 
     bl_label = "Variations"

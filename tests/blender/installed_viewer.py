@@ -64,6 +64,14 @@ try:
     press.generate(seed=7)
 except RuntimeError as error:
     report["generate"] = str(error)
+panels = ("generate", "variations", "from_file", "human", "render", "backend")
+polls = {name: getattr(getattr(bpy.types, f"PRIMDIFFUSION_PT_{name}"), "poll", None) for name in panels}
+report["panels"] = [name for name, poll in polls.items() if poll is None or poll(bpy.context)]
+report["may render"] = press.set_up_engine.poll()
+try:
+    press.export_mesh(filepath=str(folder / "mesh.glb"))
+except RuntimeError as error:
+    report["export_mesh"] = str(error)
 if program is not None:
     os.environ["PATH"] = str(program.parent)
     report["generated"] = [sorted(press.generate(seed=7, steps=2))]

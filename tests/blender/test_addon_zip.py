@@ -41,7 +41,7 @@ def test_the_zip_holds_addon_backend_and_licence_and_nothing_stray(archive):
     names = zipfile.ZipFile(archive).namelist()
     assert names == sorted(names)
     wanted = {"blender_manifest.toml", "__init__.py", "LICENSE", "backend/client.py", "scene/human.py"}
-    wanted |= {"bundled/primdiffusion/human.py", "bundled/primdiffusion/body/data/body.npz"}
+    wanted |= {"gallery/Sample.human", "bundled/primdiffusion/human.py", "bundled/primdiffusion/body/data/body.npz"}
     assert wanted <= set(names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".nbi", ".nbc"))]
     assert WEIGHTS.is_file() == ("bundled/primdiffusion/weights/default.safetensors" in names)

@@ -47,7 +47,7 @@ def test_the_zip_is_small_whole_and_accepted(archive):
         manifest, names = tomllib.loads(made.read("blender_manifest.toml").decode()), set(made.namelist())
     assert list(manifest["permissions"]) == ["files"]
     assert len(manifest["permissions"]["files"]) <= 64
-    assert {"LICENSE", "gallery/Ada.human", "bundled/primdiffusion/formats/arrays.py"} <= names
+    assert {"LICENSE", "gallery/Ada.human", "gallery/Sample.human", "bundled/primdiffusion/formats/arrays.py"} <= names
     assert not [name for name in names if name.endswith((".safetensors", ".txt"))]
     assert not [name for name in names if name.startswith(("ui/setup", "requirements"))]
 
@@ -112,6 +112,14 @@ def test_its_export_is_compact_and_comes_back(used):
 def test_generate_without_a_backend_says_in_one_sentence_what_to_do(used):
     report, _ = used
     assert report["generate"].removeprefix("Error: ").strip().rstrip(".").lower() == NOT_INSTALLED.lower()
+
+
+def test_what_needs_a_backend_is_not_shown_and_says_so_when_a_script_asks(used):
+    report, folder = used
+    assert report["panels"] == ["from_file", "human", "render"]
+    assert not report["may render"]
+    assert report["export_mesh"].removeprefix("Error: ").strip().rstrip(".").lower() == NOT_INSTALLED.lower()
+    assert not (folder / "mesh.glb").exists()
 
 
 @pytest.mark.slow
