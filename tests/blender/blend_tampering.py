@@ -281,7 +281,7 @@ def panels_fault() -> str:
         try:
             if hasattr(cls, "poll") and not cls.poll(bpy.context):
                 continue
-            texts = sidebar.draw(cls, bpy.context).texts
+            texts = sidebar.draw(cls, bpy.context, opened=True).texts
         except Exception as error:
             return f"{cls.__name__} raises {error!r:.200}"
         for text in texts:
@@ -295,8 +295,9 @@ def _menus() -> list[type]:
 
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
-    ("set_attachment", {"mode": "ARMATURE"}), ("reset_shape", {}), ("collect_files", {}), ("find_missing_volumes", {}),
-    ("human_from_captures", {}), ("verify_captures", {}), ("remove_proxy", {}), ("unmerge", {}),
+    ("set_attachment", {"mode": "ARMATURE"}), ("reshape", {"to": "GENERATED"}), ("collect_files", {}), ("find_missing_volumes", {}),
+    ("human_from_captures", {}), ("verify_captures", {}), ("show_proxy", {"shown": "REMOVED"}),
+    ("merge", {"what": "NOTHING"}),
     ("remove_unused_files", {}),
 )  # fmt: skip
 """Pressed one after the other; those that need the backend are what `edit_fault` does with its result."""

@@ -49,7 +49,7 @@ def rendered(tmp_path) -> dict:
 
 
 def test_a_human_becomes_an_asset_with_tags_and_a_preview(person, tmp_path):
-    assert ops.mark_human_as_asset() == {"FINISHED"}
+    assert ops.mark_as_asset() == {"FINISHED"}
     about = person.asset_data
     assert about.description == "Generated human, seed 0, sex female, height 1.7"
     assert {tag.name for tag in about.tags} == {"human", "female"}
@@ -61,14 +61,14 @@ def test_a_human_becomes_an_asset_with_tags_and_a_preview(person, tmp_path):
 
 
 def test_a_given_preview_needs_no_backend(person, tmp_path):
-    assert ops.mark_human_as_asset(picture=str(PICTURE)) == {"FINISHED"}
+    assert ops.mark_as_asset(picture=str(PICTURE)) == {"FINISHED"}
     assert preview(person).max() > 0
     assert not (tmp_path / "rendered.json").exists()
 
 
 def test_one_undo_makes_it_an_ordinary_collection_again(person):
     bpy.ops.ed.undo_push(message="before")
-    ops.mark_human_as_asset(human="Human")
+    ops.mark_as_asset(human="Human")
     bpy.ops.ed.undo()
     assert humans(bpy.context.scene)[0].asset_data is None
     bpy.ops.ed.redo()
@@ -78,7 +78,7 @@ def test_one_undo_makes_it_an_ordinary_collection_again(person):
 def test_unmarking_leaves_the_person(person):
     with pytest.raises(RuntimeError, match="'Human'"):
         ops.unmark_human_asset()
-    ops.mark_human_as_asset(picture=str(PICTURE))
+    ops.mark_as_asset(picture=str(PICTURE))
     assert ops.unmark_human_asset() == {"FINISHED"}
     assert person.asset_data is None
     assert humans(bpy.context.scene) == [person]
@@ -86,7 +86,7 @@ def test_unmarking_leaves_the_person(person):
 
 @pytest.mark.parametrize("link", [False, True])
 def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, tmp_path, link):
-    ops.mark_human_as_asset(picture=str(PICTURE))
+    ops.mark_as_asset(picture=str(PICTURE))
     bpy.ops.wm.save_mainfile()
     library = bpy.data.filepath
     (tmp_path / "elsewhere").mkdir()
@@ -105,7 +105,7 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
     assert (person.library is not None) == link
     if link:
         with pytest.raises(RuntimeError, match="is linked from"):
-            ops.mark_human_as_asset(picture=str(PICTURE))
+            ops.mark_as_asset(picture=str(PICTURE))
         with pytest.raises(RuntimeError, match="unmark it there"):
             ops.unmark_human_asset()
 
@@ -113,7 +113,7 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
 def test_a_pose_becomes_an_action_that_gives_it_to_any_human(person, tmp_path):
     armature = armature_of(person)
     pose_from_joint_rotations(armature, waving())
-    assert ops.mark_pose_as_asset(name="Waving") == {"FINISHED"}
+    assert ops.mark_as_asset(what="POSE", name="Waving") == {"FINISHED"}
     action = bpy.data.actions["Waving"]
     assert {tag.name for tag in action.asset_data.tags} == {"pose", "Human"}
     assert preview(action).max() > 0
@@ -130,7 +130,7 @@ def test_marking_a_pose_leaves_the_active_action(person):
     armature = armature_of(person)
     armature.keyframe_insert("location", frame=3)
     action, slot = armature.animation_data.action, armature.animation_data.action_slot
-    ops.mark_pose_as_asset(picture=str(PICTURE))
+    ops.mark_as_asset(what="POSE", picture=str(PICTURE))
     assert (armature.animation_data.action, armature.animation_data.action_slot) == (action, slot)
     assert bpy.data.actions["Pose"].asset_data is not None
 
@@ -167,9 +167,9 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "file").write_text("")
     rejected = {
-        "cannot be read as a picture": lambda: ops.mark_human_as_asset(picture=str(tmp_path / "text.png")),
-        "cannot be read as a picture:": lambda: ops.mark_pose_as_asset(picture="/nowhere.png"),
-        "'Eve' is not in the scene": lambda: ops.mark_human_as_asset(human="Eve"),
+        "cannot be read as a picture": lambda: ops.mark_as_asset(picture=str(tmp_path / "text.png")),
+        "cannot be read as a picture:": lambda: ops.mark_as_asset(what="POSE", picture="/nowhere.png"),
+        "'Eve' is not in the scene": lambda: ops.mark_as_asset(human="Eve"),
         "[Nn]ot a directory|File exists": lambda: ops.make_pose_assets(directory=str(tmp_path / "file" / "deeper")),
     }
     for sentence, call in rejected.items():
@@ -180,7 +180,7 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     assert person.asset_data is None
     person_file(person).unlink()
     with pytest.raises(RuntimeError, match="file of the human 'Human' is missing"):
-        ops.mark_human_as_asset()
+        ops.mark_as_asset()
 
 
 def test_the_panel_offers_what_makes_sense(person):
@@ -191,7 +191,7 @@ def test_the_panel_offers_what_makes_sense(person):
         return {call.args[0].partition(".")[2] for call in layout.operator.call_args_list}
 
     assert buttons() == {"mark_human_as_asset", "mark_pose_as_asset", "make_pose_assets"}
-    ops.mark_human_as_asset(picture=str(PICTURE))
+    ops.mark_as_asset(picture=str(PICTURE))
     assert buttons() == {"unmark_human_asset", "mark_pose_as_asset", "make_pose_assets"}
 
 

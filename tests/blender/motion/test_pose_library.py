@@ -91,11 +91,11 @@ def test_only_selected_bones_turn(addon, armature):
 
 def test_mirror_pose_and_reset(armature):
     ops.apply_pose(pose_name="Waving")
-    ops.mirror_pose()
+    ops.apply_pose(what="MIRRORED")
     np.testing.assert_allclose(
         current_pose(armature)[0], from_axis_angle(mirrored(builtin_poses()["Waving"])), atol=1e-5
     )
-    assert ops.reset_pose() == {"FINISHED"}
+    assert ops.apply_pose(what="REST") == {"FINISHED"}
     np.testing.assert_allclose(current_pose(armature)[0], REST, atol=1e-5)
     np.testing.assert_allclose(current_pose(armature)[1], 0, atol=1e-6)
 
@@ -121,13 +121,13 @@ def test_a_saved_pose_is_in_the_library_and_comes_back_exactly(addon, armature, 
     rotations, translation = current_pose(armature)
     assert ops.save_pose(pose_name="Kniend, müde") == {"FINISHED"}
     assert addon.scene.primdiffusion_motion.pose == "Kniend, müde"
-    ops.reset_pose()
+    ops.apply_pose(what="REST")
     ops.apply_pose(pose_name="Kniend, müde")
     np.testing.assert_allclose(current_pose(armature)[0], rotations, atol=1e-5)
     np.testing.assert_allclose(current_pose(armature)[1], translation, atol=1e-5)
     with pytest.raises(RuntimeError, match="there is a pose 'Kniend, müde' already"):
         ops.save_pose(pose_name="Kniend, müde")
-    assert ops.delete_pose(pose_name="Kniend, müde") == {"FINISHED"}
+    assert ops.save_pose(delete=True, pose_name="Kniend, müde") == {"FINISHED"}
     assert addon.scene.primdiffusion_motion.pose == "T"
     assert not list((tmp_path / "eigene Dateien").rglob("*.*"))
     with pytest.raises(RuntimeError, match="no pose 'Kniend, müde' in the library"):
@@ -156,7 +156,7 @@ def test_a_saved_pose_has_a_picture_of_itself_at_once(addon, armature, tmp_path)
     assert previews_of("mine")
     ops.save_pose(pose_name="another, before it")
     assert {item[0]: item for item in pose_panel.pose_items(None, addon)}["mine"][4] == items["mine"][4]
-    ops.delete_pose(pose_name="mine")
+    ops.save_pose(delete=True, pose_name="mine")
     assert not picture.exists()
 
 
@@ -165,7 +165,7 @@ def test_another_pose_of_the_same_name_has_another_picture(addon, armature):
         ops.apply_pose(pose_name=pose)
         ops.save_pose(pose_name="mine")
         pose_panel.pose_items(None, addon)
-        ops.delete_pose(pose_name="mine")
+        ops.save_pose(delete=True, pose_name="mine")
     assert len(previews_of("mine")) == 2
 
 
@@ -189,7 +189,7 @@ def test_names_that_cannot_be_are_rejected(armature, name):
 
 def test_a_built_in_pose_cannot_be_deleted(armature):
     with pytest.raises(RuntimeError, match="'T'"):
-        ops.delete_pose(pose_name="T")
+        ops.save_pose(delete=True, pose_name="T")
 
 
 @pytest.mark.parametrize(
@@ -221,7 +221,7 @@ def test_poses_of_wrong_shape_are_rejected(armature):
 def test_edit_mode_and_a_renamed_bone_are_rejected(addon, armature):
     addon.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode="EDIT")
-    for operator in (ops.apply_pose, ops.mirror_pose, ops.reset_pose, ops.key_pose):
+    for operator in (ops.apply_pose, ops.save_pose, ops.key_pose):
         with pytest.raises(RuntimeError, match="Edit Mode"):
             operator()
     bpy.ops.object.mode_set(mode="OBJECT")

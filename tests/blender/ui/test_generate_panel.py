@@ -122,7 +122,7 @@ def test_seeds_beyond_blenders_numbers_are_rejected(addon):
 
 def test_random_seed_puts_another_one_into_the_panel(panel_settings, monkeypatch):
     monkeypatch.setattr(random, "randrange", lambda end: end - 1)
-    assert bpy.ops.primdiffusion.random_seed() == {"FINISHED"}
+    assert bpy.ops.primdiffusion.set_seed() == {"FINISHED"}
     assert panel_settings.seed == 2**31 - 1
 
 
@@ -193,7 +193,7 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
     monkeypatch.setattr(generate_panel, "draw_set_up", lambda layout: layout.label(text="not set up"))
     texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
     assert texts[0] == "not set up"
-    assert {"primdiffusion.random_seed", "primdiffusion.generate"} <= set(texts)
+    assert {"primdiffusion.set_seed", "primdiffusion.generate"} <= set(texts)
 
 
 @pytest.mark.parametrize(

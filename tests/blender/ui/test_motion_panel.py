@@ -42,7 +42,7 @@ def test_a_strip_moves_the_person_as_the_action_did(addon, armature):
     ops.add_motion(motion="WAVE", rounds=1)
     addon.scene.frame_set(30)
     wanted = np.array(armature.pose.bones["right_elbow"].matrix)
-    ops.clear_motion()
+    ops.use_action(action="")
     ops.add_motion(motion="WAVE", rounds=1, into="STRIP")
     assert armature.animation_data.action is None
     (track,) = armature.animation_data.nla_tracks
@@ -78,11 +78,11 @@ def test_clear_motion_brings_the_rest_pose_and_keeps_the_action(addon, armature)
     ops.add_motion(motion="WAVE")
     name = armature.animation_data.action.name
     addon.scene.frame_set(40)
-    assert ops.clear_motion() == {"FINISHED"}
+    assert ops.use_action(action="") == {"FINISHED"}
     np.testing.assert_allclose(current_pose(armature)[0], np.tile(np.eye(3), (24, 1, 1)), atol=1e-5)
     assert bpy.data.actions[name].use_fake_user
     with pytest.raises(RuntimeError, match="has no motion to clear"):
-        ops.clear_motion()
+        ops.use_action(action="")
     assert ops.use_action(action=name) == {"FINISHED"}
     addon.scene.frame_set(40)
     assert np.abs(current_pose(armature)[0][17] - np.eye(3)).max() > 0.3

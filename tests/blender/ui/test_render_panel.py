@@ -86,7 +86,7 @@ def test_a_merged_pose_is_one_undo_step_and_unmerging_goes_back(person):
     bpy.ops.ed.redo()
     person = humans(bpy.context.scene)[0]
     assert attachment_of(person) == "MERGED"
-    assert ops.unmerge() == {"FINISHED"}
+    assert ops.merge(what="NOTHING") == {"FINISHED"}
     assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
 
 
@@ -94,7 +94,7 @@ def test_unmerging_goes_back_to_the_surface_where_that_was_shown(person):
     assert ops.set_attachment(mode="SURFACE") == {"FINISHED"}
     ops.merge()
     ops.merge()
-    ops.unmerge()
+    ops.merge(what="NOTHING")
     assert attachment_of(person) == "SURFACE"
 
 
@@ -121,7 +121,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     scene = bpy.context.scene
     scene.frame_set(7)
     scene.frame_start, scene.frame_end = 5, 8
-    assert ops.merge_frames(voxel=0.02) == {"FINISHED"}
+    assert ops.merge(what="FRAMES", voxel=0.02) == {"FINISHED"}
     assert scene.frame_current == 7
     volume = merged_of(person).data
     files = sequence_files(volume)
@@ -134,7 +134,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     for frame in (5, 6, 8):
         scene.frame_set(frame)
         assert not render_panel.outdated(person, scene)
-    assert ops.merge_frames(frame_start=6, frame_end=7) == {"FINISHED"}
+    assert ops.merge(what="FRAMES", frame_start=6, frame_end=7) == {"FINISHED"}
     assert merged_of(person).data.frame_duration == 2
     ops.merge()
     assert not merged_of(person).data.is_sequence
@@ -142,7 +142,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
 
 def test_a_range_that_is_none_is_rejected(person):
     with pytest.raises(RuntimeError, match="frames 7 to 7 are no sequence"):
-        ops.merge_frames(frame_start=7, frame_end=7)
+        ops.merge(what="FRAMES", frame_start=7, frame_end=7)
     assert merged_of(person) is None
 
 
@@ -218,7 +218,7 @@ def test_set_attachment_reports_what_stands_in_the_way(person):
     with pytest.raises(RuntimeError, match="press Merge"):
         ops.set_attachment(mode="MERGED")
     with pytest.raises(RuntimeError, match="no merged volume"):
-        ops.unmerge()
+        ops.merge(what="NOTHING")
     with pytest.raises(RuntimeError, match="'Nobody' is not in the scene"):
         ops.set_attachment(mode="SURFACE", human="Nobody")
 
@@ -229,7 +229,7 @@ def test_panels_show_modes_warnings_and_memory(person):
     assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 2
     ops.merge()
     assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 3
-    ops.unmerge()
+    ops.merge(what="NOTHING")
     person[MARK] = person[MARK].replace('"most_overlapping": ', '"most_overlapping": 9')
     context.scene.render.engine = "CYCLES"
     assert "volumes overlap" in drawn(render_panel.PRIMDIFFUSION_PT_cycles_look, context).replace(" | ", " ")
@@ -245,7 +245,7 @@ def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(perso
     scene.collection.objects.link(camera)
     scene.camera, scene.cycles.max_bounces = camera, 7
     world = scene.world
-    assert ops.set_up_cycles() == {"FINISHED"}
+    assert ops.set_up_engine(engine="CYCLES") == {"FINISHED"}
     assert (scene.render.engine, scene.camera, scene.world, scene.cycles.max_bounces) == ("CYCLES", camera, world, 7)
     assert scene.cycles.transparent_max_bounces == 1024
     assert scene.view_settings.view_transform == "Standard"
