@@ -139,7 +139,7 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
     def poll(cls, _context: bpy.types.Context) -> bool:
         busy = queue.busy or captures.busy or being_set_up()
         if not busy:
-            cls.poll_message_set("No job is queued")
+            cls.poll_message_set("Nothing is running: no job, no captures, no set-up")
         return busy
 
     def act(self, _context: bpy.types.Context) -> set[str]:

@@ -39,7 +39,9 @@ if not wheels:
     report["seconds_generate"] = round(time.perf_counter() - started, 1)
     report["bones"] = [len(obj.data.bones) for obj in bpy.data.objects if obj.type == "ARMATURE"]
 started = time.perf_counter()
-repair = press if wheels else lambda: bpy.ops.primdiffusion.set_up_backend(repair=True)  # without a network, from the folder again
+repair = (
+    press if wheels else lambda: bpy.ops.primdiffusion.set_up_backend(repair=True)
+)  # without a network, from the folder again
 report["repaired"] = sorted(repair())
 report["seconds_repair"] = round(time.perf_counter() - started, 1)
 report["tested"] = sorted(bpy.ops.primdiffusion.test_backend())

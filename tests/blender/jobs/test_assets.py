@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import bpy
@@ -17,7 +16,7 @@ from blender_primdiffusion.motion.pose_library import builtin_poses, current_pos
 from blender_primdiffusion.motion.rotation import from_axis_angle
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file, volume_path
-from blender_primdiffusion.ui.assets_panel import PRIMDIFFUSION_PT_assets
+from blender_primdiffusion.ui import export_panel
 
 PICTURE = Path(__file__).parents[1] / "fake_backend" / "primdiffusion" / "picture.png"
 ops = bpy.ops.primdiffusion
@@ -76,10 +75,9 @@ def test_one_undo_makes_it_an_ordinary_collection_again(person):
 
 
 def test_unmarking_leaves_the_person(person):
-    with pytest.raises(RuntimeError, match="'Human'"):
-        ops.unmark_human_asset()
     ops.mark_as_asset(picture=str(PICTURE))
-    assert ops.unmark_human_asset() == {"FINISHED"}
+    with bpy.context.temp_override(id=person):  # as the panel's button
+        assert bpy.ops.asset.clear_single() == {"FINISHED"}
     assert person.asset_data is None
     assert humans(bpy.context.scene) == [person]
 
@@ -106,8 +104,8 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
     if link:
         with pytest.raises(RuntimeError, match="is linked from"):
             ops.mark_as_asset(picture=str(PICTURE))
-        with pytest.raises(RuntimeError, match="unmark it there"):
-            ops.unmark_human_asset()
+        with bpy.context.temp_override(id=person):
+            assert not bpy.ops.asset.clear_single.poll()
 
 
 def test_a_pose_becomes_an_action_that_gives_it_to_any_human(person, tmp_path):
@@ -160,9 +158,8 @@ def test_the_built_in_poses_become_a_library_and_the_open_file_stays(addon, tmp_
 
 
 def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
-    for operator in (ops.mark_human_as_asset, ops.mark_pose_as_asset, ops.unmark_human_asset):
-        with pytest.raises(RuntimeError, match=r"poll\(\) .*no human in the scene"):
-            operator()
+    with pytest.raises(RuntimeError, match=r"poll\(\) .*no human in the scene"):
+        ops.mark_as_asset()
     ops.generate(seed=7, steps=1)
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "file").write_text("")
@@ -184,15 +181,18 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
 
 
 def test_the_panel_offers_what_makes_sense(person):
-    def buttons() -> set[str]:
+    def buttons() -> list[str]:
         layout = MagicMock()
         layout.row.return_value = layout
-        PRIMDIFFUSION_PT_assets.draw(SimpleNamespace(layout=layout), bpy.context)
-        return {call.args[0].partition(".")[2] for call in layout.operator.call_args_list}
+        export_panel._draw_assets(layout, bpy.context)
+        if layout.context_pointer_set.called:
+            layout.context_pointer_set.assert_called_once_with("id", person)
+        return [call.args[0] for call in layout.operator.call_args_list]
 
-    assert buttons() == {"mark_human_as_asset", "mark_pose_as_asset", "make_pose_assets"}
+    of_pose = ["primdiffusion.mark_as_asset", "primdiffusion.make_pose_assets"]
+    assert buttons() == ["primdiffusion.mark_as_asset", *of_pose]
     ops.mark_as_asset(picture=str(PICTURE))
-    assert buttons() == {"unmark_human_asset", "mark_pose_as_asset", "make_pose_assets"}
+    assert buttons() == ["asset.clear_single", *of_pose]
 
 
 def test_a_clay_figure_is_within_its_picture_and_lit_from_above():

@@ -190,6 +190,10 @@ def test_names_that_cannot_be_are_rejected(armature, name):
 def test_a_built_in_pose_cannot_be_deleted(armature):
     with pytest.raises(RuntimeError, match="'T'"):
         ops.save_pose(delete=True, pose_name="T")
+    ops.save_pose(pose_name="mine")
+    with pytest.raises(RuntimeError, match="'T'"):
+        ops.save_pose(delete=True, pose_name="T")
+    assert ops.save_pose(delete=True) == {"FINISHED"}, "the panel's pose"
 
 
 @pytest.mark.parametrize(
@@ -236,11 +240,11 @@ def test_the_panel_shows_pictures_and_offers_to_delete_only_own_poses(addon, arm
         layout = MagicMock()
         layout.row.return_value = layout
         PRIMDIFFUSION_PT_poses.draw(SimpleNamespace(layout=layout), addon)
-        return [call.args[0] for call in layout.operator.call_args_list]
+        return [call.kwargs.get("text") for call in layout.operator.call_args_list]
 
-    assert "primdiffusion.delete_pose" not in buttons()
+    assert "Delete Pose" not in buttons()
     ops.save_pose(pose_name="mine")
-    assert "primdiffusion.delete_pose" in buttons()
+    assert "Delete Pose" in buttons()
     assert "mine" in [item[0] for item in pose_panel.pose_items(None, addon)]
 
 

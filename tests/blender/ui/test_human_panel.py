@@ -23,10 +23,10 @@ from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of,
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
 from blender_primdiffusion.scene.surface import node_inputs
+from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_MT_people, PRIMDIFFUSION_PT_human
 from blender_primdiffusion.ui.shape_panel import (
-    PRIMDIFFUSION_OT_random_shape,
-    PRIMDIFFUSION_PT_details,
+    PRIMDIFFUSION_OT_reshape,
     PRIMDIFFUSION_PT_shape,
 )
 
@@ -151,9 +151,12 @@ def test_a_random_shape_is_the_same_for_the_same_seed(person):
 
 
 def test_each_press_of_random_is_another_body(person, addon):
-    pressed = [SimpleNamespace(seed=0, execute=lambda _: {"FINISHED"}) for _ in range(2)]
+    ungiven = SimpleNamespace(is_property_set=lambda _: False)
+    pressed = [
+        SimpleNamespace(to="RANDOM", seed=0, properties=ungiven, execute=lambda _: {"FINISHED"}) for _ in range(2)
+    ]
     for press in pressed:  # background mode has no window to press a button in
-        assert PRIMDIFFUSION_OT_random_shape.invoke(press, addon, None) == {"FINISHED"}
+        assert PRIMDIFFUSION_OT_reshape.invoke(press, addon, None) == {"FINISHED"}
     assert pressed[0].seed != pressed[1].seed
 
 
@@ -169,7 +172,7 @@ def test_a_shape_is_copied_from_the_other_person(person, other):
 
 @pytest.mark.parametrize(
     ("given", "sentence"),
-    [({}, "choose the other human"), ({"source": "Human"}, "cannot be the other"), ({"source": "Eve"}, "not in the")],
+    [({}, "choose the other human"), ({"other": "Human"}, "cannot be the other"), ({"other": "Eve"}, "not in the")],
 )
 def test_copying_without_another_human_is_rejected(person, given, sentence):
     with pytest.raises(RuntimeError, match=sentence):
@@ -316,11 +319,13 @@ def linked(tmp_path):
     return wanted.collections[0]
 
 
-@pytest.mark.parametrize("name", ["duplicate_human", "delete_human", "reset_shape"])
-def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "given"), [("duplicate_human", {}), ("delete_human", {}), ("reshape", {"to": "GENERATED"})]
+)
+def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name, given):
     linked(tmp_path)
     with pytest.raises(RuntimeError, match="linked"):
-        getattr(ops, name)()
+        getattr(ops, name)(**given)
 
 
 def test_a_linked_person_keeps_their_name(person, tmp_path, capsys):
@@ -346,7 +351,7 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
     panel = " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
     assert "In the scene: " in panel
     assert "'" in panel
-    details = " ".join(shown(PRIMDIFFUSION_PT_details, addon))
+    details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
     for text in ("Seed: 0", "Steps: 5", "Sex: female", "Edit: vary", "amount 0.5", "Volumes: 12", "Files: 0 MB"):
         assert text in details
 

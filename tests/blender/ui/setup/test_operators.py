@@ -112,7 +112,7 @@ def test_from_no_backend_to_a_backend_and_back(wheels):
     layout = draw_preferences()
     assert "Ready: torch 0-tiny" in layout.text
     assert str(places.set_up_folder().environment)[:40] in layout.text
-    assert {"primdiffusion.repair_backend", "primdiffusion.remove_backend"} <= set(layout.buttons)
+    assert {"primdiffusion.set_up_backend", "primdiffusion.remove_backend"} <= set(layout.buttons)
 
     assert press.set_up_backend() == {"FINISHED"}  # nothing to do
     assert press.test_backend() == {"FINISHED"}
@@ -194,7 +194,7 @@ def test_nothing_to_remove_test_or_cancel_is_rejected(wheels):
         press.remove_backend()
     with pytest.raises(RuntimeError, match="not set up yet: press Set Up Backend first"):
         press.test_backend()
-    with pytest.raises(RuntimeError, match="Nothing is being set up"):
+    with pytest.raises(RuntimeError, match="Nothing is running"):
         press.cancel(what="SET_UP")
 
 
