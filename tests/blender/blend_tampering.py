@@ -295,9 +295,9 @@ def _menus() -> list[type]:
 
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
-    ("set_attachment", {"mode": "ARMATURE"}), ("reshape", {"to": "GENERATED"}), ("collect_files", {}), ("find_missing_volumes", {}),
-    ("human_from_captures", {}), ("verify_captures", {}), ("show_proxy", {"shown": "REMOVED"}),
-    ("merge", {"what": "NOTHING"}),
+    ("set_attachment", {"mode": "ARMATURE"}), ("reshape", {"to": "GENERATED"}), ("collect_files", {}),
+    ("find_missing_volumes", {}), ("human_from_captures", {}), ("verify_captures", {}),
+    ("show_proxy", {"shown": "REMOVED"}), ("merge", {"what": "NOTHING"}),
     ("remove_unused_files", {}),
 )  # fmt: skip
 """Pressed one after the other; those that need the backend are what `edit_fault` does with its result."""

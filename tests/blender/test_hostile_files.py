@@ -26,7 +26,7 @@ READS = {
     "mark_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
     "mark_as_asset POSE": ("picture", (".png", ".jpg", ".exr", ".hdr")),
 }
-"""Operators that read a file, with their `what` where it is not the default: the property with its path, and endings."""
+"""Operators that read a file, with their `what` unless it is the default: the property with its path, and endings."""
 WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human", ".vdb"))]
 """Operators that write the file of their `filepath`."""
 FOLDERS = {"find_missing_volumes", "human_from_captures", "make_pose_assets", "set_up_backend"}

@@ -225,9 +225,15 @@ def test_poses_of_wrong_shape_are_rejected(armature):
 def test_edit_mode_and_a_renamed_bone_are_rejected(addon, armature):
     addon.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode="EDIT")
-    for operator in (ops.apply_pose, ops.save_pose, ops.key_pose):
+    for operator, given in (
+        (ops.apply_pose, {"what": "MIRRORED"}),
+        (ops.apply_pose, {"what": "REST"}),
+        (ops.key_pose, {}),
+    ):
         with pytest.raises(RuntimeError, match="Edit Mode"):
-            operator()
+            operator(**given)
+    with pytest.raises(RuntimeError, match="Edit Mode"):
+        ops.apply_pose()
     bpy.ops.object.mode_set(mode="OBJECT")
     armature.data.bones["neck"].name = "Hals"
     for operator in (ops.apply_pose, ops.save_pose):
