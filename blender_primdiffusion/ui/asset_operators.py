@@ -12,7 +12,11 @@ from ..jobs.target import HumanTarget
 from .on_person import SKIP, OnPerson
 
 _ITEMS = (
-    ("HUMAN", "Human", "Mark the selected human as an asset with a preview, to drag into any file"),
+    (
+        "HUMAN",
+        "Human",
+        "Mark the selected human as an asset with a preview, to drag from the Asset Browser into any file",
+    ),
     ("POSE", "Pose", "Mark the selected human's pose as an asset, to apply to any human from the pose library"),
 )
 
@@ -44,12 +48,12 @@ class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         from ..jobs.assets import HumanAssetJob, PoseAssetJob, mark_human  # needs numpy
 
-        picture = Path(bpy.path.abspath(self.picture)) if self.picture else None
-        of_pose = self.what == "POSE"
-        job = PoseAssetJob.of(person, self.name.strip() or "Pose") if of_pose else HumanAssetJob(HumanTarget.of(person))
-        if picture is None:
+        of_pose = PoseAssetJob.of(person, self.name.strip() or "Pose") if self.what == "POSE" else None
+        job = of_pose or HumanAssetJob(HumanTarget.of(person))
+        if not self.picture:
             return submit(self, context, job)
-        self.report({"INFO"}, job.marked(picture) if of_pose else mark_human(person, picture))
+        picture = Path(bpy.path.abspath(self.picture))
+        self.report({"INFO"}, of_pose.marked(picture) if of_pose is not None else mark_human(person, picture))
         bpy.ops.ed.undo_push(message=job.undo)
         return {"FINISHED"}
 

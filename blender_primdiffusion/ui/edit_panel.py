@@ -348,8 +348,9 @@ def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Contex
     if mesh is not None:
         layout.prop_search(settings, "vertex_group", mesh, "vertex_groups", text="Group")
     finish = painting(context)
-    text = "Finish Painting" if finish else "Paint Region"
-    layout.operator("primdiffusion.paint_region", text=text, icon="BRUSH_DATA").finish = finish
+    layout.operator(
+        "primdiffusion.paint_region", text="Finish Painting" if finish else "Paint Region", icon="BRUSH_DATA"
+    ).finish = finish
 
 
 def _draw_parts(layout: bpy.types.UILayout, settings, parts: tuple[str, ...], columns: int) -> None:

@@ -39,7 +39,9 @@ class PRIMDIFFUSION_OT_find_missing_volumes(bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return pgettext_tip("Choose a folder to search in" if properties.choose else str(cls.__doc__))
+        return pgettext_tip(
+            "Choose a folder to search for missing files of humans" if properties.choose else str(cls.__doc__)
+        )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if not self.choose:

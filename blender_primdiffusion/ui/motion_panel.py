@@ -39,8 +39,11 @@ class PRIMDIFFUSION_OT_use_action(OnArmature, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        clear = "Remove the motion from the human; the action stays in the file, the human returns to the rest pose"
-        return pgettext_tip(str(cls.__doc__) if properties.action else clear)
+        return pgettext_tip(
+            str(cls.__doc__)
+            if properties.action
+            else "Remove the motion from the human; the action stays in the file, the human returns to the rest pose"
+        )
 
     def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         from ..motion.pose_library import check_posable  # needs numpy

@@ -271,7 +271,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
     delete: bpy.props.BoolProperty(
         name="Delete",
         description="Delete the chosen pose from your own poses in the library, for all .blend files",
-        options=_SKIP | {"HIDDEN"},
+        options=_SKIP,
     )
 
     @classmethod
@@ -283,6 +283,9 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
         if self.delete:
             return context.window_manager.invoke_confirm(self, event)
         return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        self.layout.prop(self, "pose_name")
 
     def act(self, context: bpy.types.Context) -> set[str]:
         return self._delete(context.scene.primdiffusion_motion) if self.delete else super().act(context)

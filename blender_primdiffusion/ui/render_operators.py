@@ -83,12 +83,12 @@ _MERGES = (
     (
         "POSE",
         "Current Pose",
-        "Merge the selected human's volumes, in the current pose, into one that Cycles renders faster",
+        "Merge the selected human's volumes, in the current pose, into one that Cycles renders much faster",
     ),
     (
         "FRAMES",
         "Frame Range",
-        "Merge the human's volumes into one for each frame of the scene's range, in the background",
+        "Merge the human's volumes into one volume for each frame of the scene's range, in the background",
     ),
     ("NOTHING", "Nothing", "Show the human's own volumes again and remove the merged one"),
 )

@@ -45,11 +45,11 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
     )
     height: bpy.props.FloatProperty(name="Height (m)", description="Not given: any", options=SKIP)
     weight: bpy.props.FloatProperty(name="Weight (kg)", description="Not given: any", options=SKIP)
-    seed: bpy.props.IntProperty(name="Seed", description="Another seed gives another random body", min=0, options=SKIP)
+    seed: bpy.props.IntProperty(name="Seed", description="Another seed gives another body", min=0, options=SKIP)
     spread: bpy.props.FloatProperty(
         name="Spread",
         translation_context=CONTEXT,
-        description="How far random bodies differ from the mean body: 1 as real people do",
+        description="How far bodies differ from the mean body: 1 as real people do",
         default=1.0,
         min=0.0,
         max=2.0,
