@@ -44,6 +44,7 @@ from blender_primdiffusion.scene.human import (
     volume_path,
 )
 from blender_primdiffusion.scene.human_npz import write_now
+from blender_primdiffusion.ui.drawing import DATA
 from blender_primdiffusion.ui.on_person import FACTS
 
 COUNT = 3
@@ -279,7 +280,8 @@ def panels_fault() -> str:
     """Which panel cannot be drawn, or draws what Blender cannot show; empty when all can."""
     for cls in [*sidebar.panels(), *_menus()]:
         try:
-            if hasattr(cls, "poll") and not cls.poll(bpy.context):
+            shown = not hasattr(cls, "poll") or cls.poll(bpy.context) or getattr(cls, "bl_category", "") == DATA
+            if not shown:
                 continue
             texts = sidebar.draw(cls, bpy.context, opened=True).texts
         except Exception as error:
