@@ -10,7 +10,8 @@
 Measured without a window, which adds its redraws: the seconds from the child's answer until the human stands
 (stand_seconds) and the longest step of these without a pause; the seconds in which its volumes are written afterwards;
 memory with undo, milliseconds of a frame change, and rows of the Outliner as Blender opens them (collections open,
-objects closed). second_* are the same with another human in the scene. panels_open and sidebar_px are of `sidebar.py`.
+objects closed). second_* are the same with another human in the scene. panels_open, sidebar_px, panel_classes and
+operators are of `sidebar.py`.
 proxy_cpu_seconds is the processor time of `primdiffusion export` of a textured mesh, of the default checkpoint's human
 with seed 7.
 

@@ -51,12 +51,18 @@ class Button:
 
 
 class Layout:
-    """Takes the calls of a UILayout and adds up heights in pixels."""
+    """Takes the calls of a UILayout and adds up heights in pixels; sections are as they open, or all `opened`."""
 
     def __init__(
-        self, parent: Layout | None = None, space: float = ROOT_SPACE, across: bool = False, border: float = 0
+        self,
+        parent: Layout | None = None,
+        space: float = ROOT_SPACE,
+        across: bool = False,
+        border: float = 0,
+        opened: bool = False,
     ):
         self.parent, self.space, self.across, self.border = parent, space, across, border
+        self.opened: bool = parent.opened if parent is not None else opened
         self.items: list[float | Layout] = []
         self.enabled = True
         self.buttons: list[Button] = parent.buttons if parent is not None else []
@@ -94,7 +100,7 @@ class Layout:
     def panel(self, _idname: str, default_closed: bool = False) -> tuple[Layout, Layout | None]:
         header = self._inside(across=True)
         header.items.append(HEADER)
-        return header, None if default_closed else self._inside()
+        return header, None if default_closed and not self.opened else self._inside()
 
     def label(self, text: str = "", **_: Any) -> None:
         self.texts.append(text)
@@ -129,6 +135,9 @@ class Layout:
 
     def separator(self, factor: float = 1.0, **_: Any) -> None:
         self.items.append(SEPARATOR * factor)
+
+    def context_pointer_set(self, *_: Any) -> None:
+        """Takes no room."""
 
     def template_icon(self, scale: float = 1.0, **_: Any) -> None:
         self.items.append(ROW * scale)
@@ -174,9 +183,9 @@ def panels() -> list[type]:
     return sorted(sidebar, key=lambda cls: getattr(cls, "bl_order", 0))
 
 
-def draw(cls: type, context: bpy.types.Context) -> Layout:
-    """The content of a panel."""
-    layout = Layout()
+def draw(cls: type, context: bpy.types.Context, *, opened: bool = False) -> Layout:
+    """The content of a panel; `opened` with its closed sections."""
+    layout = Layout(opened=opened)
     cls.draw(_Drawing(cls, layout), context)
     return layout
 
@@ -217,9 +226,20 @@ def tabs(context: bpy.types.Context) -> dict[str, float]:
 
 
 def figures(context: bpy.types.Context) -> dict[str, float]:
-    """`panels_open`: open panels of the tab that has most; `sidebar_px`: height of the tallest tab."""
+    """`panels_open`: open panels of the tab that has most; `sidebar_px`: height of the tallest tab; `panel_classes` and
+    `operators`: how many the extension has registered, in all editors."""
     most = collections.Counter(cls.bl_category for cls in open_panels(context)).most_common(1)
-    return {"panels_open": most[0][1], "sidebar_px": round(max(tabs(context).values()))}
+    return {
+        "panels_open": most[0][1],
+        "sidebar_px": round(max(tabs(context).values())),
+        "panel_classes": registered(bpy.types.Panel),
+        "operators": registered(bpy.types.Operator),
+    }
+
+
+def registered(kind: type) -> int:
+    """How many classes of the extension of this kind Blender knows."""
+    return sum(cls.__name__.startswith("PRIMDIFFUSION_") and cls.is_registered for cls in kind.__subclasses__())
 
 
 def measured() -> dict[str, float]:

@@ -114,6 +114,12 @@ def preference(name: str) -> str:
     return str(getattr(addon.preferences, name, "")).strip() if addon is not None else ""
 
 
+def shows_captures() -> bool:
+    """Whether the preferences ask for the tab of captures; no where the add-on is not enabled."""
+    addon = bpy.context.preferences.addons.get(EXTENSION)
+    return addon is not None and bool(getattr(addon.preferences, "captures", False))
+
+
 def new_backend(python: str) -> Backend:
     """A backend, not yet started, on the interpreter of this path, or for "" on the one found when it starts."""
     module_path, cache = backend_module_path(), cache_folder()

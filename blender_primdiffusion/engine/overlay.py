@@ -65,7 +65,7 @@ class Overlay:
         """Draw the humans into the region that Blender draws now."""
         marcher = self.prepare()
         if self._fault:
-            self.error = f"{self._fault}: show the volumes instead (tab Output, Volumes in Viewport)"
+            self.error = f"{self._fault}: show the volumes instead (Advanced > Attachment > Volumes in Viewport)"
             return
         try:
             self._draw_or_sketch(context, marcher)

@@ -23,8 +23,8 @@ from .who_draws import Drawer, who_draws
 READING_S = 0.1
 """Time for reading the files of new humans in one go."""
 _EARLIER = (
-    "the human {!r} was made by an earlier version and its volumes are hidden: show these (in the Outliner, or tab "
-    "Output, Volumes in Viewport), edit the human, or generate it again"
+    "the human {!r} was made by an earlier version and its volumes are hidden: show these (in the Outliner, or "
+    "Advanced > Attachment > Volumes in Viewport), edit the human, or generate it again"
 )
 _UNRELATED = (
     bpy.types.Mesh,

@@ -17,7 +17,8 @@ import bpy
 from ..jobs import copies, cycles_check, follow, late_volumes, missing_files, picture_in_view, windows
 from ..scene import stand_in
 from . import (
-    assets_panel,
+    advanced_panel,
+    asset_operators,
     attributes,
     backend_state,
     batch,
@@ -48,9 +49,9 @@ from . import (
 MODULES = (
     translations, *backend_state.MODULES, preferences, windows, follow, cycles_check, jobs_panel, attributes,
     generate_panel, variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, copies,
-    late_volumes, import_motion, motion_panel, pose_panel, assets_panel, render_operators, render_panel,
-    captures_settings, captures_panel, reconstruct_panel, export_operators, gallery, export_panel, viewport_humans,
-    picture_in_view, batch, manual, stand_in,
+    late_volumes, import_motion, motion_panel, pose_panel, asset_operators, render_operators, render_panel,
+    export_operators, gallery, export_panel, advanced_panel, captures_settings, captures_panel, reconstruct_panel,
+    viewport_humans, picture_in_view, batch, manual, stand_in,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

@@ -6,13 +6,14 @@ from ..places import INSTALLS_BACKEND
 
 if INSTALLS_BACKEND:
     from .setup import operators, preferences
+    from .setup.operators import being_set_up, cancel_set_up
     from .setup.preferences import draw_set_up
 
     MODULES = (operators, preferences)
 else:
     from . import connection
-    from .connection import draw_set_up
+    from .connection import being_set_up, cancel_set_up, draw_set_up
 
     MODULES = (connection,)
 
-__all__ = ["MODULES", "draw_set_up"]
+__all__ = ["MODULES", "being_set_up", "cancel_set_up", "draw_set_up"]

@@ -1,11 +1,10 @@
-"""The sidebar panel Captures: render, cancel, verify, and a preview of the cameras."""
+"""The sidebar panel Captures: render, verify, and a preview of the cameras."""
 
 from __future__ import annotations
 
 import contextlib
 import shlex
 import time
-from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 import bpy
@@ -13,10 +12,11 @@ from bpy.app.translations import pgettext_iface
 from mathutils import Vector
 
 from ..jobs.follow import Reporting, redraw
+from ..places import shows_captures
 from ..scene.blend_values import setting_path
 from .captures_session import Busy, captures
 from .captures_settings import words_of
-from .drawing import CAPTURES, SidebarPanel, draw_lines, property_columns
+from .drawing import DATA, SidebarPanel, draw_lines, draw_section, property_columns
 
 if TYPE_CHECKING:
     import numpy as np
@@ -103,24 +103,6 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
             who = first["subject"] or first["what"]
             self.report({"ERROR"}, f"{len(report.failed)} failed; {who}: {first['why']} (all: {path})")
             return {"CANCELLED"}
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_cancel_captures(bpy.types.Operator):
-    """Stop rendering; finished pictures stay, and the next run resumes from them"""
-
-    bl_idname = "primdiffusion.cancel_captures"
-    bl_label = "Cancel"
-    bl_options: set[str] = set()
-
-    @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        if not captures.busy:
-            cls.poll_message_set("No captures are being rendered")
-        return captures.busy
-
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        captures.cancel()
         return {"FINISHED"}
 
 
@@ -227,12 +209,21 @@ def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], flo
 _SHOWN_LINES = 4
 
 
-class PRIMDIFFUSION_PT_captures(SidebarPanel, bpy.types.Panel):
-    """From where to where, the button, and how far it is."""
+class DataPanel(SidebarPanel):
+    """A panel in the tab of captures, which the preferences show."""
+
+    bl_category = DATA
+
+    @classmethod
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        return shows_captures()
+
+
+class PRIMDIFFUSION_PT_captures(DataPanel, bpy.types.Panel):
+    """From where to where, the button, how far it is, and all settings."""
 
     bl_label = "Captures"
-    bl_category = CAPTURES
-    bl_order = 0
+    bl_order = 10
     manual_page = "captures"
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -244,7 +235,7 @@ class PRIMDIFFUSION_PT_captures(SidebarPanel, bpy.types.Panel):
         if captures.busy:
             left = f" ({_minutes(captures.eta_s)} left)" if captures.eta_s else ""
             layout.progress(factor=captures.fraction, text=f"{captures.message}{left}", translate=False)
-            layout.operator("primdiffusion.cancel_captures", icon="CANCEL")
+            layout.operator("primdiffusion.cancel", icon="CANCEL").what = "CAPTURES"
         else:
             layout.operator("primdiffusion.render_captures", icon="RENDER_ANIMATION")
         for text, icon in ((captures.error, "ERROR"), (captures.notice, "INFO")):
@@ -252,26 +243,26 @@ class PRIMDIFFUSION_PT_captures(SidebarPanel, bpy.types.Panel):
         if captures.busy or captures.error:
             for text in list(captures.lines)[-_SHOWN_LINES:]:
                 draw_lines(layout, text, "DOT")
+        _draw_settings(layout, asked, context)
 
 
-def _sub_panel(name: str, label: str, content: Callable) -> type:
-    class CapturesSubPanel(SidebarPanel, bpy.types.Panel):
-        bl_idname = f"PRIMDIFFUSION_PT_captures_{name}"
-        bl_label = label
-        bl_category = CAPTURES
-        bl_parent_id = "PRIMDIFFUSION_PT_captures"
-        bl_options = {"DEFAULT_CLOSED"}
-        __doc__ = content.__doc__
-
-        def draw(self, context: bpy.types.Context) -> None:
-            layout = property_columns(self.layout)
-            if captures.busy:
-                draw_lines(layout, pgettext_iface("Wait for the captures, or cancel them"), "INFO")
-            layout.enabled = not captures.busy
-            content(layout, context.scene.primdiffusion_captures, context)
-
-    CapturesSubPanel.__name__ = CapturesSubPanel.bl_idname
-    return CapturesSubPanel
+def _draw_settings(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:
+    """Sections of settings, which cannot be changed while captures are rendered."""
+    sections = (
+        (draw_section(layout, "captures_input", text="Input"), _draw_input),
+        (draw_section(layout, "captures_poses", text="Poses"), _draw_poses),
+        (draw_section(layout, "captures_cameras", text="Cameras"), _draw_cameras),
+        (draw_section(layout, "captures_cycles", text="Cycles"), _draw_cycles),
+        (draw_section(layout, "captures_output", text="Output"), _draw_output),
+    )
+    for body, content in sections:
+        if body is None:
+            continue
+        if captures.busy:
+            draw_lines(body, pgettext_iface("Wait for the captures, or cancel them"), "INFO")
+        column = property_columns(body.column())
+        column.enabled = not captures.busy
+        content(column, asked, context)
 
 
 def _draw_input(layout: bpy.types.UILayout, asked, _context) -> None:
@@ -330,15 +321,6 @@ def _draw_output(layout: bpy.types.UILayout, asked, _context) -> None:
     row = layout.row(align=True)
     row.operator("primdiffusion.verify_captures", icon="CHECKMARK").repair = False
     row.operator("primdiffusion.verify_captures", text="Repair", icon="TOOL_SETTINGS").repair = True
-
-
-SUB_PANELS = (
-    _sub_panel("input", "Input", _draw_input),
-    _sub_panel("poses", "Poses", _draw_poses),
-    _sub_panel("cameras", "Cameras", _draw_cameras),
-    _sub_panel("cycles", "Cycles", _draw_cycles),
-    _sub_panel("output", "Output", _draw_output),
-)
 
 
 def _minutes(seconds: float) -> str:

@@ -8,7 +8,7 @@ from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, ow
 from ..backend.requests import sentence
 from ..places import EXTENSION, installed_backend, missing_packages, preference
 from .drawing import draw_lines
-from .preferences import WIDTH, CommonPreferences, forget_failures
+from .preferences import NOTHING_TO_CANCEL, WIDTH, CommonPreferences, forget_failures
 
 _SIDEBAR = 30
 """Characters that fit a box in a sidebar of default width, beside an icon."""
@@ -35,6 +35,16 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
         if not missing_packages():
             box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
     return usable
+
+
+def being_set_up() -> bool:
+    """Whether the backend is being set up: this build sets up none."""
+    return False
+
+
+def cancel_set_up() -> None:
+    """Raises ValueError: there is nothing to stop."""
+    raise ValueError(NOTHING_TO_CANCEL)
 
 
 def _backend_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:

@@ -16,8 +16,8 @@ from ..jobs.remedies import remedy_for
 from ..places import EXTENSION, backend_is_named
 from .manual import draw_manual_button
 
-CREATE, HUMAN, OUTPUT, CAPTURES = (f"PrimDiffusion {task}" for task in ("Create", "Human", "Output", "Captures"))
-"""Tabs of the sidebar. Blender puts panels of equally named tabs together, and other add-ons have a tab Create."""
+MAIN, DATA = "PrimDiffusion", "PrimDiffusion Data"
+"""Tabs of the sidebar. Blender puts panels of equally named tabs together, those of all add-ons."""
 _LINE = 34
 """Characters that fit a sidebar of default width, beside an icon."""
 _QUANTITY = re.compile(r"\d (s|min|mm|MB|GB)\b")
@@ -27,11 +27,11 @@ _MINUTES_FROM_S = 90.0
 
 
 class SidebarPanel:
-    """A panel in the sidebar. The first panel of each tab has the order 0: Blender orders tabs as it orders panels."""
+    """A panel in the sidebar. Blender orders tabs as it orders their first panels."""
 
     bl_space_type = "VIEW_3D"
     bl_region_type = "UI"
-    bl_category = CREATE
+    bl_category = MAIN
     manual_page = ""
     """Of the manual, opened by a button in the header."""
     manual_section = ""
@@ -47,6 +47,17 @@ class BackendPanel(SidebarPanel):
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
         return backend_is_named()
+
+
+def draw_section(
+    layout: bpy.types.UILayout, name: str, *, text: str, page: str = "", section: str = ""
+) -> bpy.types.UILayout | None:
+    """A part of a panel that is closed at first, with a button for its manual page; None while it is closed."""
+    header, body = layout.panel(f"primdiffusion_{name}", default_closed=True)
+    header.label(text=text)
+    if page:
+        draw_manual_button(header, page, section)
+    return None if body is None else property_columns(body)
 
 
 def property_columns(layout: bpy.types.UILayout) -> bpy.types.UILayout:
@@ -66,13 +77,16 @@ def row_unless(layout: bpy.types.UILayout, reason: str) -> bpy.types.UILayout:
 
 
 def draw_job(
-    layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str, reason: str = ""
-) -> bpy.types.OperatorProperties | None:
+    layout: bpy.types.UILayout, kind: str, operator_idname: str, icon: str, reason: str = "", *, text: str | None = None
+) -> bpy.types.OperatorProperties:
     """The button of an operator that submits jobs of `kind`, the progress of such a job, and how the last one ended.
 
-    The button is greyed out where there is a `reason`. Returns its properties, for the caller to set.
+    The button is greyed out where there is a `reason`; its `text` is the operator's label unless given. Returns its
+    properties, for the caller to set.
     """
-    props = row_unless(layout, reason).operator(operator_idname, icon=icon)
+    row = row_unless(layout, reason)
+    # Blender takes no None for the label's own text
+    props = row.operator(operator_idname, icon=icon, **({} if text is None else {"text": text}))
     if queue.current is not None and queue.current.job.kind == kind:
         if so_far.icon:
             layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)

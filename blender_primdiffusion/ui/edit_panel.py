@@ -1,19 +1,20 @@
-"""Edits of the selected human in place: the panels Vary, Re-dress Region, Transfer Texture and Blend."""
+"""The panel Edit: vary, re-dress, transfer and blend the selected human in place."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import bpy
+from bpy.app.translations import pgettext_tip
 
 from ..formats.requests import AMOUNT, FRACTION, PARTS, SIDED_PARTS, STEPS, TRANSFERS, WHOLE_PARTS
 from ..jobs.follow import Reporting, submit
-from ..jobs.target import named_person, selected_person
+from ..jobs.target import selected_person
+from ..places import backend_is_named
 from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
-from .drawing import HUMAN, SidebarPanel, draw_job, property_columns
-from .on_person import PANELS, SKIP, OnPerson
+from .drawing import draw_job, property_columns
+from .on_person import PANELS, SKIP, HumanPanel, OnPerson, other_human
 from .translations import CONTEXT
 
 PAINTED_GROUP = "PrimDiffusion Region"
@@ -45,6 +46,16 @@ def _may_be_other(_self: PRIMDIFFUSION_PG_edit, collection: bpy.types.Collection
 class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     """`scene.primdiffusion_edit`."""
 
+    kind: bpy.props.EnumProperty(
+        name="Edit",
+        description="What the panel does to the human",
+        items=[
+            ("VARY", "Vary", "A similar human"),
+            ("REDRESS", "Re-dress", "A region of the human generated again"),
+            ("TRANSFER", "Transfer", "Texture or garment of another human in a region"),
+            ("BLEND", "Blend", "More like another human"),
+        ],
+    )
     seed: bpy.props.IntProperty(
         name="Seed",
         description="Another seed gives another result; the same seed gives the same result",
@@ -102,37 +113,31 @@ class PRIMDIFFUSION_OT_paint_region(Reporting, bpy.types.Operator):
     bl_label = "Paint Region"
     bl_options = {"UNDO"}
 
+    finish: bpy.props.BoolProperty(
+        name="Finish", description="Return to Object mode and hide the body mesh; its vertex group stays", options=SKIP
+    )
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return pgettext_tip(
+            properties.rna_type.properties["finish"].description if properties.finish else str(cls.__doc__)
+        )
+
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..scene.edit import start_painting  # needs numpy
+        from ..scene.edit import end_painting, start_painting  # needs numpy
 
         settings = context.scene.primdiffusion_edit
+        if self.finish:
+            if not painting(context):
+                raise ValueError("no region is being painted: press Paint Region first")
+            end_painting(context, context.view_layer.objects.active)
+            return {"FINISHED"}
         person = selected_person(context)
         body = body_of(person)
         if body is None:
             raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
         start_painting(context, body, settings.vertex_group)
         settings.region = "PAINTED"
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_finish_painting(bpy.types.Operator):
-    """Return to Object mode and hide the body mesh; its vertex group stays"""
-
-    bl_idname = "primdiffusion.finish_painting"
-    bl_label = "Finish Painting"
-    bl_options = {"UNDO"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        now = painting(context)
-        if not now:
-            cls.poll_message_set("No region is being painted: press Paint Region first")
-        return now
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        from ..scene.edit import end_painting  # needs numpy
-
-        end_painting(context, context.view_layer.objects.active)
         return {"FINISHED"}
 
 
@@ -249,7 +254,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         return {
-            "source": _other(context, person, self.source),
+            "source": str(person_file(other_human(context, person, self.source))),
             "region": self.region(settings, person),
             "what": self.chosen("what", settings),
             "harmonise": self.chosen("harmonise", settings),
@@ -271,44 +276,28 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
-        other = _other(context, person, self.other)
-        return {"other": other, "fraction": self.chosen("fraction", settings)}
-
-
-def _other(context: bpy.types.Context, person: bpy.types.Collection, name: str) -> str:
-    """The backend's file of the other human, named by a script or picked in the panel."""
-    picked = context.scene.primdiffusion_edit.other
-    if not name and picked is None:
-        raise ValueError("choose the other human in the panel first")
-    other = named_person(context, name or picked.name)
-    if other == person:
-        raise ValueError(f"{person.name!r} cannot be the other human too: choose another one")
-    return str(person_file(other))
+        other = other_human(context, person, self.other)
+        return {"other": str(person_file(other)), "fraction": self.chosen("fraction", settings)}
 
 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)
 
 
-def _panel(name: str, label: str, order: int, content: Callable) -> type:
-    class EditPanel(SidebarPanel, bpy.types.Panel):
-        bl_idname = f"PRIMDIFFUSION_PT_edit_{name}"
-        bl_label = label
-        bl_category = HUMAN
-        bl_order = order
-        bl_options = {"DEFAULT_CLOSED"}
-        manual_page, manual_section = "editing", "edits"
-        __doc__ = content.__doc__
+class PRIMDIFFUSION_PT_edit(HumanPanel, bpy.types.Panel):
+    """Which edit, its settings and its button."""
 
-        @classmethod
-        def poll(cls, context: bpy.types.Context) -> bool:
-            return bool(humans(context.scene))
+    bl_label = "Edit"
+    bl_order = 3
+    manual_page, manual_section = "editing", "edits"
 
-        def draw(self, context: bpy.types.Context) -> None:
-            property_columns(self.layout)
-            content(self.layout, context.scene.primdiffusion_edit, context)
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return backend_is_named() and super().poll(context)
 
-    EditPanel.__name__ = EditPanel.bl_idname
-    return EditPanel
+    def draw(self, context: bpy.types.Context) -> None:
+        layout, settings = property_columns(self.layout), context.scene.primdiffusion_edit
+        layout.row().prop(settings, "kind", expand=True)
+        _DRAW[settings.kind](layout, settings, context)
 
 
 def _draw_vary(layout: bpy.types.UILayout, settings, _context) -> None:
@@ -363,8 +352,10 @@ def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Contex
         mesh = None
     if mesh is not None:
         layout.prop_search(settings, "vertex_group", mesh, "vertex_groups", text="Group")
-    action = "finish_painting" if painting(context) else "paint_region"
-    layout.operator(f"primdiffusion.{action}", icon="BRUSH_DATA")
+    finish = painting(context)
+    layout.operator(
+        "primdiffusion.paint_region", text="Finish Painting" if finish else "Paint Region", icon="BRUSH_DATA"
+    ).finish = finish
 
 
 def _draw_parts(layout: bpy.types.UILayout, settings, parts: tuple[str, ...], columns: int) -> None:
@@ -374,9 +365,4 @@ def _draw_parts(layout: bpy.types.UILayout, settings, parts: tuple[str, ...], co
         grid.prop_enum(settings, "parts", part)
 
 
-SUB_PANELS = (
-    _panel("vary", "Vary", 20, _draw_vary),
-    _panel("redress", "Re-dress Region", 21, _draw_redress),
-    _panel("transfer", "Transfer Texture", 22, _draw_transfer),
-    _panel("blend", "Blend", 23, _draw_blend),
-)
+_DRAW = {"VARY": _draw_vary, "REDRESS": _draw_redress, "TRANSFER": _draw_transfer, "BLEND": _draw_blend}

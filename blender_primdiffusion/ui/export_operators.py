@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import bpy
 
@@ -12,8 +13,14 @@ from ..formats import requests
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget
 from ..scene.human import armature_of
+from .drawing import property_columns
 from .on_person import PANELS, SKIP, OnPerson
 from .translations import CONTEXT
+
+if TYPE_CHECKING:
+    from ..jobs.queue import Job
+
+_SCENES = "Not given: the scene's"
 
 
 def destination(filepath: str, endings: Sequence[str]) -> Path:
@@ -46,24 +53,44 @@ def check_writable(folder: Path) -> None:
 
 
 FORMATS = (
-    ("GLB", "glTF", "One .glb file: for game engines, web viewers and most other programs"),
-    ("FBX", "FBX", "One .fbx file with the texture in it"),
-    ("USD", "USD", "A .usd file with its texture beside it, or one .usdz file"),
+    ("HUMAN", "Human File", "A .human file, which can be dropped into another scene", 3),
+    ("GLB", "glTF", "A textured mesh in one .glb file: for game engines, web viewers and most other programs", 0),
+    ("FBX", "FBX", "A textured mesh in one .fbx file", 1),
+    ("USD", "USD", "A textured mesh: a .usd file with its texture beside it, or one .usdz file", 2),
+    ("PLY", "Gaussians", "3D Gaussians of the current pose in a .ply file, for splat viewers", 4),
+    ("VDB", "VDB Sequence", "A volume for each frame of the scene, for any renderer that reads OpenVDB", 5),
 )
-MODEL_ENDINGS = {"GLB": (".glb",), "FBX": (".fbx",), "USD": (".usdc", ".usda", ".usd", ".usdz")}
+ENDINGS = {
+    "HUMAN": (".human", ".safetensors"),
+    "GLB": (".glb",),
+    "FBX": (".fbx",),
+    "USD": (".usdc", ".usda", ".usd", ".usdz"),
+    "PLY": (".ply",),
+    "VDB": (".vdb",),
+}
 """File extensions by format; the first is the default."""
-HUMAN_ENDINGS = (".human", ".safetensors")
+_OF_MESHES = ("texture_px", "triangles", "animation")
+OPTIONS = {
+    "HUMAN": ("motion", "compact"),
+    "GLB": _OF_MESHES,
+    "FBX": _OF_MESHES,
+    "USD": _OF_MESHES,
+    "PLY": ("gaussians",),
+    "VDB": ("voxel",),
+}
+"""Settings of each format."""
 SHOWN = (
     ("VOLUMES", "Volumes", "Show and render the volumes; the mesh proxy is hidden"),
     ("VIEWPORT", "Mesh in Viewport", "Show the mesh proxy while working, and render the volumes"),
     ("MESH", "Mesh", "Show and render the mesh proxy, in any engine; the volumes are hidden"),
+    ("REMOVED", "Remove Mesh Proxy", "Delete the mesh proxy, and show and render the volumes"),
 )
 
 
 class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     """Of a scene."""
 
-    format: bpy.props.EnumProperty(name="Format", description="What Export Mesh writes", items=FORMATS)
+    format: bpy.props.EnumProperty(name="Format", description="What Export writes", items=FORMATS, default="HUMAN")
     animation: bpy.props.BoolProperty(
         name="Animation",
         description="The scene's frames, constraints and layers included; otherwise the current pose",
@@ -121,62 +148,117 @@ class _Export(OnPerson):
         return getattr(self if given else context.scene.primdiffusion_export, name)
 
 
-class _ToFile(_Export):
-    """Base of the exports to one file."""
+class PRIMDIFFUSION_OT_export(_Export, bpy.types.Operator):
+    """Export the selected human: for another scene, as a textured mesh, as Gaussians, as volumes"""
+
+    bl_idname = "primdiffusion.export"
+    bl_label = "Export Human"
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
     check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        try:
-            person = self.person(context)
-        except ValueError as error:
-            self.report({"ERROR"}, str(error))
-            return {"CANCELLED"}
-        if not self.filepath:
-            self.filepath = bpy.path.clean_name(person.name) + self.endings(context)[0]
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
-
-    def check(self, context: bpy.types.Context) -> bool:
-        endings = self.endings(context)
-        if self.filepath and Path(self.filepath).suffix.lower() not in endings:
-            self.filepath = bpy.path.ensure_ext(self.filepath, endings[0])
-            return True
-        return False
-
-
-class PRIMDIFFUSION_OT_export_mesh(_ToFile, bpy.types.Operator):
-    """Export the selected human as a textured mesh with its armature"""
-
-    bl_idname = "primdiffusion.export_mesh"
-    bl_label = "Export Mesh"
-
-    format: bpy.props.EnumProperty(name="Format", items=FORMATS, description=PANELS, options=SKIP)
+    format: bpy.props.EnumProperty(
+        name="Format",
+        items=FORMATS,
+        description="Not given: that of the file's extension, else the panel's",
+        default="HUMAN",
+        options=SKIP,
+    )
+    motion: bpy.props.BoolProperty(name="With Motion", description=PANELS, options=SKIP)
+    compact: bpy.props.BoolProperty(name="Compact", description=PANELS, options=SKIP)
     animation: bpy.props.BoolProperty(name="Animation", description=PANELS, options=SKIP)
     texture_px: bpy.props.IntProperty(name="Texture", description=PANELS, min=64, max=8192, options=SKIP)
     triangles: bpy.props.IntProperty(
         name="Triangles", translation_context=CONTEXT, description=PANELS, min=500, max=1_000_000, options=SKIP
     )
+    gaussians: bpy.props.IntProperty(name="Gaussians", description=PANELS, min=1, options=SKIP)
+    voxel: bpy.props.FloatProperty(name="Voxel Size", description=PANELS, min=0.002, max=0.05, options=SKIP)
+    first: bpy.props.IntProperty(name="First Frame", description=f"Of a VDB sequence. {_SCENES}", options=SKIP)
+    last: bpy.props.IntProperty(name="Last Frame", description=f"Of a VDB sequence. {_SCENES}", options=SKIP)
 
-    def endings(self, context: bpy.types.Context) -> tuple[str, ...]:
-        return MODEL_ENDINGS[self.chosen(context, "format")]
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        """Open the file browser with the panel's settings."""
+        try:
+            person = self.person(context)
+        except ValueError as error:
+            self.report({"ERROR"}, str(error))
+            return {"CANCELLED"}
+        self.format = self.chosen(context, "format")
+        for name in OPTIONS[self.format]:
+            value = self.chosen(context, name)
+            setattr(self, name, int(value) if name == "texture_px" else value)
+        if not self.filepath:
+            self.filepath = bpy.path.clean_name(person.name) + ENDINGS[self.format][0]
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def check(self, _context: bpy.types.Context) -> bool:
+        """The file browser: another format changes the file's extension."""
+        endings = ENDINGS[self.format]
+        name, ending = os.path.splitext(self.filepath)
+        if not name or ending.lower() in endings:
+            return False
+        known = any(ending.lower() in each for each in ENDINGS.values())
+        self.filepath = (name if known else self.filepath) + endings[0]
+        return True
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        layout = property_columns(self.layout)
+        for name in ("format", *OPTIONS[self.format]):
+            layout.prop(self, name)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """Without a format, the file's extension decides."""
+        kind = self._format(context)
+        path = destination(self.filepath, ENDINGS[kind])
+        if kind == "HUMAN":
+            return self._write_human(context, person, path)
+        return submit(self, context, self._job(context, person, kind, path))
+
+    def _format(self, context: bpy.types.Context) -> str:
+        ending = Path(self.filepath).suffix.lower()
+        by_ending = next((kind for kind, endings in ENDINGS.items() if ending in endings), None)
+        given = self.properties.is_property_set("format")
+        return self.format if given else by_ending or self.chosen(context, "format")
+
+    def _write_human(self, context: bpy.types.Context, person: bpy.types.Collection, path: Path) -> set[str]:
+        from ..jobs.export import scene_frames, write_human  # needs numpy
+
+        frames = scene_frames(context.scene, True) if self.chosen(context, "motion") else None
+        write_human(context, person, path, frames, compact=self.chosen(context, "compact"))
+        self.report({"INFO"}, f"Exported {person.name} to {path.name}")
+        return {"FINISHED"}
+
+    def _job(self, context: bpy.types.Context, person: bpy.types.Collection, kind: str, path: Path) -> Job:
+        """What writes a mesh, Gaussians or volumes. Raises ValueError."""
         # needs numpy
-        from ..jobs.export import ExportMeshJob, scene_frames
+        from ..jobs.export import (
+            ExportGaussiansJob,
+            ExportMeshJob,
+            ExportVdbSequenceJob,
+            posed_frames,
+            posed_now,
+            scene_frames,
+        )
         from ..scene.export_model import check_ready
 
-        kind = self.chosen(context, "format")
-        if not self.properties.is_property_set("format"):
-            ending = Path(self.filepath).suffix.lower()
-            kind = next((name for name, endings in MODEL_ENDINGS.items() if ending in endings), kind)
-        path = destination(self.filepath, MODEL_ENDINGS[kind])
-        target, frames = HumanTarget.of(person), scene_frames(context.scene, self.chosen(context, "animation"))
+        target = HumanTarget.of(person)
+        if kind == "PLY":
+            return ExportGaussiansJob(target, path, posed_now(context, person), self.chosen(context, "gaussians"))
+        if kind == "VDB":
+            first, last = self._frames(context.scene)
+            people = posed_frames(context, person, range(first, last + 1))
+            return ExportVdbSequenceJob(target, path.parent, path.stem, people, first, self.chosen(context, "voxel"))
         check_ready(armature_of(person))
         px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
-        return submit(self, context, ExportMeshJob(target, px, triangles, path, kind, frames))
+        frames = scene_frames(context.scene, self.chosen(context, "animation"))
+        return ExportMeshJob(target, px, triangles, path, kind, frames)
+
+    def _frames(self, scene: bpy.types.Scene) -> tuple[int, int]:
+        given = self.properties.is_property_set
+        first = self.first if given("first") else scene.frame_start
+        last = self.last if given("last") else scene.frame_end
+        if last < first:
+            raise ValueError(f"the last frame {last} is before the first, {first}: swap them")
+        return first, last
 
 
 class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
@@ -202,7 +284,7 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
-    """Choose how the selected human is shown: as volumes or as the mesh proxy"""
+    """Choose how the selected human is shown: as volumes or as the mesh proxy; or remove the mesh proxy"""
 
     bl_idname = "primdiffusion.show_proxy"
     bl_label = "Show Volumes or Mesh"
@@ -213,103 +295,14 @@ class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
     )
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.export import show  # needs numpy
-
-        show(person, self.shown)
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_remove_proxy(_Export, bpy.types.Operator):
-    """Remove the mesh proxy of the selected human and show the volumes"""
-
-    bl_idname = "primdiffusion.remove_proxy"
-    bl_label = "Remove Mesh Proxy"
-    bl_options = {"UNDO"}
-
-    def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         # needs numpy
         from ..jobs.export import show
         from ..scene.proxy import proxy_of, remove_proxy
 
-        show(person, "VOLUMES")
-        remove_proxy(proxy_of(person))
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_export_gaussians(_ToFile, bpy.types.Operator):
-    """Export the selected human in the current pose as 3D Gaussians for splat viewers"""
-
-    bl_idname = "primdiffusion.export_gaussians"
-    bl_label = "Export Gaussians"
-
-    gaussians: bpy.props.IntProperty(name="Gaussians", description=PANELS, min=1, options=SKIP)
-
-    def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
-        return (".ply",)
-
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.export import ExportGaussiansJob, posed_now  # needs numpy
-
-        path = destination(self.filepath, self.endings(context))
-        job = ExportGaussiansJob(
-            HumanTarget.of(person), path, posed_now(context, person), self.chosen(context, "gaussians")
-        )
-        return submit(self, context, job)
-
-
-class PRIMDIFFUSION_OT_export_vdb_sequence(_Export, bpy.types.Operator):
-    """Export the selected human as one volume file for each frame, for any renderer that reads OpenVDB"""
-
-    bl_idname = "primdiffusion.export_vdb_sequence"
-    bl_label = "Export VDB Sequence"
-
-    directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options=SKIP)
-    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-    first: bpy.props.IntProperty(name="First Frame", description="Not given: the scene's", options=SKIP)
-    last: bpy.props.IntProperty(name="Last Frame", description="Not given: the scene's", options=SKIP)
-    voxel: bpy.props.FloatProperty(name="Voxel Size", description=PANELS, min=0.002, max=0.05, options=SKIP)
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
-
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.export import ExportVdbSequenceJob, posed_frames  # needs numpy
-
-        if not self.directory:
-            raise ValueError("name a folder to export to")
-        folder = Path(bpy.path.abspath(self.directory))
-        check_writable(folder)
-        scene, given = context.scene, self.properties.is_property_set
-        first = self.first if given("first") else scene.frame_start
-        last = self.last if given("last") else scene.frame_end
-        if last < first:
-            raise ValueError(f"the last frame {last} is before the first, {first}: swap them")
-        target, stem = HumanTarget.of(person), bpy.path.clean_name(person.name)
-        people = posed_frames(context, person, range(first, last + 1))
-        job = ExportVdbSequenceJob(target, folder, stem, people, first, self.chosen(context, "voxel"))
-        return submit(self, context, job)
-
-
-class PRIMDIFFUSION_OT_export_human(_ToFile, bpy.types.Operator):
-    """Export the selected human as a .human file that can be dropped into another scene"""
-
-    bl_idname = "primdiffusion.export_human"
-    bl_label = "Export Human File"
-
-    motion: bpy.props.BoolProperty(name="With Motion", description=PANELS, options=SKIP)
-    compact: bpy.props.BoolProperty(name="Compact", description=PANELS, options=SKIP)
-
-    def endings(self, _context: bpy.types.Context) -> tuple[str, ...]:
-        return HUMAN_ENDINGS
-
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.export import scene_frames, write_human  # needs numpy
-
-        path = destination(self.filepath, HUMAN_ENDINGS)
-        frames = scene_frames(context.scene, True) if self.chosen(context, "motion") else None
-        write_human(context, person, path, frames, compact=self.chosen(context, "compact"))
-        self.report({"INFO"}, f"Exported {person.name} to {path.name}")
+        removed = self.shown == "REMOVED"
+        show(person, "VOLUMES" if removed else self.shown)
+        if removed:
+            remove_proxy(proxy_of(person))
         return {"FINISHED"}
 
 
@@ -321,7 +314,7 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
     filter_glob: bpy.props.StringProperty(
-        default=";".join(f"*{ending}" for ending in HUMAN_ENDINGS), options={"HIDDEN"}
+        default=";".join(f"*{ending}" for ending in ENDINGS["HUMAN"]), options={"HIDDEN"}
     )
     location: bpy.props.FloatVectorProperty(
         name="Location",

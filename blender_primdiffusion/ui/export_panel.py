@@ -4,99 +4,103 @@ from __future__ import annotations
 
 import bpy
 
+from ..backend.requests import sentence
 from ..jobs.target import selected_person
-from ..places import INSTALLS_BACKEND
+from ..places import INSTALLS_BACKEND, backend_is_named
+from ..scene.human import humans
 from . import gallery
-from .drawing import OUTPUT, SidebarPanel, draw_job, draw_lines, property_columns
+from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
+from .export_operators import OPTIONS
+
+_JOBS = {"PLY": "export_gaussians", "VDB": "export_vdb_sequence"}
+"""Kinds of jobs by format; a .human file needs none, the others are meshes."""
+_LABELS = {"VOLUMES": "Show Volumes", "VIEWPORT": "Show Mesh in Viewport", "MESH": "Show Mesh"}
 
 
 class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
-    """The selected human as a .human file."""
+    """The selected human as a file, as a mesh proxy, as an asset."""
 
     bl_label = "Export"
-    bl_category = OUTPUT
-    bl_order = 6
+    bl_order = 3
+    bl_options = {"DEFAULT_CLOSED"}
     manual_page = "export"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
-        layout.prop(settings, "motion")
-        layout.prop(settings, "compact")
-        layout.operator("primdiffusion.export_human", icon="EXPORT")
+        kind = settings.format if backend_is_named() else "HUMAN"
+        if backend_is_named():
+            layout.prop(settings, "format")
+        for name in OPTIONS[kind]:
+            layout.prop(settings, name)
+        if kind == "HUMAN":
+            layout.operator("primdiffusion.export", icon="EXPORT")
+        else:
+            draw_job(layout, _JOBS.get(settings.format, "export_mesh"), "primdiffusion.export", "EXPORT")
+        if not backend_is_named():
+            return
+        if (body := draw_section(layout, "proxy", text="Mesh Proxy", page="export", section="mesh-proxy")) is not None:
+            _draw_proxy(body, context)
+        if (body := draw_section(layout, "assets", text="Assets", page="assets")) is not None:
+            _draw_assets(body, context)
+
+
+def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """The mesh in the scene."""
+    settings = context.scene.primdiffusion_export
+    layout.prop(settings, "texture_px")
+    layout.prop(settings, "triangles")
+    draw_job(layout, "add_proxy", "primdiffusion.add_proxy", "OUTLINER_OB_MESH")
+    try:
+        person = selected_person(context)
+    except ValueError:
+        return
+    # needs numpy
+    from ..jobs.export import shown
+    from ..scene.proxy import is_outdated, proxy_of
+    from ..scene.shape import betas_of
+
+    try:
+        proxy = proxy_of(person)
+        outdated = proxy is not None and is_outdated(person, proxy, betas_of(person))
+    except ValueError:
+        return
+    if proxy is None:
+        return
+    layout.operator_menu_enum("primdiffusion.show_proxy", "shown", text=_LABELS[shown(person)], icon="HIDE_OFF")
+    if outdated:
+        draw_lines(layout, "Shape or clothes have changed: add it again", "INFO")
+
+
+def _draw_assets(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Humans and poses for other files."""
+    try:
+        person = selected_person(context) if humans(context.scene) else None
+    except ValueError as error:
+        draw_lines(layout, sentence(error), "INFO")
+        return
+    if person is not None and person.asset_data is not None:
+        row = layout.row()
+        row.context_pointer_set("id", person)
+        row.operator("asset.clear_single", text="Unmark Human Asset", icon="X")
+    else:
+        draw_job(layout, "human_asset", "primdiffusion.mark_as_asset", "ASSET_MANAGER", text="Mark Human as Asset")
+    props = draw_job(layout, "pose_asset", "primdiffusion.mark_as_asset", "ARMATURE_DATA", text="Mark Pose as Asset")
+    props.what = "POSE"
+    layout.operator("primdiffusion.make_pose_assets", icon="FILE_FOLDER")
 
 
 class PRIMDIFFUSION_PT_from_file(SidebarPanel, bpy.types.Panel):
     """Humans from .human files."""
 
     bl_label = "From File"
-    bl_order = 2
+    bl_parent_id = "PRIMDIFFUSION_PT_generate" if INSTALLS_BACKEND else ""
+    bl_order = 2 if INSTALLS_BACKEND else 0
     bl_options = {"DEFAULT_CLOSED"} if INSTALLS_BACKEND else set()
     manual_page, manual_section = "export", "human-files"
 
     def draw(self, _context: bpy.types.Context) -> None:
         gallery.draw_samples(self.layout)
         draw_job(self.layout, "import_human", "primdiffusion.import_human", "IMPORT")
-
-
-class PRIMDIFFUSION_PT_export_mesh(SidebarPanel, bpy.types.Panel):
-    """The mesh proxy as a file, or in the scene."""
-
-    bl_label = "Textured Mesh"
-    bl_category = OUTPUT
-    bl_parent_id = "PRIMDIFFUSION_PT_export"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
-        for name in ("texture_px", "triangles", "format", "animation"):
-            layout.prop(settings, name)
-        draw_job(layout, "export_mesh", "primdiffusion.export_mesh", "EXPORT")
-        layout.separator()
-        draw_job(layout, "add_proxy", "primdiffusion.add_proxy", "OUTLINER_OB_MESH")
-        self._draw_proxy(context)
-
-    def _draw_proxy(self, context: bpy.types.Context) -> None:
-        try:
-            person = selected_person(context)
-        except ValueError:
-            return
-        # needs numpy
-        from ..jobs.export import shown
-        from ..scene.proxy import is_outdated, proxy_of
-        from ..scene.shape import betas_of
-
-        try:
-            proxy = proxy_of(person)
-            outdated = proxy is not None and is_outdated(person, proxy, betas_of(person))
-        except ValueError:
-            return
-        if proxy is None:
-            return
-        row = self.layout.row(align=True)
-        row.operator_menu_enum("primdiffusion.show_proxy", "shown", text=_LABELS[shown(person)], icon="HIDE_OFF")
-        row.operator("primdiffusion.remove_proxy", text="", icon="X")
-        if outdated:
-            draw_lines(self.layout, "Shape or clothes have changed: add it again", "INFO")
-
-
-class PRIMDIFFUSION_PT_export_volumes(SidebarPanel, bpy.types.Panel):
-    """Gaussians and VDB sequences."""
-
-    bl_label = "Gaussians and Volumes"
-    bl_category = OUTPUT
-    bl_parent_id = "PRIMDIFFUSION_PT_export"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
-        layout.prop(settings, "gaussians")
-        draw_job(layout, "export_gaussians", "primdiffusion.export_gaussians", "POINTCLOUD_DATA")
-        layout.separator()
-        layout.prop(settings, "voxel")
-        draw_job(layout, "export_vdb_sequence", "primdiffusion.export_vdb_sequence", "VOLUME_DATA")
-
-
-_LABELS = {"VOLUMES": "Show Volumes", "VIEWPORT": "Show Mesh in Viewport", "MESH": "Show Mesh"}
 
 
 class PRIMDIFFUSION_FH_human(bpy.types.FileHandler):

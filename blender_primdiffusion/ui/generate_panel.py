@@ -1,4 +1,4 @@
-"""The sidebar panel Generate: settings, presets, Generate Human, Random Seed."""
+"""The sidebar panel Generate: settings, presets, Generate Human."""
 
 from __future__ import annotations
 
@@ -266,18 +266,6 @@ class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_random_seed(bpy.types.Operator):
-    """Set a random seed"""
-
-    bl_idname = "primdiffusion.random_seed"
-    bl_label = "Random Seed"
-    bl_options = {"UNDO"}
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        context.scene.primdiffusion.seed = random_seed()
-        return {"FINISHED"}
-
-
 def _queued_seeds() -> set[int]:
     """Seeds of queued humans: a second press of the button means another human."""
     return {entry.job.seed for entry in queue.queued if entry.job.kind == "generate"}
@@ -303,7 +291,7 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
         row = column.row(align=True)
         row.prop(settings, "seed")
         row.prop(settings, "keep_seed", text="", icon="LOCKED" if settings.keep_seed else "UNLOCKED")
-        row.operator("primdiffusion.random_seed", text="", icon="FILE_REFRESH")
+        row.operator("primdiffusion.set_seed", text="", icon="FILE_REFRESH")
         column.prop(settings, "count")
         column = layout.column()
         column.prop(settings, "quality")

@@ -1,10 +1,11 @@
-"""The sidebar panel Human: the selected human as a whole, and the files of humans."""
+"""The sidebar panel Human: the selected human as a whole; operators on the files of humans."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_tip
 
 from ..backend.requests import in_words, sentence
 from ..formats.removing import OutsideFolderError, remove_file
@@ -13,13 +14,15 @@ from ..jobs.late_volumes import late_volumes
 from ..jobs.missing_files import look, state
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.human import armature_of, check_editable, humans, humans_folder, person_file, remove_human
-from .drawing import HUMAN, OUTPUT, SidebarPanel, draw_job, draw_lines
+from .drawing import SidebarPanel, draw_job, draw_lines
 from .on_person import OnPerson
 
 
-class _Find:
-    """Base of the operators that look for files."""
+class PRIMDIFFUSION_OT_find_missing_volumes(bpy.types.Operator):
+    """Find missing files of humans, and restore those that cannot be found"""
 
+    bl_idname = "primdiffusion.find_missing_volumes"
+    bl_label = "Find Missing Volumes"
     bl_options: set[str] = set()  # neither REGISTER nor UNDO: each result makes its own step
 
     directory: bpy.props.StringProperty(
@@ -29,6 +32,22 @@ class _Find:
         subtype="DIR_PATH",
         options={"SKIP_SAVE"},
     )
+    choose: bpy.props.BoolProperty(
+        name="Choose Folder", description="Choose the folder in the file browser", options={"SKIP_SAVE"}
+    )
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return pgettext_tip(
+            "Choose a folder to search for missing files of humans" if properties.choose else str(cls.__doc__)
+        )
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if not self.choose:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         # needs numpy
@@ -86,26 +105,6 @@ class _Find:
                     left.append(str(error))
         done = [job for job in jobs if submit(self, context, job) == {"FINISHED"}]
         return len(done), left
-
-
-class PRIMDIFFUSION_OT_find_missing_volumes(_Find, bpy.types.Operator):
-    """Find missing files of humans, and restore those that cannot be found"""
-
-    bl_idname = "primdiffusion.find_missing_volumes"
-    bl_label = "Find Missing Volumes"
-
-
-class PRIMDIFFUSION_OT_find_volumes_in_folder(_Find, bpy.types.Operator):
-    """Choose a folder to search for missing files of humans"""
-
-    bl_idname = "primdiffusion.find_volumes_in_folder"
-    bl_label = "Find Volumes in Folder"
-
-    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
 
 
 class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
@@ -185,7 +184,7 @@ def draw_missing(layout: bpy.types.UILayout) -> None:
     draw_lines(box, f"Missing: {state.summary}", "ERROR")
     row = box.row(align=True)
     draw_job(row.column(), "restore_volumes", "primdiffusion.find_missing_volumes", "VIEWZOOM")
-    row.operator("primdiffusion.find_volumes_in_folder", text="", icon="FILE_FOLDER")
+    row.operator("primdiffusion.find_missing_volumes", text="", icon="FILE_FOLDER").choose = True
     for name in state.without_person_file:
         draw_job(box, "regenerate", "primdiffusion.generate_again", "FILE_REFRESH").human = name
 
@@ -197,30 +196,23 @@ class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
     bl_label = "Select Human"
     bl_options = {"REGISTER", "UNDO"}
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..scene.edit import select_human  # needs numpy
+    frame: bpy.props.BoolProperty(name="Frame", description="Frame the human in the view, too", options={"SKIP_SAVE"})
 
-        select_human(context, person)
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_frame_human(OnPerson, bpy.types.Operator):
-    """Select this human and frame it in the view"""
-
-    bl_idname = "primdiffusion.frame_human"
-    bl_label = "Frame Human"
-    bl_options = {"REGISTER", "UNDO"}
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return pgettext_tip("Select this human and frame it in the view" if properties.frame else str(cls.__doc__))
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        """In the viewport that the button was pressed in, else in the first one."""
+        """Frames in the viewport that the button was pressed in, else in the first one."""
         from ..scene.edit import select_human  # needs numpy
 
-        place = _viewport(context)
-        if place is None:
+        place = _viewport(context) if self.frame else None
+        if self.frame and place is None:
             raise ValueError("no 3D viewport is open: open one")
         select_human(context, person)
-        with context.temp_override(**place):
-            bpy.ops.view3d.view_selected()
+        if place is not None:
+            with context.temp_override(**place):
+                bpy.ops.view3d.view_selected()
         return {"FINISHED"}
 
 
@@ -258,7 +250,7 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
             title = f"Delete {self.person(context).name}?"
         except ValueError:
             return self.execute(context)
-        message = "The files stay on disk for Undo: Output > Files > Remove Unused Files deletes them"
+        message = "The files stay on disk for Undo: Advanced > Files > Remove Unused Files deletes them"
         return context.window_manager.invoke_confirm(self, event, title=title, message=message)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
@@ -300,8 +292,7 @@ class PRIMDIFFUSION_PT_human(SidebarPanel, bpy.types.Panel):
     """Who is selected, by name."""
 
     bl_label = "Human"
-    bl_category = HUMAN
-    bl_order = 0
+    bl_order = 1
     manual_page = "editing"
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -316,22 +307,6 @@ class PRIMDIFFUSION_PT_human(SidebarPanel, bpy.types.Panel):
             return
         row.prop(settings, "person", text="")
         row.operator("primdiffusion.select_human", text="", icon="RESTRICT_SELECT_OFF")
-        row.operator("primdiffusion.frame_human", text="", icon="ZOOM_SELECTED")
+        row.operator("primdiffusion.select_human", text="", icon="ZOOM_SELECTED").frame = True
         row.operator("primdiffusion.duplicate_human", text="", icon="DUPLICATE")
         row.operator("primdiffusion.delete_human", text="", icon="TRASH")
-
-
-class PRIMDIFFUSION_PT_edit_files(SidebarPanel, bpy.types.Panel):
-    """Files of humans: beside the .blend, missing ones, and those left by edits."""
-
-    bl_label = "Files"
-    bl_category = OUTPUT
-    bl_order = 8
-    bl_options = {"DEFAULT_CLOSED"}
-    manual_page, manual_section = "editing", "undo-and-files-on-disk"
-
-    def draw(self, _context: bpy.types.Context) -> None:
-        layout = self.layout
-        layout.operator("primdiffusion.collect_files", icon="PACKAGE")
-        layout.operator("primdiffusion.find_volumes_in_folder", icon="VIEWZOOM")
-        layout.operator("primdiffusion.remove_unused_files", icon="TRASH")

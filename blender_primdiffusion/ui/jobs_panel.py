@@ -1,4 +1,4 @@
-"""The sidebar panels Jobs, shown while there are any, and Backend: device, memory, diagnostics."""
+"""The sidebar panel Jobs, shown while there are any; the backend: device, memory, diagnostics."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from collections.abc import Iterator
 
 import bpy
 from bpy.app.handlers import persistent
+from bpy.app.translations import pgettext_tip
 
 from ..backend.redact import redact
 from ..jobs import follow, memory
@@ -18,7 +19,9 @@ from ..jobs.picture_in_view import follow_picture
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
-from .drawing import BackendPanel, SidebarPanel, draw_ended, draw_lines, draw_queue
+from .backend_state import being_set_up, cancel_set_up
+from .captures_session import captures
+from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
 
 TEXT = "PrimDiffusion Diagnostics"
 _LOG_LINES = 60
@@ -104,6 +107,8 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
 
 
 _SKIP = {"SKIP_SAVE"}
+_CAPTURES = "Stop rendering; finished pictures stay, and the next run resumes from them"
+_SET_UP = "Stop; the next Set Up Backend uses what was downloaded"
 
 
 class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
@@ -112,18 +117,39 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.cancel"
     bl_label = "Cancel"
 
+    what: bpy.props.EnumProperty(
+        name="Cancel",
+        description="What to stop",
+        items=[
+            ("JOB", "Job", "Stop this job, or remove it from the queue; nothing is added to the scene"),
+            ("CAPTURES", "Captures", _CAPTURES),
+            ("SET_UP", "Set-Up", _SET_UP),
+        ],
+        options=_SKIP,
+    )
     number: bpy.props.IntProperty(
         name="Number", description="Number of the queued job; 0 is the running one", min=0, options=_SKIP
     )
 
     @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return pgettext_tip({"CAPTURES": _CAPTURES, "SET_UP": _SET_UP}.get(properties.what, str(cls.__doc__)))
+
+    @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
-        if not queue.busy:
-            cls.poll_message_set("No job is queued")
-        return queue.busy
+        busy = queue.busy or captures.busy or being_set_up()
+        if not busy:
+            cls.poll_message_set("Nothing is running: no job, no captures, no set-up")
+        return busy
 
     def act(self, _context: bpy.types.Context) -> set[str]:
-        if not queue.cancel(self.number):
+        if self.what == "CAPTURES":
+            if not captures.busy:
+                raise ValueError("no captures are being rendered")
+            captures.cancel()
+        elif self.what == "SET_UP":
+            cancel_set_up()
+        elif not queue.cancel(self.number):
             which = f"job {self.number} is no longer queued" if self.number else "no job is running yet"
             raise ValueError(which)
         redraw()
@@ -177,7 +203,7 @@ class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
     """Queued jobs, and those that ended before. Progress is shown below the button that started the job."""
 
     bl_label = "Jobs"
-    bl_order = 8
+    bl_order = 5
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -188,19 +214,12 @@ class PRIMDIFFUSION_PT_jobs(SidebarPanel, bpy.types.Panel):
         draw_ended(self.layout)
 
 
-class PRIMDIFFUSION_PT_backend(BackendPanel, bpy.types.Panel):
+def draw_backend(layout: bpy.types.UILayout) -> None:
     """What computes, and what to do when it does not."""
-
-    bl_label = "Backend"
-    bl_order = 9
-    bl_options = {"DEFAULT_CLOSED"}
-    manual_page = "troubleshooting"
-
-    def draw(self, _context: bpy.types.Context) -> None:
-        draw_lines(self.layout, f"Device: {device_line()}", "MEMORY")
-        column = self.layout.column(align=True)
-        column.operator("primdiffusion.release_memory", icon="TRASH")
-        column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
+    draw_lines(layout, f"Device: {device_line()}", "MEMORY")
+    column = layout.column(align=True)
+    column.operator("primdiffusion.release_memory", icon="TRASH")
+    column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
 
 
 @persistent

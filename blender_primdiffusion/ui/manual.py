@@ -2,42 +2,26 @@
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 
 import bpy
 
-MISSING = "the manual's page {!r} is not there: install the extension's zip again"
 _FOLDERS = (("manual", ".html"), ("../docs/manual", ".md"))
 """Where pages may be, from the extension's folder: in an installed zip, in a checkout."""
 
 
-class PRIMDIFFUSION_OT_open_manual(bpy.types.Operator):
-    """Open the manual page in the browser; needs no network"""
-
-    bl_idname = "primdiffusion.open_manual"
-    bl_label = "Open Manual"
-    bl_options: set[str] = set()
-
-    page: bpy.props.StringProperty(name="Page", description="Name of the page, such as first_human", default="index")
-    anchor: bpy.props.StringProperty(name="Section", description="Heading on the page; empty: its start")
-
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        import webbrowser  # slow to import, and not needed to register
-
-        path = page_file(self.page) or page_file("index")
-        if path is None:
-            self.report({"ERROR"}, MISSING.format(self.page))
-            return {"CANCELLED"}
-        if not webbrowser.open(path.as_uri() + (f"#{self.anchor}" if self.anchor else "")):
-            self.report({"ERROR"}, f"no browser could be started: open {path} by hand")
-            return {"CANCELLED"}
-        return {"FINISHED"}
-
-
 def draw_manual_button(layout: bpy.types.UILayout, page: str, anchor: str = "") -> None:
-    """A question mark that opens a page; for a panel's `draw_header_preset`."""
-    props = layout.operator("primdiffusion.open_manual", text="", icon="QUESTION", emboss=False)
-    props.page, props.anchor = page, anchor
+    """A question mark that opens a page, for the headers of panels; nothing where the manual is not there."""
+    if url := page_url(page, anchor):
+        layout.operator("wm.url_open", text="", icon="QUESTION", emboss=False).url = url
+
+
+@functools.cache
+def page_url(page: str, anchor: str = "") -> str:
+    """Address of a page, or of a heading on it; empty where there is none."""
+    path = page_file(page) or page_file("index")
+    return "" if path is None else path.as_uri() + (f"#{anchor}" if anchor else "")
 
 
 def page_file(page: str) -> Path | None:

@@ -6,15 +6,15 @@ import dataclasses
 import itertools
 
 import bpy
+from bpy.app.translations import pgettext_tip
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
-from ..jobs.follow import Reporting
-from ..scene.actions import action_curves, end_repeat, loops, repeat
+from ..scene.actions import action_curves
 from ..scene.blend_values import as_shown, stored_record
-from .drawing import HUMAN, SidebarPanel, draw_lines, property_columns
+from .drawing import SidebarPanel, draw_lines, property_columns
 from .export_operators import destination
-from .on_person import FACTS, OnArmature, WhereTo, scene_fps, target_armature
+from .on_person import FACTS, OnArmature, WhereTo, may_have_joints, scene_fps, target_armature
 from .translations import CONTEXT
 
 _MOST_FACTS = 20
@@ -26,21 +26,33 @@ _BUILT_IN = [
 ]
 
 
-class PRIMDIFFUSION_OT_use_action(Reporting, bpy.types.Operator):
+class PRIMDIFFUSION_OT_use_action(OnArmature, bpy.types.Operator):
     """Use another action of this file for the human"""
 
     bl_idname = "primdiffusion.use_action"
     bl_label = "Use Motion"
     bl_options = {"REGISTER", "UNDO"}
 
-    action: bpy.props.StringProperty(name="Action", description="Name of the action", options={"SKIP_SAVE"})
+    action: bpy.props.StringProperty(
+        name="Action", description="Name of the action; empty: none, and the rest pose", options={"SKIP_SAVE"}
+    )
 
-    def act(self, context: bpy.types.Context) -> set[str]:
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return pgettext_tip(
+            str(cls.__doc__)
+            if properties.action
+            else "Remove the motion from the human; the action stays in the file, the human returns to the rest pose"
+        )
+
+    def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         from ..motion.pose_library import check_posable  # needs numpy
 
-        action = bpy.data.actions.get(self.action)
-        armature = target_armature(context)
         check_posable(armature)
+        if not self.action:
+            _clear_motion(armature)
+            return {"FINISHED"}
+        action = bpy.data.actions.get(self.action)
         if action is None:
             raise ValueError(f"there is no action {self.action!r} in this file")
         if not moves_bones(action):
@@ -50,6 +62,21 @@ class PRIMDIFFUSION_OT_use_action(Reporting, bpy.types.Operator):
         if action_curves(armature) is None:
             animation.action_slot = next(slot for slot in action.slots if slot.target_id_type == "OBJECT")
         return {"FINISHED"}
+
+
+def _clear_motion(armature: bpy.types.Object) -> None:
+    """Remove action and strips, and pose the armature as at rest. Raises ValueError where there are none."""
+    import numpy as np  # needs numpy
+
+    from ..scene.armature import pose_from_joint_rotations  # needs numpy
+
+    animation = armature.animation_data
+    if animation is None or (animation.action is None and not animation.nla_tracks):
+        raise ValueError(f"{armature.name!r} has no motion to clear")
+    animation.action = None
+    for track in list(animation.nla_tracks):
+        animation.nla_tracks.remove(track)
+    pose_from_joint_rotations(armature, np.tile(np.eye(3), (24, 1, 1)))
 
 
 def moves_bones(action: bpy.types.Action) -> bool:
@@ -90,45 +117,6 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_clear_motion(OnArmature, bpy.types.Operator):
-    """Remove the motion from the human; the action stays in the file, the human returns to the rest pose"""
-
-    bl_idname = "primdiffusion.clear_motion"
-    bl_label = "Clear Motion"
-    bl_options = {"REGISTER", "UNDO"}
-
-    def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.pose_library import check_posable
-        from ..scene.armature import pose_from_joint_rotations
-
-        check_posable(armature)
-        animation = armature.animation_data
-        if animation is None or (animation.action is None and not animation.nla_tracks):
-            raise ValueError(f"{armature.name!r} has no motion to clear")
-        animation.action = None
-        for track in list(animation.nla_tracks):
-            animation.nla_tracks.remove(track)
-        import numpy as np  # needs numpy
-
-        pose_from_joint_rotations(armature, np.tile(np.eye(3), (24, 1, 1)))
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_loop_motion(OnArmature, bpy.types.Operator):
-    """Loop the motion, or stop looping; a walk continues from where it has arrived"""
-
-    bl_idname = "primdiffusion.loop_motion"
-    bl_label = "Loop"
-    bl_options = {"REGISTER", "UNDO"}
-
-    def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        if action_curves(armature) is None:
-            raise ValueError(f"{armature.name!r} has no action to loop: import or add a motion first")
-        (end_repeat if loops(armature) else repeat)(armature)
-        return {"FINISHED"}
-
-
 class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operator):
     """Write the human's motion as an AMASS .npz file: axis angles, translations and shape, z up"""
 
@@ -162,10 +150,14 @@ class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
     """Import and built-in motions, the current motion, and export."""
 
     bl_label = "Motion"
-    bl_category = HUMAN
-    bl_order = 3
+    bl_parent_id = "PRIMDIFFUSION_PT_human"
+    bl_order = 2
     bl_options = {"DEFAULT_CLOSED"}
     manual_page = "motion"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return may_have_joints(context)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
@@ -181,7 +173,7 @@ class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
         column.operator("primdiffusion.key_pose", icon="KEY_HLT")
         animation = armature.animation_data
         if animation is not None and (animation.action is not None or animation.nla_tracks):
-            column.operator("primdiffusion.clear_motion", icon="X")
+            column.operator("primdiffusion.use_action", text="Clear Motion", icon="X").action = ""
         layout.operator("primdiffusion.export_motion", icon="EXPORT")
 
     def _draw_action(self, layout: bpy.types.UILayout, armature: bpy.types.Object) -> None:
@@ -199,7 +191,7 @@ class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
         row.label(text="In the Scene")
         row.label(text=f"{start:g} \N{EN DASH} {end:g}", translate=False)
         if action_curves(armature) is not None:
-            layout.operator("primdiffusion.loop_motion", icon="FILE_REFRESH", depress=loops(armature))
+            layout.prop(armature.primdiffusion_human, "loop", toggle=True, icon="FILE_REFRESH")
 
 
 class PRIMDIFFUSION_MT_actions(bpy.types.Menu):

@@ -1,4 +1,4 @@
-"""Bases of operators on one human, or on one armature with SMPL's joints."""
+"""Bases of operators and panels on one human, or on one armature with SMPL's joints."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from ..jobs.copies import separate
 from ..jobs.follow import Reporting
 from ..jobs.target import named_person, selected_person
 from ..scene.human import armature_of, human_of, humans
+from .drawing import SidebarPanel
 
 SKIP = {"SKIP_SAVE"}
 PANELS = "Not given: the panel's"
@@ -41,6 +42,32 @@ class OnPerson(Reporting):
         raise NotImplementedError
 
 
+class HumanPanel(SidebarPanel):
+    """A panel in the panel Human, shown for the selected human and closed at first."""
+
+    bl_parent_id = "PRIMDIFFUSION_PT_human"
+    bl_options = {"DEFAULT_CLOSED"}
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        try:
+            selected_person(context)
+        except ValueError:
+            return False
+        return True
+
+
+def other_human(context: bpy.types.Context, person: bpy.types.Collection, name: str) -> bpy.types.Collection:
+    """The other human, named by a script, or picked in the panel where the name is empty. Raises ValueError."""
+    picked = context.scene.primdiffusion_edit.other
+    if not name and picked is None:
+        raise ValueError("choose the other human in the panel first")
+    other = named_person(context, name or picked.name)
+    if other == person:
+        raise ValueError(f"{person.name!r} cannot be the other human too: choose another one")
+    return other
+
+
 FACTS = "primdiffusion_motion"
 """Custom property of an action: what its motion is, as JSON."""
 
@@ -60,6 +87,12 @@ def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.O
         if len(missing) < len(JOINT_NAMES) or human_of(active, context.scene) is not None:
             raise ValueError(f"the armature {active.name!r} has no bone {missing[0]!r}: rename it back, or undo")
     return armature_of(selected_person(context))
+
+
+def may_have_joints(context: bpy.types.Context) -> bool:
+    """Whether there is a human, or an active armature: `target_armature` may still reject it, with a reason."""
+    active = context.view_layer.objects.active
+    return bool(humans(context.scene)) or (active is not None and active.type == "ARMATURE")
 
 
 def warn_of_rest(operator: bpy.types.Operator, armature: bpy.types.Object) -> None:
@@ -84,11 +117,12 @@ class OnArmature(Reporting):
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
-        active = context.view_layer.objects.active
-        if humans(context.scene) or (active is not None and active.type == "ARMATURE"):
-            return True
-        cls.poll_message_set("There is no human in the scene: generate one, or select an armature with SMPL's joints")
-        return False
+        found = may_have_joints(context)
+        if not found:
+            cls.poll_message_set(
+                "There is no human in the scene: generate one, or select an armature with SMPL's joints"
+            )
+        return found
 
     def act(self, context: bpy.types.Context) -> set[str]:
         separate()

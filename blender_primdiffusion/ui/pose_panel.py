@@ -7,13 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
+from bpy.app.translations import pgettext_tip
 from bpy.utils import previews
 
 from ..formats.joints import JOINT_NAMES
 from ..motion.own_poses import delete_pose, load_pose, own_poses, picture_of, save_pose
 from ..places import own_folder
-from .drawing import HUMAN, SidebarPanel, property_columns
-from .on_person import OnArmature, warn_of_rest
+from .drawing import SidebarPanel, property_columns
+from .on_person import OnArmature, may_have_joints, warn_of_rest
 from .translations import CONTEXT
 
 if TYPE_CHECKING:
@@ -157,12 +158,20 @@ class _Posing(OnArmature):
         return {"FINISHED"}
 
 
+_POSES = (
+    ("LIBRARY", "Of the Library", "Apply the chosen pose of the library to the human"),
+    ("MIRRORED", "Mirrored", "Swap left and right of the human's pose"),
+    ("REST", "Rest", "Reset the human to the rest pose"),
+)
+
+
 class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
-    """Apply the chosen pose of the library to the human"""
+    """Apply the chosen pose of the library to the human, mirror its pose, or reset it to rest"""
 
     bl_idname = "primdiffusion.apply_pose"
     bl_label = "Apply Pose"
 
+    what: bpy.props.EnumProperty(name="Pose To Apply", description="Which pose", items=_POSES, options=_SKIP)
     pose_name: bpy.props.StringProperty(
         name="Pose", description="Name of the pose in the library; empty: the panel's", options=_SKIP
     )
@@ -179,7 +188,13 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
         name="Feet on the Floor", description="Move the body down until the feet are on the floor", default=True
     )
 
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return next(pgettext_tip(text) for name, _, text in _POSES if name == properties.what)
+
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if self.what != "LIBRARY":
+            return self.execute(context)
         settings = context.scene.primdiffusion_motion
         if not self.pose_name:
             self.pose_name = settings.pose
@@ -188,7 +203,30 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
                 setattr(self, name, getattr(settings, name))
         return self.execute(context)
 
+    def draw(self, _context: bpy.types.Context) -> None:
+        layout = property_columns(self.layout)
+        layout.prop(self, "what")
+        if self.what == "LIBRARY":
+            for name in ("pose_name", "amount", "mirror", "ground"):
+                layout.prop(self, name)
+        layout.prop(self, "only_selected")
+
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        # needs numpy
+        import numpy as np
+
+        from ..motion.pose_library import current_pose, mirrored
+        from ..motion.rotation import to_axis_angle
+
+        if self.what == "REST":
+            return self.pose(context, armature, np.zeros((len(JOINT_NAMES), 3)), np.zeros(3), 1.0)
+        if self.what == "MIRRORED":
+            rotations, translation = current_pose(armature)
+            return self.pose(context, armature, mirrored(to_axis_angle(rotations)), translation * [-1.0, 1.0, 1.0], 1.0)
+        return self._apply(context, armature)
+
+    def _apply(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """A pose of the library."""
         from ..motion.pose_library import builtin_poses, mirrored, standing  # needs numpy
 
         name = self.pose_name or context.scene.primdiffusion_motion.pose
@@ -205,33 +243,6 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
         if translation is None and self.ground:
             translation = standing(armature, pose)
         return self.pose(context, armature, pose, translation, self.amount)
-
-
-class PRIMDIFFUSION_OT_mirror_pose(_Posing, bpy.types.Operator):
-    """Swap left and right of the human's pose"""
-
-    bl_idname = "primdiffusion.mirror_pose"
-    bl_label = "Mirror Pose"
-
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.pose_library import current_pose, mirrored
-        from ..motion.rotation import to_axis_angle
-
-        rotations, translation = current_pose(armature)
-        return self.pose(context, armature, mirrored(to_axis_angle(rotations)), translation * [-1.0, 1.0, 1.0], 1.0)
-
-
-class PRIMDIFFUSION_OT_reset_pose(_Posing, bpy.types.Operator):
-    """Reset the human to the rest pose"""
-
-    bl_idname = "primdiffusion.reset_pose"
-    bl_label = "Reset to Rest"
-
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        import numpy as np  # needs numpy
-
-        return self.pose(context, armature, np.zeros((len(JOINT_NAMES), 3)), np.zeros(3), 1.0)
 
 
 class PRIMDIFFUSION_OT_key_pose(OnArmature, bpy.types.Operator):
@@ -255,11 +266,29 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
     bl_label = "Save Pose"
 
     pose_name: bpy.props.StringProperty(
-        name="Name", description="Name of the new pose", default="My Pose", options=_SKIP
+        name="Name", description="Name of the new pose, or of the one to delete", default="My Pose", options=_SKIP
+    )
+    delete: bpy.props.BoolProperty(
+        name="Delete",
+        description="Delete the chosen pose from your own poses in the library, for all .blend files",
+        options=_SKIP,
     )
 
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        told = properties.rna_type.properties["delete"].description if properties.delete else str(cls.__doc__)
+        return pgettext_tip(told)
+
+    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
+        if self.delete:
+            return context.window_manager.invoke_confirm(self, event)
         return context.window_manager.invoke_props_dialog(self)
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        self.layout.prop(self, "pose_name")
+
+    def act(self, context: bpy.types.Context) -> set[str]:
+        return self._delete(context.scene.primdiffusion_motion) if self.delete else super().act(context)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         # needs numpy
@@ -280,32 +309,17 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
         self.report({"INFO"}, f"The pose {name!r} is in the library")
         return {"FINISHED"}
 
-
-class PRIMDIFFUSION_OT_delete_pose(bpy.types.Operator):
-    """Delete the chosen pose from your own poses in the library, for all .blend files"""
-
-    bl_idname = "primdiffusion.delete_pose"
-    bl_label = "Delete Pose"
-    bl_options: set[str] = set()  # a file cannot be undone
-
-    pose_name: bpy.props.StringProperty(name="Pose", description="Empty: the panel's", options=_SKIP)
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        return context.window_manager.invoke_confirm(self, event)
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        settings = context.scene.primdiffusion_motion
-        name = self.pose_name or settings.pose
+    def _delete(self, settings: PRIMDIFFUSION_PG_motion) -> set[str]:
+        """One of the user's own poses: the one named, else the panel's. A file cannot be undone."""
+        name = self.pose_name if self.properties.is_property_set("pose_name") else settings.pose
         own = own_poses(poses_folder())
         if name not in own:
-            self.report({"ERROR"}, f"{name!r} is not one of your own poses: only those can be deleted")
-            return {"CANCELLED"}
+            raise ValueError(f"{name!r} is not one of your own poses: only those can be deleted")
         try:
             delete_pose(own[name])
             reload_poses()
         except OSError as error:
-            self.report({"ERROR"}, f"{str(own[name])!r} could not be deleted ({error.strerror or error})")
-            return {"CANCELLED"}
+            raise OSError(f"{str(own[name])!r} could not be deleted ({error.strerror or error})") from error
         settings.property_unset("pose")
         return {"FINISHED"}
 
@@ -314,10 +328,14 @@ class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
     """Poses with pictures."""
 
     bl_label = "Pose Library"
-    bl_category = HUMAN
-    bl_order = 2
+    bl_parent_id = "PRIMDIFFUSION_PT_human"
+    bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}
     manual_page = "posing"
+
+    @classmethod
+    def poll(cls, context: bpy.types.Context) -> bool:
+        return may_have_joints(context)
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
@@ -329,12 +347,12 @@ class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
         layout.prop(settings, "only_selected")
         layout.operator("primdiffusion.apply_pose", icon="ARMATURE_DATA")
         row = layout.row(align=True)
-        row.operator("primdiffusion.mirror_pose", icon="MOD_MIRROR")
-        row.operator("primdiffusion.reset_pose", icon="LOOP_BACK")
+        row.operator("primdiffusion.apply_pose", text="Mirror Pose", icon="MOD_MIRROR").what = "MIRRORED"
+        row.operator("primdiffusion.apply_pose", text="Reset to Rest", icon="LOOP_BACK").what = "REST"
         row = layout.row(align=True)
         row.operator("primdiffusion.save_pose", icon="ADD")
         if settings.pose in own_poses(poses_folder()):
-            row.operator("primdiffusion.delete_pose", icon="TRASH")
+            row.operator("primdiffusion.save_pose", text="Delete Pose", icon="TRASH").delete = True
 
 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_motion", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_motion)),)

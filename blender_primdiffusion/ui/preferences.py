@@ -7,13 +7,15 @@ import sys
 import bpy
 
 from ..backend.requests import sentence
+from ..jobs.follow import redraw
 from ..jobs.late_volumes import keep_writing
 from ..jobs.queue import queue
 from ..places import EXTENSION, missing_packages
-from .drawing import draw_lines
+from .drawing import DATA, draw_lines
 
 WIDTH = 90
 """Characters in a line of the preferences window at its default size."""
+NOTHING_TO_CANCEL = "nothing is being set up"
 _VOLUMES = (
     ("ALWAYS", "Always", "Volumes are written as soon as the human stands, so that any renderer has them"),
     (
@@ -26,6 +28,10 @@ _VOLUMES = (
 
 def _keep_writing(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
     keep_writing()
+
+
+def _redraw(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+    redraw()
 
 
 def forget_failures() -> None:
@@ -66,11 +72,17 @@ class CommonPreferences:
         update=_keep_writing,
     )
 
+    captures: bpy.props.BoolProperty(
+        name="Captures",
+        description=f"Show the tab {DATA} in the sidebar: training data from scans, and humans from images",
+        update=_redraw,
+    )
+
     def draw_properties(self, layout: bpy.types.UILayout) -> None:
         """All properties that need no more than a field."""
         layout.use_property_split = True
         layout.use_property_decorate = False
-        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "volumes"):
+        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "volumes", "captures"):
             layout.prop(self, name)
 
 

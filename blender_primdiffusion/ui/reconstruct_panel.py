@@ -11,7 +11,8 @@ import bpy
 from ..formats.requests import CAPTURE_VIEWS
 from ..jobs.follow import Reporting, submit
 from ..scene.blend_values import setting_path
-from .drawing import CAPTURES, BackendPanel, draw_job, property_columns
+from .captures_panel import DataPanel
+from .drawing import draw_job, property_columns
 
 _CAMERAS_FILE = "cameras.json"
 
@@ -102,12 +103,11 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
         return submit(self, context, ReconstructJob(folder, subject, frame, views))
 
 
-class PRIMDIFFUSION_PT_human_from_captures(BackendPanel, bpy.types.Panel):
+class PRIMDIFFUSION_PT_human_from_captures(DataPanel, bpy.types.Panel):
     """Capture, subject, frame, views and the button; progress and errors."""
 
     bl_label = "Human from Captures"
-    bl_category = CAPTURES
-    bl_order = 1
+    bl_order = 11
     bl_options = {"DEFAULT_CLOSED"}
 
     def draw(self, context: bpy.types.Context) -> None:

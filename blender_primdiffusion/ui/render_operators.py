@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import bpy
+from bpy.app.translations import pgettext_tip
 
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
@@ -78,7 +79,28 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class _Merging(OnPerson):
+_MERGES = (
+    (
+        "POSE",
+        "Current Pose",
+        "Merge the selected human's volumes, in the current pose, into one that Cycles renders much faster",
+    ),
+    (
+        "FRAMES",
+        "Frame Range",
+        "Merge the human's volumes into one volume for each frame of the scene's range, in the background",
+    ),
+    ("NOTHING", "Nothing", "Show the human's own volumes again and remove the merged one"),
+)
+
+
+class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
+    """Merge the selected human's volumes into one that Cycles renders much faster, or show its own volumes again"""
+
+    bl_idname = "primdiffusion.merge"
+    bl_label = "Merge Volumes"
+
+    what: bpy.props.EnumProperty(name="Merge", description="What is merged", items=_MERGES, options=SKIP)
     voxel: bpy.props.FloatProperty(
         name="Voxel Size",
         description="Metres. Not given: the panel's",
@@ -86,64 +108,43 @@ class _Merging(OnPerson):
         default=VOXEL,
         options=SKIP,
     )
-
-    def chosen_voxel(self, context: bpy.types.Context) -> float:
-        """Metres."""
-        given = self.properties.is_property_set("voxel")
-        return self.voxel if given else context.scene.primdiffusion_merging.voxel
-
-
-class PRIMDIFFUSION_OT_merge(_Merging, bpy.types.Operator):
-    """Merge the selected human's volumes, in the current pose, into one that Cycles renders much faster"""
-
-    bl_idname = "primdiffusion.merge"
-    bl_label = "Merge Pose"
-
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.merge import MergeJob  # needs numpy
-
-        moment = _moment(person, context.evaluated_depsgraph_get())
-        return submit(self, context, MergeJob(HumanTarget.of(person), moment, self.chosen_voxel(context)))
-
-
-class PRIMDIFFUSION_OT_merge_frames(_Merging, bpy.types.Operator):
-    """Merge the human's volumes into one volume for each frame of the scene's range, in the background"""
-
-    bl_idname = "primdiffusion.merge_frames"
-    bl_label = "Merge Frame Range"
-
     frame_start: bpy.props.IntProperty(name="Start", description="Not given: the scene's", options=SKIP)
     frame_end: bpy.props.IntProperty(name="End", description="Not given: the scene's", options=SKIP)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.merge import MergeFramesJob  # needs numpy
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return next(pgettext_tip(text) for name, _, text in _MERGES if name == properties.what)
 
-        given = self.properties.is_property_set
+    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+        if self.what == "NOTHING":
+            _unmerge(person)
+            bpy.ops.ed.undo_push(message="Unmerge")
+            return {"FINISHED"}
+        from ..jobs.merge import MergeFramesJob, MergeJob  # needs numpy
+
+        given, target = self.properties.is_property_set, HumanTarget.of(person)
+        voxel = self.voxel if given("voxel") else context.scene.primdiffusion_merging.voxel
+        if self.what == "POSE":
+            moment = _moment(person, context.evaluated_depsgraph_get())
+            return submit(self, context, MergeJob(target, moment, voxel))
         start, end = (getattr(self if given(name) else context.scene, name) for name in ("frame_start", "frame_end"))
         if not 1 < end - start + 1 <= _MOST_FRAMES:
             raise ValueError(
                 f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
             )
         moments = _moments(context, person, range(start, end + 1))
-        return submit(self, context, MergeFramesJob(HumanTarget.of(person), moments, start, self.chosen_voxel(context)))
+        return submit(self, context, MergeFramesJob(target, moments, start, voxel))
 
 
-class PRIMDIFFUSION_OT_unmerge(OnPerson, bpy.types.Operator):
-    """Show the human's own volumes again and remove the merged one"""
+def _unmerge(person: bpy.types.Collection) -> None:
+    """Raises ValueError where there is no merged volume."""
+    from ..scene.merged import merged_of, remove_merged  # needs numpy
 
-    bl_idname = "primdiffusion.unmerge"
-    bl_label = "Unmerge"
-    bl_options = {"UNDO"}
-
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..scene.merged import merged_of, remove_merged  # needs numpy
-
-        if merged_of(person) is None:
-            raise ValueError(f"{person.name!r} has no merged volume")
-        if attachment_of(person) == "MERGED":
-            set_attachment(person, attachment_before_merge(person))
-        remove_merged(person)
-        return {"FINISHED"}
+    if merged_of(person) is None:
+        raise ValueError(f"{person.name!r} has no merged volume")
+    if attachment_of(person) == "MERGED":
+        set_attachment(person, attachment_before_merge(person))
+    remove_merged(person)
 
 
 class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):

@@ -1,4 +1,4 @@
-"""A human's name and shape as properties of its armature: read from the scene, and applied to it at once."""
+"""A human's name, shape and loop as properties of its armature: read from the scene, and applied to it at once."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import bpy
 
+from ..scene.actions import action_curves, end_repeat, loops, repeat
 from ..scene.human import BETA_COUNT, LARGEST_BETA, MARK
 
 if TYPE_CHECKING:
@@ -109,6 +110,17 @@ def _printed(change) -> None:
         print(f"PrimDiffusion: {error}")
 
 
+def _looped(self: PRIMDIFFUSION_PG_human) -> bool:
+    return action_curves(self.id_data) is not None and loops(self.id_data)
+
+
+def _loop(self: PRIMDIFFUSION_PG_human, looped: bool) -> None:
+    if action_curves(self.id_data) is None:
+        print(f"PrimDiffusion: {self.id_data.name!r} has no action to loop: import or add a motion first")
+    elif looped != loops(self.id_data):
+        (repeat if looped else end_repeat)(self.id_data)
+
+
 class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     """`armature.primdiffusion_human`."""
 
@@ -154,6 +166,13 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
         options=_NOT_ANIMATED,
         get=_weight,
         set=_set_weight,
+    )
+    loop: bpy.props.BoolProperty(
+        name="Loop",
+        description="Loop the motion; a walk continues from where it has arrived",
+        options=_NOT_ANIMATED,
+        get=_looped,
+        set=_loop,
     )
 
 

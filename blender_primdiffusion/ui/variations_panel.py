@@ -18,7 +18,7 @@ from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
 from .drawing import BackendPanel, draw_job, property_columns, row_unless
-from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed
+from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed, random_seed
 
 if TYPE_CHECKING:
     from ..jobs.variations import VariationsJob
@@ -66,6 +66,7 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
 
 _SELECTED = "Index from 0; -1: the selected ones"
 _SKIP = {"SKIP_SAVE"}
+_OF_VARIATION = "Set the seed of the panel Generate to that of the selected human and lock it"
 _BUILD_ALL = "Add all of these humans to the scene, side by side"
 
 
@@ -79,66 +80,63 @@ class _OnSheet(Reporting):
         return bool(sheet.variations)
 
 
-class _Variations(GenerateOptions):
-    """Base of the operators that fill the sheet."""
+class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
+    """Show several humans to choose from before building them"""
+
+    bl_idname = "primdiffusion.variations"
+    bl_label = "Show Variations"
 
     count: bpy.props.IntProperty(
         name="Count", default=0, min=0, max=64, description="How many humans; 0: the panel's", options=_SKIP
     )
+    like: bpy.props.BoolProperty(
+        name="More Like This", description="Variations of a human of the sheet, with the same body", options=_SKIP
+    )
+    index: bpy.props.IntProperty(
+        name="Index", default=-1, min=-1, description=f"Of the human for More Like This. {_SELECTED}", options=_SKIP
+    )
+    amount: bpy.props.FloatProperty(
+        name="Difference", min=0.0, max=1.0, description="Not given: the panel's", options=_SKIP
+    )
+    clear: bpy.props.BoolProperty(
+        name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=_SKIP
+    )
 
-    def seeds(self, context: bpy.types.Context, first: int) -> tuple[int, ...]:
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        told = "clear" if properties.clear else "like" if properties.like else ""
+        text = properties.rna_type.properties[told].description if told else str(cls.__doc__)
+        return pgettext_tip(text)
+
+    def act(self, context: bpy.types.Context) -> set[str]:
+        """A seed given by a script is the first of `count`."""
+        if self.clear:
+            clear_before_loading()
+            redraw()
+            return {"FINISHED"}
+        sampling = self._sampling_of_sheet(context)
+        if self.like:
+            around = _only(_targets(self.index), "select only the one to vary")
+            amount = self.amount if self.given("amount") else context.scene.primdiffusion_variations.amount
+            sampling |= {"person": str(around.person), "amount": amount, "title": f"Like seed {around.seed}"}
+        from_panel = context.scene.primdiffusion_variations.seeds != "RANDOM" and not self.like
+        first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
+        return submit(self, context, VariationsJob(self._seeds(context, first), **sampling))
+
+    def _seeds(self, context: bpy.types.Context, first: int) -> tuple[int, ...]:
         """Seeds from `first` on, random ones where it is negative. Raises ValueError."""
         count = self.count or int(context.scene.primdiffusion_variations.count)
         if first < 0:
             return tuple(random.sample(range(LARGEST_SEED + 1), count))
         return tuple(range(first, last_seed(first, count) + 1))
 
-    def sheet_sampling(self, context: bpy.types.Context) -> dict[str, Any]:
+    def _sampling_of_sheet(self, context: bpy.types.Context) -> dict[str, Any]:
         """As `sampling`, with the quality of the sheet."""
         sampling = self.sampling(context.scene.primdiffusion)
         if context.scene.primdiffusion_variations.quality == "DRAFT":
             steps, sampler = STEPS_AND_SAMPLER["DRAFT"]
             sampling |= {"steps": self.steps or steps, "sampler": self.sampler if self.given("sampler") else sampler}
         return sampling
-
-
-class PRIMDIFFUSION_OT_variations(_Variations, bpy.types.Operator):
-    """Show several humans to choose from before building them"""
-
-    bl_idname = "primdiffusion.variations"
-    bl_label = "Show Variations"
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        """A seed given by a script is the first of `count`."""
-        random_seeds = context.scene.primdiffusion_variations.seeds == "RANDOM"
-        first = -1 if random_seeds else context.scene.primdiffusion.seed
-        seeds = self.seeds(context, self.seed if self.seed >= 0 else first)
-        sampling = self.sheet_sampling(context)
-        return _submit(self, context, seeds, sampling)
-
-
-class PRIMDIFFUSION_OT_more_like_variation(_OnSheet, _Variations, bpy.types.Operator):
-    """Show variations of the selected human, with the same body, instead of these"""
-
-    bl_idname = "primdiffusion.more_like_variation"
-    bl_label = "More Like This"
-
-    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=_SKIP)
-    amount: bpy.props.FloatProperty(
-        name="Difference", min=0.0, max=1.0, description="Not given: the panel's", options=_SKIP
-    )
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        """A seed given by a script is the first of `count`."""
-        around = _targets(self.index)
-        if len(around) > 1:
-            raise ValueError(f"{len(around)} variations are selected: select only the one to vary")
-        seeds = self.seeds(context, self.seed)
-        sampling = self.sheet_sampling(context)
-        amount = self.amount if self.given("amount") else context.scene.primdiffusion_variations.amount
-        title = f"Like seed {around[0].seed}"
-        person = str(around[0].person)
-        return _submit(self, context, seeds, sampling | {"person": person, "amount": amount, "title": title})
 
 
 class PRIMDIFFUSION_OT_select_variation(_OnSheet, bpy.types.Operator):
@@ -188,47 +186,51 @@ class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_use_variation_seed(_OnSheet, bpy.types.Operator):
-    """Set the seed of the panel Generate to that of the selected human and lock it"""
+class PRIMDIFFUSION_OT_set_seed(Reporting, bpy.types.Operator):
+    """Set a random seed"""
 
-    bl_idname = "primdiffusion.use_variation_seed"
-    bl_label = "Use Seed"
+    bl_idname = "primdiffusion.set_seed"
+    bl_label = "Set Seed"
     bl_options = {"UNDO"}
 
+    to: bpy.props.EnumProperty(
+        name="To",
+        description="Which seed",
+        items=[
+            ("RANDOM", "Random Seed", "Set a random seed"),
+            ("VARIATION", "Seed of Variation", _OF_VARIATION),
+        ],
+        options=_SKIP,
+    )
     index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=_SKIP)
 
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return pgettext_tip(_OF_VARIATION if properties.to == "VARIATION" else str(cls.__doc__))
+
     def act(self, context: bpy.types.Context) -> set[str]:
-        wanted = _targets(self.index)
-        if len(wanted) > 1:
-            raise ValueError(f"{len(wanted)} variations are selected: select one")
+        settings = context.scene.primdiffusion
+        if self.to == "RANDOM":
+            settings.seed = random_seed()
+            return {"FINISHED"}
+        wanted = _only(_targets(self.index), "select one")
         if sheet.around:
             raise ValueError("variants of a human cannot be generated from a seed alone: build them instead")
-        settings = context.scene.primdiffusion
-        settings.seed, settings.keep_seed = wanted[0].seed, True
+        settings.seed, settings.keep_seed = wanted.seed, True
         return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_clear_variations(_OnSheet, bpy.types.Operator):
-    """Clear the sheet and delete its files; humans in the scene stay"""
-
-    bl_idname = "primdiffusion.clear_variations"
-    bl_label = "Clear Variations"
-
-    def execute(self, _context: bpy.types.Context) -> set[str]:
-        sheet.clear()
-        icons.free()
-        redraw()
-        return {"FINISHED"}
-
-
-def _submit(
-    operator: bpy.types.Operator, context: bpy.types.Context, seeds: tuple[int, ...], fields: dict[str, Any]
-) -> set[str]:
-    return submit(operator, context, VariationsJob(seeds, **fields))
 
 
 def _targets(index: int) -> list[Variation]:
+    """The variation at `index`, or the selected ones. Raises ValueError where there is none."""
+    if not sheet.variations:
+        raise ValueError("there are no variations: press Show Variations first")
     return sheet.chosen() if index < 0 else [sheet.at(index)]
+
+
+def _only(wanted: list[Variation], what_to_do: str) -> Variation:
+    if len(wanted) > 1:
+        raise ValueError(f"{len(wanted)} variations are selected: {what_to_do}")
+    return wanted[0]
 
 
 def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Collection], str]:
@@ -271,6 +273,7 @@ class PRIMDIFFUSION_PT_variations(BackendPanel, bpy.types.Panel):
     """Humans to choose from."""
 
     bl_label = "Variations"
+    bl_parent_id = "PRIMDIFFUSION_PT_generate"
     bl_order = 1
     bl_options = {"DEFAULT_CLOSED"}
     manual_page, manual_section = "first_human", "variations"
@@ -338,11 +341,11 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     )
     row = layout.row(align=True)
     row.operator("primdiffusion.build_variation", text="Build All").build_all = True
-    row.operator("primdiffusion.clear_variations", text="Clear", icon="TRASH")
+    row.operator("primdiffusion.variations", text="Clear", icon="TRASH").clear = True
     row = row_unless(layout, "" if number == 1 else "Select one human for these")
-    row.operator("primdiffusion.more_like_variation", icon="DUPLICATE")
+    row.operator("primdiffusion.variations", text="More Like This", icon="DUPLICATE").like = True
     if not sheet.around:
-        row.operator("primdiffusion.use_variation_seed", icon="COPYDOWN")
+        row.operator("primdiffusion.set_seed", text="Use Seed", icon="COPYDOWN").to = "VARIATION"
     layout.prop(settings, "amount")
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 from .shrink import save_jpeg, save_png
 
 PANELS = {
-    "sidebar": ("first_person", "first_human", "first_output", "first_captures"),
+    "sidebar": ("first_sidebar", "first_person"),
     "generate": ("first_denoising", "generate_in_line", "generate_error"),
     "attributes": ("generate_attributes",),
     "variations": ("variations_empty", "variations_denoising", "variations_selected"),

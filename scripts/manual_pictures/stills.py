@@ -29,7 +29,7 @@ def engine_and_cycles(folder: Path) -> list[Path]:
     scene = _stage(folder, 3, "Hands on Hips")
     exact = render(scene, folder / "engine.png", SIZE)
     bpy.ops.primdiffusion.merge(voxel=0.005)
-    bpy.ops.primdiffusion.set_up_cycles()
+    bpy.ops.primdiffusion.set_up_engine(engine="CYCLES")
     sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
     sun.rotation_euler = (0.6, 0.3, 0.4)
     sun.data.energy = 2.5

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 
 import bpy
 from mathutils import Euler, Vector
 
-_FIRST_TAB = "PrimDiffusion Create"
+_FIRST_TAB = "PrimDiffusion"
 _shown: set[str] | None = None
 """Panels to show; None: all."""
+_sections: set[str] = set()
+"""Sections of these panels to open."""
+_calls = 0
 
 
 def view() -> tuple[bpy.types.Window, bpy.types.Area]:
@@ -30,17 +34,22 @@ def sidebar(tab: str = _FIRST_TAB) -> Iterator[float]:
 
 
 def show(*names: str | None) -> Iterator[float]:
-    """Show only these panels, opened, in the tab of the first one; with None, all of the first tab.
+    """Show only these panels, opened, in the tab of the first one; with None, all of the first tab. Of panels with
+    sections, "advanced/merge" opens the section `merge` too.
 
     Blender has no function to open and close panels. So the panels are registered again, open by default, and `poll` of
-    the others returns False.
+    the others returns False. Which sections are open Blender remembers by their names, so each call gives them others.
     """
-    global _shown
-    _shown = None if names == (None,) else {name for name in names if name}
+    global _shown, _calls
+    wanted = [name.partition("/") for name in names if name]
+    _shown = None if names == (None,) else {panel for panel, _, _ in wanted}
+    _sections.clear()
+    _sections.update(section for _, _, section in wanted if section)
+    _calls += 1
     opened = bpy.types.PRIMDIFFUSION_PT_generate.__dict__.get("window_scenes")
     if not opened:
         _open_all()
-    yield from sidebar(getattr(bpy.types, names[0]).bl_category if names[0] else _FIRST_TAB)
+    yield from sidebar(getattr(bpy.types, wanted[0][0]).bl_category if wanted else _FIRST_TAB)
 
 
 def _open_all() -> None:
@@ -54,6 +63,22 @@ def _open_all() -> None:
         cls.poll = _polled(cls, getattr(cls, "poll", None))
         cls.window_scenes = True
         bpy.utils.register_class(cls)
+    ui = bpy.types.PRIMDIFFUSION_PT_generate.__module__.rpartition(".")[0]
+    draw_section = sys.modules[f"{ui}.drawing"].draw_section
+    for name, module in list(sys.modules.items()):
+        if name.startswith(f"{ui}.") and hasattr(module, "draw_section"):
+            module.draw_section = lambda layout, *args, **given: draw_section(_Opening(layout), *args, **given)
+
+
+class _Opening:
+    """A layout for `draw_section`."""
+
+    def __init__(self, layout: bpy.types.UILayout):
+        self._layout = layout
+
+    def panel(self, idname: str, *, default_closed: bool) -> tuple[bpy.types.UILayout, bpy.types.UILayout | None]:
+        closed = default_closed and idname.removeprefix("primdiffusion_") not in _sections
+        return self._layout.panel(f"{idname}_{_calls}", default_closed=closed)
 
 
 def _polled(cls: type, before) -> classmethod:

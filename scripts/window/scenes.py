@@ -45,7 +45,7 @@ def set_up(module: str, python: str) -> Steps:
 
 
 def first_human(module: str, python: str) -> Steps:
-    """The sidebar as it opens, a real click on Generate Human, denoising, the human, the other tabs."""
+    """The sidebar as it opens, a real click on Generate Human, denoising, the human."""
     yield from begin(module, python)
     yield from sidebar()
     yield "first_sidebar"
@@ -64,9 +64,6 @@ def first_human(module: str, python: str) -> Steps:
     yield "first_solid"
     yield from rendered_view()
     yield "first_person"
-    for tab in ("Human", "Output", "Captures"):
-        yield from sidebar(f"PrimDiffusion {tab}")
-        yield f"first_{tab.lower()}"
 
 
 def generate(module: str, python: str) -> Steps:
@@ -102,7 +99,7 @@ def generate(module: str, python: str) -> Steps:
 def variations(module: str, python: str) -> Steps:
     """Eight in progress, the sheet, two selected."""
     yield from begin(module, python)
-    yield from show("PRIMDIFFUSION_PT_variations")
+    yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_variations")
     bpy.context.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
     bpy.context.scene.primdiffusion.seed = 40
     yield "variations_empty"
@@ -116,11 +113,11 @@ def variations(module: str, python: str) -> Steps:
     for index in (1, 5):
         bpy.ops.primdiffusion.select_variation(index=index)
     yield "variations_selected"
-    press("primdiffusion.clear_variations")
+    press("primdiffusion.variations", clear=True)
 
 
 def human(module: str, python: str) -> Steps:
-    """Shape before and after, details, edits, another person."""
+    """Shape before and after, memory, poses, files and assets."""
     yield from with_people(module, python, FIRST_SEED)
     armature = armatures()[0]
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_shape")
@@ -130,9 +127,9 @@ def human(module: str, python: str) -> Steps:
     settings.betas[0], settings.betas[1] = 1.5, -2.0
     yield 6.0
     yield "human_shape_after"
-    press("primdiffusion.reset_shape")
+    press("primdiffusion.reshape", to="GENERATED")
     yield 4.0
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_details")
+    yield from show("PRIMDIFFUSION_PT_advanced/memory")
     yield "human_details"
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
     bpy.context.scene.primdiffusion_motion.pose = "Waving"
@@ -140,7 +137,7 @@ def human(module: str, python: str) -> Steps:
     press("primdiffusion.apply_pose")
     yield 6.0
     yield "human_poses"
-    yield from show("PRIMDIFFUSION_PT_assets", "PRIMDIFFUSION_PT_edit_files")
+    yield from show("PRIMDIFFUSION_PT_export/assets", "PRIMDIFFUSION_PT_advanced/files")
     yield "human_assets"
 
 
@@ -151,10 +148,11 @@ def edits(module: str, python: str) -> Steps:
     select(first)
     settings = bpy.context.scene.primdiffusion_edit
     settings.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit_transfer", "PRIMDIFFUSION_PT_edit_blend")
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit")
+    settings.kind = "TRANSFER"
+    yield 0.5
     yield "edit_two_people"
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit_vary", "PRIMDIFFUSION_PT_edit_redress")
-    settings.parts = {"top"}
+    settings.kind, settings.parts = "REDRESS", {"top"}
     settings.attributes.outfit = "suit"
     yield "edit_parts"
     press("primdiffusion.redress")
@@ -173,19 +171,19 @@ def edits(module: str, python: str) -> Steps:
     area.spaces.active.shading.type = "SOLID"
     yield 2.0
     yield "edit_painting"
-    press("primdiffusion.finish_painting")
+    press("primdiffusion.paint_region", finish=True)
     settings.region = "PARTS"
 
 
 def motion(module: str, python: str) -> Steps:
     """The empty panel, the dialog with what was detected in a file, after the import."""
     yield from with_people(module, python, FIRST_SEED)
-    yield from show("PRIMDIFFUSION_PT_motion")
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_motion")
     yield "motion_empty"
     path = Path(bpy.app.tempdir) / "walk_01.npz"
     press("primdiffusion.add_motion", motion="WALK", rounds=3)
     press("primdiffusion.export_motion", "EXEC_DEFAULT", filepath=str(path))
-    press("primdiffusion.clear_motion")
+    press("primdiffusion.use_action", action="")
     yield 1.0
     yield {"point": [500, 500]}
     invoke("primdiffusion.import_motion", filepath=str(path))
@@ -203,12 +201,12 @@ def motion(module: str, python: str) -> Steps:
 def render(module: str, python: str) -> Steps:
     """Engine and Cycles, attachment, merging, gain, memory."""
     yield from with_people(module, python, FIRST_SEED)
-    names = ("render", "attachment", "merge", "cycles_look", "memory")
+    names = ("render", *(f"advanced/{section}" for section in ("attachment", "merge", "cycles_look", "memory")))
     import_module(f"{module}.jobs.cycles_check").volumes_are_empty = lambda: False  # Debian's builds have this fault
     writing = import_module(f"{module}.jobs.late_volumes")._tick
     yield from wait(lambda: not bpy.app.timers.is_registered(writing), 120)
     yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
-    press("primdiffusion.set_up_cycles")
+    press("primdiffusion.set_up_engine", engine="CYCLES")
     yield "render_cycles"
     press("primdiffusion.set_attachment", mode="SURFACE")
     yield 1.0
@@ -229,7 +227,8 @@ def render(module: str, python: str) -> Steps:
 def captures(module: str, python: str) -> Steps:
     """Render Captures with its cameras, Human from Captures."""
     yield from begin(module, python)
-    yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_captures_cameras", "PRIMDIFFUSION_PT_captures_poses")
+    bpy.context.preferences.addons[module].preferences.captures = True
+    yield from show("PRIMDIFFUSION_PT_captures/captures_cameras", "PRIMDIFFUSION_PT_captures/captures_poses")
     for name in ("people", "out"):
         folder = Path(tempfile.gettempdir()) / "shots" / {"people": "scans", "out": "captures"}[name]
         folder.mkdir(exist_ok=True, parents=True)
@@ -238,9 +237,7 @@ def captures(module: str, python: str) -> Steps:
     yield 1.0
     yield "captures_cameras"
     press("primdiffusion.preview_rig")
-    yield from show(
-        "PRIMDIFFUSION_PT_captures", *(f"PRIMDIFFUSION_PT_captures_{name}" for name in ("input", "cycles", "output"))
-    )
+    yield from show(*(f"PRIMDIFFUSION_PT_captures/captures_{name}" for name in ("input", "cycles", "output")))
     yield "captures_output"
     yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_human_from_captures")
     bpy.context.scene.primdiffusion_reconstruct.capture = "/nowhere/captures"
@@ -250,9 +247,10 @@ def captures(module: str, python: str) -> Steps:
 
 
 def export(module: str, python: str) -> Steps:
-    """All of Export; the mesh proxy in the scene."""
+    """A mesh, and the mesh proxy in the scene."""
     yield from with_people(module, python, FIRST_SEED)
-    yield from show(*(f"PRIMDIFFUSION_PT_export{name}" for name in ("", "_mesh", "_volumes")))
+    bpy.context.scene.primdiffusion_export.format = "GLB"
+    yield from show("PRIMDIFFUSION_PT_export/proxy")
     yield "export_before"
     press("primdiffusion.add_proxy")
     queue = queue_of(module)
@@ -299,10 +297,12 @@ def languages(module: str, python: str) -> Steps:
     """The interface in German and French, panel by panel; an error with its remedy."""
     yield from with_people(module, python, FIRST_SEED)
     preferences = bpy.context.preferences.addons[module].preferences
+    preferences.captures = True
     preferences.checkpoint = "/nowhere/model.safetensors"
     press("primdiffusion.generate")
     yield from wait(lambda: not queue_of(module).busy, 60)
     preferences.checkpoint = ""
+    bpy.context.scene.primdiffusion_edit.kind = "REDRESS"
     for language in ("de_DE", "fr_FR"):
         bpy.context.preferences.view.language = language
         bpy.context.preferences.view.use_translate_interface = True
@@ -337,13 +337,12 @@ def click_generate() -> Steps:
 
 
 TRANSLATED = {
-    "generate": ("generate", "attributes", "variations", "from_file", "backend"),
-    "human": ("human", "shape", "details", "poses"),
-    "edits": ("human", "edit_redress", "edit_transfer"),
-    "changes": ("human", "edit_vary", "edit_blend", "motion"),
-    "files": ("assets", "edit_files"),
-    "render": ("render", "attachment", "merge", "cycles_look", "memory", "export", "export_mesh", "export_volumes"),
-    "captures": ("captures", *(f"captures_{name}" for name in ("input", "poses", "cameras", "cycles", "output"))),
+    "generate": ("generate", "attributes", "variations", "from_file"),
+    "human": ("human", "shape", "poses"),
+    "edits": ("human", "edit", "motion"),
+    "files": ("export/proxy", "export/assets", "advanced/files", "advanced/backend"),
+    "render": ("render", *(f"advanced/{name}" for name in ("attachment", "merge", "cycles_look", "memory"))),
+    "captures": tuple(f"captures/captures_{name}" for name in ("input", "poses", "cameras", "cycles", "output")),
 }
 """Panels shown together in other languages."""
 GENERATE_BUTTON_PX = 118

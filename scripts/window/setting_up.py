@@ -31,7 +31,7 @@ def set_up_real(module: str, _python: str) -> Steps:
     began = time.monotonic()
     press("primdiffusion.set_up_backend")
     yield from wait(lambda: not session.busy or session.fraction > 0.1, _MOST_S)
-    press("primdiffusion.cancel_set_up")
+    press("primdiffusion.cancel", what="SET_UP")
     yield 1.0
     yield "set_up_real_cancelled"
     press("primdiffusion.set_up_backend")

@@ -44,6 +44,7 @@ from blender_primdiffusion.scene.human import (
     volume_path,
 )
 from blender_primdiffusion.scene.human_npz import write_now
+from blender_primdiffusion.ui.drawing import DATA
 from blender_primdiffusion.ui.on_person import FACTS
 
 COUNT = 3
@@ -279,9 +280,10 @@ def panels_fault() -> str:
     """Which panel cannot be drawn, or draws what Blender cannot show; empty when all can."""
     for cls in [*sidebar.panels(), *_menus()]:
         try:
-            if hasattr(cls, "poll") and not cls.poll(bpy.context):
+            shown = not hasattr(cls, "poll") or cls.poll(bpy.context) or getattr(cls, "bl_category", "") == DATA
+            if not shown:
                 continue
-            texts = sidebar.draw(cls, bpy.context).texts
+            texts = sidebar.draw(cls, bpy.context, opened=True).texts
         except Exception as error:
             return f"{cls.__name__} raises {error!r:.200}"
         for text in texts:
@@ -295,8 +297,9 @@ def _menus() -> list[type]:
 
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
-    ("set_attachment", {"mode": "ARMATURE"}), ("reset_shape", {}), ("collect_files", {}), ("find_missing_volumes", {}),
-    ("human_from_captures", {}), ("verify_captures", {}), ("remove_proxy", {}), ("unmerge", {}),
+    ("set_attachment", {"mode": "ARMATURE"}), ("reshape", {"to": "GENERATED"}), ("collect_files", {}),
+    ("find_missing_volumes", {}), ("human_from_captures", {}), ("verify_captures", {}),
+    ("show_proxy", {"shown": "REMOVED"}), ("merge", {"what": "NOTHING"}),
     ("remove_unused_files", {}),
 )  # fmt: skip
 """Pressed one after the other; those that need the backend are what `edit_fault` does with its result."""

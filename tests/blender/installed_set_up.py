@@ -22,7 +22,7 @@ known._has_torch = lambda: False  # as in a Blender that is no module of a Pytho
 report = {"blender": bpy.app.version_string, "root": str(places.set_up_folder().root), "before": known.known().state}
 if wheels:
     report["offline"] = not bpy.app.online_access
-    press = lambda: bpy.ops.primdiffusion.install_from_folder(directory=wheels)  # noqa: E731
+    press = lambda: bpy.ops.primdiffusion.set_up_backend(directory=wheels)  # noqa: E731
 else:
     bpy.context.preferences.system.use_online_access = True
     report["cost"] = known.cost(known.chosen()[1])
@@ -39,7 +39,9 @@ if not wheels:
     report["seconds_generate"] = round(time.perf_counter() - started, 1)
     report["bones"] = [len(obj.data.bones) for obj in bpy.data.objects if obj.type == "ARMATURE"]
 started = time.perf_counter()
-repair = press if wheels else bpy.ops.primdiffusion.repair_backend  # without a network, from the folder again
+repair = (
+    press if wheels else lambda: bpy.ops.primdiffusion.set_up_backend(repair=True)
+)  # without a network, from the folder again
 report["repaired"] = sorted(repair())
 report["seconds_repair"] = round(time.perf_counter() - started, 1)
 report["tested"] = sorted(bpy.ops.primdiffusion.test_backend())

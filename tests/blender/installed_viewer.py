@@ -55,7 +55,7 @@ report["reshaped"] = sorted(press.reshape(betas=[2.0] + [0.0] * 9))
 reshaped = centres()
 report["moved"] = [float(np.abs(after - before).max()) for before, after in ((rest, posed), (posed, reshaped))]
 file = folder / "again.human"
-report["exported"] = sorted(press.export_human(filepath=str(file), compact=True))
+report["exported"] = sorted(press.export(filepath=str(file), compact=True))
 report["bytes"] = file.stat().st_size
 report["imported"] = sorted(press.import_human(filepath=str(file)))
 report["humans"] = len(human.humans(bpy.context.scene))
@@ -64,14 +64,18 @@ try:
     press.generate(seed=7)
 except RuntimeError as error:
     report["generate"] = str(error)
-panels = ("generate", "variations", "from_file", "human", "render", "backend")
+panels = ("generate", "variations", "from_file", "human", "edit", "render")
 polls = {name: getattr(getattr(bpy.types, f"PRIMDIFFUSION_PT_{name}"), "poll", None) for name in panels}
 report["panels"] = [name for name, poll in polls.items() if poll is None or poll(bpy.context)]
-report["may render"] = press.set_up_engine.poll()
-try:
-    press.export_mesh(filepath=str(folder / "mesh.glb"))
-except RuntimeError as error:
-    report["export_mesh"] = str(error)
+report["rejected"] = []
+for operator, words in (
+    (press.export, {"format": "GLB", "filepath": str(folder / "mesh.glb")}),
+    (press.set_up_engine, {"engine": "PRIMDIFFUSION"}),
+):
+    try:
+        operator(**words)
+    except RuntimeError as error:
+        report["rejected"].append(str(error))
 if program is not None:
     os.environ["PATH"] = str(program.parent)
     report["generated"] = [sorted(press.generate(seed=7, steps=2))]

@@ -37,8 +37,8 @@ def notice_of(kind: str) -> str:
     return queue.outcomes[kind].notice
 
 
-def shown(panel, context) -> list[str]:
-    """Operators and texts that a panel draws."""
+def shown(panel, context, *, opened: bool = False) -> list[str]:
+    """Operators and texts that a panel draws; `opened` with its closed sections."""
     texts: list[str] = []
 
     def layout() -> MagicMock:
@@ -46,7 +46,7 @@ def shown(panel, context) -> list[str]:
         made.operator.side_effect = lambda idname, **kw: texts.append(idname) or MagicMock()
         made.label.side_effect = lambda **kw: texts.append(kw.get("text", ""))
         made.progress.side_effect = lambda **kw: texts.append(kw["text"])
-        made.panel.side_effect = lambda *_, **__: (layout(), None)
+        made.panel.side_effect = lambda *_, **__: (layout(), layout() if opened else None)
         for part in ("row", "column", "box", "grid_flow"):
             getattr(made, part).side_effect = lambda **_: layout()
         return made

@@ -23,18 +23,13 @@ READS = {
     "import_motion": ("filepath", (".npz", ".npy", ".json", ".bvh", ".fbx")),
     "import_human": ("filepath", (".human", ".human.safetensors", ".npz")),
     "use_generate_preset": ("filepath", (".py",)),
-    "mark_human_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
-    "mark_pose_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
+    "mark_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
+    "mark_as_asset POSE": ("picture", (".png", ".jpg", ".exr", ".hdr")),
 }
-"""Operators that read a file: the property with its path, and endings."""
-WRITES = {
-    "export_motion": ".npz", "export_mesh": ".glb", "export_gaussians": ".ply", "export_human": ".human",
-}  # fmt: skip
+"""Operators that read a file, with their `what` unless it is the default: the property with its path, and endings."""
+WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human", ".vdb"))]
 """Operators that write the file of their `filepath`."""
-FOLDERS = {
-    "find_missing_volumes", "find_volumes_in_folder", "human_from_captures", "make_pose_assets", "export_vdb_sequence",
-    "install_from_folder",
-}  # fmt: skip
+FOLDERS = {"find_missing_volumes", "human_from_captures", "make_pose_assets", "set_up_backend"}
 """Operators on the folder of their `directory`."""
 PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
 
@@ -137,25 +132,26 @@ def anna(addon, tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("addon")
 def test_every_operator_with_a_path_gets_hostile_files():
-    expected = {name: {shown} for name, (shown, _) in READS.items()}
-    expected |= {name: {"filepath"} for name in WRITES} | {name: {"directory"} for name in FOLDERS}
+    expected = {name.partition(" ")[0]: {shown} for name, (shown, _) in READS.items()}
+    expected |= {name: {"filepath"} for name, _ in WRITES} | {name: {"directory"} for name in FOLDERS}
     assert with_paths() == expected
 
 
 @pytest.mark.parametrize("name", READS)
 def test_a_hostile_file_is_rejected_in_one_sentence_and_leaves_nothing(anna, name):
     shown, endings = READS[name]
+    name, _, what = name.partition(" ")
+    way = {"what": what} if what else {}
     faults = []
     for number, ending in enumerate(endings):
         folder = anna / str(number)
-        faults += [fault(name, folder, **{shown: str(path)}) for path in hostile_files(folder, ending)]
+        faults += [fault(name, folder, **way, **{shown: str(path)}) for path in hostile_files(folder, ending)]
     assert not list(filter(None, faults)), "\n".join(filter(None, faults))
     assert not (anna / "ran").exists()
 
 
-@pytest.mark.parametrize("name", WRITES)
-def test_a_place_that_cannot_be_written_is_named_in_one_sentence(anna, name):
-    ending = WRITES[name]
+@pytest.mark.parametrize(("name", "ending"), WRITES)
+def test_a_place_that_cannot_be_written_is_named_in_one_sentence(anna, name, ending):
     (anna / f"folder{ending}").mkdir()
     (anna / "file").write_bytes(b"a user's file")
     places = [f"folder{ending}", f"file/a{ending}", f"nowhere/a{ending}", f"{'n' * 300}{ending}", "file.txt/", ""]

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bpy
+from bpy.app.translations import pgettext_tip
 
 from ...backend import environment, setup
 from ...backend.packages import read_lock
@@ -15,8 +16,10 @@ from ...backend.requests import sentence
 from ...backend.setup import Steps
 from ...jobs.queue import queue
 from ...places import CACHE_VARIABLE, backend_module_path, cache_folder, preference, set_up_folder
+from ..preferences import NOTHING_TO_CANCEL
 from . import known
 
+_SKIP = {"SKIP_SAVE"}
 TICK_S = 0.2
 _PRINT_S = 2.0
 """Between lines of progress on the console in background mode."""
@@ -170,6 +173,19 @@ def _release_environment() -> None:
     studio.close()
 
 
+def being_set_up() -> bool:
+    """Whether the backend is being set up, repaired, tested or removed."""
+    return session.busy
+
+
+def cancel_set_up() -> None:
+    """Stop the set-up. Raises ValueError where there is none."""
+    if not session.busy:
+        raise ValueError(NOTHING_TO_CANCEL)
+    session.cancel()
+    redraw()
+
+
 class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
     """Download the backend's packages into a private environment and test it"""
 
@@ -177,68 +193,45 @@ class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
     bl_label = "Set Up Backend"
     bl_options: set[str] = set()
 
+    repair: bpy.props.BoolProperty(name="Repair", description="Reinstall the backend", options=_SKIP)
+    choose: bpy.props.BoolProperty(
+        name="Install from Folder",
+        description="Set up the backend from a folder of wheels, without a network; every file is checked against its "
+        "known hash",
+        options=_SKIP,
+    )
+    directory: bpy.props.StringProperty(
+        name="Folder", description="Folder of wheels; empty: they are downloaded", subtype="DIR_PATH", options=_SKIP
+    )
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        told = "choose" if properties.choose else "repair" if properties.repair else ""
+        return pgettext_tip(properties.rna_type.properties[told].description if told else str(cls.__doc__))
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if not self.choose:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
     def execute(self, context: bpy.types.Context) -> set[str]:
+        if self.choose or self.directory:
+            folder = bpy.path.abspath(self.directory)
+            if not os.path.isdir(folder):
+                self.report({"ERROR"}, f"{self.directory!r:.200} is no folder: choose the one that holds the wheels")
+                return {"CANCELLED"}
+            return _begin(self, lambda: installing(Path(folder)))
         now = known.known()
         try:
             there = now.state == "ready" and now.about.get("compute") == known.chosen()[0]
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, sentence(error))
             return {"CANCELLED"}
-        if there:
+        if there and not self.repair:
             self.report({"INFO"}, f"{now.line}; press Repair to reinstall it")
             return {"FINISHED"}
-        return _begin(self, installing)
-
-
-class PRIMDIFFUSION_OT_install_from_folder(bpy.types.Operator):
-    """Set up the backend from a folder of wheels, without a network; every file is checked against its known hash"""
-
-    bl_idname = "primdiffusion.install_from_folder"
-    bl_label = "Install from Folder"
-    bl_options: set[str] = set()
-
-    directory: bpy.props.StringProperty(name="Folder", subtype="DIR_PATH", options={"SKIP_SAVE"})
-    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        folder = bpy.path.abspath(self.directory)
-        if not os.path.isdir(folder):
-            self.report({"ERROR"}, f"{self.directory!r:.200} is no folder: choose the one that holds the wheels")
-            return {"CANCELLED"}
-        return _begin(self, lambda: installing(Path(folder)))
-
-
-class PRIMDIFFUSION_OT_cancel_set_up(bpy.types.Operator):
-    """Stop; the next Set Up Backend uses what was downloaded"""
-
-    bl_idname = "primdiffusion.cancel_set_up"
-    bl_label = "Cancel"
-    bl_options: set[str] = set()
-
-    @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        if not session.busy:
-            cls.poll_message_set("Nothing is being set up")
-        return session.busy
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        session.cancel()
-        redraw()
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_repair_backend(bpy.types.Operator):
-    """Reinstall the backend"""
-
-    bl_idname = "primdiffusion.repair_backend"
-    bl_label = "Repair"
-    bl_options: set[str] = set()
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
         return _begin(self, installing)
 
 

@@ -35,7 +35,7 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
         props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
         props.module = EXTENSION
     elif now.state == "broken":
-        box.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
+        box.operator("primdiffusion.set_up_backend", text="Repair", icon="TOOL_SETTINGS").repair = True
     else:
         box.operator("primdiffusion.set_up_backend", icon="IMPORT")
     draw_result(box, width)
@@ -46,7 +46,7 @@ def draw_progress(layout: bpy.types.UILayout, width: int) -> None:
     """The bar, the current step below it (a bar cuts long texts), and Cancel."""
     layout.progress(factor=session.fraction, text=f"{session.fraction:.0%}")
     draw_lines(layout, session.message, "BLANK1", width)
-    layout.operator("primdiffusion.cancel_set_up", icon="CANCEL")
+    layout.operator("primdiffusion.cancel", icon="CANCEL").what = "SET_UP"
 
 
 def draw_cost(layout: bpy.types.UILayout, width: int) -> bool:
@@ -130,7 +130,7 @@ class PRIMDIFFUSION_AP_preferences(CommonPreferences, bpy.types.AddonPreferences
         row = box.row()
         row.operator("primdiffusion.test_backend", icon="PLAY")
         if private or state not in {"absent", "own Python", "named"}:
-            row.operator("primdiffusion.repair_backend", icon="TOOL_SETTINGS")
+            row.operator("primdiffusion.set_up_backend", text="Repair", icon="TOOL_SETTINGS").repair = True
             row.operator("primdiffusion.remove_backend", icon="TRASH")
 
 
@@ -149,4 +149,4 @@ def _draw_private(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILa
     row = box.row()
     row.enabled = here
     row.operator("primdiffusion.set_up_backend", icon="IMPORT")
-    row.operator("primdiffusion.install_from_folder", icon="FILE_FOLDER")
+    row.operator("primdiffusion.set_up_backend", text="Install from Folder", icon="FILE_FOLDER").choose = True

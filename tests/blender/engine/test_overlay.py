@@ -164,7 +164,7 @@ def test_the_view_says_how_to_see_a_human_of_an_earlier_version(people, monkeypa
     read(people.overlay)
     assert people.overlay.error == (
         "the human 'Anna' was made by an earlier version and its volumes are hidden: show these (in the Outliner, or "
-        "tab Output, Volumes in Viewport), edit the human, or generate it again"
+        "Advanced > Attachment > Volumes in Viewport), edit the human, or generate it again"
     )
     show_in_viewport(people.anna, True)
     assert names(read(people.overlay)) == []

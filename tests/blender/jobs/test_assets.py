@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import bpy
@@ -17,7 +16,7 @@ from blender_primdiffusion.motion.pose_library import builtin_poses, current_pos
 from blender_primdiffusion.motion.rotation import from_axis_angle
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file, volume_path
-from blender_primdiffusion.ui.assets_panel import PRIMDIFFUSION_PT_assets
+from blender_primdiffusion.ui import export_panel
 
 PICTURE = Path(__file__).parents[1] / "fake_backend" / "primdiffusion" / "picture.png"
 ops = bpy.ops.primdiffusion
@@ -49,7 +48,7 @@ def rendered(tmp_path) -> dict:
 
 
 def test_a_human_becomes_an_asset_with_tags_and_a_preview(person, tmp_path):
-    assert ops.mark_human_as_asset() == {"FINISHED"}
+    assert ops.mark_as_asset() == {"FINISHED"}
     about = person.asset_data
     assert about.description == "Generated human, seed 0, sex female, height 1.7"
     assert {tag.name for tag in about.tags} == {"human", "female"}
@@ -61,14 +60,14 @@ def test_a_human_becomes_an_asset_with_tags_and_a_preview(person, tmp_path):
 
 
 def test_a_given_preview_needs_no_backend(person, tmp_path):
-    assert ops.mark_human_as_asset(picture=str(PICTURE)) == {"FINISHED"}
+    assert ops.mark_as_asset(picture=str(PICTURE)) == {"FINISHED"}
     assert preview(person).max() > 0
     assert not (tmp_path / "rendered.json").exists()
 
 
 def test_one_undo_makes_it_an_ordinary_collection_again(person):
     bpy.ops.ed.undo_push(message="before")
-    ops.mark_human_as_asset(human="Human")
+    ops.mark_as_asset(human="Human")
     bpy.ops.ed.undo()
     assert humans(bpy.context.scene)[0].asset_data is None
     bpy.ops.ed.redo()
@@ -76,17 +75,16 @@ def test_one_undo_makes_it_an_ordinary_collection_again(person):
 
 
 def test_unmarking_leaves_the_person(person):
-    with pytest.raises(RuntimeError, match="'Human'"):
-        ops.unmark_human_asset()
-    ops.mark_human_as_asset(picture=str(PICTURE))
-    assert ops.unmark_human_asset() == {"FINISHED"}
+    ops.mark_as_asset(picture=str(PICTURE))
+    with bpy.context.temp_override(id=person):  # as the panel's button
+        assert bpy.ops.asset.clear_single() == {"FINISHED"}
     assert person.asset_data is None
     assert humans(bpy.context.scene) == [person]
 
 
 @pytest.mark.parametrize("link", [False, True])
 def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, tmp_path, link):
-    ops.mark_human_as_asset(picture=str(PICTURE))
+    ops.mark_as_asset(picture=str(PICTURE))
     bpy.ops.wm.save_mainfile()
     library = bpy.data.filepath
     (tmp_path / "elsewhere").mkdir()
@@ -105,15 +103,15 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
     assert (person.library is not None) == link
     if link:
         with pytest.raises(RuntimeError, match="is linked from"):
-            ops.mark_human_as_asset(picture=str(PICTURE))
-        with pytest.raises(RuntimeError, match="unmark it there"):
-            ops.unmark_human_asset()
+            ops.mark_as_asset(picture=str(PICTURE))
+        with bpy.context.temp_override(id=person):
+            assert not bpy.ops.asset.clear_single.poll()
 
 
 def test_a_pose_becomes_an_action_that_gives_it_to_any_human(person, tmp_path):
     armature = armature_of(person)
     pose_from_joint_rotations(armature, waving())
-    assert ops.mark_pose_as_asset(name="Waving") == {"FINISHED"}
+    assert ops.mark_as_asset(what="POSE", name="Waving") == {"FINISHED"}
     action = bpy.data.actions["Waving"]
     assert {tag.name for tag in action.asset_data.tags} == {"pose", "Human"}
     assert preview(action).max() > 0
@@ -130,7 +128,7 @@ def test_marking_a_pose_leaves_the_active_action(person):
     armature = armature_of(person)
     armature.keyframe_insert("location", frame=3)
     action, slot = armature.animation_data.action, armature.animation_data.action_slot
-    ops.mark_pose_as_asset(picture=str(PICTURE))
+    ops.mark_as_asset(what="POSE", picture=str(PICTURE))
     assert (armature.animation_data.action, armature.animation_data.action_slot) == (action, slot)
     assert bpy.data.actions["Pose"].asset_data is not None
 
@@ -160,16 +158,15 @@ def test_the_built_in_poses_become_a_library_and_the_open_file_stays(addon, tmp_
 
 
 def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
-    for operator in (ops.mark_human_as_asset, ops.mark_pose_as_asset, ops.unmark_human_asset):
-        with pytest.raises(RuntimeError, match=r"poll\(\) .*no human in the scene"):
-            operator()
+    with pytest.raises(RuntimeError, match=r"poll\(\) .*no human in the scene"):
+        ops.mark_as_asset()
     ops.generate(seed=7, steps=1)
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "file").write_text("")
     rejected = {
-        "cannot be read as a picture": lambda: ops.mark_human_as_asset(picture=str(tmp_path / "text.png")),
-        "cannot be read as a picture:": lambda: ops.mark_pose_as_asset(picture="/nowhere.png"),
-        "'Eve' is not in the scene": lambda: ops.mark_human_as_asset(human="Eve"),
+        "cannot be read as a picture": lambda: ops.mark_as_asset(picture=str(tmp_path / "text.png")),
+        "cannot be read as a picture:": lambda: ops.mark_as_asset(what="POSE", picture="/nowhere.png"),
+        "'Eve' is not in the scene": lambda: ops.mark_as_asset(human="Eve"),
         "[Nn]ot a directory|File exists": lambda: ops.make_pose_assets(directory=str(tmp_path / "file" / "deeper")),
     }
     for sentence, call in rejected.items():
@@ -180,19 +177,22 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     assert person.asset_data is None
     person_file(person).unlink()
     with pytest.raises(RuntimeError, match="file of the human 'Human' is missing"):
-        ops.mark_human_as_asset()
+        ops.mark_as_asset()
 
 
 def test_the_panel_offers_what_makes_sense(person):
-    def buttons() -> set[str]:
+    def buttons() -> list[str]:
         layout = MagicMock()
         layout.row.return_value = layout
-        PRIMDIFFUSION_PT_assets.draw(SimpleNamespace(layout=layout), bpy.context)
-        return {call.args[0].partition(".")[2] for call in layout.operator.call_args_list}
+        export_panel._draw_assets(layout, bpy.context)
+        if layout.context_pointer_set.called:
+            layout.context_pointer_set.assert_called_once_with("id", person)
+        return [call.args[0] for call in layout.operator.call_args_list]
 
-    assert buttons() == {"mark_human_as_asset", "mark_pose_as_asset", "make_pose_assets"}
-    ops.mark_human_as_asset(picture=str(PICTURE))
-    assert buttons() == {"unmark_human_asset", "mark_pose_as_asset", "make_pose_assets"}
+    of_pose = ["primdiffusion.mark_as_asset", "primdiffusion.make_pose_assets"]
+    assert buttons() == ["primdiffusion.mark_as_asset", *of_pose]
+    ops.mark_as_asset(picture=str(PICTURE))
+    assert buttons() == ["asset.clear_single", *of_pose]
 
 
 def test_a_clay_figure_is_within_its_picture_and_lit_from_above():

@@ -53,7 +53,7 @@ def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):
 
 
 def test_frames_and_the_gain_come_from_the_child(person):
-    ops.merge_frames(frame_start=1, frame_end=3, voxel=0.03)
+    ops.merge(what="FRAMES", frame_start=1, frame_end=3, voxel=0.03)
     assert attachment_of(person) == "MERGED"
     assert len(sequence_files(merged_of(person).data)) == 3
     assert ops.fit_density_gain() == {"FINISHED"}

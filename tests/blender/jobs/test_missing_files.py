@@ -91,9 +91,9 @@ def test_a_folder_may_be_named_and_undo_goes_back(person, tmp_path):
     with pytest.raises(RuntimeError, match="Generate Again"):
         ops.find_missing_volumes()
     with pytest.raises(RuntimeError, match="there is no folder"):
-        ops.find_volumes_in_folder(directory=str(tmp_path / "nowhere"))
+        ops.find_missing_volumes(directory=str(tmp_path / "nowhere"))
     bpy.ops.ed.undo_push(message="before")
-    assert ops.find_volumes_in_folder(directory=str(tmp_path / "NAS")) == {"FINISHED"}
+    assert ops.find_missing_volumes(directory=str(tmp_path / "NAS")) == {"FINISHED"}
     assert whole(anna)
     bpy.ops.ed.undo()
     assert len(missing_files()) == 1
@@ -127,9 +127,9 @@ def test_all_of_a_person_lost_but_their_file_elsewhere(person, store, tmp_path):
     kept.mkdir()
     write_person(kept / "person.human.safetensors", np.zeros(10))  # somebody else
     with pytest.raises(RuntimeError, match="cannot be found"):
-        ops.find_volumes_in_folder(directory=str(kept))
+        ops.find_missing_volumes(directory=str(kept))
     shutil.copy(store / "person.human.safetensors", kept)
-    assert ops.find_volumes_in_folder(directory=str(kept)) == {"FINISHED"}
+    assert ops.find_missing_volumes(directory=str(kept)) == {"FINISHED"}
     assert whole(anna)
 
 
@@ -201,5 +201,5 @@ def test_a_merged_volume_that_is_lost_asks_to_merge_again(person, tmp_path):
     shutil.move(lost, moved)
     with pytest.raises(RuntimeError, match="merged volume of 'Anna' cannot be found: press Merge again"):
         ops.find_missing_volumes()
-    assert ops.find_volumes_in_folder(directory=str(moved)) == {"FINISHED"}
+    assert ops.find_missing_volumes(directory=str(moved)) == {"FINISHED"}
     assert not missing_files()

@@ -20,6 +20,14 @@ FAILS, TAKES_LONG = 2, 4
 ops = bpy.ops.primdiffusion
 
 
+def more_like(**given):
+    return ops.variations(like=True, **given)
+
+
+def use_seed(**given):
+    return ops.set_seed(to="VARIATION", **given)
+
+
 @pytest.fixture
 def shown_people(addon):
     """A sheet of seeds 11 to 14."""
@@ -99,9 +107,11 @@ def test_whom_files_are_missing_of_is_not_built_and_those_before_stay(addon, sho
 
 
 def test_nothing_selected_a_wrong_number_and_no_sheet_are_rejected(addon):
-    for operator in (ops.build_variation, ops.more_like_variation, ops.use_variation_seed, ops.clear_variations):
+    for operator in (ops.build_variation, ops.select_variation):
         assert not operator.poll()
-    assert not ops.select_variation.poll()
+    for call in (more_like, use_seed):
+        with pytest.raises(RuntimeError, match="no variations: press Show Variations first"):
+            call()
     ops.variations(seed=11, count=2, steps=1)
     with pytest.raises(RuntimeError, match="no variation is selected"):
         ops.build_variation()
@@ -109,9 +119,9 @@ def test_nothing_selected_a_wrong_number_and_no_sheet_are_rejected(addon):
         ops.select_variation(index=2)
     for index in (0, 1):
         ops.select_variation(index=index)
-    for operator in (ops.more_like_variation, ops.use_variation_seed):
+    for call in (more_like, use_seed):
         with pytest.raises(RuntimeError, match="2 variations are selected: select"):
-            operator()
+            call()
     with pytest.raises(RuntimeError, match="2 seeds from 2147483647 on go beyond"):
         ops.variations(seed=2**31 - 1, count=2)
 
@@ -119,17 +129,17 @@ def test_nothing_selected_a_wrong_number_and_no_sheet_are_rejected(addon):
 def test_more_like_this_requests_variants_of_the_chosen_human(addon, shown_people):
     ops.select_variation(index=1)
     kept = sheet.variations[1].person
-    assert ops.more_like_variation(count=3, seed=20, amount=0.25, steps=4) == {"FINISHED"}
+    assert more_like(count=3, seed=20, amount=0.25, steps=4) == {"FINISHED"}
     asked = sent(sheet.variations[0].person)
     assert (asked["person"], asked["amount"], asked["steps"]) == (str(kept), 0.25, 4)
     assert seeds() == [20, 21, 22]
     assert sheet.title == "Like seed 12"
     with pytest.raises(RuntimeError, match="cannot be generated from a seed alone"):
-        ops.use_variation_seed(index=0)
+        use_seed(index=0)
 
 
 def test_a_seed_is_put_into_the_panel_and_locked(addon, shown_people):
-    ops.use_variation_seed(index=3)
+    use_seed(index=3)
     assert (addon.scene.primdiffusion.seed, addon.scene.primdiffusion.keep_seed) == (14, True)
 
 
@@ -162,7 +172,8 @@ def test_the_panel_shows_the_sheet_and_what_can_be_done_with_those_selected(addo
     ops.select_variation(index=1)
     texts = shown(variations_panel.PRIMDIFFUSION_PT_variations, addon)
     assert texts.count("primdiffusion.select_variation") == 4
-    assert {"primdiffusion.build_variation", "primdiffusion.more_like_variation", "New humans: 4"} <= set(texts)
+    assert {"primdiffusion.build_variation", "primdiffusion.set_seed", "New humans: 4"} <= set(texts)
+    assert texts.count("primdiffusion.variations") == 3, "show, clear, more like this"
 
 
 @pytest.mark.parametrize(("width", "columns"), [(300, 2), (420, 3), (2000, 8), (50, 2)])
@@ -191,7 +202,7 @@ def test_files_and_pictures_go_when_it_is_cleared_another_file_is_loaded_or_the_
     icons.of(sheet.variations[0].picture)
     assert files_left()
     if end == "clear":
-        ops.clear_variations()
+        ops.variations(clear=True)
     elif end == "load":
         bpy.ops.wm.read_homefile(use_empty=True)
     else:
@@ -206,7 +217,7 @@ def test_files_and_pictures_go_when_it_is_cleared_another_file_is_loaded_or_the_
 
 def test_a_person_cleared_before_its_turn_is_named(addon, shown_people):
     queue.add(addon, VariationsJob((1,), 1, "ddim", person=str(sheet.variations[0].person)))
-    ops.clear_variations()
+    ops.variations(clear=True)
     drive()
     assert "the human to vary was cleared" in error_of("variations").lower()
 
@@ -223,11 +234,7 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
 
 
 def test_none_can_be_redone_with_a_slider():
-    for operator in (
-        variations_panel.PRIMDIFFUSION_OT_variations,
-        variations_panel.PRIMDIFFUSION_OT_more_like_variation,
-    ):
-        assert not {"REGISTER", "UNDO"} & operator.bl_options
+    assert not {"REGISTER", "UNDO"} & variations_panel.PRIMDIFFUSION_OT_variations.bl_options
 
 
 @pytest.mark.any_blender

@@ -91,11 +91,11 @@ def test_only_selected_bones_turn(addon, armature):
 
 def test_mirror_pose_and_reset(armature):
     ops.apply_pose(pose_name="Waving")
-    ops.mirror_pose()
+    ops.apply_pose(what="MIRRORED")
     np.testing.assert_allclose(
         current_pose(armature)[0], from_axis_angle(mirrored(builtin_poses()["Waving"])), atol=1e-5
     )
-    assert ops.reset_pose() == {"FINISHED"}
+    assert ops.apply_pose(what="REST") == {"FINISHED"}
     np.testing.assert_allclose(current_pose(armature)[0], REST, atol=1e-5)
     np.testing.assert_allclose(current_pose(armature)[1], 0, atol=1e-6)
 
@@ -121,13 +121,13 @@ def test_a_saved_pose_is_in_the_library_and_comes_back_exactly(addon, armature, 
     rotations, translation = current_pose(armature)
     assert ops.save_pose(pose_name="Kniend, müde") == {"FINISHED"}
     assert addon.scene.primdiffusion_motion.pose == "Kniend, müde"
-    ops.reset_pose()
+    ops.apply_pose(what="REST")
     ops.apply_pose(pose_name="Kniend, müde")
     np.testing.assert_allclose(current_pose(armature)[0], rotations, atol=1e-5)
     np.testing.assert_allclose(current_pose(armature)[1], translation, atol=1e-5)
     with pytest.raises(RuntimeError, match="there is a pose 'Kniend, müde' already"):
         ops.save_pose(pose_name="Kniend, müde")
-    assert ops.delete_pose(pose_name="Kniend, müde") == {"FINISHED"}
+    assert ops.save_pose(delete=True, pose_name="Kniend, müde") == {"FINISHED"}
     assert addon.scene.primdiffusion_motion.pose == "T"
     assert not list((tmp_path / "eigene Dateien").rglob("*.*"))
     with pytest.raises(RuntimeError, match="no pose 'Kniend, müde' in the library"):
@@ -156,7 +156,7 @@ def test_a_saved_pose_has_a_picture_of_itself_at_once(addon, armature, tmp_path)
     assert previews_of("mine")
     ops.save_pose(pose_name="another, before it")
     assert {item[0]: item for item in pose_panel.pose_items(None, addon)}["mine"][4] == items["mine"][4]
-    ops.delete_pose(pose_name="mine")
+    ops.save_pose(delete=True, pose_name="mine")
     assert not picture.exists()
 
 
@@ -165,7 +165,7 @@ def test_another_pose_of_the_same_name_has_another_picture(addon, armature):
         ops.apply_pose(pose_name=pose)
         ops.save_pose(pose_name="mine")
         pose_panel.pose_items(None, addon)
-        ops.delete_pose(pose_name="mine")
+        ops.save_pose(delete=True, pose_name="mine")
     assert len(previews_of("mine")) == 2
 
 
@@ -189,7 +189,11 @@ def test_names_that_cannot_be_are_rejected(armature, name):
 
 def test_a_built_in_pose_cannot_be_deleted(armature):
     with pytest.raises(RuntimeError, match="'T'"):
-        ops.delete_pose(pose_name="T")
+        ops.save_pose(delete=True, pose_name="T")
+    ops.save_pose(pose_name="mine")
+    with pytest.raises(RuntimeError, match="'T'"):
+        ops.save_pose(delete=True, pose_name="T")
+    assert ops.save_pose(delete=True) == {"FINISHED"}, "the panel's pose"
 
 
 @pytest.mark.parametrize(
@@ -221,9 +225,15 @@ def test_poses_of_wrong_shape_are_rejected(armature):
 def test_edit_mode_and_a_renamed_bone_are_rejected(addon, armature):
     addon.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode="EDIT")
-    for operator in (ops.apply_pose, ops.mirror_pose, ops.reset_pose, ops.key_pose):
+    for operator, given in (
+        (ops.apply_pose, {"what": "MIRRORED"}),
+        (ops.apply_pose, {"what": "REST"}),
+        (ops.key_pose, {}),
+    ):
         with pytest.raises(RuntimeError, match="Edit Mode"):
-            operator()
+            operator(**given)
+    with pytest.raises(RuntimeError, match="Edit Mode"):
+        ops.apply_pose()
     bpy.ops.object.mode_set(mode="OBJECT")
     armature.data.bones["neck"].name = "Hals"
     for operator in (ops.apply_pose, ops.save_pose):
@@ -236,11 +246,11 @@ def test_the_panel_shows_pictures_and_offers_to_delete_only_own_poses(addon, arm
         layout = MagicMock()
         layout.row.return_value = layout
         PRIMDIFFUSION_PT_poses.draw(SimpleNamespace(layout=layout), addon)
-        return [call.args[0] for call in layout.operator.call_args_list]
+        return [call.kwargs.get("text") for call in layout.operator.call_args_list]
 
-    assert "primdiffusion.delete_pose" not in buttons()
+    assert "Delete Pose" not in buttons()
     ops.save_pose(pose_name="mine")
-    assert "primdiffusion.delete_pose" in buttons()
+    assert "Delete Pose" in buttons()
     assert "mine" in [item[0] for item in pose_panel.pose_items(None, addon)]
 
 

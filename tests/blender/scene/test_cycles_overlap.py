@@ -17,7 +17,7 @@ from blender_primdiffusion.scene.human_npz import read_human
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import generated_betas
 from blender_primdiffusion.scene.volumes import bake
-from blender_primdiffusion.ui.shape_panel import details
+from blender_primdiffusion.ui.advanced_panel import details
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 

@@ -96,7 +96,7 @@ def test_linked_people_are_whole_and_reject_edits(person, tmp_path):
     where = places(person)
     anna = linked(tmp_path)
     assert whole(anna, where)
-    for operator in (ops.vary, ops.reset_shape, ops.delete_human, ops.duplicate_human):
+    for operator in (ops.vary, ops.reshape, ops.delete_human, ops.duplicate_human):
         with pytest.raises(RuntimeError, match="linked"):
             operator()
     assert ops.collect_files() == {"FINISHED"}

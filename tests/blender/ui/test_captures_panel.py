@@ -235,7 +235,7 @@ def test_cancelling_ends_the_child_and_the_next_run_resumes(extension, only_good
     asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 3, 400, 400, 30
     captures.start(words_of(asked, extension, captures.new_folder()))
     follow(until=lambda: captures.fraction > 0)
-    assert bpy.ops.primdiffusion.cancel_captures() == {"FINISHED"}
+    assert bpy.ops.primdiffusion.cancel(what="CAPTURES") == {"FINISHED"}
     follow()
     assert captures.notice.startswith("Cancelled")
     assert captures.error == ""

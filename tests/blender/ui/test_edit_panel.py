@@ -49,8 +49,10 @@ def start(person, seed: int = FINE, **params) -> None:
     queue.add(bpy.context, VaryJob.of(person, 2, {"amount": 0.5, "seed": seed, **params}))
 
 
-def texts(panel, context) -> str:
-    return " | ".join(shown(panel, context))
+def drawn(kind: str) -> str:
+    """The panel, with this edit chosen."""
+    bpy.context.scene.primdiffusion_edit.kind = kind
+    return " | ".join(shown(edit_panel.PRIMDIFFUSION_PT_edit, bpy.context))
 
 
 def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):
@@ -139,9 +141,10 @@ def test_a_painted_region_travels_as_weights_of_all_vertices(person):
     assert np.flatnonzero(painted).tolist() == [3, 5]
     assert painted[3] == pytest.approx(0.75)
     assert body.mode == "WEIGHT_PAINT"
-    assert ops.finish_painting() == {"FINISHED"}
+    assert ops.paint_region(finish=True) == {"FINISHED"}
     assert (body.mode, body.hide_viewport) == ("OBJECT", True)
-    assert not ops.finish_painting.poll()
+    with pytest.raises(RuntimeError, match="no region is being painted"):
+        ops.paint_region(finish=True)
 
 
 def test_a_vertex_group_that_is_not_there_is_named(person):
@@ -166,8 +169,8 @@ def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, s
     assert (paths(person), person_file(person)) == (before, file)
     assert sorted(file.parent.iterdir()) == files
     assert not list(Path(bpy.app.tempdir).glob("vary_*"))
-    assert sentence in texts(edit_panel.SUB_PANELS[0], bpy.context)
-    assert sentence not in texts(edit_panel.SUB_PANELS[1], bpy.context)
+    assert sentence in drawn("VARY")
+    assert sentence not in drawn("REDRESS")
 
 
 def test_a_human_removed_during_the_job_is_reported_and_the_other_is_untouched(person):
@@ -288,13 +291,13 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tm
         ops.vary(human="Human")
 
 
-def test_a_panel_shows_only_its_own_job_and_cancels_it(person):
+def test_each_edit_shows_only_its_own_job_and_cancels_it(person):
     start(person, TAKES_LONG)
     until_running()
-    shown_by_vary = texts(edit_panel.SUB_PANELS[0], bpy.context)
+    shown_by_vary = drawn("VARY")
     assert "primdiffusion.cancel" in shown_by_vary
     assert "step" in shown_by_vary
-    assert "primdiffusion.cancel" not in texts(edit_panel.SUB_PANELS[1], bpy.context)
+    assert "primdiffusion.cancel" not in drawn("REDRESS")
     ops.cancel()
     drive()
     assert notice_of("vary") == "Cancelled"
@@ -307,12 +310,13 @@ def test_no_edit_can_be_redone_with_a_slider():
         assert not {"REGISTER", "UNDO"} & operator.bl_options
 
 
-def test_the_sub_panels_offer_all_edits(person):
-    shown = " ".join(texts(panel, bpy.context) for panel in edit_panel.SUB_PANELS)
-    for name in ("vary", "redress", "transfer_texture", "blend"):
-        assert f"primdiffusion.{name}" in shown
+def test_the_panel_offers_the_chosen_edit_alone(person):
+    offered = {"VARY": "vary", "REDRESS": "redress", "TRANSFER": "transfer_texture", "BLEND": "blend"}
+    for kind in offered:
+        shown = drawn(kind)
+        assert [other for other, name in offered.items() if f"primdiffusion.{name}" in shown] == [kind]
     bpy.context.scene.primdiffusion_edit.region = "PAINTED"
-    assert "primdiffusion.paint_region" in texts(edit_panel.SUB_PANELS[1], bpy.context)
+    assert "primdiffusion.paint_region" in drawn("REDRESS")
 
 
 def test_unused_files_are_removed_and_those_in_use_stay(person):

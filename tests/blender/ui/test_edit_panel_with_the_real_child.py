@@ -77,7 +77,7 @@ def test_a_painted_head_is_all_that_changes(people):
     differ = changed(before, files(anna))
     assert differ
     assert differ <= region("head")
-    ops.finish_painting()
+    ops.paint_region(finish=True)
 
 
 def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_them(people):

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
+from types import SimpleNamespace
+from unittest.mock import MagicMock
 
 import bpy
 import exporting
@@ -18,6 +21,7 @@ from blender_primdiffusion.scene.human import BETAS, armature_of, humans
 from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.proxy import proxy_of
 from blender_primdiffusion.scene.surface import primitives_of
+from blender_primdiffusion.ui.export_operators import PRIMDIFFUSION_OT_export
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
@@ -68,11 +72,11 @@ def assert_rejected(sentence, operator, **properties):
         operator(**properties)
 
 
-@pytest.mark.parametrize("name", ["a.glb", "b.fbx", "c.usdz", "d"])
-def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name):
+@pytest.mark.parametrize(("name", "given"), [("a.glb", {}), ("b.fbx", {}), ("c.usdz", {}), ("d", {"format": "GLB"})])
+def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name, given):
     moving(anna)
     before = everything()
-    assert OPERATORS.export_mesh(filepath=str(out / name), animation=True, texture_px=64) == {"FINISHED"}
+    assert OPERATORS.export(filepath=str(out / name), **given, animation=True, texture_px=64) == {"FINISHED"}
     assert everything() == before
     assert [path.name for path in out.iterdir()] == [name if "." in name else f"{name}.glb"]
 
@@ -80,7 +84,7 @@ def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name):
 def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
     before = everything()
     monkeypatch.setenv("EXPORT_FAILS", "1")
-    assert_rejected("too thin", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
+    assert_rejected("too thin", OPERATORS.export, filepath=str(out / "a.glb"))
     assert everything() == before
     assert not list(out.iterdir())
 
@@ -88,16 +92,16 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
 @pytest.mark.parametrize(
     ("operator", "properties", "sentence"),
     [
-        ("export_mesh", {"filepath": "OUT/a.stl"}, "another ending"),
-        ("export_mesh", {"filepath": "OUT/none/a.glb"}, "there is no folder"),
-        ("export_mesh", {"filepath": ""}, "name a file"),
-        ("export_mesh", {"filepath": "OUT/a.glb", "human": "Bert"}, "'Bert' is not in the scene"),
-        ("export_gaussians", {"filepath": "OUT/a.glb"}, "another ending"),
-        ("export_human", {"filepath": "OUT/none/a.human"}, "there is no folder"),
-        ("export_vdb_sequence", {"directory": "OUT/none"}, "there is no folder"),
-        ("export_vdb_sequence", {"directory": "OUT", "first": 5, "last": 2}, "before the first"),
+        ("export", {"filepath": "OUT/a.stl"}, "another ending"),
+        ("export", {"filepath": "OUT/none/a.glb"}, "there is no folder"),
+        ("export", {"filepath": ""}, "name a file"),
+        ("export", {"filepath": "OUT/a.glb", "human": "Bert"}, "'Bert' is not in the scene"),
+        ("export", {"filepath": "OUT/a.glb", "format": "PLY"}, "another ending than .ply"),
+        ("export", {"filepath": "OUT/none/a.human"}, "there is no folder"),
+        ("export", {"filepath": "OUT/none/a.vdb"}, "there is no folder"),
+        ("export", {"filepath": "OUT/a.vdb", "first": 5, "last": 2}, "before the first"),
         ("show_proxy", {"shown": "MESH"}, "no mesh proxy"),
-        ("remove_proxy", {}, "no mesh proxy"),
+        ("show_proxy", {"shown": "REMOVED"}, "no mesh proxy"),
         ("add_proxy", {"human": "Bert"}, "'Bert' is not in the scene"),
         ("import_human", {"filepath": "OUT/none.human"}, "there is no file"),
     ],
@@ -109,15 +113,15 @@ def test_an_impossible_export_is_reported_in_a_sentence(anna, out, operator, pro
 
 
 def test_without_a_human_there_is_nothing_to_export(store, out):
-    assert_rejected("poll", OPERATORS.export_mesh, filepath=str(out / "a.glb"))
+    assert_rejected("poll", OPERATORS.export, filepath=str(out / "a.glb"))
 
 
 def test_a_missing_persons_file_is_named(anna, out):
     for path in Path(bpy.data.filepath).parent.rglob("person.human.safetensors"):
         if "store" not in path.parts:
             path.unlink()
-    for operator, file in ((OPERATORS.export_mesh, "a.glb"), (OPERATORS.export_human, "a.human")):
-        assert_rejected("is missing", operator, filepath=str(out / file))
+    for file in ("a.glb", "a.human"):
+        assert_rejected("is missing", OPERATORS.export, filepath=str(out / file))
 
 
 def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
@@ -140,7 +144,7 @@ def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):
     once = everything()
     OPERATORS.add_proxy(texture_px=64)
     assert {kind: len(names) for kind, names in everything().items()} == {k: len(n) for k, n in once.items()}
-    OPERATORS.remove_proxy()
+    OPERATORS.show_proxy(shown="REMOVED")
     assert everything() == before
     assert not primitives_of(anna).hide_viewport
 
@@ -149,7 +153,7 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
     turns = moving(anna)
     bpy.context.scene.frame_set(2)
     armature_of(anna).location.x = 3.0
-    OPERATORS.export_gaussians(filepath=str(out / "a.ply"), gaussians=123)
+    OPERATORS.export(filepath=str(out / "a.ply"), gaussians=123)
     asked = json.loads((out / "a.ply").read_text())
     assert asked["limit"] == 123
     assert np.array(asked["object"])[0, 3] == pytest.approx(3.0)
@@ -159,7 +163,7 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
 def test_a_vdb_for_each_frame_lies_where_the_person_stands(anna, out):
     moving(anna)
     armature_of(anna).location = (2.0, 0.0, 0.0)
-    OPERATORS.export_vdb_sequence(directory=str(out), first=1, last=3, voxel=0.01)
+    OPERATORS.export(filepath=str(out / "Anna.vdb"), first=1, last=3, voxel=0.01)
     assert sorted(path.name for path in out.iterdir()) == [f"Anna_{frame:04d}.vdb" for frame in (1, 2, 3)]
     bpy.utils.expose_bundled_modules()
     import openvdb
@@ -174,7 +178,7 @@ def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
     armature = armature_of(anna)
     shape = np.linspace(-1, 1, 10)
     armature[BETAS] = shape.tolist()
-    OPERATORS.export_human(filepath=str(out / "Anna Müller.human"), motion=True)
+    OPERATORS.export(filepath=str(out / "Anna Müller.human"), motion=True)
     kept = read_tensors(out / "Anna Müller.human")
     assert json.loads(kept.metadata["provenance"]) == {"seed": 5}
     assert np.frombuffer(kept.arrays["betas"][2], "<f4") == pytest.approx(shape, abs=1e-6)
@@ -189,7 +193,7 @@ def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
 
 
 def test_a_human_file_without_motion_holds_the_person_alone(anna, out):
-    OPERATORS.export_human(filepath=str(out / "a"), motion=False)
+    OPERATORS.export(filepath=str(out / "a"), motion=False)
     kept = read_tensors(out / "a.human")
     assert "motion" not in kept.metadata
     assert set(kept.arrays) == {"betas"}
@@ -213,8 +217,51 @@ def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, dam
     assert not humans(bpy.context.scene)
 
 
-def test_the_panels_draw_in_the_sidebar_and_files_can_be_dropped(store):
-    types = bpy.types
-    for name in ("mesh", "volumes"):
-        assert getattr(types, f"PRIMDIFFUSION_PT_export_{name}").bl_parent_id == "PRIMDIFFUSION_PT_export"
-    assert types.PRIMDIFFUSION_FH_human.bl_import_operator == "primdiffusion.import_human"
+def test_without_an_extension_the_panels_format_is_written(anna, out):
+    bpy.context.scene.primdiffusion_export.format = "PLY"
+    OPERATORS.export(filepath=str(out / "a"))
+    assert [path.name for path in out.iterdir()] == ["a.ply"]
+
+
+class Dialog:
+    """An export in the file browser, which calls `check` after each change."""
+
+    def __init__(self, **given):
+        self.given, self.filepath, self.reported = given, "", []
+        self.properties = SimpleNamespace(is_property_set=lambda name: name in self.given)
+        vars(self).update(given)
+
+    def __getattr__(self, name):
+        return functools.partial(getattr(PRIMDIFFUSION_OT_export, name), self)
+
+
+@pytest.mark.parametrize(
+    ("format", "before", "after"),
+    [
+        ("GLB", "/a/Anna.human", "/a/Anna.glb"),
+        ("USD", "/a/Anna.usdz", "/a/Anna.usdz"),
+        ("HUMAN", "/a/Anna v1.2", "/a/Anna v1.2.human"),
+        ("VDB", "", ""),
+    ],
+)
+def test_another_format_in_the_file_browser_changes_the_extension(anna, format, before, after):
+    dialog = Dialog(format=format)
+    dialog.filepath = before
+    assert dialog.check(bpy.context) == (before != after)
+    assert dialog.filepath == after
+
+
+def test_the_file_browser_opens_with_the_panels_format_and_settings(anna):
+    settings = bpy.context.scene.primdiffusion_export
+    settings.format, settings.triangles, settings.texture_px = "FBX", 1234, "512"
+    window_manager = MagicMock()
+    context = SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer, window_manager=window_manager)
+    dialog = Dialog(human="")
+    assert dialog.invoke(context, None) == {"RUNNING_MODAL"}
+    assert (dialog.format, dialog.triangles, dialog.texture_px) == ("FBX", 1234, 512)
+    assert dialog.filepath == "Anna.fbx"
+    window_manager.fileselect_add.assert_called_once()
+
+
+def test_files_can_be_dropped(store):
+    assert bpy.types.PRIMDIFFUSION_FH_human.bl_import_operator == "primdiffusion.import_human"

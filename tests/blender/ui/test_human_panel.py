@@ -23,10 +23,10 @@ from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of,
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
 from blender_primdiffusion.scene.surface import node_inputs
+from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_MT_people, PRIMDIFFUSION_PT_human
 from blender_primdiffusion.ui.shape_panel import (
-    PRIMDIFFUSION_OT_random_shape,
-    PRIMDIFFUSION_PT_details,
+    PRIMDIFFUSION_OT_reshape,
     PRIMDIFFUSION_PT_shape,
 )
 
@@ -116,7 +116,7 @@ def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_wh
     assert list(armature_of(person)[BETAS]) == before
     assert "Edit Mode: leave it" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
     with pytest.raises(RuntimeError, match="Edit Mode: leave it"):
-        ops.reset_shape()
+        ops.reshape(to="GENERATED")
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
@@ -124,7 +124,7 @@ def test_humans_of_earlier_versions_have_to_be_generated_again(addon, tmp_path):
     build_human(addon, synthetic.write(tmp_path / "old.npz", 8))
     assert "generate the human again" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
     with pytest.raises(RuntimeError, match="generate the human again"):
-        ops.random_shape()
+        ops.reshape(to="RANDOM")
 
 
 def test_an_animated_shape_is_reported(person, addon):
@@ -135,45 +135,48 @@ def test_an_animated_shape_is_reported(person, addon):
 def test_reset_brings_back_the_shape_the_person_was_generated_with(person):
     before = surface(person)
     reshape(person, np.array(TALL))
-    assert ops.reset_shape() == {"FINISHED"}
+    assert ops.reshape(to="GENERATED") == {"FINISHED"}
     np.testing.assert_allclose(surface(person), before, atol=1e-5)
 
 
 def test_a_random_shape_is_the_same_for_the_same_seed(person):
-    ops.random_shape(seed=5)
+    ops.reshape(to="RANDOM", seed=5)
     first = betas_of(person)
-    ops.random_shape(seed=6)
+    ops.reshape(to="RANDOM", seed=6)
     assert np.abs(betas_of(person) - first).max() > 0.1
-    ops.random_shape(seed=5)
+    ops.reshape(to="RANDOM", seed=5)
     np.testing.assert_array_equal(betas_of(person), first)
-    ops.random_shape(seed=5, spread=0.0)
+    ops.reshape(to="RANDOM", seed=5, spread=0.0)
     assert not betas_of(person).any()
 
 
 def test_each_press_of_random_is_another_body(person, addon):
-    pressed = [SimpleNamespace(seed=0, execute=lambda _: {"FINISHED"}) for _ in range(2)]
+    ungiven = SimpleNamespace(is_property_set=lambda _: False)
+    pressed = [
+        SimpleNamespace(to="RANDOM", seed=0, properties=ungiven, execute=lambda _: {"FINISHED"}) for _ in range(2)
+    ]
     for press in pressed:  # background mode has no window to press a button in
-        assert PRIMDIFFUSION_OT_random_shape.invoke(press, addon, None) == {"FINISHED"}
+        assert PRIMDIFFUSION_OT_reshape.invoke(press, addon, None) == {"FINISHED"}
     assert pressed[0].seed != pressed[1].seed
 
 
 def test_a_shape_is_copied_from_the_other_person(person, other):
     reshape(other, np.array(TALL))
-    assert ops.copy_shape(human="Human", source="Ötzi") == {"FINISHED"}
+    assert ops.reshape(to="OTHER", human="Human", other="Ötzi") == {"FINISHED"}
     np.testing.assert_allclose(betas_of(person), TALL)
     bpy.context.scene.primdiffusion_edit.other = person
     reshape(person, np.zeros(10))
-    assert ops.copy_shape(human="Ötzi") == {"FINISHED"}
+    assert ops.reshape(to="OTHER", human="Ötzi") == {"FINISHED"}
     assert not betas_of(other).any()
 
 
 @pytest.mark.parametrize(
     ("given", "sentence"),
-    [({}, "choose the other human"), ({"source": "Human"}, "cannot be the other"), ({"source": "Eve"}, "not in the")],
+    [({}, "choose the other human"), ({"other": "Human"}, "cannot be the other"), ({"other": "Eve"}, "not in the")],
 )
 def test_copying_without_another_human_is_rejected(person, given, sentence):
     with pytest.raises(RuntimeError, match=sentence):
-        ops.copy_shape(**given)
+        ops.reshape(to="OTHER", **given)
 
 
 def test_a_script_gives_betas_and_measures(person):
@@ -232,7 +235,7 @@ def test_a_view_is_needed_to_frame_a_human(person, addon):
         for area in window.screen.areas:
             area.type = "CONSOLE"
     with pytest.raises(RuntimeError, match="no 3D viewport is open"):
-        ops.frame_human()
+        ops.select_human(frame=True)
 
 
 def test_a_duplicate_is_a_person_of_their_own_on_the_same_files(person, addon):
@@ -316,11 +319,13 @@ def linked(tmp_path):
     return wanted.collections[0]
 
 
-@pytest.mark.parametrize("name", ["duplicate_human", "delete_human", "reset_shape"])
-def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name):
+@pytest.mark.parametrize(
+    ("name", "given"), [("duplicate_human", {}), ("delete_human", {}), ("reshape", {"to": "GENERATED"})]
+)
+def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name, given):
     linked(tmp_path)
     with pytest.raises(RuntimeError, match="linked"):
-        getattr(ops, name)()
+        getattr(ops, name)(**given)
 
 
 def test_a_linked_person_keeps_their_name(person, tmp_path, capsys):
@@ -333,7 +338,7 @@ def test_a_frame_is_put_around_a_human_where_a_viewport_is_open(person, addon):
     area.type = "VIEW_3D"
     view = area.spaces.active.region_3d
     view.view_location, view.view_distance = (50, 50, 50), 1.0
-    assert ops.frame_human() == {"FINISHED"}
+    assert ops.select_human(frame=True) == {"FINISHED"}
     assert view.view_location.length < 3
     assert addon.view_layer.objects.active == armature_of(person)
 
@@ -346,7 +351,7 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
     panel = " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
     assert "In the scene: " in panel
     assert "'" in panel
-    details = " ".join(shown(PRIMDIFFUSION_PT_details, addon))
+    details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
     for text in ("Seed: 0", "Steps: 5", "Sex: female", "Edit: vary", "amount 0.5", "Volumes: 12", "Files: 0 MB"):
         assert text in details
 

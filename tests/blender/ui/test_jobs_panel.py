@@ -11,6 +11,7 @@ from jobs_driven import drive, shown
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.ui import jobs_panel
+from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 
 pytestmark = pytest.mark.any_blender
 FAILS = 2
@@ -43,8 +44,18 @@ def test_the_panel_jobs_is_shown_only_while_there_are_any(addon):
     assert queue.ended
     assert not shows(addon)
     assert {"primdiffusion.release_memory", "primdiffusion.copy_diagnostics"} <= set(
-        shown(jobs_panel.PRIMDIFFUSION_PT_backend, addon)
+        shown(PRIMDIFFUSION_PT_advanced, addon, opened=True)
     )
+
+
+def test_cancel_says_what_is_not_running(addon):
+    with pytest.raises(RuntimeError, match="Nothing is running"):
+        ops.cancel()
+    queue.add(addon, GenerateJob(11, 1))
+    for what, sentence in (("CAPTURES", "no captures are being rendered"), ("SET_UP", "[Nn]othing is being set up")):
+        with pytest.raises(RuntimeError, match=sentence):
+            ops.cancel(what=what)
+    drive()
 
 
 def test_diagnostics_can_be_copied_before_anything_was_done(addon):

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import re
+import sys
 import webbrowser
 import zipfile
+from pathlib import Path
+from unittest.mock import MagicMock
 
 import bpy
 import pytest
 
 import build_addon
 import build_manual
-from blender_primdiffusion.ui import manual
+from blender_primdiffusion.ui import drawing, manual
+
+sys.path.insert(0, str(Path(__file__).parents[3] / "benchmarks"))
+import sidebar
 
 pytestmark = pytest.mark.any_blender
 
@@ -23,29 +29,47 @@ def opened(monkeypatch) -> list[str]:
     return urls
 
 
+def button(page: str, anchor: str = "") -> list[str]:
+    """Addresses that the question mark of a panel opens."""
+    layout = MagicMock()
+    manual.draw_manual_button(layout, page, anchor)
+    return [
+        layout.operator.return_value.url for call in layout.operator.call_args_list if call.args == ("wm.url_open",)
+    ]
+
+
 def test_the_button_opens_the_page_from_disk_at_its_section(addon, opened):
-    assert bpy.ops.primdiffusion.open_manual(page="batch", anchor="render") == {"FINISHED"}
-    (url,) = opened
+    (url,) = button("batch", "render")
     assert re.fullmatch(r"file:///.*/docs/manual/batch\.md#render", url)
+    assert bpy.ops.wm.url_open(url=url) == {"FINISHED"}
+    assert opened == [url]
 
 
 @pytest.mark.parametrize("page", ["no_such_page", "../captures", ""])
-def test_for_a_page_that_is_not_there_the_list_of_pages_is_shown(addon, opened, page):
-    assert bpy.ops.primdiffusion.open_manual(page=page) == {"FINISHED"}
-    assert opened[0].endswith("/docs/manual/index.md")
+def test_for_a_page_that_is_not_there_the_list_of_pages_is_shown(addon, page):
+    assert button(page)[0].endswith("/docs/manual/index.md")
 
 
-def test_an_installation_without_its_manual_is_reported(addon, opened, monkeypatch):
+def test_without_the_manual_there_is_no_button(addon, monkeypatch):
     monkeypatch.setattr(manual, "page_file", lambda _page: None)
-    with pytest.raises(RuntimeError, match="page 'batch' is not there: install"):
-        bpy.ops.primdiffusion.open_manual(page="batch")
-    assert opened == []
+    manual.page_url.cache_clear()
+    try:
+        assert button("batch") == []
+    finally:
+        manual.page_url.cache_clear()
 
 
-def test_without_a_browser_the_file_is_named(addon, monkeypatch):
-    monkeypatch.setattr(webbrowser, "open", lambda *_, **__: False)
-    with pytest.raises(RuntimeError, match=r"open .*batch\.md by hand"):
-        bpy.ops.primdiffusion.open_manual(page="batch")
+def test_every_panel_and_section_leads_to_a_heading_that_is_there(armature, monkeypatch):
+    asked = []
+    monkeypatch.setattr(drawing, "draw_manual_button", lambda _layout, page, anchor="": asked.append((page, anchor)))
+    for cls in sidebar.panels():
+        asked.append((cls.manual_page, cls.manual_section))
+        sidebar.draw(cls, bpy.context, opened=True)
+    pages = build_manual.manual()
+    for page, anchor in filter(lambda pair: pair[0], asked):
+        text = pages[f"{page}.html"].decode()
+        assert not anchor or f'id="{anchor}"' in text, (page, anchor)
+    assert len(asked) > 15
 
 
 @pytest.mark.parametrize(

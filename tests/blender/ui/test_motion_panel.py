@@ -42,7 +42,7 @@ def test_a_strip_moves_the_person_as_the_action_did(addon, armature):
     ops.add_motion(motion="WAVE", rounds=1)
     addon.scene.frame_set(30)
     wanted = np.array(armature.pose.bones["right_elbow"].matrix)
-    ops.clear_motion()
+    ops.use_action(action="")
     ops.add_motion(motion="WAVE", rounds=1, into="STRIP")
     assert armature.animation_data.action is None
     (track,) = armature.animation_data.nla_tracks
@@ -56,12 +56,17 @@ def test_a_looped_walk_continues_from_where_it_has_got_to(addon, armature):
     end = int(last_key(armature))
     addon.scene.frame_set(end)
     reached = current_pose(armature)[1][2]
-    ops.loop_motion()
+    armature.primdiffusion_human.loop = True
     assert loops(armature)
     addon.scene.frame_set(2 * end - 1)
     assert current_pose(armature)[1][2] == pytest.approx(2 * reached, rel=1e-3)
-    ops.loop_motion()
+    armature.primdiffusion_human.loop = True
+    assert armature.primdiffusion_human.loop
+    armature.primdiffusion_human.loop = False
     assert not loops(armature)
+    ops.use_action(action="")
+    armature.primdiffusion_human.loop = True
+    assert not armature.primdiffusion_human.loop, "there is nothing to loop"
 
 
 def test_built_in_motion_fits_long_and_short_legs(addon, armature):
@@ -78,11 +83,11 @@ def test_clear_motion_brings_the_rest_pose_and_keeps_the_action(addon, armature)
     ops.add_motion(motion="WAVE")
     name = armature.animation_data.action.name
     addon.scene.frame_set(40)
-    assert ops.clear_motion() == {"FINISHED"}
+    assert ops.use_action(action="") == {"FINISHED"}
     np.testing.assert_allclose(current_pose(armature)[0], np.tile(np.eye(3), (24, 1, 1)), atol=1e-5)
     assert bpy.data.actions[name].use_fake_user
     with pytest.raises(RuntimeError, match="has no motion to clear"):
-        ops.clear_motion()
+        ops.use_action(action="")
     assert ops.use_action(action=name) == {"FINISHED"}
     addon.scene.frame_set(40)
     assert np.abs(current_pose(armature)[0][17] - np.eye(3)).max() > 0.3
@@ -134,6 +139,7 @@ def texts(cls, context) -> list[str]:
     panel = SimpleNamespace(layout=layout, _draw_action=lambda *a: cls._draw_action(None, *a))
     cls.draw(panel, context)
     labels = [call.kwargs["text"] for call in layout.label.call_args_list]
+    labels += [call.args[1] for call in layout.prop.call_args_list]
     return labels + [call.args[0] for call in layout.operator.call_args_list]
 
 
@@ -141,7 +147,7 @@ def test_the_panel_shows_what_was_found(addon, armature, tmp_path):
     ops.import_motion(filepath=write_amass(tmp_path / "m.npz"))
     shown = texts(PRIMDIFFUSION_PT_motion, addon)
     assert {"SMPL-H", "z", "31 (0.3 s)", "120", "metres"} <= set(shown)
-    assert "primdiffusion.loop_motion" in shown
+    assert "loop" in shown
     assert texts(PRIMDIFFUSION_MT_actions, addon) == ["primdiffusion.use_action"]
     armature.animation_data.action["primdiffusion_motion"] = "rubbish"
     assert "SMPL-H" not in texts(PRIMDIFFUSION_PT_motion, addon)

@@ -1,9 +1,8 @@
-"""The Render panel as the user meets it, with the real client and a child that merges small grids."""
+"""The panels Render and Advanced as the user meets them, with the real client and a child that merges small grids."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -34,7 +33,7 @@ from blender_primdiffusion.scene.human import (
 )
 from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of, merged_state
-from blender_primdiffusion.ui import render_panel
+from blender_primdiffusion.ui import advanced_panel, render_panel
 
 ops = bpy.ops.primdiffusion
 
@@ -57,12 +56,9 @@ def raise_left_arm(person, angle: float) -> None:
     bpy.context.view_layer.update()
 
 
-def drawn(panel_class, context) -> str:
-    """Operators and texts of a panel of the person."""
-    standing = SimpleNamespace(
-        draw=lambda asked, context: panel_class.draw_person(asked, context, humans(context.scene)[0])
-    )
-    return " | ".join(shown(standing, context))
+def advanced() -> str:
+    """Operators and texts of the panel Advanced, with its sections opened."""
+    return " ".join(shown(advanced_panel.PRIMDIFFUSION_PT_advanced, bpy.context, opened=True))
 
 
 def density_of(person) -> float:
@@ -86,7 +82,7 @@ def test_a_merged_pose_is_one_undo_step_and_unmerging_goes_back(person):
     bpy.ops.ed.redo()
     person = humans(bpy.context.scene)[0]
     assert attachment_of(person) == "MERGED"
-    assert ops.unmerge() == {"FINISHED"}
+    assert ops.merge(what="NOTHING") == {"FINISHED"}
     assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
 
 
@@ -94,23 +90,23 @@ def test_unmerging_goes_back_to_the_surface_where_that_was_shown(person):
     assert ops.set_attachment(mode="SURFACE") == {"FINISHED"}
     ops.merge()
     ops.merge()
-    ops.unmerge()
+    ops.merge(what="NOTHING")
     assert attachment_of(person) == "SURFACE"
 
 
 def test_the_panel_reports_a_changed_pose(person):
     raise_left_arm(person, 0.3)
     ops.merge()
-    assert not render_panel.outdated(person, bpy.context.scene)
+    assert not advanced_panel.outdated(person, bpy.context.scene)
     armature_of(person).location.x = 2  # the merged volume moves along
     bpy.context.view_layer.update()
-    assert not render_panel.outdated(person, bpy.context.scene)
+    assert not advanced_panel.outdated(person, bpy.context.scene)
     raise_left_arm(person, 0.4)
-    assert render_panel.outdated(person, bpy.context.scene)
-    assert "of another pose" in drawn(render_panel.PRIMDIFFUSION_PT_merge, bpy.context).replace(" | ", " ")
+    assert advanced_panel.outdated(person, bpy.context.scene)
+    assert "of another pose" in advanced()
     ops.merge()
-    assert not render_panel.outdated(person, bpy.context.scene)
-    assert "of another pose" not in drawn(render_panel.PRIMDIFFUSION_PT_merge, bpy.context).replace(" | ", " ")
+    assert not advanced_panel.outdated(person, bpy.context.scene)
+    assert "of another pose" not in advanced()
 
 
 def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(person):
@@ -121,7 +117,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     scene = bpy.context.scene
     scene.frame_set(7)
     scene.frame_start, scene.frame_end = 5, 8
-    assert ops.merge_frames(voxel=0.02) == {"FINISHED"}
+    assert ops.merge(what="FRAMES", voxel=0.02) == {"FINISHED"}
     assert scene.frame_current == 7
     volume = merged_of(person).data
     files = sequence_files(volume)
@@ -133,8 +129,8 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     np.testing.assert_allclose(found, 10 + 10 * np.sin(0.2 * np.arange(4)), rtol=2e-3)
     for frame in (5, 6, 8):
         scene.frame_set(frame)
-        assert not render_panel.outdated(person, scene)
-    assert ops.merge_frames(frame_start=6, frame_end=7) == {"FINISHED"}
+        assert not advanced_panel.outdated(person, scene)
+    assert ops.merge(what="FRAMES", frame_start=6, frame_end=7) == {"FINISHED"}
     assert merged_of(person).data.frame_duration == 2
     ops.merge()
     assert not merged_of(person).data.is_sequence
@@ -142,7 +138,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
 
 def test_a_range_that_is_none_is_rejected(person):
     with pytest.raises(RuntimeError, match="frames 7 to 7 are no sequence"):
-        ops.merge_frames(frame_start=7, frame_end=7)
+        ops.merge(what="FRAMES", frame_start=7, frame_end=7)
     assert merged_of(person) is None
 
 
@@ -173,12 +169,12 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
 @pytest.mark.parametrize(
     ("order", "message"), [("fails", "large grid"), ("gives garbage", "damaged"), ("dies", "ended")]
 )
-@pytest.mark.parametrize("merging", [ops.merge, ops.merge_frames])
-def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypatch, order, message, merging):
+@pytest.mark.parametrize("what", ["POSE", "FRAMES"])
+def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypatch, order, message, what):
     monkeypatch.setenv("FAKE_MERGE", order)
     before = sorted(folder_of(person).iterdir())
     with pytest.raises(RuntimeError, match=message):
-        merging()
+        ops.merge(what=what)
     assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
     assert sorted(folder_of(person).iterdir()) == before
 
@@ -218,25 +214,25 @@ def test_set_attachment_reports_what_stands_in_the_way(person):
     with pytest.raises(RuntimeError, match="press Merge"):
         ops.set_attachment(mode="MERGED")
     with pytest.raises(RuntimeError, match="no merged volume"):
-        ops.unmerge()
+        ops.merge(what="NOTHING")
     with pytest.raises(RuntimeError, match="'Nobody' is not in the scene"):
         ops.set_attachment(mode="SURFACE", human="Nobody")
 
 
 def test_panels_show_modes_warnings_and_memory(person):
     context = bpy.context
-    assert "merge_frames" in drawn(render_panel.PRIMDIFFUSION_PT_merge, context)
-    assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 2
+    assert advanced().count("primdiffusion.merge") == 2
+    assert advanced().count("set_attachment") == 2
     ops.merge()
-    assert drawn(render_panel.PRIMDIFFUSION_PT_attachment, context).count("set_attachment") == 3
-    ops.unmerge()
+    assert advanced().count("set_attachment") == 3
+    ops.merge(what="NOTHING")
     person[MARK] = person[MARK].replace('"most_overlapping": ', '"most_overlapping": 9')
     context.scene.render.engine = "CYCLES"
-    assert "volumes overlap" in drawn(render_panel.PRIMDIFFUSION_PT_cycles_look, context).replace(" | ", " ")
+    assert "volumes overlap" in advanced()
     context.scene.render.engine = "PRIMDIFFUSION"
-    assert "overlap" not in drawn(render_panel.PRIMDIFFUSION_PT_cycles_look, context), "of no interest to this engine"
-    assert "MB" in drawn(render_panel.PRIMDIFFUSION_PT_memory, context)
-    assert "primdiffusion.set_up_cycles" in shown(render_panel.PRIMDIFFUSION_PT_render, context)
+    assert "volumes overlap" not in advanced(), "of no interest to this engine"
+    assert "MB" in advanced()
+    assert shown(render_panel.PRIMDIFFUSION_PT_render, context).count("primdiffusion.set_up_engine") == 2
 
 
 def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(person):
@@ -245,7 +241,7 @@ def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(perso
     scene.collection.objects.link(camera)
     scene.camera, scene.cycles.max_bounces = camera, 7
     world = scene.world
-    assert ops.set_up_cycles() == {"FINISHED"}
+    assert ops.set_up_engine(engine="CYCLES") == {"FINISHED"}
     assert (scene.render.engine, scene.camera, scene.world, scene.cycles.max_bounces) == ("CYCLES", camera, world, 7)
     assert scene.cycles.transparent_max_bounces == 1024
     assert scene.view_settings.view_transform == "Standard"

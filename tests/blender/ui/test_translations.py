@@ -30,9 +30,9 @@ def composed() -> set[str]:
     """Labels that are put together where they are shown, and choices that a checkpoint or a folder offers."""
     from blender_primdiffusion.jobs.remedies import _REMEDIES
     from blender_primdiffusion.motion.poses import LIBRARY
+    from blender_primdiffusion.ui.advanced_panel import _SHOWN
     from blender_primdiffusion.ui.attributes import CATEGORIES, menu
     from blender_primdiffusion.ui.render_panel import APPROXIMATE, EXACT, OTHER_ENGINE, UNLIT
-    from blender_primdiffusion.ui.shape_panel import _SHOWN
     from blender_primdiffusion.ui.variations_panel import _BUILD_ALL
 
     sliders = {"Stature", "Shoulders", "Waist", "Girth"}

@@ -103,7 +103,7 @@ def test_from_no_backend_to_a_backend_and_back(wheels):
     assert "Downloads" in layout.text
     assert "primdiffusion.set_up_backend" in layout.buttons
 
-    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
     assert known.known().state == "ready"
     assert session.notice.startswith("The backend is ready: torch 0-tiny")
     layout = Layout()
@@ -112,7 +112,7 @@ def test_from_no_backend_to_a_backend_and_back(wheels):
     layout = draw_preferences()
     assert "Ready: torch 0-tiny" in layout.text
     assert str(places.set_up_folder().environment)[:40] in layout.text
-    assert {"primdiffusion.repair_backend", "primdiffusion.remove_backend"} <= set(layout.buttons)
+    assert {"primdiffusion.set_up_backend", "primdiffusion.remove_backend"} <= set(layout.buttons)
 
     assert press.set_up_backend() == {"FINISHED"}  # nothing to do
     assert press.test_backend() == {"FINISHED"}
@@ -126,7 +126,7 @@ def test_set_up_backend_downloads_when_blender_may_use_the_network(online, monke
         assert press.set_up_backend() == {"FINISHED"}
         assert known.known().state == "ready"
         next(places.set_up_folder().environment.rglob("tiny.py")).unlink()
-        assert press.repair_backend() == {"FINISHED"}
+        assert press.set_up_backend(repair=True) == {"FINISHED"}
     assert known.known().state == "ready"
     assert list(places.set_up_folder().environment.rglob("tiny.py"))
 
@@ -153,31 +153,31 @@ def test_a_failure_raises_and_stays_in_the_panel(online):
 @pytest.mark.parametrize("folder", ["", "/no/such/folder"])
 def test_a_folder_that_is_none_is_rejected(wheels, folder):
     with pytest.raises(RuntimeError, match="is no folder: choose the one that holds the wheels"):
-        press.install_from_folder(directory=folder)
+        press.set_up_backend(choose=True, directory=folder)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
 def test_a_pipe_among_the_wheels_is_named(wheels):
     os.mkfifo(wheels / "tensorflow.whl")
     with pytest.raises(RuntimeError, match=r"tensorflow\.whl: this is not a regular file"):
-        press.install_from_folder(directory=str(wheels))
+        press.set_up_backend(choose=True, directory=str(wheels))
 
 
 def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypatch):
     ours = write_lock(tmp_path / "ours.txt", [write_wheel(tmp_path / "elsewhere", "torch", "")])
     monkeypatch.setattr(known, "available", lambda: {"cpu": ours})
     with pytest.raises(RuntimeError, match="hash differs"):
-        press.install_from_folder(directory=str(wheels))
+        press.set_up_backend(choose=True, directory=str(wheels))
     write_lock(wheels / operators.OWN_LOCK, sorted(wheels.glob("*.whl"))[:1])
     with pytest.raises(RuntimeError, match="torch"):
-        press.install_from_folder(directory=str(wheels))
+        press.set_up_backend(choose=True, directory=str(wheels))
     write_lock(wheels / operators.OWN_LOCK, sorted(wheels.glob("*.whl")))
-    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
     assert known.known().about["lock_name"] == "requirements.txt"
 
 
 def test_an_environment_with_outdated_packages_is_reported(wheels, monkeypatch):
-    assert press.install_from_folder(directory=str(wheels)) == {"FINISHED"}
+    assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
     (path,) = known.available().values()
     monkeypatch.setattr(known, "LOCKS", path.parent)
     path.write_text(path.read_text() + "# another\n")
@@ -185,7 +185,7 @@ def test_an_environment_with_outdated_packages_is_reported(wheels, monkeypatch):
     assert known.known().state == "outdated"
     assert "press Repair" in known.known().line
     with pytest.raises(RuntimeError, match="Blender may not use the network"):
-        press.repair_backend()
+        press.set_up_backend(repair=True)
     assert known.known().state == "outdated"  # still there, and it works
 
 
@@ -194,8 +194,8 @@ def test_nothing_to_remove_test_or_cancel_is_rejected(wheels):
         press.remove_backend()
     with pytest.raises(RuntimeError, match="not set up yet: press Set Up Backend first"):
         press.test_backend()
-    with pytest.raises(RuntimeError, match="Nothing is being set up"):
-        press.cancel_set_up()
+    with pytest.raises(RuntimeError, match="Nothing is running"):
+        press.cancel(what="SET_UP")
 
 
 def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, tmp_path, monkeypatch):
@@ -205,10 +205,10 @@ def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, 
         until(lambda: session.tick() is None or any(path.startswith("/torch-") for path in handler.asked))
         layout = Layout()
         assert not preferences.draw_set_up(layout)
-        assert layout.buttons == ["primdiffusion.cancel_set_up"]
+        assert layout.buttons == ["primdiffusion.cancel"]
         with pytest.raises(RuntimeError, match="being set up already"):
-            press.repair_backend()
-        assert press.cancel_set_up() == {"FINISHED"}
+            press.set_up_backend(repair=True)
+        assert press.cancel(what="SET_UP") == {"FINISHED"}
     assert not session.busy
     assert session.notice.startswith("Cancelled")
     assert known.known().state == "broken"

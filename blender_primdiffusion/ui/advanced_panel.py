@@ -1,0 +1,210 @@
+"""The sidebar panel Advanced: how volumes follow the body, merging, the look in Cycles, memory, files, the backend."""
+
+from __future__ import annotations
+
+import bpy
+from bpy.app.translations import pgettext_iface
+
+from ..backend.requests import sentence
+from ..formats.requests import DENSITY_GAIN, VOXEL
+from ..jobs.target import selected_person
+from ..places import backend_is_named
+from ..scene.attachment import MODES, attachment_of, in_viewport
+from ..scene.blend_values import as_shown
+from ..scene.human import humans, provenance_of
+from ..scene.material import density_gain, set_density_gain
+from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
+from .jobs_panel import draw_backend
+from .render_operators import ATTACHMENT_ITEMS
+
+
+class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
+    """`scene.primdiffusion_merging`."""
+
+    voxel: bpy.props.FloatProperty(
+        name="Voxel Size",
+        description="Voxel size of the merged volume: half the size shows more detail and takes eight times the memory",
+        subtype="DISTANCE",
+        unit="LENGTH",
+        default=VOXEL,
+        min=0.001,
+        max=0.1,
+        soft_min=0.003,
+        soft_max=0.02,
+        step=0.1,
+        precision=4,
+    )
+
+
+def _gain(person: bpy.types.Collection) -> float:
+    gain = density_gain(person)
+    return DENSITY_GAIN if gain is None else gain
+
+
+def _set_gain(person: bpy.types.Collection, gain: float) -> None:
+    try:
+        set_density_gain(person, gain)
+    except ValueError as error:  # a property has no report
+        print(f"PrimDiffusion: {error}")
+
+
+def gain_property() -> bpy.props.FloatProperty:
+    """`collection.primdiffusion_density_gain` of a human's collection."""
+    return bpy.props.FloatProperty(
+        name="Density Gain",
+        description="Factor on the density in Cycles, which absorbs exponentially while the PrimDiffusion "
+        "engine adds opacity up",
+        min=0.01,
+        max=100.0,
+        soft_min=0.5,
+        soft_max=5.0,
+        step=10,
+        get=_gain,
+        set=_set_gain,
+    )
+
+
+class PRIMDIFFUSION_PT_advanced(SidebarPanel, bpy.types.Panel):
+    """What a first picture does not need, in closed sections."""
+
+    bl_label = "Advanced"
+    bl_order = 4
+    bl_options = {"DEFAULT_CLOSED"}
+
+    def draw(self, context: bpy.types.Context) -> None:
+        layout = property_columns(self.layout)
+        if humans(context.scene):
+            _draw_sections(layout, context)
+        if (body := draw_section(layout, "files", text="Files", page="editing", section=_FILES)) is not None:
+            body.operator("primdiffusion.collect_files", icon="PACKAGE")
+            find = body.operator("primdiffusion.find_missing_volumes", text="Find Volumes in Folder", icon="VIEWZOOM")
+            find.choose = True
+            body.operator("primdiffusion.remove_unused_files", icon="TRASH")
+        if not backend_is_named():
+            return
+        if (body := draw_section(layout, "backend", text="Backend", page="troubleshooting")) is not None:
+            draw_backend(body)
+
+
+_FILES = "undo-and-files-on-disk"
+"""Section of the manual."""
+
+
+def _draw_sections(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Of the selected human."""
+    try:
+        person = selected_person(context)
+    except ValueError as error:
+        draw_lines(layout, sentence(error), "INFO")
+        return
+    page, can_merge = "rendering", backend_is_named()
+    if (body := draw_section(layout, "attachment", text="Attachment", page=page, section="attachment")) is not None:
+        _draw_attachment(body, person)
+    if (
+        can_merge
+        and (body := draw_section(layout, "merge", text="Merge for Cycles", page=page, section="merge-for-cycles"))
+        is not None
+    ):
+        _draw_merge(body, context, person)
+    if (
+        body := draw_section(layout, "cycles_look", text="Look in Cycles", page=page, section="look-in-cycles")
+    ) is not None:
+        _draw_cycles_look(body, context, person)
+    if (body := draw_section(layout, "memory", text="Memory", page=page, section="memory")) is not None:
+        column = body.column(align=True)
+        for name, value in details(person):
+            column.label(text=f"{pgettext_iface(name)}: {value}", translate=False)
+
+
+def _draw_attachment(layout: bpy.types.UILayout, person: bpy.types.Collection) -> None:
+    """How volumes follow the body."""
+    from ..scene.merged import merged_of  # needs numpy
+
+    now = attachment_of(person)
+    row = layout.row(align=True)
+    for mode, label, _ in ATTACHMENT_ITEMS:
+        if mode != MODES[2] or merged_of(person) is not None:
+            row.operator("primdiffusion.set_attachment", text=label, depress=mode == now).mode = mode
+    icon = "RESTRICT_VIEW_OFF" if in_viewport(person) else "RESTRICT_VIEW_ON"
+    layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)
+
+
+def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Collection) -> None:
+    """One volume for Cycles."""
+    from ..scene.merged import merged_of  # needs numpy
+
+    layout.prop(context.scene.primdiffusion_merging, "voxel")
+    draw_job(layout, "merge", "primdiffusion.merge", "VOLUME_DATA", text="Merge Pose")
+    frames = draw_job(layout, "merge_frames", "primdiffusion.merge", "RENDER_ANIMATION", text="Merge Frame Range")
+    frames.what = "FRAMES"
+    if merged_of(person) is not None:
+        if outdated(person, context.scene):
+            draw_lines(layout, "The merged volume is of another pose: merge again to update it", "ERROR")
+        layout.operator("primdiffusion.merge", text="Unmerge", icon="X").what = "NOTHING"
+
+
+def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Collection) -> None:
+    """What brings Cycles near the exact picture."""
+    from ..scene.cycles import overlap_warning_in  # numpy, which Blender starts without
+
+    if density_gain(person) is None:
+        draw_lines(layout, "The human's material has no node Density Gain", "INFO")
+    else:
+        layout.prop(person, "primdiffusion_density_gain")
+    draw_job(layout, "fit_gain", "primdiffusion.fit_density_gain", "MOD_OPACITY")
+    warning = overlap_warning_in(context.scene, person)
+    if warning is not None and attachment_of(person) != "MERGED":
+        draw_lines(layout, sentence(f"{warning}, or merge the human"), "ERROR")
+
+
+def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
+    """Whether the merged volume shows another pose, shape or human than the armature as it is now."""
+    # needs numpy
+    from ..jobs.merge import Moment
+    from ..scene.merged import merged_of, merged_state
+
+    try:
+        return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)
+    except (ValueError, OSError):  # other panels report broken bones and files
+        return True
+
+
+_SHOWN = ("seed", "steps", "sampler", "guidance", "checkpoint", "version")
+"""Fields of the provenance, in this order."""
+_MOST_LINES = 60
+"""Lines of Details about the provenance."""
+
+
+def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
+    """Names and values that Details shows."""
+    # needs numpy
+    from ..scene.cycles import current_overlap
+    from ..scene.volumes import person_memory
+
+    provenance = provenance_of(person)
+    attributes, edits = provenance.get("attributes"), provenance.get("edits")
+    shown = {name: provenance[name] for name in _SHOWN if provenance.get(name) not in (None, "")}
+    lines = [(name.capitalize(), as_shown(value)) for name, value in shown.items()]
+    if isinstance(attributes, dict):
+        lines += [(as_shown(name.capitalize()), as_shown(value)) for name, value in attributes.items()]
+    for edit in edits if isinstance(edits, list) else ():
+        if isinstance(edit, dict):
+            rest = [f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)]
+            lines.append((f"Edit: {as_shown(edit.get('edit', '?'))}", as_shown(", ".join(rest))))
+    del lines[_MOST_LINES:]
+    volumes = [obj for obj in person.all_objects if obj.type == "VOLUME"]
+    memory = person_memory(person)
+    try:
+        most = str(current_overlap(person))
+    except ValueError:  # changed by hand
+        most = "?"
+    lines.append(("Volumes", f"{len(volumes)}, up to {most} overlap"))
+    lines.append(("Memory once drawn", f"{memory.grids / 1e6:.0f} MB"))
+    lines.append(("Files", f"{memory.files / 1e6:.0f} MB"))
+    return lines
+
+
+PROPERTIES = (
+    (bpy.types.Scene, "primdiffusion_merging", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_merging)),
+    (bpy.types.Collection, "primdiffusion_density_gain", gain_property()),
+)
