@@ -74,49 +74,42 @@ class PRIMDIFFUSION_PT_advanced(SidebarPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
         if humans(context.scene):
-            _draw_sections(layout, context)
-        if (body := draw_section(layout, "files", text="Files", page="editing", section=_FILES)) is not None:
-            body.operator("primdiffusion.collect_files", icon="PACKAGE")
-            find = body.operator("primdiffusion.find_missing_volumes", text="Find Volumes in Folder", icon="VIEWZOOM")
+            _draw_person(layout, context)
+        files = draw_section(layout, "files", text="Files", page="editing", section="undo-and-files-on-disk")
+        if files is not None:
+            files.operator("primdiffusion.collect_files", icon="PACKAGE")
+            find = files.operator("primdiffusion.find_missing_volumes", text="Find Volumes in Folder", icon="VIEWZOOM")
             find.choose = True
-            body.operator("primdiffusion.remove_unused_files", icon="TRASH")
+            files.operator("primdiffusion.remove_unused_files", icon="TRASH")
         if not backend_is_named():
             return
-        if (body := draw_section(layout, "backend", text="Backend", page="troubleshooting")) is not None:
-            draw_backend(body)
+        backend = draw_section(layout, "backend", text="Backend", page="troubleshooting")
+        if backend is not None:
+            draw_backend(backend)
 
 
-_FILES = "undo-and-files-on-disk"
-"""Section of the manual."""
-
-
-def _draw_sections(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Of the selected human."""
+def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Sections of the selected human."""
     try:
         person = selected_person(context)
     except ValueError as error:
         draw_lines(layout, sentence(error), "INFO")
         return
-    page, can_merge = "rendering", backend_is_named()
-    if (body := draw_section(layout, "attachment", text="Attachment", page=page, section="attachment")) is not None:
-        _draw_attachment(body, person)
-    if (
-        can_merge
-        and (body := draw_section(layout, "merge", text="Merge for Cycles", page=page, section="merge-for-cycles"))
-        is not None
-    ):
-        _draw_merge(body, context, person)
-    if (
-        body := draw_section(layout, "cycles_look", text="Look in Cycles", page=page, section="look-in-cycles")
-    ) is not None:
-        _draw_cycles_look(body, context, person)
-    if (body := draw_section(layout, "memory", text="Memory", page=page, section="memory")) is not None:
-        column = body.column(align=True)
-        for name, value in details(person):
-            column.label(text=f"{pgettext_iface(name)}: {value}", translate=False)
+    sections = [
+        ("attachment", "Attachment", "attachment", _draw_attachment),
+        ("merge", "Merge for Cycles", "merge-for-cycles", _draw_merge),
+        ("look", "Look in Cycles", "look-in-cycles", _draw_cycles_look),
+        ("memory", "Memory", "memory", _draw_memory),
+    ]
+    for name, text, section, content in sections:
+        if content is _draw_merge and not backend_is_named():
+            continue
+        body = draw_section(layout, name, text=text, page="rendering", section=section)
+        if body is not None:
+            content(body, context, person)
 
 
-def _draw_attachment(layout: bpy.types.UILayout, person: bpy.types.Collection) -> None:
+def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Collection) -> None:
     """How volumes follow the body."""
     from ..scene.merged import merged_of  # needs numpy
 
@@ -157,6 +150,13 @@ def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, pe
         draw_lines(layout, sentence(f"{warning}, or merge the human"), "ERROR")
 
 
+def _draw_memory(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Collection) -> None:
+    """How the human was made, and what it takes."""
+    column = layout.column(align=True)
+    for name, value in details(person):
+        column.label(text=f"{pgettext_iface(name)}: {value}", translate=False)
+
+
 def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or human than the armature as it is now."""
     # needs numpy
@@ -172,11 +172,11 @@ def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
 _SHOWN = ("seed", "steps", "sampler", "guidance", "checkpoint", "version")
 """Fields of the provenance, in this order."""
 _MOST_LINES = 60
-"""Lines of Details about the provenance."""
+"""Lines about the provenance."""
 
 
 def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
-    """Names and values that Details shows."""
+    """Names and values: how the human was made, what its files and volumes take."""
     # needs numpy
     from ..scene.cycles import current_overlap
     from ..scene.volumes import person_memory

@@ -201,7 +201,7 @@ def motion(module: str, python: str) -> Steps:
 def render(module: str, python: str) -> Steps:
     """Engine and Cycles, attachment, merging, gain, memory."""
     yield from with_people(module, python, FIRST_SEED)
-    names = ("render", *(f"advanced/{section}" for section in ("attachment", "merge", "cycles_look", "memory")))
+    names = ("render", *(f"advanced/{section}" for section in ("attachment", "merge", "look", "memory")))
     import_module(f"{module}.jobs.cycles_check").volumes_are_empty = lambda: False  # Debian's builds have this fault
     writing = import_module(f"{module}.jobs.late_volumes")._tick
     yield from wait(lambda: not bpy.app.timers.is_registered(writing), 120)
@@ -341,7 +341,7 @@ TRANSLATED = {
     "human": ("human", "shape", "poses"),
     "edits": ("human", "edit", "motion"),
     "files": ("export/proxy", "export/assets", "advanced/files", "advanced/backend"),
-    "render": ("render", *(f"advanced/{name}" for name in ("attachment", "merge", "cycles_look", "memory"))),
+    "render": ("render", *(f"advanced/{name}" for name in ("attachment", "merge", "look", "memory"))),
     "captures": tuple(f"captures/captures_{name}" for name in ("input", "poses", "cameras", "cycles", "output")),
 }
 """Panels shown together in other languages."""

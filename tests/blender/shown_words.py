@@ -20,6 +20,21 @@ def classes(kind: type) -> list[type]:
     return sorted({cls for cls in found if cls.is_registered}, key=lambda cls: cls.__name__)
 
 
+_WAYS = {"what", "to", "choose", "clear", "delete", "finish", "frame", "like", "repair"}
+"""Properties by which one operator does several things."""
+
+
+def ways(name: str) -> list[dict[str, object]]:
+    """Properties for each of the things that an operator does; the first are none."""
+    found: list[dict[str, object]] = [{}]
+    properties = getattr(bpy.ops.primdiffusion, name).get_rna_type().properties
+    for way in sorted(_WAYS & set(properties.keys())):
+        prop = properties[way]
+        values = [item.identifier for item in prop.enum_items][1:] if prop.type == "ENUM" else [True]
+        found += [{way: value} for value in values]
+    return found
+
+
 def rna(cls: type):
     if issubclass(cls, bpy.types.Operator):
         return getattr(bpy.ops.primdiffusion, cls.bl_idname.partition(".")[2]).get_rna_type()

@@ -19,6 +19,7 @@ import synthetic_shape
 from exporting import write_person
 from jobs_driven import drive
 from scene_state import state
+from shown_words import ways
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.generate import GenerateJob
@@ -29,21 +30,11 @@ from blender_primdiffusion.ui.drawing import DATA
 
 ELSEWHERE = {"test_backend", "set_up_backend", "make_pose_assets", "copy_diagnostics"}
 """Set up, write a library or a text: whatever is in the scene, it stays as it is."""
-WAYS = {"what", "to", "choose", "clear", "delete", "finish", "frame", "like", "repair"}
-"""Properties by which one operator does several things."""
 
 
 def operators() -> list[tuple[str, dict[str, object]]]:
     """Every operator, in each of its ways."""
-    found: list[tuple[str, dict[str, object]]] = []
-    for name in dir(bpy.ops.primdiffusion):
-        properties = getattr(bpy.ops.primdiffusion, name).get_rna_type().properties
-        found.append((name, {}))
-        for way in sorted(WAYS & set(properties.keys())):
-            prop = properties[way]
-            values = [item.identifier for item in prop.enum_items][1:] if prop.type == "ENUM" else [True]
-            found += [(name, {way: value}) for value in values]
-    return found
+    return [(name, given) for name in dir(bpy.ops.primdiffusion) for given in ways(name)]
 
 
 def fault(name: str, properties: dict[str, object]) -> str:

@@ -7,7 +7,7 @@ import re
 
 import bpy
 import pytest
-from shown_words import classes, labels, properties, tooltips
+from shown_words import classes, labels, properties, tooltips, ways
 
 pytestmark = pytest.mark.any_blender
 
@@ -46,6 +46,22 @@ def test_every_tooltip_is_a_sentence_without_a_full_stop(addon):
 def test_no_tooltip_repeats_its_label(addon):
     label_of = {where: prop.name.lower() for where, prop in properties()}
     assert not [where for where, text in tooltips() if text.strip().lower() == label_of.get(where)]
+
+
+def test_each_thing_that_an_operator_does_has_its_own_tooltip(addon):
+    several = []
+    for cls in classes(bpy.types.Operator):
+        told = []
+        for given in ways(cls.bl_idname.partition(".")[2]):
+            properties = bpy.context.window_manager.operator_properties_last(cls.bl_idname)
+            for name, value in given.items():
+                setattr(properties, name, value)
+            told.append(cls.description(bpy.context, properties) if hasattr(cls, "description") else cls.__doc__)
+            for name in given:
+                properties.property_unset(name)
+        assert len(set(told)) == len(told), cls.__name__
+        several += [cls.bl_idname] if len(told) > 1 else []
+    assert len(several) >= 10
 
 
 def test_operators_that_are_greyed_out_say_why(addon):
