@@ -95,16 +95,16 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     except ValueError as error:
         draw_lines(layout, sentence(error), "INFO")
         return
+    page = "rendering"
     sections = [
-        ("attachment", "Attachment", "attachment", _draw_attachment),
-        ("merge", "Merge for Cycles", "merge-for-cycles", _draw_merge),
-        ("look", "Look in Cycles", "look-in-cycles", _draw_cycles_look),
-        ("memory", "Memory", "memory", _draw_memory),
+        (draw_section(layout, "attachment", text="Attachment", page=page, section="attachment"), _draw_attachment),
+        (draw_section(layout, "look", text="Look in Cycles", page=page, section="look-in-cycles"), _draw_cycles_look),
+        (draw_section(layout, "memory", text="Memory", page=page, section="memory"), _draw_memory),
     ]
-    for name, text, section, content in sections:
-        if content is _draw_merge and not backend_is_named():
-            continue
-        body = draw_section(layout, name, text=text, page="rendering", section=section)
+    if backend_is_named():
+        merge = draw_section(layout, "merge", text="Merge for Cycles", page=page, section="merge-for-cycles")
+        sections.append((merge, _draw_merge))
+    for body, content in sections:
         if body is not None:
             content(body, context, person)
 
