@@ -30,8 +30,10 @@ def ways(name: str) -> list[dict[str, object]]:
     properties = getattr(bpy.ops.primdiffusion, name).get_rna_type().properties
     for way in sorted(_WAYS & set(properties.keys())):
         prop = properties[way]
-        values = [item.identifier for item in prop.enum_items][1:] if prop.type == "ENUM" else [True]
-        found += [{way: value} for value in values]
+        if prop.type == "ENUM":
+            found += [{way: item.identifier} for item in prop.enum_items[1:]]
+        elif prop.type == "BOOLEAN":
+            found.append({way: True})
     return found
 
 
