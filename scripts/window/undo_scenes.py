@@ -45,7 +45,7 @@ class Round:
 
     @property
     def motion_after(self) -> int:
-        return 1 + 11 * self.number % (2 * KEYS - 1)
+        return 1 + 11 * self.number % (KEYS + KEYS // 2)
 
     @property
     def import_after(self) -> int:
