@@ -19,8 +19,10 @@ from .windows import in_the_way, window_of
 
 SOON_S = 0.2
 UNDONE_S = 1.0
-"""Changes that come within this time after undo or redo are their own."""
+"""Changes that come within this time after undo or redo, and after the update that they bring, are their own."""
 _undone = -math.inf
+_update_follows = False
+"""The update that undo or redo bring is still to come: Blender may evaluate the scene for longer than UNDONE_S."""
 _held = False
 """Copies are as undo or redo has left them."""
 
@@ -51,8 +53,10 @@ def tick() -> float | None:
 @persistent
 def look(*_: object) -> None:
     """Handler of depsgraph_update_post and load_post."""
-    global _held
-    if _held and time.monotonic() - _undone > UNDONE_S:
+    global _undone, _update_follows, _held
+    if _update_follows:
+        _undone, _update_follows = time.monotonic(), False
+    elif _held and time.monotonic() - _undone > UNDONE_S:
         _held = False
     if bpy.app.background or _held or not any_humans() or bpy.app.timers.is_registered(tick) or missing_packages():
         return
@@ -65,8 +69,8 @@ def look(*_: object) -> None:
 @persistent
 def hold(*_: object) -> None:
     """Handler of undo_post and redo_post."""
-    global _undone, _held
-    _undone, _held = time.monotonic(), True
+    global _undone, _update_follows, _held
+    _undone, _update_follows, _held = time.monotonic(), True, True
 
 
 @persistent
@@ -79,8 +83,8 @@ def separate_before_rendering(*_: object) -> None:
 @persistent
 def forget(*_: object) -> None:
     """Handler of load_pre: another file has its own steps."""
-    global _held
-    _held = False
+    global _update_follows, _held
+    _update_follows = _held = False
 
 
 HANDLERS = (

@@ -28,7 +28,8 @@ def with_people(module: str, python: str, *seeds: int) -> Steps:
         bpy.ops.wm.open_mainfile(filepath=str(path), load_ui=False)
     else:
         for seed in seeds:
-            press("primdiffusion.generate", seed=seed)
+            if press("primdiffusion.generate", seed=seed) == {"CANCELLED"}:
+                raise RuntimeError("the button Generate is rejected: see the line above")
         yield from wait(lambda: not queue_of(module).busy, _MOST_S)
         if len(armatures()) < len(seeds):
             last = queue_of(module).last

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+
 import bpy
 import numpy as np
 import pytest
@@ -211,6 +213,24 @@ def test_undo_right_after_leads_back_through_the_bare_copy(person, monkeypatch):
     check_apart(named(), named("Anna.001"))
     bpy.ops.ed.undo()
     monkeypatch.setattr(copies, "UNDONE_S", -1.0)  # the next change comes later
+    copies.look()
+    copies.tick()
+    check_apart(named(), named("Anna.001"))
+
+
+def test_undo_leads_back_also_where_evaluating_the_scene_takes_long(person, monkeypatch):
+    copy_of(armature_of(person))
+    copies.tick()
+    monkeypatch.setattr(copies, "UNDONE_S", 0.1)
+    evaluating = bpy.app.handlers.depsgraph_update_pre
+    evaluating.append(slowly := lambda *_: time.sleep(0.2))
+    try:
+        bpy.ops.ed.undo()
+    finally:
+        evaluating.remove(slowly)
+    copies.tick()
+    assert names() == ["Anna"], "the update is undo's own"
+    time.sleep(0.2)
     copies.look()
     copies.tick()
     check_apart(named(), named("Anna.001"))
