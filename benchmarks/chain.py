@@ -6,8 +6,8 @@ renders of their meshes (16 samples a pixel), all over grey, sRGB-encoded. Stage
     mesh         the mesh at one sample a pixel: what aliasing alone costs
     from_mesh    `from_mesh`, through its storage in bytes
     payload      fitted to renders of the mesh, likewise
-    codec_input  what the model learned from, at its own density: fitted, or from_mesh where a detail decoder follows
-    codec        that after the model's codec (and detail decoder)
+    codec_input  what the model learned from, at its own density: fitted, or from_mesh for older models
+    codec        that after the model's codec
     step<t>      that after one denoising step from noise of level t
 
 Views: `body` from the front (yaw 20) and back (200), 512 x 512; `head` 256 x 256. Measures: psnr over the figure and 8

@@ -15,7 +15,6 @@ from primdiffusion.body.model import BodyPose, ShapedBody, default_body
 from primdiffusion.capture.poses import BUILT_IN, built_in_poses
 from primdiffusion.diffusion.codec import CellCodec, cells_from_voxels
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.detail import DetailCodec
 from primdiffusion.diffusion.model import DiffusionModel, sample, seeded
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
@@ -146,8 +145,8 @@ def stored(payload: Payload, betas: np.ndarray) -> PersonVariants:
 
 
 def learns_fitted(model: DiffusionModel) -> bool:
-    """Whether its latents are of fitted payloads; those with a detail decoder, and older ones, are of `from_mesh`."""
-    return model.full_density == FULL_DENSITY and not isinstance(model.codec, DetailCodec)
+    """Whether its latents are of fitted payloads; those of older models are of `from_mesh`."""
+    return model.full_density == FULL_DENSITY
 
 
 def at_density(person: PersonVariants, full_density: float) -> Payload:

@@ -45,7 +45,6 @@ COMMANDS = {
     "captures": ("commands.captures:run", "Multi-view captures: render, verify, info, pack, sheet, farm"),
     "fit": ("training.fit:run", "Train the encoder on captures: from images to primitives"),
     "train": ("training.diffuse:run", "Train the diffusion model on primitives"),
-    "train-detail": ("training.detail:run", "Train a decoder that adds detail to a diffusion model's humans"),
     "evaluate": ("commands.evaluate:run", "Evaluate trained models"),
     "import-released": (
         "commands.import_released:run",

@@ -194,12 +194,6 @@ def all_programs(given: Inputs) -> list[Program]:
         Program("fit", lambda out: fit_words(given.captures, out), small="fit_scenes", resumes=True),
         Program("train", lambda out: train_words(given.people, out), small="diffuse_runs", resumes=True),
         Program(
-            "train-detail",
-            lambda out: detail_words(given.people, given.people, given.base, out),
-            small="diffuse_runs",
-            resumes=True,
-        ),
-        Program(
             "evaluate",
             lambda out: ["evaluate", "reconstruction", "--captures", given.captures, "--checkpoint", given.encoder,
                          "--people", "1", "--views", "2", "--size", "16", "--json", out / "scores.json"],
@@ -304,13 +298,6 @@ def train_words(people: Path, run: Path) -> Words:
     person = ["model.person:person-network-config", "--model.person.width", "16", "--model.person.blocks", "1"]
     return ["train", "--data", people, "--run", run, *TRAINED, *phases, "--codec.channels", "4", "--prior.components",
             "3", *person, "model.local:local-u-net-config", *_network("--model.local.")]  # fmt: skip
-
-
-def detail_words(fine: Path, coarse: Path, checkpoint: Path, run: Path) -> Words:
-    """A run of a detail decoder of three steps, saved after each."""
-    detail = ["--detail.steps", "3", "--detail.batch", "2", "--detail.evaluate-every", "3"]
-    return ["train-detail", "--data", fine, "--coarse", coarse, "--checkpoint", checkpoint, "--run", run, *TRAINED,
-            *detail, "--codec.channels", "6", *_network("--model.")]  # fmt: skip
 
 
 def _network(prefix: str) -> list[str]:

@@ -143,12 +143,6 @@ def read_prepared(path: Path) -> None:
     _load_prepared(path)
 
 
-def read_prepared_detail(path: Path) -> None:
-    from primdiffusion.training.detail_latents import _load_prepared
-
-    _load_prepared(path)
-
-
 def make_lock(folder: Path) -> Path:
     (folder / "requirements.txt").write_text(f"torch==2.9 --hash=sha256:{'0' * 64}\n", encoding="utf-8")
     return folder / "requirements.txt"
@@ -307,7 +301,6 @@ TARGETS = tuple(
         ("run: starts", make_run("run.json"), begin_run),
         ("run: metrics", make_run("metrics.jsonl"), begin_run),
         ("run: latents", make_prepared, read_prepared),
-        ("run: latents of detail", make_prepared, read_prepared_detail),
         ("lock of packages", make_lock, read_lock),
         ("picture of Cycles", make_exr, read_exr),
         ("ONNX network", make_onnx, read_onnx),

@@ -175,7 +175,6 @@ BACKEND = {
     "torch_file.py": FORMATS,
     "training/captured_people.py": ("human's card", "payload"),
     "training/cells.py": ("run: latents",),
-    "training/detail_latents.py": ("run: latents of detail",),
     "training/run_folder.py": ("run: settings", "run: starts", "run: metrics"),
     "training/shards.py": ("packed index", "packed shard"),
     "training/state.py": ("training state",),

@@ -65,7 +65,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     "networks and training states `.safetensors`": (
         (
             "checkpoint", "encoder", "attribute network", "joints network", "training state", "vocabulary",
-            "run: latents", "run: latents of detail", "hub: weights",
+            "run: latents", "hub: weights",
         ),
         (
             "tests/backend/diffusion/test_checkpoint.py::test_a_network_larger_than_its_file_is_not_built",

@@ -19,9 +19,8 @@ from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.consistency import check_codec, check_fine, check_parts
+from primdiffusion.diffusion.consistency import check_codec, check_parts
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
-from primdiffusion.diffusion.detail import DetailCodec, DetailConfig, DetailDecoder, FineCodec
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
 from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior
@@ -43,7 +42,7 @@ ENCODER_FORMAT = "primdiffusion-encoder"
 """Format of the files of `encoder.model`."""
 FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
-_HALVED = ("codec.mean", "codec.basis", "denoiser.", "fine.mean", "fine.basis", "detail.")
+_HALVED = ("codec.mean", "codec.basis", "denoiser.")
 _WHOLE = ("prior_variance", "prior_log_weight")
 SYMMETRIC = 1e-4
 """Largest difference between an entry of a person component and its mirror image; entries are up to 1."""
@@ -68,11 +67,6 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
         codec = model.codec.codec
         tensors |= _fields("codec", codec)
         _store_half(tensors, codec)
-        if isinstance(model.codec, DetailCodec):
-            fine, decoder = model.codec.fine, model.codec.decoder
-            tensors |= _fields("fine", fine.codec) | {"back": fine.back}
-            tensors |= {f"detail.{key}": value for key, value in decoder.state_dict().items()}
-            architecture["detail"] = dataclasses.asdict(decoder.config)
         tensors |= _fields("shapes", model.shapes)
         architecture |= {"kind": "person"}
     else:
@@ -158,6 +152,11 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
     path = default_checkpoint() if path is None else Path(path)
     tensors, architecture, card = read_checkpoint(path)
     with mismatches_named(path):
+        if "detail" in architecture:
+            raise CheckpointError(
+                f"{path} has a detail decoder, which this version no longer reads: train a new checkpoint, or use the "
+                "default one"
+            )
         if architecture["kind"] == RELEASED:
             return _released_model(tensors, architecture, card, path.parent).to(device)
     with mismatches_named(path, ValueError, AttributeError):
@@ -173,7 +172,8 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
         denoiser: torch.nn.Module = tensor_file.load_network(lambda: SlabUNet(_unet_config(config)), weights)
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
-        codec = _cell_codec(tensors, architecture.get("detail"))
+        codec = CellCodec(_linear_codec(under(tensors, "codec.")))
+        check_codec(codec.codec)
         _restore_half(weights, codec.codec)
         prior = PersonPrior(**under(weights, "prior_"))
         shapes = ShapePrior(**under(tensors, "shapes."))
@@ -208,22 +208,6 @@ def _whole_components(
 ) -> Float[Tensor, "r d"]:
     left = torch.nn.functional.pad(half, (0, GRID // 2))
     return (left + parity[:, None, None, None] * codec.mirror(left)).flatten(1)
-
-
-def _cell_codec(tensors: Mapping[str, Tensor], detail: Mapping[str, Any] | None) -> CellCodec:
-    """The codec of latents, with its detail decoder if the checkpoint has one."""
-    codec = _linear_codec(under(tensors, "codec."))
-    check_codec(codec)
-    if detail is None:
-        return CellCodec(codec)
-    fine = FineCodec(_linear_codec(under(tensors, "fine.")), tensors["back"])
-    check_fine(fine, codec)
-    config = DetailConfig(**{**detail, "widths": tuple(detail["widths"])})
-    decoder = tensor_file.load_network(
-        lambda: DetailDecoder(codec.channels, fine.codec.channels, config), under(tensors, "detail.")
-    )
-    decoder.eval().requires_grad_(False)
-    return DetailCodec(codec, fine, decoder)
 
 
 def _linear_codec(tensors: Mapping[str, Tensor]) -> LinearCodec:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import VALUES, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.detail import FineCodec
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.geometry.records import check_shapes
@@ -42,14 +41,6 @@ def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, voca
         raise ValueError(f"body shapes depend on {shapes.weight.shape[1]} components of {components}")
     if prior.kind.shape[-1] not in (0, vocabulary.width):
         raise ValueError(f"parts are described by {prior.kind.shape[-1]} values, attributes by {vocabulary.width}")
-
-
-def check_fine(fine: FineCodec, codec: LinearCodec) -> None:
-    """Raise ValueError unless the codec of a detail decoder leads back to the latents of `codec`."""
-    check_codec(fine.codec)
-    channels = codec.channels
-    if tuple(fine.back.shape) != (channels, channels):
-        raise ValueError(f"back has shape {tuple(fine.back.shape)}, not {channels} x {channels}")
 
 
 def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:

@@ -19,7 +19,7 @@ from typing import Concatenate, ParamSpec, Protocol, TypeVar
 import torch
 
 GRID_THREADS = 4
-"""For networks over the 32 x 32 grid. Two cores lose 4 % to it with the default sizes, up to 14 % with half of them."""
+"""For networks over the 32 x 32 grid. Two cores lose about 4 % to it with the default network."""
 SLAB_THREADS = 16
 """For networks over the whole slab, whose operations take a thousand times longer."""
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from typing import TypeVar
 
 import torch
@@ -168,38 +167,7 @@ class LocalStage(nn.ModuleList):
         return x
 
 
-class GridUNet(nn.Module):
-    """Base of the networks over the 32 x 32 grid: levels of local blocks, with attention in all but the first."""
-
-    def add_levels(self, widths: Sequence[int], blocks: int, condition_width: int, heads: int) -> None:
-        """Create the modules of all levels; `widths` are their channels, `blocks` their residual blocks each way."""
-        self.down, self.up, self.shrink, self.grow, self.attend = (nn.ModuleList() for _ in range(5))
-        for level, width in enumerate(widths):
-            self.down.append(LocalStage([LocalBlock(width, width, condition_width) for _ in range(blocks)]))
-            self.up.append(
-                LocalStage([LocalBlock(2 * width if i == 0 else width, width, condition_width) for i in range(blocks)])
-            )
-            self.attend.append(LocalAttention(width, heads) if level else nn.Identity())
-            if level < len(widths) - 1:
-                self.shrink.append(nn.Conv2d(width, widths[level + 1], 2, stride=2))
-                self.grow.append(nn.Conv2d(widths[level + 1], width, 1))
-
-    def through_levels(self, x: Float[Tensor, "b c h w"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b c h w"]:
-        """The features of the first level after all of them."""
-        skips = []
-        for level, stage in enumerate(self.down):
-            x = self.attend[level](stage(x, condition))
-            skips.append(x)
-            if level < len(self.shrink):
-                x = self.shrink[level](x)
-        for level in reversed(range(len(self.up))):
-            x = self.up[level](torch.cat([x, skips.pop()], dim=1), condition)
-            if level:
-                x = self.grow[level - 1](functional.interpolate(x, scale_factor=2.0, mode="nearest"))
-        return x
-
-
-class LocalUNet(GridUNet):
+class LocalUNet(nn.Module):
     """Correction of the closed-form guess of the rest, in standard deviations; starts at 0."""
 
     def __init__(
@@ -221,7 +189,18 @@ class LocalUNet(GridUNet):
         self.picture_channels = channels if picture_channels is None else picture_channels
         seen = channels + self.picture_channels + config.position_channels
         self.inner = nn.Conv2d(seen, widths[0], config.end_kernel, padding="same")
-        self.add_levels(widths, config.blocks, condition_width, config.heads)
+        self.down, self.up, self.shrink, self.grow, self.attend = (nn.ModuleList() for _ in range(5))
+        for level, width in enumerate(widths):
+            self.down.append(LocalStage([LocalBlock(width, width, condition_width) for _ in range(config.blocks)]))
+            self.up.append(
+                LocalStage(
+                    [LocalBlock(2 * width if i == 0 else width, width, condition_width) for i in range(config.blocks)]
+                )
+            )
+            self.attend.append(LocalAttention(width, config.heads) if level else nn.Identity())
+            if level < len(widths) - 1:
+                self.shrink.append(nn.Conv2d(width, widths[level + 1], 2, stride=2))
+                self.grow.append(nn.Conv2d(widths[level + 1], width, 1))
         self.norm, self.outer = (
             nn.GroupNorm(8, widths[0]),
             zeroed(nn.Conv2d(widths[0], channels, config.end_kernel, padding="same")),
@@ -243,8 +222,22 @@ class LocalUNet(GridUNet):
                 memory_format=torch.channels_last
             )
         )
-        x = self.through_levels(x, condition)
+        x = self._through_levels(x, condition)
         return self.outer(functional.silu(self.norm(x)))
+
+    def _through_levels(self, x: Float[Tensor, "b c h w"], condition: Float[Tensor, "b e"]) -> Float[Tensor, "b c h w"]:
+        """The features of the first level after all of them."""
+        skips = []
+        for level, stage in enumerate(self.down):
+            x = self.attend[level](stage(x, condition))
+            skips.append(x)
+            if level < len(self.shrink):
+                x = self.shrink[level](x)
+        for level in reversed(range(len(self.up))):
+            x = self.up[level](torch.cat([x, skips.pop()], dim=1), condition)
+            if level:
+                x = self.grow[level - 1](functional.interpolate(x, scale_factor=2.0, mode="nearest"))
+        return x
 
 
 def embedded(

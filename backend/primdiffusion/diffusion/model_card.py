@@ -7,7 +7,7 @@ from typing import Any
 
 from primdiffusion.diffusion.checkpoint import read_card
 
-_SECTIONS = ("held_out_rms_x0_error", "held_out_rms_detail_error", "limits")
+_SECTIONS = ("held_out_rms_x0_error", "limits")
 
 
 def model_card(card: Mapping[str, Any]) -> str:
@@ -24,7 +24,6 @@ def model_card(card: Mapping[str, Any]) -> str:
             "",
             *_attribute_section(card.get("attributes", {})),
             *_error_section(card.get("held_out_rms_x0_error")),
-            *_detail_section(card.get("held_out_rms_detail_error")),
             "## Limits",
             "",
             *(f"- {limit}" for limit in card.get("limits", ())),
@@ -54,21 +53,6 @@ def _error_table(errors: Mapping[str, Mapping[str, float]]) -> list[str]:
     levels = list(next(iter(errors.values())))
     rows = [f"| {name} | " + " | ".join(f"{by[level]:.4f}" for level in levels) + " |" for name, by in errors.items()]
     return ["| t | " + " | ".join(levels) + " |", "|---" * (len(levels) + 1) + "|", *rows]
-
-
-def _detail_section(errors: Mapping[str, Mapping[str, float]] | None) -> list[str]:
-    """Lines of the section on the detail decoder; empty for a model without."""
-    if errors is None:
-        return []
-    return [
-        "## Held-out error of the detail decoder",
-        "",
-        "Root mean square error of the finer codec's latents, from clean latents (0) and from the denoiser's guesses",
-        "at steps t. `linear`: least squares of each cell; `decoder`: this checkpoint.",
-        "",
-        *_error_table(errors),
-        "",
-    ]
 
 
 def _attribute_section(attributes: Mapping[str, Any]) -> list[str]:

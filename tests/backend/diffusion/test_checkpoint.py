@@ -74,6 +74,15 @@ def test_symmetric_person_components_are_stored_by_half(path):
     assert sizes[0] - sizes[1] == pytest.approx(basis.numel(), abs=200)
 
 
+def test_a_checkpoint_with_a_detail_decoder_is_rejected_with_what_reads_it(path):
+    def with_detail(metadata):
+        return metadata | {"architecture": json.dumps(json.loads(metadata["architecture"]) | {"detail": {}})}
+
+    rewrite(path, change_metadata=with_detail)
+    with pytest.raises(CheckpointError, match="has a detail decoder, which this version no longer reads: train"):
+        load_checkpoint(path)
+
+
 def test_a_codec_of_before_weights_is_read_as_it_was(path):
     rewrite(path, lambda t: {k: v for k, v in t.items() if k not in ("codec.weight", "codec.dead_zone")})
     codec = load_checkpoint(path).codec.codec

@@ -1,18 +1,13 @@
 """Checkpoints whose parts do not fit each other are rejected when they are loaded, not when a human is generated."""
 
-import dataclasses
 import json
 
 import pytest
 import torch
 from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint
-from primdiffusion.diffusion.codec import VALUES
-from primdiffusion.diffusion.consistency import check_fine
-from primdiffusion.diffusion.detail import FineCodec
 from primdiffusion.human import generate
-from primdiffusion.primitives.primitives import K
 from primdiffusion.tensor_file import read, save
-from tiny_model import save_tiny_checkpoint, tiny_model
+from tiny_model import save_tiny_checkpoint
 
 
 @pytest.fixture(scope="module")
@@ -61,17 +56,6 @@ def test_what_loads_generates_and_what_does_not_fit_does_not_load(content, tmp_p
 def test_values_that_make_no_human_are_rejected(content, tmp_path, name, value, reason):
     with pytest.raises(CheckpointError, match=reason):
         load_with(content, tmp_path / "a.safetensors", **{name: value})
-
-
-@pytest.mark.parametrize(
-    ("back", "mean", "reason"),
-    [((3, 4), (K, VALUES), "back"), ((4, 4), (K - 1, VALUES), "region"), ((4, 4), (K, 3), "basis")],
-)
-def test_a_detail_decoders_codec_leads_back_to_the_latents(back, mean, reason):
-    coarse = tiny_model().codec.codec
-    check_fine(FineCodec(coarse, torch.eye(4)), coarse)
-    with pytest.raises(ValueError, match=f"^{reason} has shape"):
-        check_fine(FineCodec(dataclasses.replace(coarse, mean=torch.zeros(mean)), torch.zeros(back)), coarse)
 
 
 def test_a_vocabulary_of_another_width_is_rejected(content, tmp_path):

@@ -17,13 +17,16 @@ from diffuse_runs import DEFAULT_FILES, TINY_UNET, child_environment, logged, ma
 from diffusion_people import write_people
 from PIL import Image
 from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.codec import codec_regions
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.failures import describe
 from primdiffusion.human import generate
+from primdiffusion.primitives.anchors import default_anchors
+from primdiffusion.primitives.primitives import S
 from primdiffusion.training import phase, slabs
 from primdiffusion.training.cells import CellTrainee, prepare
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
-from primdiffusion.training.diffuse import MODEL, train
+from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
 from primdiffusion.training.losses import LEVELS
 from primdiffusion.training.phase import step_seed
 from primdiffusion.training.shards import INDEX, pack_people
@@ -143,7 +146,15 @@ def test_the_card_tells_data_settings_and_errors(whole):
     assert (card["geometries"], card["people"], card["held_out_geometries"]) == (13, 39, 3)
     assert card["licence"] == "CC0-1.0"
     assert "4 of 2051 numbers" in " ".join(card["limits"])
+    assert DISTANCE_LIMIT in card["limits"]
     assert f"{errors['gaussian']['500']:.4f}" in model_card(card)
+
+
+def test_the_distance_on_the_card_is_that_of_the_heads_voxels():
+    of_the_head = default_anchors().rest_half_extent[codec_regions() == 1, :2]
+    voxel_m = float((2 * of_the_head / (S - 1)).mean())
+    assert f"{1000 * voxel_m:.0f} mm wide" in DISTANCE_LIMIT
+    assert voxel_m * 50 / 36 * 1920 == pytest.approx(20, abs=1)
 
 
 def test_a_card_claims_nothing_of_people_it_does_not_know(people, run):

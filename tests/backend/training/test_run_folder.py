@@ -3,7 +3,6 @@
 import diffuse_runs
 import fit_scenes
 import pytest
-from primdiffusion.training.detail import DetailTrainingConfig, train_detail
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
 from primdiffusion.training.folder_lock import FolderInUseError, lock_folder
@@ -14,9 +13,8 @@ from primdiffusion.training.folder_lock import FolderInUseError, lock_folder
     [
         lambda data, run: train(diffuse_runs.settings(data, run)),
         lambda data, run: fit(fit_scenes.settings(data, run)),
-        lambda data, run: train_detail(DetailTrainingConfig(data=data, coarse=data, run=run)),
     ],
-    ids=["train", "fit", "train_detail"],
+    ids=["train", "fit"],
 )
 def test_a_second_run_in_a_folder_is_rejected(tmp_path, start):
     run = tmp_path / "run"
