@@ -63,9 +63,10 @@ class LatentSet(TensorRecord):
 
 def _moments(latents: Float[Tensor, "n c 32 32"], codec: LinearCodec) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation of each number [C, 32, 32] over samples and their mirror images."""
-    mean = sum(chunk.float().sum(0) for chunk in latents.split(CHUNK)) / len(latents)
+    chunks = latents.split(CHUNK)
+    mean = torch.stack([chunk.float().sum(0) for chunk in chunks]).sum(0) / len(latents)
     mean = (mean + codec.mirror(mean)) / 2
-    square = sum((chunk.float() - mean).square().sum(0) for chunk in latents.split(CHUNK)) / len(latents)
+    square = torch.stack([(chunk.float() - mean).square().sum(0) for chunk in chunks]).sum(0) / len(latents)
     return mean, ((square + codec.mirror(square).abs()) / 2).sqrt()
 
 
