@@ -1,4 +1,4 @@
-"""Undo and redo by key, twenty at a time, while timers change data. Played on request: 100 rounds take half an hour.
+"""Undo and redo by key, twenty at a time, while timers change data. Played on request: 100 rounds take an hour.
 
     ROUNDS=100 python scripts/window/look.py --scenes undo_and_timers
 
