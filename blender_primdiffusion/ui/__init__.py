@@ -41,13 +41,12 @@ from . import (
     render_panel,
     shape_panel,
     shape_settings,
-    translations,
     variations_panel,
     viewport_humans,
 )
 
 MODULES = (
-    translations, *backend_state.MODULES, preferences, windows, follow, cycles_check, jobs_panel, attributes,
+    *backend_state.MODULES, preferences, windows, follow, cycles_check, jobs_panel, attributes,
     generate_panel, variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, copies,
     late_volumes, import_motion, motion_panel, pose_panel, asset_operators, render_operators, render_panel,
     export_operators, gallery, export_panel, advanced_panel, captures_settings, captures_panel, reconstruct_panel,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bpy
-from bpy.app.translations import pgettext_iface
 
 from ..backend.requests import sentence
 from ..formats.requests import DENSITY_GAIN, VOXEL
@@ -154,7 +153,7 @@ def _draw_memory(layout: bpy.types.UILayout, _context: bpy.types.Context, person
     """How the human was made, and what it takes."""
     column = layout.column(align=True)
     for name, value in details(person):
-        column.label(text=f"{pgettext_iface(name)}: {value}", translate=False)
+        column.label(text=f"{name}: {value}", translate=False)
 
 
 def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:

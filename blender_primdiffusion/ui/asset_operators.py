@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
-from bpy.app.translations import pgettext_tip
 
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget
@@ -43,7 +42,7 @@ class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(pgettext_tip(text) for name, _, text in _ITEMS if name == properties.what)
+        return next(text for name, _, text in _ITEMS if name == properties.what)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         from ..jobs.assets import HumanAssetJob, PoseAssetJob, mark_human  # needs numpy

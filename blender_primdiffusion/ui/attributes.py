@@ -12,7 +12,6 @@ import bpy
 from ..backend.vocabulary import Vocabulary, read_vocabulary
 from ..formats.regular_files import is_local_path
 from ..places import backend_module_path, preference
-from .translations import CONTEXT
 
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
@@ -73,9 +72,7 @@ def title(name: str) -> str:
 
 def _menu_property(name: str):
     items: Callable = lambda _self, _context: menu(name)  # noqa: E731  bpy wants a function of its own for each
-    return bpy.props.EnumProperty(
-        name=title(name), description="Attribute of the generated human", items=items, translation_context=CONTEXT
-    )
+    return bpy.props.EnumProperty(name=title(name), description="Attribute of the generated human", items=items)
 
 
 class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
@@ -88,13 +85,9 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     hair: _menu_property("hair")
     hat: _menu_property("hat")
     use_height: bpy.props.BoolProperty(name="Use Height", description="Generate a body of this height")
-    height: bpy.props.FloatProperty(
-        name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1, translation_context=CONTEXT
-    )
+    height: bpy.props.FloatProperty(name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1)
     use_weight: bpy.props.BoolProperty(name="Use Weight", description="Generate a body of this weight")
-    weight: bpy.props.FloatProperty(
-        name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100, translation_context=CONTEXT
-    )
+    weight: bpy.props.FloatProperty(name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100)
 
 
 def asked(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
@@ -132,7 +125,7 @@ def draw_attributes(layout: bpy.types.UILayout, group: PRIMDIFFUSION_PG_attribut
             layout.prop(group, name)
     for name in SCALARS:
         if name in vocabulary.scalars:
-            row = layout.row(align=True, heading=title(name), heading_ctxt=CONTEXT)
+            row = layout.row(align=True, heading=title(name))
             row.prop(group, f"use_{name}", text="")
             number = row.row()
             number.enabled = getattr(group, f"use_{name}")

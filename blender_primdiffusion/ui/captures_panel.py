@@ -8,7 +8,6 @@ import time
 from typing import TYPE_CHECKING
 
 import bpy
-from bpy.app.translations import pgettext_iface
 from mathutils import Vector
 
 from ..jobs.follow import Reporting, redraw
@@ -259,7 +258,7 @@ def _draw_settings(layout: bpy.types.UILayout, asked, context: bpy.types.Context
         if body is None:
             continue
         if captures.busy:
-            draw_lines(body, pgettext_iface("Wait for the captures, or cancel them"), "INFO")
+            draw_lines(body, "Wait for the captures, or cancel them", "INFO")
         column = property_columns(body.column())
         column.enabled = not captures.busy
         content(column, asked, context)

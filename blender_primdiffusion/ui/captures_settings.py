@@ -11,7 +11,6 @@ import bpy
 
 from ..formats.requests import LAYOUTS, PASSES
 from ..scene.blend_values import setting_path
-from .translations import CONTEXT
 
 if TYPE_CHECKING:
     from ..formats.camera_rig import Rig
@@ -88,7 +87,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         subtype="ANGLE",
     )
     fov: bpy.props.FloatProperty(
-        name="Field of View", translation_context=CONTEXT, description="Vertical", default=math.radians(30),
+        name="Field of View", description="Vertical", default=math.radians(30),
         min=math.radians(1), max=math.radians(150), subtype="ANGLE",
     )  # fmt: skip
     margin: bpy.props.FloatProperty(name="Margin", description="Room around people", default=1.05, min=0.1, max=100)
@@ -99,7 +98,6 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     samples: bpy.props.IntProperty(name="Samples", description="Of a pixel", default=16, min=1, soft_max=1024)
     light: bpy.props.EnumProperty(
         name="Light",
-        translation_context=CONTEXT,
         description="Lighting of the people",
         items=[
             ("uniform", "Uniform", "Every surface shows its own colour"),

@@ -6,7 +6,6 @@ import re
 import textwrap
 
 import bpy
-from bpy.app.translations import pgettext_iface
 
 from ..backend.requests import RequestError
 from ..jobs.follow import building, in_the_way
@@ -72,7 +71,7 @@ def row_unless(layout: bpy.types.UILayout, reason: str) -> bpy.types.UILayout:
     row = layout.row(align=True)
     row.enabled = not reason
     if reason:
-        draw_lines(layout, pgettext_iface(reason), "INFO")
+        draw_lines(layout, reason, "INFO")
     return row
 
 

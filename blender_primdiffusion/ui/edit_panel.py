@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import bpy
-from bpy.app.translations import pgettext_tip
 
 from ..formats.requests import AMOUNT, FRACTION, PARTS, SIDED_PARTS, STEPS, TRANSFERS, WHOLE_PARTS
 from ..jobs.follow import Reporting, submit
@@ -15,7 +14,6 @@ from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
 from .drawing import draw_job, property_columns
 from .on_person import PANELS, SKIP, HumanPanel, OnPerson, other_human
-from .translations import CONTEXT
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
@@ -31,7 +29,6 @@ def parts_property():
     """A choice of several body parts."""
     return bpy.props.EnumProperty(
         name="Parts",
-        translation_context=CONTEXT,
         description="Parts to change: Shift-click for several. Left and right are the human's",
         items=[(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)],
         options={"ENUM_FLAG", "SKIP_SAVE"},
@@ -97,7 +94,6 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     )
     fraction: bpy.props.FloatProperty(
         name="Fraction",
-        translation_context=CONTEXT,
         description="Share of the other human: 0 is this human, 1 the other",
         default=FRACTION,
         min=0.0,
@@ -119,9 +115,7 @@ class PRIMDIFFUSION_OT_paint_region(Reporting, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return pgettext_tip(
-            properties.rna_type.properties["finish"].description if properties.finish else str(cls.__doc__)
-        )
+        return properties.rna_type.properties["finish"].description if properties.finish else str(cls.__doc__)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         from ..scene.edit import end_painting, start_painting  # needs numpy
@@ -270,9 +264,7 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
     job = "BlendJob"
 
     other: bpy.props.StringProperty(name="Other", description=f"Name of the other human. {PANELS}", options=SKIP)
-    fraction: bpy.props.FloatProperty(
-        name="Fraction", translation_context=CONTEXT, min=0.0, max=1.0, description=PANELS, options=SKIP
-    )
+    fraction: bpy.props.FloatProperty(name="Fraction", min=0.0, max=1.0, description=PANELS, options=SKIP)
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit

@@ -15,7 +15,6 @@ from ..jobs.target import HumanTarget
 from ..scene.human import armature_of
 from .drawing import property_columns
 from .on_person import PANELS, SKIP, OnPerson
-from .translations import CONTEXT
 
 if TYPE_CHECKING:
     from ..jobs.queue import Job
@@ -104,7 +103,6 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
     triangles: bpy.props.IntProperty(
         name="Triangles",
-        translation_context=CONTEXT,
         description="Maximum number of triangles of the mesh proxy",
         default=requests.TRIANGLES,
         min=500,
@@ -167,9 +165,7 @@ class PRIMDIFFUSION_OT_export(_Export, bpy.types.Operator):
     compact: bpy.props.BoolProperty(name="Compact", description=PANELS, options=SKIP)
     animation: bpy.props.BoolProperty(name="Animation", description=PANELS, options=SKIP)
     texture_px: bpy.props.IntProperty(name="Texture", description=PANELS, min=64, max=8192, options=SKIP)
-    triangles: bpy.props.IntProperty(
-        name="Triangles", translation_context=CONTEXT, description=PANELS, min=500, max=1_000_000, options=SKIP
-    )
+    triangles: bpy.props.IntProperty(name="Triangles", description=PANELS, min=500, max=1_000_000, options=SKIP)
     gaussians: bpy.props.IntProperty(name="Gaussians", description=PANELS, min=1, options=SKIP)
     voxel: bpy.props.FloatProperty(name="Voxel Size", description=PANELS, min=0.002, max=0.05, options=SKIP)
     first: bpy.props.IntProperty(name="First Frame", description=f"Of a VDB sequence. {_SCENES}", options=SKIP)
@@ -268,9 +264,7 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
     bl_label = "Add Mesh Proxy"
 
     texture_px: bpy.props.IntProperty(name="Texture", description=PANELS, min=64, max=8192, options=SKIP)
-    triangles: bpy.props.IntProperty(
-        name="Triangles", translation_context=CONTEXT, description=PANELS, min=500, max=1_000_000, options=SKIP
-    )
+    triangles: bpy.props.IntProperty(name="Triangles", description=PANELS, min=500, max=1_000_000, options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         # needs numpy
@@ -290,9 +284,7 @@ class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
     bl_label = "Show Volumes or Mesh"
     bl_options = {"UNDO"}
 
-    shown: bpy.props.EnumProperty(
-        name="Show", translation_context=CONTEXT, description="How the human is shown", items=SHOWN
-    )
+    shown: bpy.props.EnumProperty(name="Show", description="How the human is shown", items=SHOWN)
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         # needs numpy

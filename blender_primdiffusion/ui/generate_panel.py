@@ -24,7 +24,6 @@ from .gallery import draw_samples
 from .manual import draw_manual_button
 from .presets import read_preset
 from .render_panel import draw_next_step
-from .translations import CONTEXT
 
 LARGEST_SEED = 2**31 - 1
 """The backend itself takes seeds up to 2^63 - 1."""
@@ -309,7 +308,6 @@ class PRIMDIFFUSION_PT_attributes(SidebarPanel, bpy.types.Panel):
     """Attributes to generate with; none unless chosen."""
 
     bl_label = "Attributes"
-    bl_translation_context = CONTEXT
     bl_parent_id = "PRIMDIFFUSION_PT_generate"
     bl_options = {"DEFAULT_CLOSED"}
 

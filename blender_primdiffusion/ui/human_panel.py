@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
-from bpy.app.translations import pgettext_tip
 
 from ..backend.requests import in_words, sentence
 from ..formats.removing import OutsideFolderError, remove_file
@@ -39,9 +38,7 @@ class PRIMDIFFUSION_OT_find_missing_volumes(bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return pgettext_tip(
-            "Choose a folder to search for missing files of humans" if properties.choose else str(cls.__doc__)
-        )
+        return "Choose a folder to search for missing files of humans" if properties.choose else str(cls.__doc__)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if not self.choose:
@@ -200,7 +197,7 @@ class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return pgettext_tip("Select this human and frame it in the view" if properties.frame else str(cls.__doc__))
+        return "Select this human and frame it in the view" if properties.frame else str(cls.__doc__)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Frames in the viewport that the button was pressed in, else in the first one."""

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 
 import bpy
 from bpy.app.handlers import persistent
-from bpy.app.translations import pgettext_tip
 
 from ..backend.redact import redact
 from ..jobs import follow, memory
@@ -133,7 +132,7 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return pgettext_tip({"CAPTURES": _CAPTURES, "SET_UP": _SET_UP}.get(properties.what, str(cls.__doc__)))
+        return {"CAPTURES": _CAPTURES, "SET_UP": _SET_UP}.get(properties.what, str(cls.__doc__))
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:

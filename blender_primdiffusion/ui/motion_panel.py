@@ -6,7 +6,6 @@ import dataclasses
 import itertools
 
 import bpy
-from bpy.app.translations import pgettext_tip
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
@@ -15,7 +14,6 @@ from ..scene.blend_values import as_shown, stored_record
 from .drawing import SidebarPanel, draw_lines, property_columns
 from .export_operators import destination
 from .on_person import FACTS, OnArmature, WhereTo, may_have_joints, scene_fps, target_armature
-from .translations import CONTEXT
 
 _MOST_FACTS = 20
 _BUILT_IN = [
@@ -39,7 +37,7 @@ class PRIMDIFFUSION_OT_use_action(OnArmature, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return pgettext_tip(
+        return (
             str(cls.__doc__)
             if properties.action
             else "Remove the motion from the human; the action stays in the file, the human returns to the rest pose"
@@ -97,9 +95,7 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
     bl_label = "Add Motion"
     bl_options = {"REGISTER", "UNDO"}
 
-    motion: bpy.props.EnumProperty(
-        name="Motion", translation_context=CONTEXT, description="What the human does", items=_BUILT_IN
-    )
+    motion: bpy.props.EnumProperty(name="Motion", description="What the human does", items=_BUILT_IN)
     rounds: bpy.props.IntProperty(name="Rounds", description="Number of repetitions", default=2, min=1, max=500)
     speed: bpy.props.FloatProperty(name="Speed", description="2 is twice as fast", default=1.0, min=0.1, max=10.0)
 

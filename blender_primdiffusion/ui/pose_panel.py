@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import bpy
-from bpy.app.translations import pgettext_tip
 from bpy.utils import previews
 
 from ..formats.joints import JOINT_NAMES
@@ -15,7 +14,6 @@ from ..motion.own_poses import delete_pose, load_pose, own_poses, picture_of, sa
 from ..places import own_folder
 from .drawing import SidebarPanel, property_columns
 from .on_person import OnArmature, may_have_joints, warn_of_rest
-from .translations import CONTEXT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -108,7 +106,6 @@ class PRIMDIFFUSION_PG_motion(bpy.types.PropertyGroup):
     mirror: bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
     only_selected: bpy.props.BoolProperty(
         name="Only Selected Bones",
-        translation_context=CONTEXT,
         description="Change only the selected bones",
         default=False,
     )
@@ -190,7 +187,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(pgettext_tip(text) for name, _, text in _POSES if name == properties.what)
+        return next(text for name, _, text in _POSES if name == properties.what)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.what != "LIBRARY":
@@ -277,7 +274,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         told = properties.rna_type.properties["delete"].description if properties.delete else str(cls.__doc__)
-        return pgettext_tip(told)
+        return told
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self.delete:

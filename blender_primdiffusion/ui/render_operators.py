@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import bpy
-from bpy.app.translations import pgettext_tip
 
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
@@ -113,7 +112,7 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(pgettext_tip(text) for name, _, text in _MERGES if name == properties.what)
+        return next(text for name, _, text in _MERGES if name == properties.what)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         if self.what == "NOTHING":

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 
 import bpy
-from bpy.app.translations import pgettext_iface, pgettext_tip
 from mathutils import Euler, Vector
 
 from ..backend.environment import NOT_INSTALLED
@@ -120,7 +119,7 @@ class PRIMDIFFUSION_OT_set_up_engine(Reporting, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(pgettext_tip(text) for name, _, text in _ENGINES if name == properties.engine)
+        return next(text for name, _, text in _ENGINES if name == properties.engine)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         """Camera, world, film and bounces of light between other objects stay as they are."""
@@ -210,7 +209,7 @@ def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     for (name, label, _), icon in zip(_ENGINES, ("SHADING_RENDERED", "SHADING_TEXTURE"), strict=True):
         if name != ENGINE or backend_is_named():
             row.operator("primdiffusion.set_up_engine", text=label, depress=engine == name, icon=icon).engine = name
-    draw_lines(layout, pgettext_iface(line), "INFO")
+    draw_lines(layout, line, "INFO")
     _draw_fault(layout, engine)
 
 

@@ -6,14 +6,12 @@ import random
 from typing import TYPE_CHECKING
 
 import bpy
-from bpy.app.translations import pgettext_tip
 
 from ..backend.requests import sentence
 from ..jobs.target import selected_person
 from ..scene.human import BETA_COUNT, BETAS, armature_of, humans
 from .drawing import draw_lines, property_columns
 from .on_person import SKIP, HumanPanel, OnPerson, other_human
-from .translations import CONTEXT
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -48,7 +46,6 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
     seed: bpy.props.IntProperty(name="Seed", description="Another seed gives another body", min=0, options=SKIP)
     spread: bpy.props.FloatProperty(
         name="Spread",
-        translation_context=CONTEXT,
         description="How far bodies differ from the mean body: 1 as real people do",
         default=1.0,
         min=0.0,
@@ -61,8 +58,8 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         if properties.to == "GIVEN":
-            return pgettext_tip(str(cls.__doc__))
-        return next(pgettext_tip(text) for name, _, text in _SHAPES if name == properties.to)
+            return str(cls.__doc__)
+        return next(text for name, _, text in _SHAPES if name == properties.to)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.to == "RANDOM" and not self.properties.is_property_set("seed"):

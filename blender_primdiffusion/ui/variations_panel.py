@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import bpy
 from bpy.app.handlers import persistent
-from bpy.app.translations import pgettext_iface, pgettext_tip
 
 from ..backend.requests import sentence
 from ..formats.requests import AMOUNT
@@ -106,7 +105,7 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         told = "clear" if properties.clear else "like" if properties.like else ""
         text = properties.rna_type.properties[told].description if told else str(cls.__doc__)
-        return pgettext_tip(text)
+        return text
 
     def act(self, context: bpy.types.Context) -> set[str]:
         """A seed given by a script is the first of `count`."""
@@ -166,7 +165,7 @@ class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return pgettext_tip(_BUILD_ALL if properties.build_all else str(cls.__doc__))
+        return _BUILD_ALL if properties.build_all else str(cls.__doc__)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         from ..scene.cycles import overlap_warning_in  # numpy, which Blender starts without
@@ -206,7 +205,7 @@ class PRIMDIFFUSION_OT_set_seed(Reporting, bpy.types.Operator):
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return pgettext_tip(_OF_VARIATION if properties.to == "VARIATION" else str(cls.__doc__))
+        return _OF_VARIATION if properties.to == "VARIATION" else str(cls.__doc__)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.primdiffusion
@@ -335,7 +334,7 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     number = sum(variation.chosen for variation in sheet.variations)
     row_unless(layout, "" if number else "Select the humans to build").operator(
         "primdiffusion.build_variation",
-        text=f"{pgettext_iface('Build Selected')} ({number})",
+        text=f"Build Selected ({number})",
         translate=False,
         icon="OUTLINER_OB_ARMATURE",
     )

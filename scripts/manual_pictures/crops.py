@@ -24,7 +24,6 @@ PANELS = {
     "captures": ("captures_cameras", "captures_output", "captures_human"),
     "export": ("export_before", "export_proxy"),
     "missing": ("missing_files",),
-    "german_french": ("language_de_generate", "language_fr_generate"),
 }
 """Rows of sidebars, cropped to their panels."""
 WINDOWS = {

@@ -293,25 +293,6 @@ def missing(module: str, python: str) -> Steps:
         away.rename(folder)
 
 
-def languages(module: str, python: str) -> Steps:
-    """The interface in German and French, panel by panel; an error with its remedy."""
-    yield from with_people(module, python, FIRST_SEED)
-    preferences = bpy.context.preferences.addons[module].preferences
-    preferences.captures = True
-    preferences.checkpoint = "/nowhere/model.safetensors"
-    press("primdiffusion.generate")
-    yield from wait(lambda: not queue_of(module).busy, 60)
-    preferences.checkpoint = ""
-    bpy.context.scene.primdiffusion_edit.kind = "REDRESS"
-    for language in ("de_DE", "fr_FR"):
-        bpy.context.preferences.view.language = language
-        bpy.context.preferences.view.use_translate_interface = True
-        for group, names in TRANSLATED.items():
-            yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
-            yield f"language_{language[:2]}_{group}"
-    bpy.context.preferences.view.language = "en_US"
-
-
 def paint(armature: bpy.types.Object) -> None:
     """Set the weights of the chest, because brush strokes need a mouse."""
     body = bpy.context.view_layer.objects.active
@@ -336,15 +317,6 @@ def click_generate() -> Steps:
     yield {"point": [x - 400, top + 300]}
 
 
-TRANSLATED = {
-    "generate": ("generate", "attributes", "variations", "from_file"),
-    "human": ("human", "shape", "poses"),
-    "edits": ("human", "edit", "motion"),
-    "files": ("export/proxy", "export/assets", "advanced/files", "advanced/backend"),
-    "render": ("render", *(f"advanced/{name}" for name in ("attachment", "merge", "look", "memory"))),
-    "captures": tuple(f"captures/captures_{name}" for name in ("input", "poses", "cameras", "cycles", "output")),
-}
-"""Panels shown together in other languages."""
 GENERATE_BUTTON_PX = 118
 """Distance from the top of the sidebar, with the panel as it opens."""
 
@@ -366,7 +338,6 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "export": export,
     "cancelled": cancelled,
     "missing": missing,
-    "languages": languages,
     "stalls": stalls,
     "redraw": redraw,
     "opening": opening,

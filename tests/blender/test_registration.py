@@ -93,22 +93,7 @@ def traces() -> set[str]:
     for handler in bpy.types.FileHandler.__subclasses__():
         if handler.is_registered:
             found.add(f"file handler {handler.__name__}")
-    words = ("Generate Human", "Human", "Captures")
-    found |= {f"{language}: {word}" for language in ("de_DE", "fr_FR") for word in words if _translated(word, language)}
     return found
-
-
-def _translated(word: str, language: str) -> bool:
-    view = bpy.context.preferences.view
-    before = view.language
-    try:
-        view.language = language
-    except TypeError:  # this Blender has no languages
-        return False
-    try:
-        return bpy.app.translations.pgettext_iface(word) != word
-    finally:
-        view.language = before
 
 
 def test_register_and_unregister_twice_leave_no_trace(empty_scene):

@@ -210,7 +210,6 @@ EXTENSION = {
     "ui/batch/render.py": ("Blender: .blend",),
     "ui/batch/running.py": ("batch settings",),
     "ui/presets.py": ("preset",),
-    "ui/translations/__init__.py": OWN,
 }
 MODULES: dict[str, tuple[str, ...] | str] = {
     **{f"backend/primdiffusion/{name}": tried for name, tried in BACKEND.items()},

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from pathlib import Path
 
 import bpy
-from bpy.app.translations import pgettext_tip
 
 from ...backend import environment, setup
 from ...backend.packages import read_lock
@@ -208,7 +207,7 @@ class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         told = "choose" if properties.choose else "repair" if properties.repair else ""
-        return pgettext_tip(properties.rna_type.properties[told].description if told else str(cls.__doc__))
+        return properties.rna_type.properties[told].description if told else str(cls.__doc__)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if not self.choose:
