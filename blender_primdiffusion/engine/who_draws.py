@@ -10,8 +10,6 @@ from .engine import ENGINE
 
 WORKBENCH = "BLENDER_WORKBENCH"
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
-_without: set[str] = {WORKBENCH}
-"""Engines that list volumes among what they draw and still show no human by them: Workbench draws a grey fog."""
 
 
 class Drawer(enum.Enum):
@@ -40,11 +38,7 @@ def view_engine(engine: str, shading: str) -> str:
 
 def renders_volumes(engine: str) -> bool:
     """Whether an engine lights volumes. Engines declare that as Blender's own do: their name is in COMPAT_ENGINES of
-    the panel of a volume's file (in Blender 4.5 to 5.2 Cycles, EEVEE and Hydra Storm)."""
+    the panel of a volume's file (in Blender 4.5 to 5.2 Cycles, EEVEE and Hydra Storm). Workbench declares it too, but
+    draws a grey fog."""
     panel = getattr(bpy.types, "DATA_PT_volume_file", None)
-    return engine in getattr(panel, "COMPAT_ENGINES", ()) and engine not in _without | {ENGINE}
-
-
-def note_volumes(engine: str, empty: bool) -> None:
-    """Say whether an engine draws volumes empty in this Blender, and so counts as one that renders none."""
-    (_without.add if empty else _without.discard)(engine)
+    return engine in getattr(panel, "COMPAT_ENGINES", ()) and engine not in (WORKBENCH, ENGINE)

@@ -14,7 +14,7 @@ from types import ModuleType
 
 import bpy
 
-from ..jobs import copies, cycles_check, follow, late_volumes, missing_files, picture_in_view, windows
+from ..jobs import copies, follow, late_volumes, missing_files, picture_in_view, windows
 from ..scene import stand_in
 from . import (
     advanced_panel,
@@ -46,7 +46,7 @@ from . import (
 )
 
 MODULES = (
-    *backend_state.MODULES, preferences, windows, follow, cycles_check, jobs_panel, attributes,
+    *backend_state.MODULES, preferences, windows, follow, jobs_panel, attributes,
     generate_panel, variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, copies,
     late_volumes, import_motion, motion_panel, pose_panel, asset_operators, render_operators, render_panel,
     export_operators, gallery, export_panel, advanced_panel, captures_settings, captures_panel, reconstruct_panel,

@@ -9,10 +9,8 @@ import bpy
 from mathutils import Euler, Vector
 
 from ..backend.environment import NOT_INSTALLED
-from ..backend.requests import sentence
 from ..engine.engine import ENGINE
-from ..engine.who_draws import Drawer, renders_volumes, who_draws
-from ..jobs import cycles_check
+from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting
 from ..places import backend_is_named
 from ..scene.attachment import in_viewport
@@ -184,7 +182,7 @@ def how_shown(scene: bpy.types.Scene) -> str:
         return EXACT
     if engine != "CYCLES":
         return OTHER_ENGINE
-    return UNLIT if drawer is Drawer.OVERLAY and renders_volumes(engine) else APPROXIMATE
+    return UNLIT if drawer is Drawer.OVERLAY else APPROXIMATE
 
 
 def draw_next_step(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
@@ -199,7 +197,6 @@ def draw_next_step(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         layout.operator("primdiffusion.add_camera", icon="CAMERA_DATA")
     else:
         layout.operator("render.render", text="Render Image", icon="RENDER_STILL")
-    _draw_fault(layout, engine)
 
 
 def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
@@ -210,12 +207,6 @@ def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
         if name != ENGINE or backend_is_named():
             row.operator("primdiffusion.set_up_engine", text=label, depress=engine == name, icon=icon).engine = name
     draw_lines(layout, line, "INFO")
-    _draw_fault(layout, engine)
-
-
-def _draw_fault(layout: bpy.types.UILayout, engine: str) -> None:
-    if engine == "CYCLES" and cycles_check.volumes_are_empty():
-        draw_lines(layout, sentence(cycles_check.FAULT), "ERROR")
 
 
 class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):

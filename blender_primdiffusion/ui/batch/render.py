@@ -16,7 +16,7 @@ from pathlib import Path
 
 import bpy
 
-from ...backend.requests import Backend, sentence
+from ...backend.requests import Backend
 from ...capture.report import Report
 from ...console import Stop
 from ...engine import studio
@@ -24,7 +24,6 @@ from ...engine.engine import ENGINE
 from ...formats.regular_files import check_regular, exists_in_its_folder, real_path
 from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
-from ...jobs import cycles_check
 from ...jobs.open_human import opened
 from ...scene.collect import collect_unwritten
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
@@ -180,7 +179,7 @@ class _Drawing:
     ):
         self.say = say
         self._options, self._movement, self._backend, self._stop = options, movement, backend, stop
-        self._checked = self._warned = False
+        self._checked = False
 
     def draw(self, source: RenderSource) -> int:
         if source.is_blend:
@@ -261,9 +260,6 @@ class _Drawing:
             render.resolution_percentage = 100
         render.film_transparent = options.transparent or (options.source.suffix == ".blend" and render.film_transparent)
         if render.engine == "CYCLES":
-            if not self._warned and cycles_check.check():
-                self.say(sentence(cycles_check.FAULT))
-            self._warned = True
             if options.engine or options.samples:
                 fit_cycles_to_volumes(scene, options.samples or _SAMPLES)
             _check_volumes(scene)

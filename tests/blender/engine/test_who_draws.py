@@ -5,18 +5,11 @@ from __future__ import annotations
 import bpy
 import pytest
 
-from blender_primdiffusion.engine import who_draws as module
-from blender_primdiffusion.engine.who_draws import Drawer, note_volumes, renders_volumes, view_engine, who_draws
-from blender_primdiffusion.jobs import cycles_check
+from blender_primdiffusion.engine.who_draws import Drawer, view_engine, who_draws
 
 pytestmark = pytest.mark.any_blender
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
 SHADINGS = ("WIREFRAME", "SOLID", "MATERIAL", "RENDERED")
-
-
-@pytest.fixture(autouse=True)
-def nothing_is_known_of_this_build(monkeypatch):
-    monkeypatch.setattr(module, "_without", {module.WORKBENCH})
 
 
 def drawers(engine: str, volumes_shown: bool) -> list[Drawer]:
@@ -49,14 +42,3 @@ def test_an_engine_declares_that_it_renders_volumes_as_blenders_own_do(addon):
         assert who_draws("SOMEBODYS", "RENDERED", True) is Drawer.VOLUMES
     finally:
         engines.discard("SOMEBODYS")
-
-
-def test_where_an_engine_draws_volumes_empty_the_overlay_draws(addon, monkeypatch):
-    monkeypatch.setattr(cycles_check, "_recall", lambda: True)
-    assert cycles_check.volumes_are_empty()
-    assert who_draws("CYCLES", "RENDERED", True) is Drawer.OVERLAY
-    monkeypatch.setattr(cycles_check, "_recall", lambda: False)
-    assert not cycles_check.volumes_are_empty()
-    assert renders_volumes("CYCLES")
-    note_volumes("CYCLES", empty=True)
-    assert who_draws("CYCLES", "RENDERED", True) is Drawer.OVERLAY

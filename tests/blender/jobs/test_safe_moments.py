@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import time
 from types import SimpleNamespace
 
@@ -10,7 +9,7 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of
 
-from blender_primdiffusion.jobs import cycles_check, late_volumes, windows
+from blender_primdiffusion.jobs import late_volumes, windows
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
@@ -201,15 +200,3 @@ def test_a_job_without_a_step_that_leaves_data_makes_one(addon, resting_at_once,
     bpy.ops.ed.undo()
     assert "baked by an exporter" not in bpy.data.images
     assert names() == {"before"}
-
-
-def test_the_check_of_cycles_is_followed_after_another_file_is_loaded(addon, monkeypatch):
-    process = subprocess.Popen(["sleep", "60"], stdout=subprocess.PIPE, text=True)
-    monkeypatch.setattr(cycles_check, "_recall", lambda: None)
-    monkeypatch.setattr(cycles_check, "_start", lambda: process)
-    try:
-        assert not cycles_check.volumes_are_empty()
-        bpy.ops.wm.read_homefile(use_empty=True)
-        assert bpy.app.timers.is_registered(cycles_check._follow)
-    finally:
-        cycles_check.unregister()

@@ -217,15 +217,6 @@ def test_after_success_the_panel_has_one_line_and_the_button_of_the_next_step(ad
     assert last == button
 
 
-def test_the_fault_of_some_builds_of_cycles_is_named_where_cycles_is_chosen_alone(addon, monkeypatch):
-    monkeypatch.setattr(render_panel.cycles_check, "volumes_are_empty", lambda: True)
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
-    for engine, named in (("CYCLES", True), ("PRIMDIFFUSION", False), ("BLENDER_WORKBENCH", False)):
-        addon.scene.render.engine = engine
-        texts = " ".join(shown(generate_panel.PRIMDIFFUSION_PT_generate, addon))
-        assert ("draws volumes empty" in texts) == named
-
-
 def test_limits_of_cycles_are_named_in_the_result_where_cycles_is_chosen_alone(addon, monkeypatch):
     monkeypatch.setattr(cycles, "current_overlap", lambda _: 37)
     for engine, named in (("BLENDER_WORKBENCH", False), ("CYCLES", True)):

@@ -13,7 +13,6 @@ from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion import places
-from blender_primdiffusion.engine.who_draws import note_volumes
 from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
@@ -260,9 +259,6 @@ def test_the_panel_says_who_draws_humans(person):
     assert render_panel.how_shown(scene) == render_panel.APPROXIMATE
     assert "with light and shadows" in " ".join(shown(render_panel.PRIMDIFFUSION_PT_render, bpy.context))
     show_in_viewport(person, False)
-    note_volumes("CYCLES", empty=True)
-    assert render_panel.how_shown(scene) == render_panel.APPROXIMATE, "of renders; the fault is said below"
-    note_volumes("CYCLES", empty=False)
     assert ops.set_up_engine() == {"FINISHED"}
     assert render_panel.how_shown(scene) == render_panel.EXACT
     scene.render.engine = "BLENDER_WORKBENCH"
