@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import functools
 import random
-from pathlib import Path
 from typing import Any
 
 import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
-from ..backend.requests import in_words, sentence
+from ..backend.requests import sentence
 from ..formats import requests
 from ..jobs.follow import Reporting, submit
 from ..jobs.memory import device_line
@@ -22,7 +20,6 @@ from .backend_state import draw_set_up
 from .drawing import BackendPanel, SidebarPanel, draw_job, draw_lines, property_columns
 from .gallery import draw_samples
 from .manual import draw_manual_button
-from .presets import read_preset
 from .render_panel import draw_next_step
 
 LARGEST_SEED = 2**31 - 1
@@ -167,16 +164,13 @@ class GenerateOptions(Reporting):
 SUBDIR = "primdiffusion/generate"
 _ASKED = (*CATEGORIES, *(part for name in SCALARS for part in (f"use_{name}", name)))
 
-NO_PRESET = "Generate Presets"
-"""Label of the menu before a preset is chosen; afterwards the preset's name, as in Blender's own menus."""
-
 
 class PRIMDIFFUSION_PT_generate_presets(PresetPanel, bpy.types.Panel):
     """Choose, add and remove presets"""
 
-    bl_label = NO_PRESET
+    bl_label = "Generate Presets"
     preset_subdir = SUBDIR
-    preset_operator = "primdiffusion.use_generate_preset"
+    preset_operator = "script.execute_preset"
     preset_add_operator = "primdiffusion.add_generate_preset"
 
 
@@ -194,45 +188,6 @@ class PRIMDIFFUSION_OT_add_generate_preset(AddPresetBase, bpy.types.Operator):
         "settings.guidance",
         *(f"settings.attributes.{name}" for name in _ASKED),
     ]
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        if not (self.remove_name or self.remove_active or self.as_filename(self.name)):
-            self.report({"ERROR"}, "The preset has no name: type one")
-            return {"CANCELLED"}
-        return AddPresetBase.execute(self, context)
-
-
-class PRIMDIFFUSION_OT_use_generate_preset(bpy.types.Operator):
-    """Use the settings of this preset"""
-
-    bl_idname = "primdiffusion.use_generate_preset"
-    bl_label = "Use Generate Preset"
-    bl_options = {"UNDO"}
-
-    filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options={"SKIP_SAVE"})
-
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """A preset may ask for attributes that the checkpoint lacks: then nothing is applied."""
-        path = Path(self.filepath)
-        name, before = bpy.path.display_name(path.name), []
-        try:
-            for names, value in read_preset(path):
-                if f"settings.{'.'.join(names)}" not in PRIMDIFFUSION_OT_add_generate_preset.preset_values:
-                    raise ValueError(f"it sets {'.'.join(names):.40}")
-                holder = functools.reduce(getattr, names[:-1], context.scene.primdiffusion)
-                before.append((holder, names[-1], getattr(holder, names[-1])))
-                setattr(holder, names[-1], value)
-        except OSError as error:
-            self.report({"ERROR"}, f"The preset cannot be read: {in_words(error)}. Choose another one")
-            return {"CANCELLED"}
-        except (TypeError, AttributeError, ValueError, OverflowError) as error:
-            for holder, setting, value in reversed(before):
-                setattr(holder, setting, value)
-            reason = sentence(f"{error!s:.120}")
-            self.report({"ERROR"}, f"The preset {name!r} does not match this checkpoint or version: {reason} Remove it")
-            return {"CANCELLED"}
-        PRIMDIFFUSION_PT_generate_presets.bl_label = name
-        return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
@@ -318,8 +273,3 @@ class PRIMDIFFUSION_PT_attributes(SidebarPanel, bpy.types.Panel):
 
 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_settings)),)
-
-
-def unregister() -> None:
-    """Restore the label of the presets menu."""
-    PRIMDIFFUSION_PT_generate_presets.bl_label = NO_PRESET

@@ -22,7 +22,6 @@ LONGEST_SENTENCE = 300
 READS = {
     "import_motion": ("filepath", (".npz", ".npy", ".json", ".bvh", ".fbx")),
     "import_human": ("filepath", (".human", ".human.safetensors", ".npz")),
-    "use_generate_preset": ("filepath", (".py",)),
     "mark_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
     "mark_as_asset POSE": ("picture", (".png", ".jpg", ".exr", ".hdr")),
 }

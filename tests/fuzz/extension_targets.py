@@ -171,21 +171,6 @@ def read_batch(path: Path) -> None:
     claim(path, {"seeds": [1, 2], "steps": 30, "size": [64, 64]}, whatever_is_there=False)
 
 
-def make_preset(folder: Path) -> Path:
-    lines = ["import bpy", "settings = bpy.context.scene.primdiffusion", "", "settings.steps = 30",
-             "settings.sampler = 'ddim'", "settings.guidance = 1.5", "settings.attributes.outfit = 'suit'"]  # fmt: skip
-    (folder / "quick.py").write_text("\n".join(lines), encoding="utf-8")
-    return folder / "quick.py"
-
-
-def read_preset(path: Path) -> None:
-    from blender_primdiffusion.ui.presets import read_preset
-
-    for _, value in read_preset(path):
-        if isinstance(value, float):
-            finite(value)
-
-
 TARGETS = (
     Target("human in Blender", make_human, mutations.SAFETENSORS, read_human),
     Target("moving human in Blender", make_moving, mutations.SAFETENSORS, read_human),
@@ -201,5 +186,4 @@ TARGETS = (
     Target("parameters of a scan", make_parameters, mutations.NPZ, read_parameters),
     Target("shape of a scan", make_scan, mutations.PLAIN, read_scan_shape),
     Target("batch settings", make_batch, mutations.JSON, read_batch),
-    Target("preset", make_preset, mutations.TEXT, read_preset),
 )

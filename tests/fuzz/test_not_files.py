@@ -207,7 +207,6 @@ EXTENSION = {
     "scene/volumes.py": "it reads the header of a regular file; any other has no format",
     "ui/batch/render.py": ("Blender: .blend",),
     "ui/batch/running.py": ("batch settings",),
-    "ui/presets.py": ("preset",),
 }
 MODULES: dict[str, tuple[str, ...] | str] = {
     **{f"backend/primdiffusion/{name}": tried for name, tried in BACKEND.items()},

@@ -148,10 +148,6 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("run: settings", "run: starts", "run: metrics"),
         ("tests/backend/training/test_folder_lock.py::test_of_two_processes_the_second_is_rejected_in_one_sentence",),
     ),
-    "presets `.py`": (
-        ("preset",),
-        ("tests/blender/ui/test_generate_panel.py::test_a_preset_that_does_not_fit_is_one_sentence",),
-    ),
     "requirements in a folder of wheels": (
         ("lock of packages",),
         (
