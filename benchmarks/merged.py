@@ -8,6 +8,8 @@ surface_error is against the backend's own frames on the posed surface. `--no-vo
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import sys
 import time
 from pathlib import Path
@@ -19,13 +21,15 @@ import psutil
 import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.frame import PosedPerson
-from primdiffusion.commands.merge import FitGainRequest, MergeRequest
+from primdiffusion.commands.merge import MergeRequest
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.formats.requests import DENSITY_GAIN
-from primdiffusion.human import body_of, generate, pose_body
+from primdiffusion.human import body_of, framing, generate, place_skinned, pose_body
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.primitives.anchors import attach
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.march import march
 from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -41,6 +45,11 @@ from blender_primdiffusion.scene.volumes import person_memory
 
 SEED, STEPS, SIZE, GREY = 7, 30, 512, 0.48
 FRAMES = 10
+FAINT = 1e-4
+"""Factor on density with which no ray of a human saturates."""
+MET = 1e-3
+"""Rays with less opacity than this miss the human."""
+GAIN_PIXELS, GAINS = 128, np.geomspace(0.1, 20, 2000).tolist()
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
@@ -105,6 +114,21 @@ def psnr(one: np.ndarray, other: np.ndarray) -> float:
     return float(-10 * np.log10(((one.astype(np.float64) - other) ** 2).mean()))
 
 
+def fitted_gains(primitives: Primitives) -> dict[str, float]:
+    """The gain g with the least mean of |(1 - exp(-g s)) - min(s, 1)|, its mean, and that of DENSITY_GAIN.
+
+    s is the sum of all opacities along a ray, which the marcher clamps to 1 (SPEC 4), of rays from four sides that
+    meet the human: marched with so little density that no ray saturates.
+    """
+    faint = dataclasses.replace(primitives, density=primitives.density * FAINT)
+    cameras = [framing(primitives, math.pi / 2 * side, GAIN_PIXELS, GAIN_PIXELS) for side in range(4)]
+    reached = np.concatenate([march(faint, camera).alpha.double().numpy().ravel() / FAINT for camera in cameras])
+    met = reached[reached >= MET]
+    errors = {gain: np.abs(-np.expm1(-gain * met) - np.minimum(met, 1)).mean() for gain in (*GAINS, DENSITY_GAIN)}
+    best = min(GAINS, key=lambda gain: errors[gain])
+    return {"gain_gain": best, "gain_error": errors[best], "gain_error_before": errors[DENSITY_GAIN]}
+
+
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--pictures", type=Path, required=True, help="folder for the PNGs")
@@ -154,12 +178,12 @@ def main() -> None:
     files = merging.publish([folder / "grid.vdb"], [digest], merging.merged_folder(person))
     figures |= {"seconds_write_merged": time.perf_counter() - began, "merged_mb": files[0].stat().st_size / 1e6}
     merging.show_merged(person, files, merging.MergedState(("",), grid.voxel))
-    fit = FitGainRequest(people=[posed]).run(session, lambda *_, **__: None)
-    figures |= {f"gain_{name}": fit[name] for name in ("gain", "error", "error_before")}
+    gains = fitted_gains(place_skinned(human, *(torch.tensor(numbers) for numbers in (posed.joints, posed.object))))
+    figures |= gains
 
     setup_cycles_preview(bpy.context.scene, size=SIZE, samples=1, yaw=0.5, world=GREY)
     pictures = {}
-    for name, gain in (("usual", DENSITY_GAIN), ("fitted", fit["gain"])):
+    for name, gain in (("usual", DENSITY_GAIN), ("fitted", gains["gain_gain"])):
         set_density_gain(person, gain)
         set_attachment(person, "MERGED")
         pictures[name], figures["seconds_cycles_merged"] = rendered(folder / f"merged_{name}.png")

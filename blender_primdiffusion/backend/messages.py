@@ -53,7 +53,6 @@ _ANSWERS: dict[str, dict[str, tuple[type, ...]]] = {
     "variations": {"people": (list,), "seconds": (int, float)},
     "merge": {"out": (str,), "seconds": (int, float)},
     "merge_frames": {"files": (list,), "seconds": (int, float)},
-    "fit_gain": dict.fromkeys(("gain", "error", "gain_before", "error_before"), (int, float)),
     "proxy": {"proxy": (str,), "texture": (str,), "betas": (list,), "triangles": (int,), "seconds": (int, float)},
     "gaussians": {"out": (str,), "gaussians": (int,)},
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 import numpy as np
@@ -14,7 +14,6 @@ from ..formats.joints import JOINT_NAMES
 from ..formats.removing import remove_file
 from ..scene.attachment import set_attachment
 from ..scene.human import armature_of
-from ..scene.material import set_density_gain
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from .queue import Job
 from .target import HumanTarget
@@ -126,33 +125,6 @@ class MergeFramesJob(Job):
         set_attachment(person, "MERGED")
         size = sum(path.stat().st_size for path in files) / 1e6
         return f"Merged {len(files)} frames of {person.name} in {result['seconds']:.1f} s, {size:.0f} MB"
-
-
-@dataclasses.dataclass(frozen=True)
-class FitGainJob(Job):
-    """Fit the density gain of a human in one pose."""
-
-    kind = method = "fit_gain"
-    undo = "Fit Density Gain"
-    decimals: ClassVar[int] = 2
-
-    target: HumanTarget
-    moment: Moment
-
-    @property
-    def label(self) -> str:
-        return f"Fit Density Gain: {self.target.name}"
-
-    def params(self, _folder: Path) -> dict[str, Any]:
-        return {"people": [{**self.moment.params, "human": self.target.file_now()}]}
-
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        person, gain = self.target.found(), round(result["gain"], self.decimals)
-        set_density_gain(person, gain)
-        return (
-            f"Density gain {gain:g} for {person.name}: opacity is off by {100 * result['error']:.1f} % on average, by "
-            f"{100 * result['error_before']:.1f} % with {result['gain_before']:g}"
-        )
 
 
 def _grid(folder: Path, index: int) -> Path:

@@ -143,7 +143,6 @@ def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, pe
         draw_lines(layout, "The human's material has no node Density Gain", "INFO")
     else:
         layout.prop(person, "primdiffusion_density_gain")
-    draw_job(layout, "fit_gain", "primdiffusion.fit_density_gain", "MOD_OPACITY")
     warning = overlap_warning_in(context.scene, person)
     if warning is not None and attachment_of(person) != "MERGED":
         draw_lines(layout, sentence(f"{warning}, or merge the human"), "ERROR")

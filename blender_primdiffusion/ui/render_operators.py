@@ -146,19 +146,6 @@ def _unmerge(person: bpy.types.Collection) -> None:
     remove_merged(person)
 
 
-class PRIMDIFFUSION_OT_fit_density_gain(OnPerson, bpy.types.Operator):
-    """Find the density gain with which Cycles shows the selected human as opaque as the PrimDiffusion engine does"""
-
-    bl_idname = "primdiffusion.fit_density_gain"
-    bl_label = "Fit Density Gain"
-
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.merge import FitGainJob  # needs numpy
-
-        graph = context.evaluated_depsgraph_get()
-        return submit(self, context, FitGainJob(HumanTarget.of(person), _moment(person, graph)))
-
-
 def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
     from ..jobs.merge import Moment  # needs numpy
 

@@ -217,8 +217,6 @@ def render(module: str, python: str) -> Steps:
     yield from wait(lambda: not queue.busy, 240)
     yield "render_merged"
     press("primdiffusion.apply_pose", pose_name="Waving")
-    press("primdiffusion.fit_density_gain")
-    yield from wait(lambda: not queue.busy, 240)
     press("primdiffusion.set_up_engine")
     yield "render_outdated"
 

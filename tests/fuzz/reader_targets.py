@@ -70,7 +70,7 @@ def read_by_both(path: Path) -> None:
 def make_requests(folder: Path) -> Path:
     """Requests, each with an empty line behind it so that it is run before the next one comes, and a notification."""
     lines = [json.dumps({"jsonrpc": "2.0", "method": "cancel", "params": {"id": 1}})]
-    for id, name in enumerate(("hello", "attributes", "cancel", "render", "fit_gain")):
+    for id, name in enumerate(("hello", "attributes", "cancel", "render", "merge")):
         lines += [json.dumps({"jsonrpc": "2.0", "id": id, "method": name, "params": served.CALLS[name]}), ""]
     (folder / "requests.json").write_text("\n".join(lines), encoding="utf-8")
     return folder / "requests.json"
@@ -83,7 +83,6 @@ RESULTS: dict[str, dict[str, Any]] = {
         "people": [{"seed": 3, "human": "a.npz", "person": "a.human", "picture": "a.png"}], "seconds": 0.1,
     },
     "merge_frames": {"files": ["a.npz"], "seconds": 1},
-    "fit_gain": {"gain": 1.5, "error": 0.1, "gain_before": 1, "error_before": 0.2},
     "proxy": {"proxy": "a.npz", "texture": "a.png", "betas": [0.5] * 10, "triangles": 500, "seconds": 2.5},
     "hello": {
         "name": "primdiffusion", "version": "1", "protocol": 1, "pid": 7, "python": "3.11", "executable": "python",

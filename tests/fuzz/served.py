@@ -88,7 +88,6 @@ CALLS: dict[str, dict[str, Any]] = {
     },
     "merge": {"people": [POSED], "out": "made/x.npz", "voxel": 0.1},
     "merge_frames": {"people": [POSED, POSED], "out_dir": "made", "voxel": 0.1},
-    "fit_gain": {"people": [POSED]},
     "proxy": {**PERSON, "out_dir": "made", "betas": [0.5] * 10, "triangles": 500, "texture_px": 64, "spacing": 0.05},
     "gaussians": {
         **PERSON, "out": "made/x.ply", "object": STILL, "joints": [STILL] * 24, "betas": [0.5] * 10, "limit": 50,

@@ -1,6 +1,6 @@
 """Merge humans into voxel grids for other renderers.
 
-`primdiffusion merge`, and `merge`, `merge_frames` and `fit_gain` of JSON-RPC.
+`primdiffusion merge`, and `merge` and `merge_frames` of JSON-RPC.
 """
 
 from __future__ import annotations
@@ -17,18 +17,13 @@ import tyro
 
 from primdiffusion.commands.frame import PosedPerson
 from primdiffusion.commands.request import Pace, ReportProgress, check_ending, check_voxel, parse
-from primdiffusion.formats.requests import DENSITY_GAIN, VOXEL
+from primdiffusion.formats.requests import VOXEL
 from primdiffusion.formats.whole_files import written_whole
 
 if TYPE_CHECKING:
     from primdiffusion.commands.session import Session
     from primdiffusion.human import Human
     from primdiffusion.primitives.primitives import Primitives
-
-GAIN_VIEWS = 4
-"""Views around the human."""
-GAIN_PIXELS = 128
-"""Width and height of each view; about ten thousand of the 4 x 128 x 128 rays meet a standing human."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -93,41 +88,6 @@ class MergeFramesRequest:
             files.append(str(file))
             report("merge", index + 1, count, pace.left(index + 1, count))
         return {"files": files, "seconds": round(time.perf_counter() - began, 3)}
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class FitGainRequest:
-    """Fit the density gain for renderers with exponential absorption. Needs no checkpoint."""
-
-    people: list[PosedPerson]
-    """Humans in the pose to fit in."""
-
-    def check(self) -> None:
-        """See `RequestRecord`."""
-        _check_people(self.people)
-
-    def run(self, session: Session, report: ReportProgress) -> dict[str, Any]:
-        """Return the gain, fitted in views around the humans. Raises as `fit_gain`."""
-        import numpy as np  # late
-
-        # torch is loaded late
-        from primdiffusion.human import framing
-        from primdiffusion.render.merge import fit_gain, unclamped_alpha
-
-        primitives = _together(self.people)
-        reached = []
-        for view in range(GAIN_VIEWS):
-            report("fit", view, GAIN_VIEWS, None)
-            camera = framing(primitives, 2 * math.pi * view / GAIN_VIEWS, GAIN_PIXELS, GAIN_PIXELS)
-            reached.append(unclamped_alpha(primitives, camera).numpy())
-        fit = fit_gain(np.stack(reached))
-        return {
-            "gain": round(fit.gain, 3),
-            "error": round(fit.error, 5),
-            "gain_before": DENSITY_GAIN,
-            "error_before": round(fit.error_before, 5),
-            "rays": fit.rays,
-        }
 
 
 def _check_people(people: list[PosedPerson]) -> None:

@@ -1,4 +1,4 @@
-"""Merge all boxes into one voxel grid for renderers with exponential absorption, and fit their gain on density."""
+"""Merge all boxes into one voxel grid for renderers with exponential absorption."""
 
 from __future__ import annotations
 
@@ -10,13 +10,10 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from numpy import ndarray
-from torch import Tensor
 
-from primdiffusion.formats.requests import DENSITY_GAIN, VOXEL
-from primdiffusion.geometry.camera import Camera
+from primdiffusion.formats.requests import VOXEL
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
 from primdiffusion.render.cpu_compiled import kernel, on_all_threads, take
-from primdiffusion.render.march import MarchSettings, march
 
 _HALF_POWER = WINDOW_POWER // 2
 
@@ -183,57 +180,3 @@ def _around(values: ndarray) -> ndarray:
         total[:-1] += moved[1:]
         values = np.moveaxis(total, 0, axis)
     return values
-
-
-FAINT = 1e-4
-"""Factor on density with which no ray of a human saturates."""
-MET = 1e-3
-"""Rays with less opacity than this miss the human."""
-SMALLEST_GAIN, LARGEST_GAIN = 0.1, 20.0
-
-
-@dataclasses.dataclass(frozen=True)
-class GainFit:
-    """The gain that reproduces the paper's alpha best."""
-
-    gain: float
-    error: float
-    """Mean absolute difference of alpha over rays that hit the human, with this gain."""
-    error_before: float
-    """The same for DENSITY_GAIN."""
-    rays: int
-    """Number of rays that hit the human."""
-
-
-def unclamped_alpha(
-    primitives: Primitives,
-    camera: Camera,
-    settings: MarchSettings = MarchSettings(),  # noqa: B008
-) -> Float[Tensor, "h w"]:
-    """Sum of all opacities along each ray, before the marcher clamps it to 1 (SPEC 4).
-
-    Computed by marching with density scaled by FAINT, so that no ray saturates.
-    """
-    faint = dataclasses.replace(primitives, density=primitives.density * FAINT)
-    return march(faint, camera, settings).alpha / FAINT
-
-
-def fit_gain(reached: Float[ndarray, "n"]) -> GainFit:
-    """Minimise the mean of |(1 - exp(-g s)) - min(s, 1)| over g, for rays with `unclamped_alpha` s >= MET.
-
-    Accurate to 0.1 %, between SMALLEST_GAIN and LARGEST_GAIN. Raises ValueError if no ray hits anything.
-    """
-    met = np.asarray(reached, np.float64).ravel()
-    met = met[met >= MET]
-    if len(met) == 0:
-        raise ValueError("no ray hits the human, so the gain cannot be fitted: generate the human again")
-
-    def error(gain: float) -> float:
-        return float(np.abs(-np.expm1(-gain * met) - np.minimum(met, 1)).mean())
-
-    candidates = np.geomspace(SMALLEST_GAIN, LARGEST_GAIN, 100)
-    for _ in range(2):
-        best = int(np.argmin([error(gain) for gain in candidates]))
-        candidates = np.geomspace(candidates[max(best - 1, 0)], candidates[min(best + 1, len(candidates) - 1)], 100)
-    gain = float(candidates[int(np.argmin([error(gain) for gain in candidates]))])
-    return GainFit(gain, error(gain), error(DENSITY_GAIN), len(met))

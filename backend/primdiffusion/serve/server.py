@@ -27,7 +27,7 @@ from primdiffusion.commands.edit import InpaintRequest, InterpolateRequest, Tran
 from primdiffusion.commands.export import GaussiansRequest, HumanNpzRequest, ProxyRequest
 from primdiffusion.commands.generate import GenerateRequest, VariationsRequest
 from primdiffusion.commands.info import AttributesRequest
-from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, MergeRequest
+from primdiffusion.commands.merge import MergeFramesRequest, MergeRequest
 from primdiffusion.commands.reconstruct import ReconstructRequest
 from primdiffusion.commands.render import DrawRequest, RenderRequest
 from primdiffusion.commands.request import ParameterError, RequestRecord, parse, read_record, read_request
@@ -68,7 +68,6 @@ REQUESTS: dict[str, type[RequestRecord]] = {
     "draw": DrawRequest,
     "merge": MergeRequest,
     "merge_frames": MergeFramesRequest,
-    "fit_gain": FitGainRequest,
     "proxy": ProxyRequest,
     "gaussians": GaussiansRequest,
     "human_npz": HumanNpzRequest,

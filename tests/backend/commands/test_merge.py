@@ -9,11 +9,10 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.frame import PosedPerson
-from primdiffusion.commands.merge import FitGainRequest, MergeFramesRequest, MergeRequest
+from primdiffusion.commands.merge import MergeFramesRequest, MergeRequest
 from primdiffusion.commands.request import RequestRecord, read_request
 from primdiffusion.commands.session import Session
 from primdiffusion.export.merged_file import upright_grid
-from primdiffusion.formats.requests import DENSITY_GAIN
 from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.merge import merge
@@ -106,14 +105,6 @@ def test_a_cancelled_merge_leaves_no_file(person, tmp_path):
     assert not list(tmp_path.glob("*grid*"))
 
 
-def test_a_fitted_gain_is_at_least_as_good_as_the_usual_one(person):
-    fit = done(FitGainRequest(people=[person]))
-    assert fit["error"] <= fit["error_before"] < 0.2
-    assert fit["gain_before"] == DENSITY_GAIN
-    assert 0.1 <= fit["gain"] <= 20
-    assert fit["rays"] > 1000
-
-
 @pytest.mark.parametrize(
     ("record", "wrong", "name"),
     [
@@ -123,7 +114,6 @@ def test_a_fitted_gain_is_at_least_as_good_as_the_usual_one(person):
         (MergeFramesRequest, {"people": [], "out_dir": "folder"}, "people"),
         (MergeFramesRequest, {"out_dir": ""}, "out_dir"),
         (MergeFramesRequest, {"out_dir": "folder", "voxel": float("inf")}, "voxel"),
-        (FitGainRequest, {"people": []}, "people"),
     ],
 )
 def test_a_wrong_parameter_is_named(record, wrong, name):
@@ -133,4 +123,4 @@ def test_a_wrong_parameter_is_named(record, wrong, name):
 
 
 def test_the_child_knows_the_methods():
-    assert {"merge", "merge_frames", "fit_gain"} <= set(REQUESTS)
+    assert {"merge", "merge_frames"} <= set(REQUESTS)

@@ -19,7 +19,7 @@ from blender_primdiffusion.jobs.export import (
     posed_frames,
     posed_now,
 )
-from blender_primdiffusion.jobs.merge import FitGainJob, MergeJob, Moment
+from blender_primdiffusion.jobs.merge import MergeJob, Moment
 from blender_primdiffusion.jobs.queue import Job
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
@@ -42,7 +42,6 @@ def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Job]:
         TransferJob.of(person, 3, {"other": "/a/b"}),
         BlendJob.of(person, 3, {"other": "/a/b", "fraction": 0.5}),
         MergeJob(target, moment, 0.006),
-        FitGainJob(target, moment),
         ExportMeshJob(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
         AddProxyJob(target, 512, 9000),
         ExportGaussiansJob(target, folder / "ä.ply", posed_now(context, person), 500),

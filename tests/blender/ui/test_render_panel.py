@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
-from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
 from blender_primdiffusion import places
@@ -30,7 +29,6 @@ from blender_primdiffusion.scene.human import (
     sequence_files,
     volume_path,
 )
-from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.ui import advanced_panel, render_panel
 
@@ -195,18 +193,7 @@ def test_a_renamed_bone_is_rejected_with_what_to_do(person):
 def test_a_missing_file_of_the_person_is_named(person):
     (folder_of(person) / "person.human.safetensors").unlink()
     with pytest.raises(RuntimeError, match=r"person\.human\.safetensors"):
-        ops.fit_density_gain()
-
-
-def test_a_fitted_gain_is_the_person_s_and_the_slider_changes_it(person):
-    assert ops.fit_density_gain() == {"FINISHED"}
-    assert density_gain(person) == pytest.approx(1.54)
-    assert "1.54" in notice_of("fit_gain")
-    assert "1.4 % with 1.6" in notice_of("fit_gain")
-    person.primdiffusion_density_gain = 3.0
-    assert density_gain(person) == person.primdiffusion_density_gain == 3.0
-    bpy.ops.ed.undo()
-    assert density_gain(humans(bpy.context.scene)[0]) == pytest.approx(DENSITY_GAIN)
+        ops.merge()
 
 
 def test_set_attachment_reports_what_stands_in_the_way(person):

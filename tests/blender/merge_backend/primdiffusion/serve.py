@@ -43,11 +43,7 @@ def merge_frames(params: dict) -> dict:
     return {"files": [], "seconds": 0.1}
 
 
-def fit_gain(_params: dict) -> dict:
-    return {"gain": 1.543, "error": 0.01, "gain_before": 1.6, "error_before": 0.014, "rays": 100}
-
-
-WORK = {"merge": merge, "merge_frames": merge_frames, "fit_gain": fit_gain}
+WORK = {"merge": merge, "merge_frames": merge_frames}
 cancelled = threading.Event()
 
 
