@@ -2,26 +2,38 @@
 
 A pickle is a program that may call any importable function. This reader maps every allowed global to one of the inert
 records below, which only store their arguments, and rejects all others. `as_array` rebuilds arrays afterwards, so not
-even numpy or scipy interprets the file's instructions. Reads files written by Python 2 (latin1 strings), chumpy, and
-old and new versions of numpy and scipy; chumpy need not be installed.
+even numpy or scipy interprets the file's instructions. Before Python's unpickler runs, a scan of the operations rejects
+those that would take memory, time or C stack out of proportion to the file. Reads files written by Python 2 (latin1
+strings), chumpy, and old and new versions of numpy and scipy; chumpy need not be installed.
 """
 
 from __future__ import annotations
 
+import io
+import pickle
+import pickletools
 import re
 
 import numpy as np
 import scipy.sparse
 
-from primdiffusion.body.pickle_opcodes import Inert, load_pickle
 from primdiffusion.formats.regular_files import FileContent
 
+MOST_OPERATIONS = 300_000
+"""SMPL's files have a few thousand: their arrays are one string each. Indices of the memo, for which the unpickler
+reserves memory, are below it too."""
+MOST_TUPLES = 2000
+"""Some six for each array. Tuples in tuples are hashed recursively if they are the key of a dictionary."""
 MOST_NUMBERS = 10_000_000
 """In sparse matrices as they become dense; the regressor of SMPL's joints has 165,360."""
 MOST_LISTED = 2_000_000
 """Numbers in lists, each of which is visited; SMPL's arrays are not lists."""
 MAX_NESTING = 8
 """Limit on nested chumpy selections; body models nest less."""
+_DAMAGED = (
+    pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError, EOFError,
+)  # fmt: skip
+"""What the unpickler raises where operations do not fit their values."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
 
 
@@ -31,6 +43,23 @@ class BodyFileError(ValueError):
 
 class UnsafePickleError(BodyFileError):
     """A pickle names a global that a body model does not need."""
+
+
+class Inert:
+    """Constructor arguments and state of a pickled object."""
+
+    arguments: tuple[object, ...]
+    state: object
+
+    def __new__(cls, *arguments: object) -> Inert:
+        """Store the arguments: the operations of a pickle call __new__ or the class."""
+        self = object.__new__(cls)
+        self.arguments, self.state = arguments, None
+        return self
+
+    def __setstate__(self, state: object) -> None:
+        """Store the state. The unpickler sets attributes itself where a class has no such method."""
+        self.state = state
 
 
 class _Array(Inert):
@@ -65,10 +94,10 @@ class _SparseColumns(Inert):
     """scipy's compressed sparse columns: state["data"], ["indices"], ["indptr"], ["_shape"]."""
 
 
-class _Reconstructed:
+class _Reconstructed(Inert):
     """copyreg's object constructor of protocols 0 and 1: arguments (class, base, base state)."""
 
-    def __new__(cls, kind: object, *_: object) -> Inert:  # type: ignore[misc]
+    def __new__(cls, kind: object, *_: object) -> Inert:
         if not (isinstance(kind, type) and issubclass(kind, Inert)):
             raise UnsafePickleError(
                 f"The pickle rebuilds a {type(kind).__name__}, which is no array; take the publisher's file again."
@@ -98,14 +127,34 @@ _GLOBALS: dict[tuple[str, str], type] = {
 }
 
 
-def _find(module: str, name: str) -> type:
-    try:
-        return _GLOBALS[module, name]
-    except KeyError:
-        raise UnsafePickleError(
-            f"it asks for the global {f'{module}.{name}':.80}, which a body model does not need, so nothing in "
-            "it was run; take the file from its publisher again, or convert it to .npz where you trust it."
-        ) from None
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> type:
+        """Return an inert record. Raises UnsafePickleError for other globals."""
+        try:
+            return _GLOBALS[module, name]
+        except KeyError:
+            raise UnsafePickleError(
+                f"it asks for the global {f'{module}.{name}':.80}, which a body model does not need, so nothing in "
+                "it was run; take the file from its publisher again, or convert it to .npz where you trust it."
+            ) from None
+
+
+class _Scanned(io.BytesIO):
+    def readline(self, *_: object) -> bytes:
+        """An empty string for each in quotes: pickletools takes them for ASCII, and Python 2 wrote latin1."""
+        line = super().readline()
+        return b"''\n" if line[:1] in (b"'", b'"') and line.endswith(b"\n") else line
+
+
+def _scan(data: bytes) -> None:
+    """Raise ValueError for lengths beyond the data's end, and for numbers of operations beyond the limits."""
+    tuples = 0
+    for number, (operation, argument, _) in enumerate(pickletools.genops(_Scanned(data))):
+        tuples += operation.name.startswith("TUPLE")
+        if number >= MOST_OPERATIONS or tuples > MOST_TUPLES:
+            raise ValueError("it has more operations than a body model")
+        if operation.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) >= MOST_OPERATIONS:
+            raise ValueError(f"it remembers a value as number {argument!s:.20}")
 
 
 def read_pickle(file: FileContent) -> dict[str, object]:
@@ -128,14 +177,24 @@ def load_restricted(data: bytes, name: str) -> object:
 
     Raises:
         UnsafePickleError: the pickle names a global outside the list above.
-        BodyFileError: it is not a pickle, is truncated, or exceeds the limits of `load_pickle`.
+        BodyFileError: it is not a pickle, is truncated, or exceeds MOST_OPERATIONS or MOST_TUPLES.
     """
     try:
-        return load_pickle(data, _find)
+        _scan(data)
+        return _Unpickler(io.BytesIO(data), encoding="latin1").load()
     except UnsafePickleError as error:
         raise UnsafePickleError(f"{name}: {error}") from None
-    except ValueError as error:  # also of numbers and texts that are none
-        raise BodyFileError(f"{name} is not a whole pickle file ({error!s:.100}); download it again.") from error
+    except (
+        pickle.UnpicklingError,
+        ValueError,
+        TypeError,
+        LookupError,
+        AttributeError,
+        OverflowError,
+        EOFError,
+    ) as error:
+        reason = " ".join(str(error).split())
+        raise BodyFileError(f"{name} is not a whole pickle file ({reason:.80}); download it again.") from error
 
 
 def array_of_objects(value: object) -> list[object]:
