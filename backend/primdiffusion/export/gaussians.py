@@ -18,13 +18,13 @@ from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from primdiffusion.export.field import pack_field
 from primdiffusion.export.surface import depth_below
 from primdiffusion.formats.requests import GAUSSIANS
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
+from primdiffusion.render.merge import merge
 
 WIDTH = 1 / 6**0.5
 """Standard deviation of a voxel's trilinear kernel, in voxel spacings: the Gaussian has the kernel's own variance."""
@@ -33,6 +33,8 @@ GAIN = 1.2
 marcher adds opacities until 1 and so occludes sooner."""
 DEEPEST = 0.025
 """Depth below the surface beyond which voxels are dropped as invisible, metres."""
+DEPTH_VOXEL = 0.008
+"""Voxel of the grid in which depth is measured, metres."""
 FAINTEST = 1 / 255
 """Opacity below which viewers skip a Gaussian."""
 C0 = 0.28209479177387814
@@ -76,7 +78,8 @@ def gaussians_of(primitives: Primitives, limit: int = GAUSSIANS) -> Gaussians:
     box, d, h, w = (opacity >= FAINTEST).nonzero(as_tuple=True)
     local = torch.stack([centre[w], centre[h], centre[d]], -1) * primitives.half_extent[box]
     position = primitives.position[box] + (primitives.rotation[box] @ local[..., None])[..., 0]
-    seen = torch.from_numpy(depth_below(pack_field(primitives), position.double().cpu().numpy()) <= DEEPEST)
+    grid = merge(primitives, DEPTH_VOXEL, points=1)
+    seen = torch.from_numpy(depth_below(grid, position.double().cpu().numpy()) <= DEEPEST)
     kept = opacity[box, d, h, w].clamp_max(0.995)
     chosen = seen.to(kept.device).nonzero()[:, 0]
     if len(chosen) > limit:

@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray as Array
 from PIL import Image
-from scipy import ndimage, sparse
+from scipy import ndimage, sparse, spatial
 from torch import Tensor
 
-from primdiffusion.export.field import Field, march_rays, pack_field, weights_at
 from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
 from primdiffusion.formats import requests
@@ -25,7 +24,9 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, ver
 from primdiffusion.human import Human, body_of, place
 from primdiffusion.people.gltf import Skeleton, glb
 from primdiffusion.primitives.anchors import anchor_skin_weights
+from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.uv_atlas import rasterise_uv
+from primdiffusion.render.merge import Merged, merge
 from primdiffusion.worker_process import run_in_process
 
 OUTSIDE = 0.008
@@ -33,6 +34,10 @@ OUTSIDE = 0.008
 INSIDE = 0.024
 """End of a texel's ray: depth below the surface, metres."""
 STEP = 0.002
+NEAREST_BOXES = 16
+"""Boxes whose skin weights a vertex takes."""
+FALLOFF = 0.03
+"""Distance beyond the nearest box's centre at which the weight of a box is 1/e of that one's, metres."""
 SMOOTHING = 6
 """Smoothing iterations of skin weights along the mesh."""
 INFLUENCES = 4
@@ -105,9 +110,10 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
     Exceptions raised by `on_stage` cancel. Raises NoSurface. Takes about ten seconds of processor time.
     """
     body, anchors = body_of(human)
-    field = pack_field(place(human))
+    primitives = place(human)
     on_stage("surface", 0, 3)
-    fine = outside_surface(field, settings.spacing, lambda: on_stage("surface", 0, 3))
+    grid = merge(primitives, settings.spacing, points=1)
+    fine = outside_surface(grid, lambda: on_stage("surface", 0, 3))
     *coarse, corner_uv = run_in_process(
         simplified_and_unwrapped,
         *fine,
@@ -116,31 +122,39 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
         on_wait=lambda: on_stage("unwrap", 1, 3),
     )
     surface = OuterSurface(*coarse)
-    weights = skin_weights(field, surface, anchor_skin_weights(anchors, body))
-    texture = bake_texture(field, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
+    weights = skin_weights(primitives, surface, anchor_skin_weights(anchors, body))
+    colours = grid if settings.spacing <= requests.VOXEL else merge(primitives, points=1)
+    texture = bake_texture(colours, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
     joints = body.shape(human.betas).joints.detach().double().numpy()
     skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), joints)
     return MeshProxy(surface.vertices, surface.faces, corner_uv, weights, texture, skeleton)
 
 
-def skin_weights(field: Field, surface: OuterSurface, box_weights: Float[Tensor, "k 24"]) -> Float32[Array, "v 24"]:
-    """Skin weights of the vertices: those of the boxes, smoothed along the mesh, limited to INFLUENCES joints."""
-    weights = weights_at(field, surface.vertices, box_weights.detach().cpu().numpy())
+def skin_weights(
+    primitives: Primitives, surface: OuterSurface, box_weights: Float[Tensor, "k 24"]
+) -> Float32[Array, "v 24"]:
+    """Skin weights of the vertices: a mean over the nearest boxes, smoothed along the mesh, of INFLUENCES joints.
+
+    A box may reach into the other leg and must not move it, so closeness to its centre decides.
+    """
+    centres = spatial.cKDTree(primitives.position.detach().cpu().numpy())
+    away, box = centres.query(surface.vertices, min(NEAREST_BOXES, centres.n))
+    share = np.exp((away[:, :1] ** 2 - away**2) / FALLOFF**2)
+    weights = np.einsum("vb,vbj->vj", share, box_weights.detach().cpu().numpy()[box]).astype(np.float32)
     count = len(surface.vertices)
     edges = np.concatenate([surface.faces[:, [0, 1]], surface.faces[:, [1, 2]], surface.faces[:, [2, 0]]])
     links = sparse.csr_array((np.ones(len(edges), np.float32), tuple(edges.T)), shape=(count, count))
     links = ((links + links.T + sparse.eye_array(count)) > 0).astype(np.float32)
     for _ in range(SMOOTHING):
         weights = links @ weights
-        weights /= np.maximum(weights.sum(1, keepdims=True), 1e-12)  # rows of zeros take their neighbours' weights
-    weights[weights.sum(1) < 0.5, 0] = 1.0
+        weights /= weights.sum(1, keepdims=True)
     largest = np.sort(weights, 1)[:, -INFLUENCES][:, None]
     weights = np.where(weights >= largest, weights, 0)
     return (weights / weights.sum(1, keepdims=True)).astype(np.float32)
 
 
 def bake_texture(
-    field: Field,
+    grid: Merged,
     surface: OuterSurface,
     corner_uv: Float[Array, "f 3 2"],
     texture_px: int,
@@ -157,7 +171,7 @@ def bake_texture(
     for first in range(0, len(points), RAYS_AT_ONCE):
         some = slice(first, first + RAYS_AT_ONCE)
         starts = points[some] + OUTSIDE * normals[some]
-        colour[some], alpha[some] = march_rays(field, starts, -normals[some], OUTSIDE + INSIDE, STEP)
+        colour[some], alpha[some] = _march_inwards(grid, starts, -normals[some])
         on_wait()
     seen = alpha > 0.1
     picture = np.zeros((texture_px, texture_px, 3), np.float32)
@@ -167,6 +181,24 @@ def bake_texture(
     nearest = np.asarray(ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True))
     picture = picture[tuple(nearest)][::-1]  # v points up, rows of a picture down
     return np.rint(picture * 255).astype(np.uint8)
+
+
+def _march_inwards(grid: Merged, origins: Array, directions: Array) -> tuple[Array, Array]:
+    """Straight (not premultiplied) linear colour [N, 3] and opacity [N] along rays [N, 3] of OUTSIDE + INSIDE metres.
+
+    Composited as by the marcher: opacities add up until 1 is reached (SPEC 4). Empty rays are black.
+    """
+    colour, alpha = np.zeros((len(origins), 3)), np.zeros(len(origins))
+    for step in range(round((OUTSIDE + INSIDE) / STEP)):
+        rays = np.flatnonzero(alpha < 1)
+        at = ((origins[rays] + (step + 0.5) * STEP * directions[rays] - grid.origin) / grid.voxel).T
+        part = np.minimum(ndimage.map_coordinates(grid.density, at, order=1) * STEP, 1 - alpha[rays])
+        met = part > 0
+        rays, at, part = rays[met], at[:, met], part[met]
+        alpha[rays] += part
+        for channel in range(3):
+            colour[rays, channel] += part * ndimage.map_coordinates(grid.colour[..., channel], at, order=1)
+    return colour / np.maximum(alpha, 1e-12)[:, None], alpha
 
 
 def write_proxy_glb(path: str | Path, proxy: MeshProxy, provenance: Mapping[str, Any]) -> None:

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray as Array
 from scipy import ndimage
 
-from primdiffusion.export.field import Field, density_at
+from primdiffusion.render.merge import Merged
 
 LEVEL = 12.0
 """Isosurface density, 1/m: gives mesh and marched image silhouettes of equal area. It is low because grazing rays are
@@ -19,7 +19,8 @@ SMALLEST_PIECE = 5e-5
 """Volume below which a disconnected piece is dropped, cubic metres."""
 GAP = 0.012
 """Openings narrower than this are closed before cavities are filled, metres."""
-POINTS_AT_ONCE = 2**19
+_MARGIN = 2
+"""Empty points around the grid, so that gaps are closed at its sides too."""
 THIN = "this human is nowhere dense enough to have a surface: generate it again"
 
 
@@ -35,49 +36,25 @@ class OuterSurface(NamedTuple):
     faces: Int64[Array, "f 3"]
 
 
-class DensityGrid(NamedTuple):
-    """Density at the points origin + spacing * index."""
-
-    density: Float64[Array, "x y z"]
-    """1/m."""
-    origin: Float64[Array, "3"]
-    spacing: float
-
-
-def outside_surface(field: Field, spacing: float, on_wait: Callable[[], None] = lambda: None) -> OuterSurface:
+def outside_surface(grid: Merged, on_wait: Callable[[], None] = lambda: None) -> OuterSurface:
     """Extract the outer surface by marching cubes (libigl); cavities are filled, small pieces dropped.
 
-    `spacing` is the grid's in metres. `on_wait` is called regularly; exceptions it raises cancel. Raises NoSurface.
+    `on_wait` is called regularly; exceptions it raises cancel. Raises NoSurface.
     """
     import igl  # large, and used only here
 
-    grid = density_grid(field, spacing, on_wait)
-    solid = filled(grid.density > LEVEL, spacing)
+    density = np.pad(grid.density, _MARGIN)
+    solid = filled(density > LEVEL, grid.voxel)
     if not solid.any():
         raise NoSurface(THIN)
-    values = np.where(grid.density > LEVEL, grid.density, 2 * LEVEL)  # cavities and closed gaps count as full
-    values = np.where(solid, np.minimum(values, 2 * LEVEL), np.minimum(grid.density, LEVEL * 0.999))
+    on_wait()
+    values = np.where(density > LEVEL, density, 2 * LEVEL)  # cavities and closed gaps count as full
+    values = np.where(solid, np.minimum(values, 2 * LEVEL), np.minimum(density, LEVEL * 0.999))
     corners, cubes = _cubes_across(solid)
-    places = grid.origin + spacing * np.stack(np.unravel_index(corners, solid.shape), -1)
+    places = grid.origin + grid.voxel * (np.stack(np.unravel_index(corners, solid.shape), -1) - _MARGIN)
     on_wait()
     vertices, faces, _ = igl.marching_cubes(values.ravel()[corners].astype(np.float64), places, cubes, LEVEL)
     return _large_pieces(np.asarray(vertices), np.asarray(faces)[:, ::-1])
-
-
-def density_grid(field: Field, spacing: float, on_wait: Callable[[], None] = lambda: None) -> DensityGrid:
-    """Sample the field on a grid around all boxes, padded by three empty points on every side."""
-    margin = 3 * spacing
-    reach = np.abs(np.linalg.inv(field.to_local)).sum(-1)
-    low = (field.position - reach).min(0) - margin
-    shape = np.ceil(((field.position + reach).max(0) + margin - low) / spacing).astype(np.int64) + 1
-    total = int(shape.prod())
-    density = np.empty(total)
-    for first in range(0, total, POINTS_AT_ONCE):
-        index = np.arange(first, min(first + POINTS_AT_ONCE, total))
-        points = low + spacing * np.stack(np.unravel_index(index, tuple(shape)), -1)
-        density[first : first + len(index)] = density_at(field, points)
-        on_wait()
-    return DensityGrid(density.reshape(shape), low, spacing)
 
 
 def filled(solid: Bool[Array, "x y z"], spacing: float) -> Bool[Array, "x y z"]:
@@ -87,11 +64,11 @@ def filled(solid: Bool[Array, "x y z"], spacing: float) -> Bool[Array, "x y z"]:
     return solid | (inside & np.logical_not(closed))  # gaps that only the closing filled stay open
 
 
-def depth_below(field: Field, points: Float64[Array, "n 3"], spacing: float = 0.008) -> Float64[Array, "n"]:
-    """Depth of points below the outer surface, metres, accurate to `spacing`; 0 outside."""
-    grid = density_grid(field, spacing)
-    depth = np.asarray(ndimage.distance_transform_edt(filled(grid.density > LEVEL, spacing))) * spacing
-    index = np.rint((points - grid.origin) / spacing).astype(np.int64)
+def depth_below(grid: Merged, points: Float64[Array, "n 3"]) -> Float64[Array, "n"]:
+    """Depth of points below the outer surface, metres, accurate to a voxel; 0 outside."""
+    solid = filled(np.pad(grid.density, _MARGIN) > LEVEL, grid.voxel)
+    depth = np.asarray(ndimage.distance_transform_edt(solid)) * grid.voxel
+    index = np.rint((points - grid.origin) / grid.voxel).astype(np.int64) + _MARGIN
     return depth[tuple(index.clip(0, np.array(depth.shape) - 1).T)]
 
 

@@ -9,19 +9,25 @@ import torch
 import trimesh
 from export_people import person
 from PIL import Image
-from primdiffusion.body.model import BodyPose
+from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.export.proxy import (
     ARRAYS,
+    OUTSIDE,
     TEXTURE,
     ProxySettings,
+    _march_inwards,
     mesh_proxy,
+    skin_weights,
     write_proxy_arrays,
     write_proxy_glb,
     write_proxy_obj,
 )
+from primdiffusion.export.surface import OuterSurface
 from primdiffusion.human import framing, place, pose_body
+from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 from primdiffusion.raster.rasterise import rasterise
-from primdiffusion.render.march import march
+from primdiffusion.render.march import MarchSettings, march
+from primdiffusion.render.merge import merge
 
 SMALL = ProxySettings(spacing=0.012, triangles=4000, texture_px=256)
 
@@ -50,6 +56,30 @@ def test_each_hand_follows_its_own_arm():
     left = proxy().vertices[:, 0] > 0.65
     arm = [16, 18, 20, 22]
     assert proxy().skin_weights[left][:, arm].sum(1).min() > 0.99
+
+
+def test_each_leg_follows_itself_though_boxes_of_the_other_reach_it():
+    primitives, body = place(person()), default_body()
+    joints = body.shape(torch.zeros(10)).joints.double().numpy()
+    shin = (joints[4] + joints[7]) / 2 + np.array([[0.0, 0.0, 0.03], [0.01, 0.0, 0.03], [0.0, 0.01, 0.03]])
+    found = skin_weights(
+        primitives, OuterSurface(shin, np.array([[0, 1, 2]])), anchor_skin_weights(default_anchors(), body)
+    )
+    assert found[:, [1, 4, 7]].sum(1).min() > 0.99
+
+
+def test_rays_inwards_see_what_the_marcher_draws():
+    primitives = place(person())
+    camera = framing(primitives, 0.4, 48, 48)
+    drawn = march(primitives, camera, MarchSettings(step=0.001))
+    full = drawn.alpha.reshape(-1) > 0.99
+    origin, directions = camera.rays()
+    rays = directions.reshape(-1, 3)[full]
+    entered = drawn.depth.reshape(-1)[full, None] - OUTSIDE
+    colour, alpha = _march_inwards(merge(primitives, points=1), (origin + entered * rays).numpy(), rays.numpy())
+    straight = (drawn.rgb.reshape(-1, 3)[full] / drawn.alpha.reshape(-1)[full, None]).numpy()
+    assert np.abs(colour - straight)[alpha > 0.99].mean() < 0.01
+    assert (alpha > 0.99).mean() > 0.9
 
 
 @pytest.mark.parametrize("raised", [0.0, -0.9])
