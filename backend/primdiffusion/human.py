@@ -32,7 +32,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import polar
-from primdiffusion.primitives.anchors import Anchors, attach, default_anchors
+from primdiffusion.primitives.anchors import Anchors, attach, default_anchors, stretched
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
@@ -175,7 +175,7 @@ def place(
     Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
     """
     body, anchors = body_of(human, body, anchors)
-    frames = attach(anchors, pose_body(human.betas, pose, body).vertices, body.faces)
+    frames = _frames(human, pose_body(human.betas, pose, body).vertices, body, anchors)
     return Primitives.place(frames, human.payload)
 
 
@@ -209,7 +209,7 @@ def place_skinned(
         raise ValueError(f"the object's mean scale is {scale:.3g}: give it a nonzero scale along every axis")
     orthogonal, unit_stretch = orthogonal.to(skinning), (stretch / scale).to(skinning)
     vertices = body.shape(human.betas).follow(skinning) @ unit_stretch.T
-    frames = attach(anchors, vertices, body.faces)
+    frames = _frames(human, vertices, body, anchors)
     frames = Frames(
         position=frames.position @ (scale * orthogonal).T + object_to_world[:3, 3],
         rotation=orthogonal @ frames.rotation,
@@ -220,6 +220,14 @@ def place_skinned(
     return Primitives.place(
         frames, payload if unscaled else dataclasses.replace(payload, density=payload.density / scale)
     )
+
+
+def _frames(human: Human, vertices: Float[Tensor, "v 3"], body: BodyModel, anchors: Anchors) -> Frames:
+    """Frames on posed vertices; boxes follow the stretch of the skin, except those of the released code."""
+    frames = attach(anchors, vertices, body.faces)
+    if human.body_setup is not None:
+        return frames
+    return stretched(frames, anchors, vertices, body.shape(human.betas).vertices)
 
 
 def body_of(human: Human, body: BodyModel | None = None, anchors: Anchors | None = None) -> tuple[BodyModel, Anchors]:

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel
 from primdiffusion.human import Human, body_of
-from primdiffusion.primitives.anchors import Anchors, tangent_plane
+from primdiffusion.primitives.anchors import Anchors, cell_sides
 
 SHARE = 0.5
 """Exponent of the stretch: 0 keeps box sizes, 1 scales boxes with the surface."""
@@ -55,11 +55,3 @@ def box_growth(
     sides = [cell_sides(anchors, body.shape(betas).vertices) for betas in (before, after)]
     stretch = sides[1] / sides[0].clamp_min(torch.finfo(sides[0].dtype).tiny)
     return torch.cat([stretch**SHARE, torch.ones_like(stretch[..., :1])], -1)
-
-
-def cell_sides(anchors: Anchors, vertices: Float[Tensor, "v 3"]) -> Float[Tensor, "k 2"]:
-    """Side lengths of the UV grid's cells along T and B = N x T, metres."""
-    du, dv = tangent_plane(anchors, vertices)
-    length = du.norm(dim=-1)
-    area = torch.linalg.cross(du, dv).norm(dim=-1)
-    return torch.stack([length, area / length.clamp_min(torch.finfo(length.dtype).tiny)], -1)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..scene.body_file import read_body_file
 from ..scene.human_file import HumanPayload, file_version, read_sizes
-from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, tangent_frames
+from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, stretch_of, tangent_frames
 from .picture import PosedHuman
 from .view import PinholeView
 
@@ -91,12 +91,15 @@ class BoxRig:
         if not scale > SMALLEST_SCALE:
             raise ValueError(f"the object's mean scale is {scale:.3g}: give it a nonzero scale along every axis")
         centre, du, dv = self._blend(self._posed(betas, human.joints), linear @ human.joints)
+        stretch = 1.0
+        if payload.rest_half_extent is None:  # the released code's boxes, on other bodies, do not follow the skin
+            stretch = stretch_of((du / scale, dv / scale), self._at_rest(tuple(betas))[1])
         rotation = tangent_frames(du, dv)
         rotation[..., 2] *= np.sign(determinant)  # mirrored frames, not frames on a mirrored body
         return Boxes(
             position=centre + human.object_to_world[:, 3],
             rotation=rotation,
-            half_extent=extent * payload.delta_scale * self._growth(tuple(own), tuple(betas)) * scale,
+            half_extent=extent * payload.delta_scale * self._growth(tuple(own), tuple(betas)) * stretch * scale,
             density_scale=1 / scale,
         )
 

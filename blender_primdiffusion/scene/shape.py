@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite
+from ..formats.body_layout import LARGEST_STRETCH
 from .blend_values import as_numbers, stored_numbers
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, armature_of, provenance_of
 
@@ -139,6 +140,15 @@ def box_growth(before: tuple[NDArray, NDArray], after: tuple[NDArray, NDArray]) 
     """Scale factors [K, 3] of boxes whose cells' dP/du and dP/dv [K, 3] at rest change so; see `ShapeModel.growth`."""
     stretch = _sides(*after) / np.maximum(_sides(*before), _TINY)
     return np.concatenate([stretch**SHARE, np.ones_like(stretch[:, :1])], -1)
+
+
+def stretch_of(posed: tuple[NDArray, NDArray], rest: tuple[NDArray, NDArray]) -> NDArray[np.float64]:
+    """Scale factors [K, 3] of boxes whose cells have these dP/du and dP/dv [K, 3] in a pose and at rest.
+
+    Twin of the backend's `anchors.stretched`.
+    """
+    growth = (_sides(*posed) / np.maximum(_sides(*rest), _TINY)).clip(1, LARGEST_STRETCH)
+    return np.concatenate([growth, np.ones_like(growth[:, :1])], -1)
 
 
 def _sides(du: NDArray, dv: NDArray) -> NDArray[np.float64]:

@@ -6,8 +6,8 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.human import Human, generate, place
-from primdiffusion.primitives.anchors import Anchors, default_anchors
-from primdiffusion.reshaping import SHARE, box_growth, cell_sides, reshaped
+from primdiffusion.primitives.anchors import Anchors, cell_sides, default_anchors
+from primdiffusion.reshaping import SHARE, box_growth, reshaped
 from tiny_model import tiny_model
 
 WIDER = torch.tensor([0.3, 2.6, 1.0, 2.2, 0.3, 4.0, 1.5, -1.7, -0.4, -0.3])

@@ -36,6 +36,9 @@ LARGEST_IN_PLANE = {"torso": 0.050, "head": 0.050, "arm": 0.050, "hand": 0.035, 
 NORMAL_HALF_EXTENT = {"torso": 0.055, "head": 0.055, "arm": 0.045, "hand": 0.025, "leg": 0.060, "foot": 0.040}
 """Metres along the normal, by region. Jackets, skirts and hair are 4-6 cm away from the skin; surface outside all boxes
 is missing from the result. Sleeves and shoes are closer, and a hand's eight voxels must resolve fingers 2 cm thick."""
+LARGEST_STRETCH = 1.6
+"""Factor up to which a box grows in its plane when a pose stretches the skin under it. Only about ten boxes, at the
+groin of a raised leg, stretch further."""
 
 
 def read_layout(path: Path) -> dict[str, NDArray]:

@@ -70,6 +70,27 @@ def attach(anchors: Anchors, vertices: Float[Tensor, "*b v 3"], faces: Int[Tenso
     return Frames(position, torch.stack([tangent, bitangent, normal], -1), half_extent)
 
 
+def stretched(
+    frames: Frames, anchors: Anchors, posed: Float[Tensor, "*b v 3"], rest: Float[Tensor, "*b v 3"]
+) -> Frames:
+    """Frames whose boxes grow in their plane where the posed skin is stretched compared with `rest`.
+
+    The paper computes sizes once; then boxes come apart where a pose stretches the skin, at the groin of a raised leg.
+    """
+    tiny = torch.finfo(posed.dtype).tiny
+    growth = cell_sides(anchors, posed) / cell_sides(anchors, rest).clamp_min(tiny)
+    growth = torch.cat([growth.clamp(1, body_layout.LARGEST_STRETCH), torch.ones_like(growth[..., :1])], -1)
+    return dataclasses.replace(frames, half_extent=frames.half_extent * growth)
+
+
+def cell_sides(anchors: Anchors, vertices: Float[Tensor, "*b v 3"]) -> Float[Tensor, "*b k 2"]:
+    """Side lengths of the UV grid's cells along T and B = N x T, metres."""
+    du, dv = tangent_plane(anchors, vertices)
+    length = du.norm(dim=-1)
+    area = torch.linalg.cross(du, dv).norm(dim=-1)
+    return torch.stack([length, area / length.clamp_min(torch.finfo(length.dtype).tiny)], -1)
+
+
 def tangent_plane(
     anchors: Anchors, vertices: Float[Tensor, "*b v 3"]
 ) -> tuple[Float[Tensor, "*b k 3"], Float[Tensor, "*b k 3"]]:

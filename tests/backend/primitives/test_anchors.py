@@ -5,7 +5,12 @@ import dataclasses
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.formats.body_layout import LARGEST_IN_PLANE, NORMAL_HALF_EXTENT, SPACING_TO_HALF_EXTENT
+from primdiffusion.formats.body_layout import (
+    LARGEST_IN_PLANE,
+    LARGEST_STRETCH,
+    NORMAL_HALF_EXTENT,
+    SPACING_TO_HALF_EXTENT,
+)
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.surface import surface_points, vertex_normals
 from primdiffusion.primitives.anchors import (
@@ -14,6 +19,7 @@ from primdiffusion.primitives.anchors import (
     anchor_skin_weights,
     attach,
     default_anchors,
+    stretched,
     tangent_plane,
 )
 from primdiffusion.primitives.primitives import GRID, K
@@ -182,3 +188,11 @@ def test_anchors_convert_as_one():
     assert double.stencil_du.dtype == torch.float64
     assert double.face.dtype == torch.int64
     assert dataclasses.replace(double).barycentric.dtype == torch.float64
+
+
+def test_boxes_follow_the_skin_where_a_pose_stretches_it():
+    assert torch.equal(stretched(REST, ANCHORS, BODY.template, BODY.template).half_extent, REST.half_extent)
+    for factor in (0.8, 1.3, LARGEST_STRETCH, 3.0):
+        grown = stretched(REST, ANCHORS, factor * BODY.template, BODY.template).half_extent / REST.half_extent
+        expected = torch.tensor([min(max(factor, 1.0), LARGEST_STRETCH)] * 2 + [1.0])
+        assert torch.allclose(grown, expected.expand_as(grown), rtol=1e-4)
