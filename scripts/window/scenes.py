@@ -12,6 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 import bpy
+from file_scenes import cancelled_captures, five_humans, handles, other_files, read_back
 from moving_scenes import opening, playing, turning
 from panels import show, sidebar, view
 from press import Steps, invoke, press, wait
@@ -335,6 +336,11 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "export": export,
     "cancelled": cancelled,
     "missing": missing,
+    "five_humans": five_humans,
+    "other_files": other_files,
+    "read_back": read_back,
+    "handles": handles,
+    "cancelled_captures": cancelled_captures,
     "stalls": stalls,
     "redraw": redraw,
     "opening": opening,

@@ -1,0 +1,155 @@
+"""Scenes of whole files: five humans, one deleted and back, humans of another file, exports read back, handles, and a
+capture that is cancelled (see `scenes.py`)."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+
+import bpy
+from panels import show, sidebar, view
+from press import Steps, press, wait
+from start import FIRST_SEED, SECOND_SEED, armatures, begin, people_file, queue_of, select, with_people
+from visible_scene import at_rest
+
+_FIVE = (FIRST_SEED, SECOND_SEED, 11, 21, 31)
+
+
+def five_humans(module: str, python: str) -> Steps:
+    """Five humans, one in local view, all through the camera, one deleted, and back by undo."""
+    yield from with_people(module, python, *_FIVE)
+    yield from sidebar()
+    press("view3d.view_all", "EXEC_DEFAULT")
+    yield from at_rest(module)
+    yield "five_humans"
+    select(armatures()[2])
+    press("view3d.localview", "EXEC_DEFAULT")
+    yield from at_rest(module)
+    yield "five_local"
+    press("view3d.localview", "EXEC_DEFAULT")
+    press("primdiffusion.add_camera")
+    press("view3d.view_camera", "EXEC_DEFAULT")
+    yield from at_rest(module)
+    yield "five_camera"
+    select(armatures()[2])
+    bpy.ops.ed.undo_push(message="Before")
+    press("primdiffusion.delete_human", "EXEC_DEFAULT")
+    bpy.ops.ed.undo_push(message="Delete Human")
+    expect(module, len(_FIVE) - 1)
+    yield from at_rest(module)
+    yield "five_deleted"
+    window, area = view()
+    yield {"point": [area.x + area.width // 2, window.height - area.y - area.height // 2]}
+    yield {"key": "ctrl+z"}
+    yield from wait(lambda: len(armatures()) == len(_FIVE), 20)
+    expect(module, len(_FIVE))
+    yield from at_rest(module)
+    yield "five_undone"
+
+
+def other_files(module: str, python: str) -> Steps:
+    """A human appended and one linked from another file, in Blender's factory scene."""
+    yield from with_people(module, python, FIRST_SEED)
+    source = people_file(module)
+    yield from begin(module, python)
+    for link in (False, True):
+        with bpy.data.libraries.load(str(source), link=link) as (stored, wanted):
+            wanted.collections = [name for name in stored.collections if name != "Collection"][:1]
+        (collection,) = wanted.collections
+        bpy.context.scene.collection.children.link(collection)
+    yield from at_rest(module)
+    yield from sidebar()
+    yield "other_files"
+    expect(module, 2)
+
+
+def read_back(module: str, python: str) -> Steps:
+    """A waving human as GLB, USD and FBX, each read into an empty scene by Blender's own importer."""
+    yield from with_people(module, python, FIRST_SEED)
+    press("primdiffusion.apply_pose", pose_name="Waving")
+    files = {name: Path(bpy.app.tempdir) / f"waving.{name}" for name in ("glb", "usdc", "fbx")}
+    for path in files.values():
+        press("primdiffusion.export", "EXEC_DEFAULT", filepath=str(path))
+        yield from wait(lambda: not queue_of(module).busy, 300)
+    importers: dict[str, Callable[..., object]] = {
+        "glb": bpy.ops.import_scene.gltf,
+        "usdc": bpy.ops.wm.usd_import,
+        "fbx": bpy.ops.import_scene.fbx,
+    }
+    for kind, path in files.items():
+        bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
+        yield 1.0
+        importers[kind](filepath=str(path))
+        bones = [len(obj.data.bones) for obj in bpy.data.objects if obj.type == "ARMATURE"]
+        meshes = [obj for obj in bpy.data.objects if obj.type == "MESH" and len(obj.data.polygons) > 1000]
+        if not meshes or not bones or bones[0] < 24:
+            raise RuntimeError(f"{path.name}: {len(meshes)} meshes, bones {bones}")
+        _, area = view()
+        area.spaces.active.shading.type = "MATERIAL"
+        press("view3d.view_all", "EXEC_DEFAULT")
+        yield 4.0
+        yield f"read_back_{kind}"
+
+
+def handles(module: str, python: str) -> Steps:
+    """IK handles: added, the pelvis lowered with the feet where they were, baked back."""
+    yield from with_people(module, python, FIRST_SEED)
+    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
+    armature = armatures()[0]
+    press("primdiffusion.add_handles")
+    press("object.mode_set", "EXEC_DEFAULT", mode="POSE")
+    yield from at_rest(module)
+    yield "handles_added"
+    pelvis = armature.pose.bones["pelvis"]
+    matrix = pelvis.matrix.copy()
+    matrix.translation.z -= 0.2
+    pelvis.matrix = matrix
+    yield from at_rest(module)
+    yield "handles_lowered"
+    press("object.mode_set", "EXEC_DEFAULT", mode="OBJECT")
+    press("primdiffusion.bake_handles")
+    yield from at_rest(module)
+    yield "handles_baked"
+
+
+def cancelled_captures(module: str, python: str) -> Steps:
+    """A small capture of an exported human, cancelled in the middle; it continues where it was."""
+    yield from with_people(module, python, FIRST_SEED)
+    folder = Path(tempfile.mkdtemp(dir=bpy.app.tempdir))
+    for name in ("people", "captures"):
+        (folder / name).mkdir()
+    press("primdiffusion.export", "EXEC_DEFAULT", filepath=str(folder / "people" / "first.glb"))
+    yield from wait(lambda: not queue_of(module).busy, 300)
+    bpy.context.preferences.addons[module].preferences.captures = True
+    yield from show("PRIMDIFFUSION_PT_captures")
+    settings = bpy.context.scene.primdiffusion_captures
+    settings.people, settings.out = str(folder / "people"), str(folder / "captures")
+    captures = import_module(f"{module}.ui.captures_session").captures
+    press("primdiffusion.render_captures", "EXEC_DEFAULT", options="--size 128 128")
+
+    def pictures() -> int:
+        return len(list((folder / "captures").rglob("*.png")))
+
+    yield from wait(lambda: pictures() > 5 or not captures.busy, 240)
+    yield "captures_rendering"
+    captures.cancel()
+    yield from wait(lambda: not captures.busy, 60)
+    before = pictures()
+    if captures.busy or not before:
+        raise RuntimeError(f"after Cancel: busy {captures.busy}, {before} pictures")
+    yield "captures_stopped"
+    press("primdiffusion.render_captures", "EXEC_DEFAULT", options="--size 128 128")
+    yield from wait(lambda: pictures() > before or not captures.busy, 240)
+    if pictures() <= before:
+        raise RuntimeError("the capture did not continue")
+    captures.cancel()
+    yield from wait(lambda: not captures.busy, 60)
+
+
+def expect(module: str, count: int) -> None:
+    """Raise RuntimeError where the scene does not have this number of humans."""
+    found = len(import_module(f"{module}.scene.human").humans(bpy.context.scene))
+    if found != count:
+        raise RuntimeError(f"{found} humans, not {count}")
