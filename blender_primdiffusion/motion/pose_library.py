@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite
 from ..formats.joints import JOINT_NAMES
-from ..scene.armature import bone_bases, rest_rotations
+from ..scene.armature import bone_bases, model_origin, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, matrix_to_quaternion, points_to_backend
+from ..scene.handles import key_handles
 from .adjust import leg_ratio
 from .poses import LIBRARY, grounding
 from .rotation import from_axis_angle, slerp, to_axis_angle
@@ -34,9 +35,11 @@ def mirrored(pose: NDArray) -> NDArray[np.float64]:
 
 
 def rest_joints(armature: bpy.types.Object) -> NDArray[np.float64]:
-    """Heads of SMPL's joints at rest [24, 3], y up, in the armature's units. Raises ValueError as `rest_rotations`."""
+    """SMPL's joints at rest [24, 3] in the body model's space, y up, in the armature's units. Raises ValueError as
+    `rest_rotations`."""
     rest_rotations(armature)
-    return points_to_backend([armature.data.bones[name].head_local for name in JOINT_NAMES])
+    heads = np.array([armature.data.bones[name].head_local for name in JOINT_NAMES], np.float64)
+    return points_to_backend(heads - model_origin(armature.data))
 
 
 def check_posable(armature: bpy.types.Object) -> None:
@@ -106,7 +109,7 @@ def apply_pose(
 
 
 def key_pose(armature: bpy.types.Object, frame: float, joints: Collection[str] = JOINT_NAMES) -> None:
-    """Insert keyframes of the current pose. Raises ValueError as `check_posable` does."""
+    """Insert keyframes of the current pose, and of IK handles. Raises ValueError as `check_posable` does."""
     check_posable(armature)
     for name in joints:
         bone = armature.pose.bones[name]
@@ -117,6 +120,7 @@ def key_pose(armature: bpy.types.Object, frame: float, joints: Collection[str] =
         bone.keyframe_insert("rotation_quaternion", frame=frame, group=name)
         if name == JOINT_NAMES[0]:
             bone.keyframe_insert("location", frame=frame, group=name)
+    key_handles(armature, frame)
 
 
 def selected_joints(armature: bpy.types.Object) -> list[str]:
