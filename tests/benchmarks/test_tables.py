@@ -13,9 +13,9 @@ from primdiffusion.evaluation.tables import Cell, Judged, Networks
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import tables
-from diffusion_primitives import train_model
 from latent_baseline import decoded_rest, sample_people
 from tables import Model, check_equal, figures_of, judged
+from train_baselines import train_model
 
 CARD = {"minutes": 3.0, "people": 10, "geometries": 5, "steps": {"local": 7}}
 

@@ -16,16 +16,20 @@ from primdiffusion.render.march import MarchSettings, march
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 from voxel_baseline import (
     BLOCKS,
+    BOUNDS,
+    SIDE,
     VALUES,
     VoxelCodec,
     VoxelModel,
     VoxelUNetConfig,
     fit_voxel_codec,
     load_voxel_model,
+    primitives_of,
     save_voxel_model,
     voxel_denoiser,
+    voxelise,
+    voxelise_payload,
 )
-from voxel_grid import BOUNDS, SIDE, primitives_of, voxelise, voxelise_payload
 
 FULL = 100.0
 
