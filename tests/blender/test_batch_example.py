@@ -9,11 +9,11 @@ import bpy
 import numpy as np
 import pytest
 from engine_stage import pixels
+from support.fake_child import FAILS
 
 from blender_primdiffusion.scene.human import armature_of, humans
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "blender_batch.py"
-FAILS = 2
 """A seed that the fake child takes as an order."""
 
 

@@ -30,7 +30,7 @@ sys.path.insert(0, str(root / "tests" / "blender"))
 import blender_primdiffusion
 import pytest
 from backend_python import use_this_python
-use_this_python(pytest.MonkeyPatch(), root / "tests" / "blender" / "fake_backend")
+use_this_python(pytest.MonkeyPatch(), root / "tests" / "support" / "child")
 blender_primdiffusion.register()
 from blender_primdiffusion.ui.batch import execute
 words = ["generate", "--out", out, "--steps", "1", "--pictures", "16"]

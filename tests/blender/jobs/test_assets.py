@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
 import pytest
 import synthetic
+from support.fake_child import PICTURE
 
 from blender_primdiffusion.jobs.assets import SIDE, clay_figure, picture_of_file
 from blender_primdiffusion.motion.pose_library import builtin_poses, current_pose
@@ -18,7 +18,6 @@ from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file, volume_path
 from blender_primdiffusion.ui import export_panel
 
-PICTURE = Path(__file__).parents[1] / "fake_backend" / "primdiffusion" / "picture.png"
 ops = bpy.ops.primdiffusion
 
 

@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import bpy
 import pytest
 from jobs_driven import drive, until_running
+from support.fake_child import TAKES_LONG
 
 from blender_primdiffusion.jobs import memory
 from blender_primdiffusion.jobs.generate import GenerateJob
@@ -16,7 +17,6 @@ from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
 
 pytestmark = pytest.mark.any_blender
-TAKES_LONG = 4
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 

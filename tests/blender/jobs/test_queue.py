@@ -11,6 +11,7 @@ from pathlib import Path
 import bpy
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
+from support.fake_child import DIES, FAILS, IGNORES_CANCEL, NO_MEMORY, TAKES_LONG
 
 from blender_primdiffusion.jobs import follow as follow_module
 from blender_primdiffusion.jobs.follow import follow, watch
@@ -22,7 +23,6 @@ from blender_primdiffusion.ui.jobs_panel import PRIMDIFFUSION_PT_jobs
 
 pytestmark = pytest.mark.any_blender
 
-DIES, FAILS, TAKES_LONG, IGNORES_CANCEL, NO_MEMORY = 1, 2, 4, 105, 106
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 

@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
+from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.follow import follow
@@ -17,7 +18,6 @@ from blender_primdiffusion.scene.edit import painted_weights
 from blender_primdiffusion.scene.human import armature_of, body_of, humans, person_file, remove_human
 from blender_primdiffusion.ui import edit_panel
 
-DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""
 FINE = 8
 ops = bpy.ops.primdiffusion

@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 import pytest
 from jobs_driven import drive, notice_of, shown
+from support.fake_child import FAILS
 
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
@@ -23,7 +24,6 @@ from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.scene.place import GAP_M
 from blender_primdiffusion.ui import generate_panel, render_panel
 
-FAILS = 2
 """A seed that the fake child takes as an order."""
 
 

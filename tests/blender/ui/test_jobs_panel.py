@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 import pytest
 from jobs_driven import drive, shown
+from support.fake_child import FAILS
 
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
@@ -14,7 +15,6 @@ from blender_primdiffusion.ui import jobs_panel
 from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 
 pytestmark = pytest.mark.any_blender
-FAILS = 2
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 

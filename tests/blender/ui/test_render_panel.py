@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
@@ -11,7 +9,6 @@ import synthetic
 import synthetic_shape
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 
-from blender_primdiffusion import places
 from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
@@ -38,7 +35,6 @@ ops = bpy.ops.primdiffusion
 @pytest.fixture
 def person(addon, tmp_path, monkeypatch):
     """Somebody in shot.blend whom there is to merge."""
-    monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parents[1] / "merge_backend")
     kept = tmp_path / "person.human.safetensors"
     kept.write_bytes(b"kept")
     person = build_human(addon, synthetic_shape.write(tmp_path / "human.npz", 6), keep=[kept])
@@ -140,7 +136,7 @@ def test_a_range_that_is_none_is_rejected(person):
 
 
 def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
-    monkeypatch.setenv("FAKE_MERGE", "takes long")
+    monkeypatch.setenv("FAKE_ORDER", "takes long")
     moment = Moment.now(person)
     before = sorted(folder_of(person).iterdir())
     queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment, moment], 1, 0.02))
@@ -164,11 +160,11 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("order", "message"), [("fails", "large grid"), ("gives garbage", "damaged"), ("dies", "ended")]
+    ("order", "message"), [("fails", "checkpoint is damaged"), ("gives garbage", "damaged"), ("dies", "ended")]
 )
 @pytest.mark.parametrize("what", ["POSE", "FRAMES"])
 def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypatch, order, message, what):
-    monkeypatch.setenv("FAKE_MERGE", order)
+    monkeypatch.setenv("FAKE_ORDER", order)
     before = sorted(folder_of(person).iterdir())
     with pytest.raises(RuntimeError, match=message):
         ops.merge(what=what)

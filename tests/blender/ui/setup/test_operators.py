@@ -10,7 +10,8 @@ from pathlib import Path
 
 import bpy
 import pytest
-from tiny_packages import BACKEND, own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
+from support.fake_child import FAKE_CHILD
+from tiny_packages import own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
 
 import blender_primdiffusion
 import build_addon
@@ -34,8 +35,8 @@ def wheels(empty_scene, tmp_path, monkeypatch) -> Path:
     own_index(monkeypatch)
     with_this_pip(monkeypatch, setup)
     monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: tmp_path / "eigener ordner")
-    monkeypatch.setattr(places, "backend_module_path", lambda: BACKEND)
-    monkeypatch.setattr("blender_primdiffusion.ui.setup.operators.backend_module_path", lambda: BACKEND)
+    monkeypatch.setattr(places, "backend_module_path", lambda: FAKE_CHILD)
+    monkeypatch.setattr("blender_primdiffusion.ui.setup.operators.backend_module_path", lambda: FAKE_CHILD)
     monkeypatch.setattr(known, "_has_torch", lambda: False)
     monkeypatch.setattr(known, "available", lambda: {"cpu": lock})
     bpy.context.preferences.system.use_online_access = False
