@@ -1,17 +1,12 @@
 """Measures of the chain from mesh to sample: on pictures, payloads and colours whose answers are known."""
 
-import sys
-from pathlib import Path
-
+import chain
 import numpy as np
 import pytest
 import torch
 from primdiffusion.evaluation.image_metrics import compare_detail, detail_energy, figure_psnr, overlap
 from primdiffusion.primitives.primitives import K, Payload
 from scipy import ndimage
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import chain
 
 
 def figure(side=64):

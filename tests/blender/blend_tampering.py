@@ -22,6 +22,7 @@ import synthetic
 import synthetic_shape
 from exporting import write_person
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
 

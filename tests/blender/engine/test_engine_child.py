@@ -17,6 +17,7 @@ import pytest
 from backend_python import use_this_python
 from blender_primdiffusion.formats.whole_files import writer
 from engine_stage import pixels, set_up_render
+from support.errors import refused
 from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
@@ -127,7 +128,7 @@ def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
 
 def test_a_child_that_dies_is_one_error_and_the_next_render_works(stage, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "dies")
-    with pytest.raises(RuntimeError, match=r"ended by itself.*Render again") as caught:
+    with refused(RuntimeError, "Render") as caught:
         render()
     assert str(caught.value).count("Error:") == 1
     assert not stage.out.exists()
@@ -148,14 +149,14 @@ def test_an_error_of_the_child_keeps_its_remedy_and_ends_an_animation(stage, mon
     monkeypatch.setenv("FAKE_ORDER", "fails")
     stage.scene.frame_end = 3
     stage.scene.render.filepath = str(tmp_path / "frame_")
-    with pytest.raises(RuntimeError, match=r"The checkpoint is damaged\. Choose another checkpoint\."):
+    with refused(RuntimeError, "checkpoint"):
         bpy.ops.render.render(animation=True)
     assert not list(tmp_path.glob("frame_*"))
 
 
 def test_without_a_backend_the_error_names_what_was_tried(stage, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.backend.environment.search", find_nothing)
-    with pytest.raises(RuntimeError, match="extension's preferences"):
+    with refused(RuntimeError, "preferences"):
         render()
 
 
@@ -172,32 +173,32 @@ def test_an_unsupported_camera_is_one_clear_error(stage, kind):
     else:
         stage.scene.camera = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SPOT"))
         stage.scene.collection.objects.link(stage.scene.camera)
-    with pytest.raises(RuntimeError, match=f"of type {kind.lower()}.*perspective and orthographic"):
+    with refused(RuntimeError, kind.lower()):
         render()
 
 
 def test_a_camera_that_shows_nothing_is_one_clear_error(stage):
     camera = stage.scene.camera
     camera.data.clip_start, camera.data.clip_end = 5.0, 1.0
-    with pytest.raises(RuntimeError, match="clips everything, from 5 m to 1 m"):
+    with refused(RuntimeError, "5 m", "1 m"):
         render()
     camera.data.clip_end, camera.scale = 100.0, (0, 0, 0)
-    with pytest.raises(RuntimeError, match="scaled to zero: give it a scale"):
+    with refused(RuntimeError, "scaled"):
         render()
 
 
 def test_blender_itself_rejects_a_picture_without_camera_or_pixels_and_the_next_one_works(stage):
     camera, settings = stage.scene.camera, stage.scene.render
     stage.scene.camera = None
-    with pytest.raises(RuntimeError, match="no camera"):
+    with refused(RuntimeError, "camera"):
         render()
     stage.scene.camera, settings.use_border = camera, True
     for edges in ((0.5, 0.5), (0.5, 0.501), (0.7, 0.3)):
         settings.border_min_x, settings.border_max_x = edges
-        with pytest.raises(RuntimeError, match="too small"):
+        with refused(RuntimeError, "small"):
             render()
     settings.use_border, settings.resolution_percentage = False, 1
-    with pytest.raises(RuntimeError, match="too small"):
+    with refused(RuntimeError, "small"):
         render()
     settings.resolution_percentage = 100
     assert render() == {"FINISHED"}

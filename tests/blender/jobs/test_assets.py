@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from support.errors import refused
 from support.fake_child import PICTURE
 
 from blender_primdiffusion.jobs.assets import SIDE, clay_figure, picture_of_file
@@ -101,7 +102,7 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
     assert armature_of(person).pose.bones["head"]
     assert (person.library is not None) == link
     if link:
-        with pytest.raises(RuntimeError, match="is linked from"):
+        with refused(RuntimeError, "linked"):
             ops.mark_as_asset(picture=str(PICTURE))
         with bpy.context.temp_override(id=person):
             assert not bpy.ops.asset.clear_single.poll()
@@ -157,7 +158,7 @@ def test_the_built_in_poses_become_a_library_and_the_open_file_stays(addon, tmp_
 
 
 def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
-    with pytest.raises(RuntimeError, match=r"poll\(\) .*no human in the scene"):
+    with refused(RuntimeError, "human"):
         ops.mark_as_asset()
     ops.generate(seed=7, steps=1)
     (tmp_path / "text.png").write_text("no picture")
@@ -175,7 +176,7 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     (person,) = humans(addon.scene)
     assert person.asset_data is None
     person_file(person).unlink()
-    with pytest.raises(RuntimeError, match="file of the human 'Human' is missing"):
+    with refused(RuntimeError, "Human"):
         ops.mark_as_asset()
 
 

@@ -8,6 +8,7 @@ import pytest
 import synthetic
 import synthetic_shape
 from jobs_driven import drive, error_of, notice_of, shown, until_running
+from support.errors import refused
 
 from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
@@ -130,7 +131,7 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
 
 
 def test_a_range_that_is_none_is_rejected(person):
-    with pytest.raises(RuntimeError, match="frames 7 to 7 are no sequence"):
+    with refused(RuntimeError, "7 to 7"):
         ops.merge(what="FRAMES", frame_start=7, frame_end=7)
     assert merged_of(person) is None
 
@@ -182,22 +183,22 @@ def test_a_human_removed_meanwhile_is_not_merged(person):
 
 def test_a_renamed_bone_is_rejected_with_what_to_do(person):
     armature_of(person).data.bones["left_knee"].name = "knee"
-    with pytest.raises(RuntimeError, match=r"no bone 'left_knee': give it this name again"):
+    with refused(RuntimeError, "left_knee"):
         ops.merge()
 
 
 def test_a_missing_file_of_the_person_is_named(person):
     (folder_of(person) / "person.human.safetensors").unlink()
-    with pytest.raises(RuntimeError, match=r"person\.human\.safetensors"):
+    with refused(RuntimeError, "person.human.safetensors"):
         ops.merge()
 
 
 def test_set_attachment_reports_what_stands_in_the_way(person):
-    with pytest.raises(RuntimeError, match="press Merge"):
+    with refused(RuntimeError, "Merge"):
         ops.set_attachment(mode="MERGED")
-    with pytest.raises(RuntimeError, match="no merged volume"):
+    with refused(RuntimeError, "merged"):
         ops.merge(what="NOTHING")
-    with pytest.raises(RuntimeError, match="'Nobody' is not in the scene"):
+    with refused(RuntimeError, "Nobody"):
         ops.set_attachment(mode="SURFACE", human="Nobody")
 
 
@@ -265,7 +266,7 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
 
 
 def test_a_scene_without_humans_is_rejected(addon):
-    with pytest.raises(RuntimeError, match="no human in the scene"):
+    with refused(RuntimeError, "human"):
         ops.add_camera()
     assert not ops.merge.poll()
     assert not bpy.data.cameras
