@@ -59,13 +59,6 @@ train(settings(Path(sys.argv[1]), Path(sys.argv[2]), save_every=0.0))
 
 
 @pytest.fixture(scope="module")
-def people(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("people")
-    write_people(folder, geometries=16, variants=3)
-    return folder
-
-
-@pytest.fixture(scope="module")
 def few(tmp_path_factory):
     """For the paper's preset."""
     folder = tmp_path_factory.mktemp("few")
