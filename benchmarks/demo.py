@@ -61,13 +61,13 @@ def main() -> None:
 
     stage("build the extension", "build_addon.py", "--out", out, figures_file=False)
     archive = next(out.glob("primdiffusion-*.zip"))
-    stage("generate a person in Blender", "benchmarks/demo_blender.py", "person", "--zip", archive, "--blend", blend,
+    stage("generate a person in Blender", "benchmarks/demo_stages.py", "person", "--zip", archive, "--blend", blend,
           "--human", human, "--seed", str(arguments.seed), "--frames", str(FRAMES), "--shown", str(SHOWN))  # fmt: skip
     if not arguments.quick:
         frame = out / "cycles.png"
-        stage("Cycles, 384 x 384", "benchmarks/demo_blender.py", "cycles", "--blend", blend, "--out", frame)
+        stage("Cycles, 384 x 384", "benchmarks/demo_stages.py", "cycles", "--blend", blend, "--out", frame)
     walk = ("--frames", str(FRAMES), "--frame", str(SHOWN))
-    stage("march five pictures", "benchmarks/demo_march.py", "--human", human, *walk, "--out", out)
+    stage("march five pictures", "benchmarks/demo_stages.py", "march", "--human", human, *walk, "--out", out)
     count = "4" if arguments.quick else "12"
     stage("contact sheet", "benchmarks/contact_sheet.py", "--count", count, "--out", out / "contact_sheet.png")
     if arguments.json is not None and arguments.assets is not None:

@@ -6,14 +6,22 @@ which take some minutes to compute. Distances are Frechet distances of features;
 meshes, the best that a model can reach; `from_mesh`, `payload` and `codec` are what stored humans lose before any
 network. `attribute_read_*` is the feature network's accuracy on renders of held-out meshes. Figures that need an
 omitted option are null. Times are of two threads. --quick takes few samples of each.
+
+`python benchmarks/diffusion.py pictures --people DIR --reference DIR --neighbours docs/pictures/neighbours.png` renders
+humans from consecutive seeds, not hand-picked, each beside the nearest training samples by features and by latents,
+with distances (1 is the median of the held-out set). `--comparison docs/pictures/generated_comparison.png --checkpoint
+ours/model.safetensors --latents latents/model.safetensors --voxel voxels/voxel.safetensors` renders rows of held-out
+samples, and of the models that benchmarks/tables.py compares.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import islice
 from pathlib import Path
 
+import numpy as np
 import torch
 from diffusion_sets import (
     decoded,
@@ -27,13 +35,15 @@ from diffusion_sets import (
     stored_voxels,
     voxels,
 )
+from latent_baseline import sample_people
 from march import from_script
 from neighbours import nearest_stored
+from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
-from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
-from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_of
+from primdiffusion.evaluation.distances import frechet_distance, kernel_distance, nearest
+from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_of, payload_sources
 from primdiffusion.evaluation.generation import (
     Comparison,
     ReferenceSet,
@@ -42,12 +52,18 @@ from primdiffusion.evaluation.generation import (
     real_vs_real,
     table,
 )
+from primdiffusion.evaluation.portraits import PORTRAITS, Portrait, camera_of
 from primdiffusion.evaluation.pretrained_networks import load_clip_vision, load_inception
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import place
 from primdiffusion.people.assets import Assets, open_assets
-from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.people.payloads import rest_frames
+from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.render.image import over
+from primdiffusion.render.march import march
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
-from record import report
+from record import report, run
 from torch import Tensor
 from voxel_baseline import load_voxel_model
 
@@ -82,6 +98,14 @@ PAPER = (
     "The paper's Table 2 (FID with weights that are not at hand here, on other people; not to be compared in value): "
     "primitives FID_CLIP 12.11, FID 17.95, KID 1.63; voxels of 64^3 19.53, 81.78, 7.72."
 )
+BACKGROUND = (0.72, 0.72, 0.72)
+CELL = 192
+HEADING, NAME, CAPTION = 26, 24, 20
+"""Heights of the headings' row and of captions, width of the rows' names, pixels."""
+INK, PAGE = (30, 30, 30), (221, 221, 221)
+FRONT, BACK, HEAD = (next(p for p in PORTRAITS if p.name == name) for name in ("front", "back", "head"))
+MARGIN = 0.09
+"""Share of the front view's width that is cut off at each side."""
 
 
 def main() -> None:
@@ -131,7 +155,7 @@ def parsed() -> argparse.Namespace:
         "--reference", type=Path, default=Path("runs/reference"), help="folder for portraits and feature network"
     )
     parser.add_argument("--checkpoint", type=Path, help="model to measure; the default one if omitted")
-    parser.add_argument("--voxel", type=Path, help="baseline of diffusion_voxel.py")
+    parser.add_argument("--voxel", type=Path, help="baseline of train_baselines.py voxels")
     parser.add_argument("--inception", type=Path, help="weights for FID: pt_inception-2015-12-05-6726825d.pth")
     parser.add_argument("--clip", type=Path, help="weights for FID_CLIP: ViT-B/32 as .safetensors")
     parser.add_argument("--count", type=int, default=256, help="samples of each set")
@@ -270,5 +294,124 @@ def epoch(number: int, loss: float) -> None:
     print("features, epoch", number, f"loss {loss:.3f}", flush=True)
 
 
+def pictures() -> None:
+    parser = argparse.ArgumentParser(description="Renders generated humans, neighbours, baselines.")
+    parser.add_argument("--people", type=Path, required=True, help="folder of the payloads that were trained on")
+    parser.add_argument("--holdout", type=float, default=0.08)
+    parser.add_argument("--seed", type=int, default=0, help="of the training run")
+    parser.add_argument("--reference", type=Path, default=Path("runs/reference"))
+    parser.add_argument("--checkpoint", type=Path)
+    parser.add_argument("--latents", type=Path, help="baseline of train_baselines.py")
+    parser.add_argument("--voxel", type=Path, help="baseline of train_baselines.py voxels")
+    parser.add_argument("--count", type=int, default=8, help="people in a picture")
+    parser.add_argument("--neighbours", type=Path, help="PNG of people beside their neighbours")
+    parser.add_argument("--comparison", type=Path, help="PNG of people beside baselines'")
+    arguments = parser.parse_args()
+    model = load_checkpoint(arguments.checkpoint)
+    train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
+    if arguments.neighbours is not None:
+        reference = open_reference_set(
+            payload_sources(train, read_person),
+            payload_sources(held, read_person),
+            arguments.reference,
+            progress("portraits"),
+            epoch,
+        )
+        neighbours(reference, model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
+        print(arguments.neighbours)
+    if arguments.comparison is not None:
+        comparison(model, held, arguments.latents, arguments.voxel, arguments.count).save(
+            arguments.comparison, optimize=True
+        )
+        print(arguments.comparison)
+
+
+def neighbours(
+    reference: ReferenceSet, model: DiffusionModel, train: Sequence[Path], held: Sequence[Path], count: int
+) -> Image.Image:
+    """A column a seed: the person, the nearest by features and the nearest by latents."""
+
+    def encode(payload: Payload) -> Tensor:
+        return model.encode(payload)
+
+    people = list(generated(model, seeds_of(count)))
+    primitives = [place(human) for human in people]
+    by_features = nearest(features_of(reference.network, made_gallery(primitives)), reference.train_features)
+    new = nearest(reference.held_features, reference.train_features).distance.median()
+    references = [payload_of(read_person(path), 0) for path in held[:: max(len(held) // 32, 1)]]
+    queries = torch.stack([encode(payload).flatten() for payload in (*(h.payload for h in people), *references)])
+    by_latents = nearest_stored(queries, train, read_person, encode, progress("latents"))
+    new_latents = by_latents.distance[count:].median()
+    rows: list[tuple[str, list[tuple[Primitives, str]]]] = [
+        ("generated", [(one, f"seed {seed}") for seed, one in zip(seeds_of(count), primitives, strict=True)]),
+        ("nearest by features", []),
+        ("nearest by latents", []),
+    ]
+    for number in range(count):
+        row = int(by_features.index[number])
+        geometry = int(reference.train.geometry[row])
+        colouring = row - int((reference.train.geometry < geometry).sum())
+        rows[1][1].append((stored_one(train[geometry], colouring), f"{float(by_features.distance[number] / new):.2f}"))
+        path, colouring = train[int(by_latents.file[number])], int(by_latents.colouring[number])
+        rows[2][1].append((stored_one(path, colouring), f"{float(by_latents.distance[number] / new_latents):.2f}"))
+    return sheet(rows, "Distances in units of the median held-out person's: 1 is as new as new people are")
+
+
+def stored_one(path: Path, colouring: int) -> Primitives:
+    person = read_person(path)
+    return Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, colouring))
+
+
+def comparison(
+    model: DiffusionModel, held: Sequence[Path], latents: Path | None, voxel: Path | None, count: int
+) -> Image.Image:
+    """A row for each way to make people."""
+    seeds = seeds_of(count)
+    some = held[:: max(len(held) // count, 1)][:count]
+    sets: dict[str, Iterable[Primitives]] = {
+        "held out": (stored_one(path, 0) for path in some),
+        "ours": placed(generated(model, seeds)),
+    }
+    if latents is not None:
+        sets["latents"] = placed(iter(sample_people(load_checkpoint(latents), seeds)))
+    if voxel is not None:
+        sets["voxels"] = voxels(load_voxel_model(voxel), seeds)
+    rows = [(name, [(one, "") for one in islice(made, count)]) for name, made in sets.items()]
+    return sheet(rows, "In T pose, from the front, and heads; consecutive seeds, evenly spaced held-out samples")
+
+
+def sheet(rows: Sequence[tuple[str, Sequence[tuple[Primitives, str]]]], heading: str) -> Image.Image:
+    """Rows of whole people over their heads, with captions."""
+    columns = max(len(row) for _, row in rows)
+    whole, below = round(CELL * (1 - 2 * MARGIN)), CELL // 2
+    width, height = whole + below, CELL + CAPTION
+    page = Image.new("RGB", (NAME + columns * width, HEADING + len(rows) * height), PAGE)
+    pen, font = ImageDraw.Draw(page), ImageFont.load_default(14)
+    pen.text((page.width / 2, HEADING / 2), heading, INK, font, anchor="mm")
+    for row, (name, people) in enumerate(rows):
+        top = HEADING + row * height
+        label = Image.new("RGB", (height, NAME), PAGE)
+        ImageDraw.Draw(label).text((height / 2, NAME / 2), name, INK, font, anchor="mm")
+        page.paste(label.rotate(90, expand=True), (0, top))
+        for column, (primitives, caption) in enumerate(people):
+            left = NAME + column * width
+            page.paste(Image.fromarray(portraits(primitives)), (left, top))
+            pen.text((left + width / 2, top + CELL + CAPTION / 2), caption, INK, font, anchor="mm")
+    return page
+
+
+def portraits(primitives: Primitives) -> np.ndarray:
+    """From the front, beside the head over the back view."""
+    front, back, head = (seen(primitives, portrait, size) for portrait, size in ((FRONT, 0), (BACK, 1), (HEAD, 1)))
+    cut = round(CELL * MARGIN)
+    return np.concatenate([front[:, cut : CELL - cut], np.concatenate([head, back], 0)], 1)
+
+
+def seen(primitives: Primitives, portrait: Portrait, halvings: int) -> np.ndarray:
+    """sRGB bytes of a portrait."""
+    view = march(primitives, camera_of(portrait, CELL >> halvings))
+    return (encode_srgb(over(view, BACKGROUND)).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
 if __name__ == "__main__":
-    main()
+    run(main, pictures=pictures)

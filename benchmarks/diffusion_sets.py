@@ -22,8 +22,7 @@ from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
 from primdiffusion.training.stored_people import read_person
 from torch import Tensor
-from voxel_baseline import VoxelModel
-from voxel_grid import primitives_of, voxelise_payload
+from voxel_baseline import VoxelModel, primitives_of, voxelise_payload
 
 TOGETHER = 8
 """Batch size of sampling."""

@@ -8,36 +8,80 @@ that the encoder was not given. As in the paper, psnr_shared_scale and similar f
 capture folders, held-out people are made from MakeHuman's assets (--assets), with seeds that training does not use.
 --quick evaluates one person. Times are the best or median of several; names with `processor` are processor time, the
 others wall time.
+
+`encoder.py curve --metrics docs/results/encoder_metrics.jsonl --plot docs/pictures/encoder_curve.png` plots PSNR on
+training and held-out people by step from a run's metrics.jsonl, and prints the gain of the last doubling of the steps,
+an upper bound for the gain of another doubling.
+
+`encoder.py pictures --train CAPTURES --heldout CAPTURES --out docs/pictures/encoder.png` draws a row for each person,
+not hand-picked: one of the eight views that the encoder was given and its reconstruction; a view and a pose that it was
+not given, each beside the captured picture; the novel pose's depth and primitives.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
+import statistics
 import tempfile
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from encoder_speed import VIEWS, reconstruct_seconds, step_seconds
-from march import from_script
+import numpy as np
+import torch
+from march import best_ms, from_script
+from matplotlib.figure import Figure
+from PIL import Image, ImageDraw, ImageFont
+from primdiffusion.capture.conditioning import captured_person, conditioning_views, default_betas, spread_cameras
+from primdiffusion.capture.dataset import batches
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.capture.render import RenderJob, render
-from primdiffusion.encoder.model import EncoderModel, load_encoder
+from primdiffusion.drawing.draw import draw
+from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.encoder.config import PRESETS
+from primdiffusion.encoder.model import EncoderModel, load_encoder, look_up
+from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
-from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary, table
+from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, picture, summary, table
 from primdiffusion.formats.camera_rig import Rig
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from record import command_line, report
+from primdiffusion.primitives.anchors import default_anchors
+from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.render.march import MarchSettings, march
+from primdiffusion.training.fit_config import FitConfig
+from primdiffusion.training.fit_data import FitSample, fit_dataset
+from primdiffusion.training.fit_losses import loss_terms
+from record import command_line, report, run
+from torch import Tensor
 
 FIRST_SEED = 30_000_000
 """Seed of the first person made here; training sets count from 0."""
 PEOPLE, POSES, CAMERAS = 6, 4, 12
 REFINE_FIGURES = ("refine_psnr_heldout_views", "refine_seconds_cpu")
 Figures = dict[str, float | int | str | None]
+VIEWS = 8
+PARTS = ("data", "forward", "march", "march_backward", "backward", "update")
+"""The parts of a step. `march` includes the loss, a small share; `backward` is the network's alone."""
+
+SETS = {"psnr_train": "training people", "psnr_held": "people held out"}
+SIZE = 512
+MARGIN = 0.06
+"""Margin on each side of the person, as a share of the cropped square's side."""
+COLUMNS = (
+    "given view (1 of 8)", "reconstruction", "novel view", "captured", "novel pose", "captured", "depth", "primitives"
+)  # fmt: skip
+HEADING, NAME = 26, 22
+"""Height of the heading row and width of the name column, in pixels."""
+INK, PAPER = (235, 235, 235), (0, 0, 0)
 
 
 class Variant(NamedTuple):
@@ -207,5 +251,198 @@ def table_of(qualities: dict[str, Quality]) -> str:
     return "\n".join(lines)
 
 
+def reconstruct_seconds(model: EncoderModel, captures: Captures, repeats: int) -> dict[str, float]:
+    """Seconds from eight 512 x 512 views in memory to a payload: the fastest of several runs, and its parts."""
+    person = captured_person(captures.root, captures.subjects[0], 0, VIEWS)
+
+    def whole() -> Payload:
+        return model.encode(person.views, person.betas)
+
+    def unproject() -> object:
+        return look_up(model.config, person.views, person.betas)
+
+    whole()
+    figures = {}
+    for name, clock in (("", time.perf_counter), ("processor_", time.process_time)):
+        total = best_ms(whole, repeats, clock) / 1e3
+        looked_up = best_ms(unproject, repeats, clock) / 1e3
+        figures |= {
+            f"reconstruct_{name}seconds_cpu": total,
+            f"reconstruct_unproject_{name}seconds_cpu": looked_up,
+            f"reconstruct_forward_{name}seconds_cpu": max(total - looked_up, 0.0),
+        }
+    return figures
+
+
+def step_seconds(captures: Captures, steps: int) -> dict[str, float | int]:
+    """Processor seconds of the parts of a training step with the default settings: medians of `steps` steps."""
+    config = FitConfig(data=captures.root, run=Path("unused"))
+    torch.manual_seed(0)
+    encoder = Encoder(PRESETS[config.encoder]).train()
+    optimiser = torch.optim.AdamW(encoder.parameters(), config.learning_rate)
+    stream = batches(fit_dataset(captures, config), config.batch)
+    taken: list[dict[str, float]] = []
+    for _ in range(steps + 1):
+        seconds: dict[str, float] = {}
+        _step(config, encoder, optimiser, lambda: next(stream)[0], seconds)
+        taken.append(seconds)
+    medians = {part: statistics.median(seconds[part] for seconds in taken[1:]) for part in PARTS}  # first: warm-up
+    total = sum(medians.values())
+    share = (medians["march"] + medians["march_backward"]) / total
+    figures: dict[str, float | int] = {f"step_{part}_processor_seconds": medians[part] for part in PARTS}
+    about = {"step_people": config.batch, "step_pictures": config.batch * config.targets, "step_size": config.size}
+    return figures | about | {"step_processor_seconds": total, "step_marcher_share": share}
+
+
+def _step(
+    config: FitConfig,
+    encoder: Encoder,
+    optimiser: torch.optim.Optimizer,
+    read: Callable[[], FitSample],
+    seconds: dict[str, float],
+) -> None:
+    """One step, split at the boxes that are marched: the marcher's adjoint is timed separately from the network's."""
+
+    @contextmanager
+    def timed(part: str) -> Iterator[None]:
+        began = time.process_time()
+        yield
+        seconds[part] = time.process_time() - began
+
+    with timed("data"):
+        sample = read()
+    with timed("forward"):
+        made = Primitives.place(sample.frames, encoder(sample.found, sample.axis_angle))
+    boxes = made.map(lambda tensor: tensor.detach().requires_grad_(tensor.requires_grad))
+    with timed("march"):
+        people = boxes.map(lambda tensor: tensor[:, None])
+        drawn = march(people, sample.target.camera, MarchSettings(step=config.step))
+        target, mask = (values.float() / 255 for values in (sample.target.image, sample.target.mask))
+        terms = loss_terms(encode_srgb(drawn.rgb), drawn.alpha, boxes.half_extent, target, mask, config.loss)
+        total = torch.stack(list(terms.values())).sum()
+    with timed("march_backward"):
+        total.backward()
+    with timed("backward"):
+        names = [name for name, tensor in vars(made).items() if tensor.requires_grad]
+        torch.autograd.backward([getattr(made, name) for name in names], [getattr(boxes, name).grad for name in names])
+    with timed("update"):
+        optimiser.step()
+        optimiser.zero_grad()
+
+
+def read_curve(path: Path) -> dict[str, list[tuple[int, float]]]:
+    """Step and PSNR (dB) of each record, for both sets."""
+    rows = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    return {name: [(row["step"], row[name]) for row in rows if name in row] for name in SETS}
+
+
+def last_doubling(curve: list[tuple[int, float]]) -> float:
+    """Gain in dB from half of the steps to all of them."""
+    half = min(curve, key=lambda point: abs(point[0] - curve[-1][0] / 2))
+    return curve[-1][1] - half[1]
+
+
+def curve() -> None:
+    parser = argparse.ArgumentParser(description="Plots an encoder's training.")
+    parser.add_argument("--metrics", type=Path, required=True, help="metrics.jsonl of a run")
+    parser.add_argument("--plot", type=Path, help="PNG to write")
+    arguments = parser.parse_args()
+    curves = read_curve(arguments.metrics)
+    for name, curve in curves.items():
+        steps, psnr = curve[-1]
+        print(f"{name}: {psnr:.2f} dB after {steps} steps, {last_doubling(curve):+.2f} in the last doubling")
+    if arguments.plot is not None:
+        figure = Figure(figsize=(7, 4), layout="constrained")
+        axes = figure.subplots()
+        for name, curve in curves.items():
+            axes.plot(*zip(*curve, strict=True), label=SETS[name])
+        axes.set(xlabel="steps", ylabel="PSNR, dB (whole images, 256 x 256)")
+        axes.grid(alpha=0.3)
+        axes.legend()
+        figure.savefig(arguments.plot, dpi=120)
+
+
+def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) -> Iterator[np.ndarray]:
+    """The person's pictures in the order of COLUMNS, each cropped around the person; sRGB bytes."""
+    subject, betas = captures.subject(name), default_betas(captures.subject(name))
+    given = spread_cameras(subject, 0, VIEWS)
+    novel = [camera for camera in range(len(subject.views)) if camera not in given] or list(given)
+    shown = (given[0], novel[0], novel[len(novel) // 2])
+    views = conditioning_views(captures, name, 0, given, SIZE)
+    payload = model.encode(views, betas)
+    for number, (frame, camera) in enumerate(zip((0, 0, novel_frame), shown, strict=True)):
+        seen = conditioning_views(captures, name, frame, [camera], SIZE)
+        primitives = model.place(payload, betas, seen.pose)
+        view = seen.camera.map(lambda tensor: tensor[0])
+        drawn, target = picture(march(primitives, view)), seen.image[0].float() / 255
+        for image in (target, drawn) if number == 0 else (drawn, target):
+            yield cropped(image, seen.mask[0])
+    for look in ("depth", "boxes"):
+        yield cropped(drawn_view(primitives, view, look), seen.mask[0])
+
+
+def drawn_view(primitives: Primitives, camera: Camera, look: str) -> Tensor:
+    """The depth or the primitives, drawn over black, sRGB-encoded."""
+    drawn = draw(Scene(primitives, chart=default_anchors().chart), camera, ViewSettings(look))
+    return encode_srgb(torch.from_numpy(drawn.combined[..., :3]).clamp(0, 1))
+
+
+def cropped(image: Tensor, mask: Tensor) -> np.ndarray:
+    """The square around the person, as bytes; black outside the picture."""
+    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    middle = [(int(hits[0]) + int(hits[-1])) / 2 for hits in (rows, columns)]
+    longest = max(int(rows[-1] - rows[0]), int(columns[-1] - columns[0])) + 1
+    side = round(longest / (1 - 2 * MARGIN))
+    top, left = (round(centre - side / 2) for centre in middle)
+    padded = torch.nn.functional.pad(image, (0, 0, side, side, side, side))[
+        top + side : top + 2 * side, left + side : left + 2 * side
+    ]
+    return (padded.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+
+def sheet(rows: list[tuple[str, list[np.ndarray]]], cell: int) -> Image.Image:
+    """The rows one below the other, with column headings and row names."""
+    whole = Image.new("RGB", (NAME + cell * len(COLUMNS), HEADING + cell * len(rows)), PAPER)
+    pen, font = ImageDraw.Draw(whole), ImageFont.load_default(14)
+    for number, title in enumerate(COLUMNS):
+        pen.text((NAME + (number + 0.5) * cell, HEADING / 2), title, INK, font, anchor="mm")
+    for number, (title, pictures) in enumerate(rows):
+        label = Image.new("RGB", (cell, NAME), PAPER)
+        ImageDraw.Draw(label).text((cell / 2, NAME / 2), title, INK, font, anchor="mm")
+        whole.paste(label.rotate(90, expand=True), (0, HEADING + number * cell))
+        for column, pixels in enumerate(pictures):
+            small = Image.fromarray(pixels).resize((cell, cell), Image.Resampling.LANCZOS)
+            whole.paste(small, (NAME + column * cell, HEADING + number * cell))
+    return whole
+
+
+def pictures() -> None:
+    parser = argparse.ArgumentParser(description="Draws the documentation's picture of the encoder.")
+    parser.add_argument("--train", type=Path, help="captures of training people")
+    parser.add_argument("--heldout", type=Path, help="captures of held-out people")
+    parser.add_argument("--checkpoint", type=Path, help="without it, the package's encoder")
+    parser.add_argument("--people", type=int, default=3, help="number of people from each set, evenly spaced")
+    parser.add_argument("--cell", type=int, default=224, help="side of a picture in pixels")
+    parser.add_argument("--out", type=Path, required=True, help="PNG to write")
+    arguments = parser.parse_args()
+    model = load_encoder(arguments.checkpoint)
+    rows = []
+    for title, root in (("trained on", arguments.train), ("held out", arguments.heldout)):
+        if root is None:
+            continue
+        captures = open_captures(root)
+        count = min(arguments.people, len(captures.subjects))
+        for number in range(count):
+            name = captures.subjects[number * len(captures.subjects) // count]
+            last = captures.subject(name).frames - 1
+            novel_frame = 1 + number % last if last else 0
+            rows.append((title, list(row(model, captures, name, novel_frame))))
+    if not rows:
+        parser.error("give captures with --train or --heldout")
+    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    sheet(rows, arguments.cell).save(arguments.out, optimize=True)
+    print(arguments.out)
+
+
 if __name__ == "__main__":
-    main()
+    run(main, curve=curve, pictures=pictures)

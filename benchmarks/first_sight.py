@@ -45,11 +45,10 @@ from pathlib import Path
 import blender_isolated  # noqa: F401  before bpy
 import bpy
 import numpy as np
-import resident
 import sidebar
 from march_people import checkered_human
 from primdiffusion.human_file import export_for_blender, save_human
-from record import command_line, report
+from record import command_line, report, resident_mb, trim
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
@@ -148,16 +147,16 @@ def children_seconds() -> float:
 
 
 def one_human(npz: Path, person: Path) -> dict[str, float]:
-    resident.trim()
-    memory = resident.resident_mb()
+    trim()
+    memory = resident_mb()
     steps: list[float] = []
     prepared = prepare(npz, steps)
     found: list[bpy.types.Collection] = []
     steps.append(seconds(lambda: found.append(enter(prepared, person))))
     del prepared
     figures = {"stand_seconds": sum(steps), "longest_step_seconds": max(steps)}
-    resident.trim()
-    figures["person_memory_mb"] = resident.resident_mb() - memory
+    trim()
+    figures["person_memory_mb"] = resident_mb() - memory
     figures["person_frame_ms"] = frame_ms(armature_of(found[0]))
     figures["outliner_rows"] = outliner_rows(found[0])
     figures["volumes_seconds"] = sum(seconds(lambda path=path: list(write_unwritten(path))) for path in unwritten())

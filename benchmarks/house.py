@@ -1,7 +1,8 @@
-"""Figures of the source tree: sizes by room, import circles, hidden imports, threads, ambiguous names, stray tests.
+"""Figures of the source tree: sizes by room, import circles, hidden imports, threads, ambiguous names, tests.
 
     python benchmarks/house.py
     python benchmarks/house.py --walk --json docs/results/house.json    # --walk: also run Generate and count the files
+    python benchmarks/house.py --tests ...    # also run `make test` and time it, on an idle machine
 
 The source is parsed, never imported. The items counted are printed above the figures.
 """
@@ -24,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = {"backend": ROOT / "backend" / "primdiffusion", "extension": ROOT / "blender_primdiffusion"}
 TESTS = {"backend": ROOT / "tests" / "backend", "extension": ROOT / "tests" / "blender"}
 """tests/contract tests both programs together, so it mirrors neither."""
-SUITE = ROOT / "docs" / "results" / "suite.json"
+BLENDERS = ("5.0", "4.5", "5.2")
 THREAD_MODULES = {"threading", "_thread", "concurrent.futures", "multiprocessing"}
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
@@ -64,6 +65,7 @@ class Module:
 def main() -> None:
     parser = record.command_line(__doc__)
     parser.add_argument("--walk", action="store_true", help="generate in Blender and count the files passed (walk.py)")
+    parser.add_argument("--tests", action="store_true", help="time the tests on each Blender; all must pass")
     arguments = parser.parse_args()
     modules = parsed()
     findings = {
@@ -76,7 +78,7 @@ def main() -> None:
     for name, found in findings.items():
         print(f"{name}:", *(found or ["none"]), sep="\n  ", end="\n\n")
     figures: dict[str, float | None] = {**sizes(modules), **{name: len(found) for name, found in findings.items()}}
-    figures["test_minutes"] = json.loads(SUITE.read_text())["test_minutes"] if SUITE.is_file() else None
+    figures |= test_sizes() | (test_minutes() if arguments.tests else {"test_minutes": None})
     figures |= walk() if arguments.walk else {"walk_extension_files": None, "walk_backend_files": None}
     record.report(figures, arguments.json)
 
@@ -175,6 +177,26 @@ def tests_without_source() -> list[str]:
             if not any((beside / f"{name}.py").is_file() or (beside / name).is_dir() for name in names):
                 found.append(str(path.relative_to(ROOT)))
     return found
+
+
+def test_sizes() -> dict[str, float | None]:
+    """Lines and files of the tests with their helpers, and how many of them match an error's words."""
+    sources = [path.read_text(encoding="utf-8") for path in (ROOT / "tests").rglob("*.py")]
+    return {
+        "test_lines": sum(len(source.splitlines()) for source in sources),
+        "test_files": len(sources),
+        "match_in_tests": sum(source.count("match=") for source in sources),
+    }
+
+
+def test_minutes() -> dict[str, float | None]:
+    """Minutes of the tests on each Blender and in all; ends with an error if a test fails."""
+    figures: dict[str, float | None] = {}
+    for blender in BLENDERS:
+        with record.measured() as took:
+            subprocess.run(["make", f"test-{blender}"], cwd=ROOT, check=True)
+        figures[f"test_minutes_{blender.replace('.', '_')}"] = took.seconds / 60
+    return {"test_minutes": sum(filter(None, figures.values())), **figures}
 
 
 def walk() -> Mapping[str, float | None]:

@@ -66,7 +66,7 @@ def sample_people(model: DiffusionModel, seeds: Sequence[int], steps: int = STEP
     """A human for each seed: the vector by DDIM from the start that our model has, then decoded."""
     denoiser, schedule = model.denoiser, model.schedule
     if not isinstance(denoiser, PersonDenoiser) or model.card.get("baseline") != "latents":
-        raise ValueError("this is no latent baseline: train one with benchmarks/diffusion_primitives.py")
+        raise ValueError("this is no latent baseline: train one with benchmarks/train_baselines.py")
     prior, chain = denoiser.prior, model.chain(schedule.length, steps)
     starts = []
     for seed in seeds:

@@ -5,10 +5,16 @@ draws each from directions that `from_mesh` does not use, at rest and in a pose 
 primitives by the posed body). `iou` is of the silhouettes (alpha over one half). `psnr` is of sRGB-encoded pictures on
 black inside the bounding box of the mesh, `psnr_whole` of the whole picture and `psnr_shared` of the pixels in both
 silhouettes. `--quick` takes 4 people from 2 sides. `--pictures DIR` saves mesh and payload side by side.
+
+`python benchmarks/people.py sheet --assets DIR --out people.png` draws a sheet of the 64 people that `primdiffusion
+people` makes from successive seeds, not hand-picked, with lowered arms and a simple light. `--flat` leaves the light
+out, as captures under uniform light do; `--heads` draws only heads; `--poses F.npz` poses the people by a file of SMPL
+poses [N, 72] (key `poses`), evenly spaced.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 import time
 from collections.abc import Callable
@@ -25,14 +31,14 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
-from primdiffusion.people.person import make_person
+from primdiffusion.people.person import Person, make_person
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.raster.rasterise import RasterImage, rasterise
+from primdiffusion.raster.rasterise import RasterImage, TriangleSoup, draw, flatten, rasterise, shade
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
-from record import command_line, report
+from record import command_line, report, run
 
 Result = TypeVar("Result")
 FIRST_SEED = 10_000_000
@@ -56,6 +62,14 @@ BENDS = {
     "head": (0.1, 0.3, 0),
 }
 """The pose: axis-angle (radians) by joint; arms lowered and bent, a step forward, the upper body and head turned."""
+YAW, PITCH, SHEET_FIELD_OF_VIEW = math.radians(28), math.radians(6), math.radians(26)
+SUPERSAMPLE = 3
+BACKGROUND = 0.18
+"""Linear grey."""
+HEIGHT = 2.15
+"""Metres shown in a picture of a whole person, at the person's distance."""
+ARMS_DOWN = {"left_collar": 0.1, "left_shoulder": 1.05, "right_collar": -0.1, "right_shoulder": -1.05}
+"""Rotations about -z in radians."""
 
 
 def camera_at(bounds: np.ndarray, yaw: float, pitch: float) -> Camera:
@@ -165,5 +179,95 @@ def main() -> None:
     report(figures, arguments.json)
 
 
+def arms_down() -> np.ndarray:
+    """[24, 3] axis-angle: standing, with lowered arms."""
+    theta = np.zeros((J, 3))
+    for name, angle in ARMS_DOWN.items():
+        theta[JOINT_NAMES.index(name), 2] = -angle
+    return theta
+
+
+def posed(person: Person, theta: np.ndarray) -> TexturedMesh:
+    """The mesh of a person in a pose, [24, 3] axis-angle."""
+    shaped = default_body().shape(torch.from_numpy(person.betas).float())
+    pose = BodyPose.from_axis_angle(torch.from_numpy(theta).float().flatten())
+    return person.mesh.posed(shaped.pose(pose).skinning.numpy())
+
+
+def view_of(mesh: TexturedMesh, width: int, height: int, heads: bool) -> tuple[Camera, np.ndarray]:
+    """A camera to the front and the side, at the same distance for every person, and the direction to it."""
+    low, high = mesh.bounds
+    eyes = next(part for part in mesh.parts if part.name == "eyes").vertices.mean(0)
+    middle = (low + high) / 2
+    aim = np.array([middle[0], low[1] + 0.48 * HEIGHT, middle[2]])
+    extent, target = (0.4, eyes + np.array([0, 0.02, -0.06])) if heads else (HEIGHT, aim)
+    direction = np.array([math.sin(YAW) * math.cos(PITCH), math.sin(PITCH), math.cos(YAW) * math.cos(PITCH)])
+    place = target + direction * extent / 2 / math.tan(SHEET_FIELD_OF_VIEW / 2)
+    place, target = (torch.from_numpy(point).float() for point in (place, target))
+    return look_at(place, target, vertical_fov=SHEET_FIELD_OF_VIEW, width=width, height=height), direction
+
+
+def sheet_picture(mesh: TexturedMesh, width: int, height: int, heads: bool, lit: bool) -> np.ndarray:
+    """The person's picture, [height, width, 3] bytes."""
+    camera, direction = view_of(mesh, width * SUPERSAMPLE, height * SUPERSAMPLE, heads)
+    soup = flatten(mesh)
+    fragments = draw(soup, camera)
+    rgb = shade(soup, fragments)
+    if lit:
+        normal = np.einsum("hwk,hwkc->hwc", fragments.barycentric, normals(soup)[soup.faces[fragments.face]])
+        rgb = rgb * light(normal, direction)[..., None]
+    rgb = np.where((fragments.face >= 0)[..., None], rgb, BACKGROUND)
+    blocks = rgb.reshape(height, SUPERSAMPLE, width, SUPERSAMPLE, 3).mean((1, 3))
+    return np.rint(encode_srgb(np.clip(blocks, 0, 1)) * 255).astype(np.uint8)
+
+
+def normals(soup: TriangleSoup) -> np.ndarray:
+    """[V, 3] smooth normals, not of unit length."""
+    corners = soup.vertices[soup.faces]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    total = np.zeros_like(soup.vertices)
+    for corner in range(3):
+        np.add.at(total, soup.faces[:, corner], across)
+    return total
+
+
+def light(normal: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """[H, W] brightness: a lamp above the camera's left shoulder and a bright sky."""
+    unit = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+    unit = np.where((unit @ direction)[..., None] < 0, -unit, unit)
+    lamp = direction + np.array([0, 0.8, 0]) - 0.7 * np.cross([0, 1, 0], direction)
+    return 0.5 + 0.15 * unit[..., 1] + 0.55 * np.clip(unit @ (lamp / np.linalg.norm(lamp)), 0, 1)
+
+
+def sheet_of_people() -> None:
+    parser = argparse.ArgumentParser(description="Draws a sheet of people from successive seeds.")
+    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
+    parser.add_argument("--out", type=Path, required=True, help="picture to write")
+    parser.add_argument("--count", type=int, default=64)
+    parser.add_argument("--seed", type=int, default=0, help="seed of the first person")
+    parser.add_argument("--columns", type=int, default=16)
+    parser.add_argument("--height", type=int, default=260, help="pixels for each person")
+    parser.add_argument("--heads", action="store_true")
+    parser.add_argument("--flat", action="store_true")
+    parser.add_argument("--poses", type=Path, help="npz with poses [N, 72]")
+    arguments = parser.parse_args()
+    assets, base = open_assets(arguments.assets), load_base_mesh()
+    poses = [arms_down()]
+    if arguments.poses:
+        with np.load(arguments.poses, allow_pickle=False) as file:
+            poses = file["poses"].reshape(-1, J, 3)
+    width = arguments.height if arguments.heads or arguments.poses else arguments.height // 2
+    cells = []
+    for number in range(arguments.count):
+        person = make_person(assets, base, arguments.seed + number)
+        mesh = posed(person, poses[number * len(poses) // arguments.count])
+        cells.append(sheet_picture(mesh, width, arguments.height, arguments.heads, not arguments.flat))
+    cells += [np.full_like(cells[0], cells[0][0, 0])] * (-len(cells) % arguments.columns)
+    rows = [np.concatenate(cells[i : i + arguments.columns], 1) for i in range(0, len(cells), arguments.columns)]
+    sheet = Image.fromarray(np.concatenate(rows, 0))
+    palette = sheet.quantize(256, kmeans=2)
+    sheet.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG).save(arguments.out, optimize=True)
+
+
 if __name__ == "__main__":
-    main()
+    run(main, sheet=sheet_of_people)

@@ -1,9 +1,10 @@
-"""Writes the benchmarks' figures: one flat JSON object with device, versions and commit beside the numbers."""
+"""What the benchmarks share: command lines, memory, and figures as a flat JSON object with device, versions, commit."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import ctypes
 import dataclasses
 import datetime
 import importlib.metadata
@@ -12,9 +13,10 @@ import math
 import os
 import platform
 import subprocess
+import sys
 import threading
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import psutil
@@ -28,6 +30,14 @@ def command_line(documentation: str | None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(description=documentation, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--json", type=Path, help="write the figures here, flat, with device, versions and commit")
     return parser
+
+
+def run(main: Callable[[], None], **others: Callable[[], None]) -> None:
+    """Calls the one of `others` that the first word of the command line names, or else `main`."""
+    name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if name in others:
+        sys.argv = [f"{sys.argv[0]} {name}", *sys.argv[2:]]
+    others.get(name, main)()
 
 
 def write_record(path: str | Path, figures: Mapping[str, float | int | bool | str | None]) -> None:
@@ -140,3 +150,15 @@ def _resident() -> int:
         with contextlib.suppress(psutil.NoSuchProcess):
             total += member.memory_info().rss
     return total
+
+
+def trim() -> None:
+    """Return the memory that the C library has freed to the system, so that resident memory is memory in use."""
+    release = getattr(ctypes.CDLL(None), "malloc_trim", None)
+    if release is not None:
+        release(0)
+
+
+def resident_mb() -> float:
+    """Resident memory of this process in MB."""
+    return psutil.Process().memory_info().rss / 1e6

@@ -48,10 +48,6 @@ SOURCES = {
         "Attributes that were asked for",
         "benchmarks/attribute_hits.py --assets DIR --reference DIR --json docs/results/attribute_hits.json",
     ),
-    "coverage_rooms": (
-        "Line coverage of the tests by room",
-        "benchmarks/coverage_by_room.py before.json after.json --json docs/results/coverage_rooms.json",
-    ),
     "faults": ("Faults: hostile files, kills, full disks", "benchmarks/faults.py --json docs/results/faults.json"),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
 }  # fmt: skip

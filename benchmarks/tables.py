@@ -2,7 +2,7 @@
 
 `python benchmarks/tables.py --models DIR --assets DIR --json docs/results/tables.json --table
 docs/results/tables_table.md` samples DIR/ours/model.safetensors and DIR/latents/model.safetensors of
-diffusion_primitives.py and DIR/voxels/voxel.safetensors of diffusion_voxel.py, and judges --count humans of each by the
+train_baselines.py and DIR/voxels/voxel.safetensors, and judges --count humans of each by the
 code of `primdiffusion evaluate generation --table 2`: 512 x 512 pictures over white from --views sides beside renders
 of twice as many meshes of seeds that no model trains on. All are in the rest pose, since voxels have no other.
 Distances, PCKh and depth errors are of our own network; `_real` are of the renders, `_floor` of its card. `_default` is

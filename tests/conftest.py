@@ -1,5 +1,6 @@
 """Shape annotations of the backend's maths are checked at run time in tests."""
 
+import pytest
 from jaxtyping import install_import_hook
 from primdiffusion.machine import share_processors
 
@@ -20,3 +21,14 @@ CHECKED = [
     )
 ]
 install_import_hook(CHECKED, "beartype.beartype")
+
+
+@pytest.fixture(scope="module")
+def one_thread():
+    """torch computes on one thread, so that sums have one order."""
+    import torch  # after `share_processors`
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)

@@ -4,7 +4,7 @@ A payload fits the body it was generated with: half extents are constants of the
 (paper sec. 3.1), independent of betas. On a stretched surface, boxes of the same size lie farther apart, which shows as
 gaps and repeated patterns. So a box grows along T and B by a power of the stretch of its cell of the UV grid. The full
 stretch would suit a flat surface; on a curved one, the corners of wider boxes stand off the body.
-`benchmarks/reshape_boxes.py` compares exponents.
+`benchmarks/reshape.py boxes` compares exponents.
 """
 
 from __future__ import annotations

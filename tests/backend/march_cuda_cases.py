@@ -14,6 +14,7 @@ from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cuda import Shapes, march_cuda
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, Span
 from primdiffusion.render.reference import march_reference
+from support.errors import refused
 from torch import Tensor
 
 INTERPRETED = os.environ.get("TRITON_INTERPRET") == "1"
@@ -317,34 +318,34 @@ def test_voxels_without_density_receive_the_gradient_of_their_limit():
 def test_nan_is_rejected_by_name(name):
     boxes = random_boxes(2)
     getattr(boxes, name).view(-1)[-1] = torch.nan
-    with pytest.raises(ValueError, match=rf"primitives\.{name} holds NaN"):
+    with refused(ValueError, f"primitives.{name}", "NaN"):
         draw(boxes, camera_at((0.0, 0.0, 0.5)))
 
 
 def test_bad_scenes_are_rejected_as_check_scene_does():
     boxes, camera = random_boxes(2), camera_at((0.0, 0.0, 0.5))
-    with pytest.raises(ValueError, match="smallest density is -1"):
+    with refused(ValueError, "density is -1"):
         draw(dataclasses.replace(boxes, density=boxes.density * 0 - 1), camera)
-    with pytest.raises(ValueError, match=r"camera\.intrinsics"):
+    with refused(ValueError, "camera.intrinsics"):
         draw(boxes, dataclasses.replace(camera, intrinsics=camera.intrinsics * torch.nan))
-    with pytest.raises(ValueError, match="scales or shears"):
+    with refused(ValueError, "scales"):
         draw(boxes, dataclasses.replace(camera, world_to_camera=camera.world_to_camera * 2))
     lens = camera.intrinsics.clone()
     lens[0, 0] = 0
-    with pytest.raises(ValueError, match="focal lengths"):
+    with refused(ValueError, "lengths"):
         draw(boxes, dataclasses.replace(camera, intrinsics=lens))
-    with pytest.raises(ValueError, match="not a rotation"):
+    with refused(ValueError, "rotation"):
         draw(dataclasses.replace(boxes, rotation=boxes.rotation * 1.1), camera)
-    with pytest.raises(ValueError, match="0 x 20 pixels"):
+    with refused(ValueError, "0 x 20 pixels"):
         draw(boxes, dataclasses.replace(camera, width=0))
     limit = torch.full((20, 24), torch.nan, dtype=torch.float64)
-    with pytest.raises(ValueError, match=r"span\.near holds NaN"):
+    with refused(ValueError, "span.near", "NaN"):
         draw(boxes, camera, span=Span(limit, torch.ones_like(limit)))
-    with pytest.raises(ValueError, match="index_order"):
+    with refused(ValueError, "index_order"):
         draw(boxes, camera, MarchSettings(compositing="index_order"))
-    with pytest.raises(ValueError, match="float32"):
+    with refused(ValueError, "float32"):
         march_cuda(batch(boxes), batch(camera))
-    with pytest.raises(ValueError, match="call march"):
+    with refused(ValueError, "march"):
         march_cuda(single(boxes), single(batch(camera)))
-    with pytest.raises(ValueError, match=r"8\^3 voxels"):
+    with refused(ValueError, "8^3"):
         draw(random_boxes(2, size=4), camera)

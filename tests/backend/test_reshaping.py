@@ -8,6 +8,7 @@ from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.human import Human, generate, place
 from primdiffusion.primitives.anchors import Anchors, cell_sides, default_anchors
 from primdiffusion.reshaping import SHARE, box_growth, reshaped
+from support.errors import refused
 from tiny_model import tiny_model
 
 WIDER = torch.tensor([0.3, 2.6, 1.0, 2.2, 0.3, 4.0, 1.5, -1.7, -0.4, -0.3])
@@ -78,7 +79,7 @@ def test_reshaping_twice_is_reshaping_once_and_back_again_is_nothing(human):
 
 
 def test_another_number_of_betas_and_nan_are_rejected(human):
-    with pytest.raises(ValueError, match="3 betas for a body with 10"):
+    with refused(ValueError, "3 betas"):
         reshaped(human, torch.zeros(3))
-    with pytest.raises(ValueError, match="finite"):
+    with refused(ValueError, "finite"):
         reshaped(human, torch.full((10,), torch.nan))

@@ -22,6 +22,7 @@ from primdiffusion.tensor_file import (
     save,
 )
 from safetensors import safe_open
+from support.errors import refused
 from torch import nn
 
 TENSORS = {"b": torch.arange(6.0).reshape(2, 3), "a": torch.ones(3, dtype=torch.float16), "ä": torch.zeros(0)}
@@ -55,7 +56,7 @@ def test_without_metadata_only_the_order_can_differ_from_safetensors():
 
 
 def test_a_view_is_refused():
-    with pytest.raises(ValueError, match="contiguous"):
+    with refused(ValueError, "contiguous"):
         save({"x": torch.ones(3, 4).T})
 
 
@@ -93,7 +94,7 @@ def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
     path = tmp_path / "a.safetensors"
     with path.open("wb") as file:
         file.truncate(LARGEST_FILE + 1)
-    with pytest.raises(TooLargeError, match=r"a\.safetensors"):
+    with refused(TooLargeError, "a.safetensors"):
         read(path)
     path.unlink()
     os.mkfifo(path)
@@ -134,7 +135,7 @@ def test_a_network_gets_the_weights_of_a_file():
     weights = {"weight": torch.ones(2, 3), "bias": torch.zeros(2)}
     network = load_network(lambda: nn.Linear(3, 2), weights)
     assert torch.equal(network(torch.ones(1, 3)), torch.full((1, 2), 3.0))
-    with pytest.raises(RuntimeError, match="bias"):
+    with refused(RuntimeError, "bias"):
         load_network(lambda: nn.Linear(3, 2), {"weight": torch.ones(2, 3)})
 
 
@@ -148,5 +149,5 @@ def test_a_network_gets_the_weights_of_a_file():
     ],
 )
 def test_what_is_larger_than_the_file_gets_no_memory(build):
-    with pytest.raises(RuntimeError, match="more parameters than the file"), RoomFor({"a": torch.zeros(10)}):
+    with refused(RuntimeError, "parameters"), RoomFor({"a": torch.zeros(10)}):
         build()

@@ -14,6 +14,7 @@ import pytest
 import torch
 from primdiffusion import torch_file
 from primdiffusion.formats.arrays import ArrayFileError
+from support.errors import refused
 
 
 @pytest.fixture(params=["private", "public"], autouse=True)
@@ -65,7 +66,7 @@ def test_an_archive_that_unpacks_to_more_than_it_has_is_refused(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.pt") as stored, zipfile.ZipFile(tmp_path / "b.pt", "w", 8) as packed:
         for name in stored.namelist():
             packed.writestr(name, stored.read(name))
-    with pytest.raises(ValueError, match="compressed"):
+    with refused(ValueError, "compressed"):
         torch_file.load(tmp_path / "b.pt")
 
 
@@ -97,7 +98,7 @@ def test_two_members_of_what_torch_takes_for_one_name_are_refused(tmp_path, name
     members.insert(0 if first else len(members), (name, HOSTILE["memory"]))
     path = archive_of(tmp_path / "a.pt", members)
     path.write_bytes(path.read_bytes().replace(b"data.pkl?.txt", b"data.pkl\0.txt"))  # readers end names at a null
-    with pytest.raises(ArrayFileError, match=r"a\.pt holds '.*' twice"):
+    with refused(ArrayFileError, "a.pt"):
         torch_file.load(path)
 
 
@@ -181,7 +182,7 @@ def test_archives_of_another_kind_are_refused(tmp_path, member):
 def test_a_damaged_pickle_is_refused(tmp_path):
     path = archive_of(tmp_path / "a.pt", [("x/data.pkl", storage_pickle()), ("x/data/0", bytes(8))])
     path.write_bytes(path.read_bytes().replace(b"storage", b"storagf", 1))
-    with pytest.raises(torch_file.PICKLE_ERRORS, match="damaged"):
+    with refused(torch_file.PICKLE_ERRORS, "damaged"):
         torch_file.load(path)
 
 
@@ -251,7 +252,7 @@ def test_without_the_private_module_the_reader_is_imported_and_reads(tmp_path, m
     spec.loader.exec_module(again)
     assert again._weights_only_unpickler is None
     archive_of(tmp_path / "a.pt", [("x/data.pkl", HOSTILE["memory"])])
-    with pytest.raises(again.PICKLE_ERRORS, match=r"GLOBAL builtins\.bytearray"):
+    with refused(again.PICKLE_ERRORS, "GLOBAL", "builtins.bytearray"):
         again.load(tmp_path / "a.pt")
 
 

@@ -1,17 +1,12 @@
 """Measures of the chain from mesh to sample: on pictures, payloads and colours whose answers are known."""
 
-import sys
-from pathlib import Path
-
+import chain
 import numpy as np
 import pytest
 import torch
 from primdiffusion.evaluation.image_metrics import compare_detail, detail_energy, figure_psnr, overlap
 from primdiffusion.primitives.primitives import K, Payload
 from scipy import ndimage
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import chain_measures
 
 
 def figure(side=64):
@@ -81,7 +76,7 @@ def test_compare_of_shifted_squares_gives_the_overlap_by_hand():
     true, drawn = torch.zeros(32, 32, 4), torch.zeros(32, 32, 4)
     true[8:24, 8:24] = 1
     drawn[8:24, 12:28] = 1
-    measured = chain_measures.compare(drawn, true)
+    measured = chain.compare(drawn, true)
     assert measured["iou"] == pytest.approx(12 / 20)
     assert overlap(true[..., 3] > 0.5, drawn[..., 3] > 0.5) == pytest.approx(12 / 20)
 
@@ -91,23 +86,23 @@ def test_change_cosine_of_equal_opposite_and_invisible_changes():
         return Payload(torch.full((K, 3, 8, 8, 8), grey), torch.full((K, 8, 8, 8), density), torch.ones(K, 3))
 
     start, up, down = payload(0.3, 50.0), payload(0.3, 60.0), payload(0.3, 40.0)
-    assert chain_measures.change_cosine(up, up, start, 100.0) == pytest.approx(1)
-    assert chain_measures.change_cosine(up, down, start, 100.0) == pytest.approx(-1)
+    assert chain.change_cosine(up, up, start, 100.0) == pytest.approx(1)
+    assert chain.change_cosine(up, down, start, 100.0) == pytest.approx(-1)
     edge = up.map(torch.clone)
     edge.density[..., 0, 0, 0] = 0.0
-    assert chain_measures.change_cosine(up, edge, start, 100.0) == pytest.approx(1, abs=1e-2)
+    assert chain.change_cosine(up, edge, start, 100.0) == pytest.approx(1, abs=1e-2)
 
 
 def test_lab_of_known_colours():
-    lab = chain_measures.lab_of_linear(np.array([[1.0, 1, 1], [0, 0, 0], [1, 0, 0]]))
+    lab = chain.lab_of_linear(np.array([[1.0, 1, 1], [0, 0, 0], [1, 0, 0]]))
     np.testing.assert_allclose(lab, [[100, 0, 0], [0, 0, 0], [53.24, 80.09, 67.20]], atol=0.03)
 
 
 def test_rest_std_is_measured_region_by_region():
-    chart = chain_measures.default_anchors().chart
+    chart = chain.default_anchors().chart
     rest = torch.ones(2, 5, K)
-    rest[..., chart == chain_measures.CHARTS.index("head")] = -3.0
-    spread = chain_measures.rest_std(rest.unflatten(-1, (32, 32)))
+    rest[..., chart == chain.CHARTS.index("head")] = -3.0
+    spread = chain.rest_std(rest.unflatten(-1, (32, 32)))
     assert spread["head"] == pytest.approx(3)
     assert spread["torso"] == pytest.approx(1)
 
@@ -117,6 +112,6 @@ def test_a_sleeve_is_no_skin():
     bare = {"face": face, "hands": near, "forearms": near}
     dressed = {"face": face, "hands": near, "forearms": sleeve}
     masked = {"hands": near}
-    differences = chain_measures.skin_differences([bare, dressed, masked])
+    differences = chain.skin_differences([bare, dressed, masked])
     assert differences["hands"] == pytest.approx([5, 5])
     assert differences["forearm"] == pytest.approx([5])

@@ -1,19 +1,15 @@
 """The ablations of Table 3 in the paper's form: trained for their time, compared in poses that training had not."""
 
 import argparse
-import sys
-from pathlib import Path
 
+import encoder_paper_form
 import fit_scenes
 import pytest
 from capture_scenes import captured
+from encoder_paper_form import FORMS, figures_of, measured, train
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.encoder.config import PAPER, PRESETS
 from tiny_encoder import TINY
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
-import encoder_paper_form
-from encoder_paper_form import FORMS, figures_of, measured, train
 
 
 def test_forms_differ_from_the_papers_in_one_setting():

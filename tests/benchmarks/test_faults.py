@@ -4,10 +4,8 @@ import json
 import sys
 from pathlib import Path
 
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import faults
+import pytest
 
 NAMES = {
     "threads_person_error_max", "same_bytes_threads", "small_input_peak_mb", "small_input_seconds", "fuzz_inputs",

@@ -1,12 +1,7 @@
 """The figures of the source tree count what they say, on trees small enough to count by hand."""
 
-import sys
-from pathlib import Path
-
-import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import house
+import pytest
 
 
 @pytest.fixture

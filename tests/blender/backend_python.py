@@ -13,8 +13,8 @@ from blender_primdiffusion import places
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import BackendPython
 
-ORDERS = ("FAKE_", "EXPORT_")
-"""Beginnings of the variables that tell a fake child what to do; the extension itself passes none of them on."""
+ORDERS = "FAKE_"
+"""Beginning of the variables that tell the fake child what to do; the extension itself passes none of them on."""
 
 
 def fake_client(python: Path, module_path: Path | None, *, cache_dir: Path | None = None) -> BackendClient:

@@ -22,6 +22,7 @@ import synthetic
 import synthetic_shape
 from exporting import write_person
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
 
@@ -393,13 +394,14 @@ def figures() -> dict[str, int]:
     folder beside the .blend. Takes some minutes; for a process of its own, in which the extension is not registered."""
     import pytest
     from backend_python import use_this_python
+    from support.fake_child import FAKE_CHILD
 
     import blender_primdiffusion
 
     outside = 0
     with tempfile.TemporaryDirectory() as root, pytest.MonkeyPatch.context() as patch:
         patch.setenv("FAKE_HUMAN", str(synthetic.write(Path(root) / "prepared.npz", COUNT)))
-        use_this_python(patch, Path(__file__).parent / "fake_backend")
+        use_this_python(patch, FAKE_CHILD)
         bpy.ops.wm.read_factory_settings(use_empty=True)
         blender_primdiffusion.register()
         pristine = Stage(Path(root) / "pristine")

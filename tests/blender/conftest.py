@@ -71,12 +71,13 @@ def addon(saved_scene, tmp_path, monkeypatch):
     """The add-on registered from the checkout, on an interpreter that runs the fake child."""
     import synthetic
     from backend_python import use_this_python
+    from support.fake_child import FAKE_CHILD
 
     import blender_primdiffusion
     from blender_primdiffusion.jobs.queue import queue
 
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
-    use_this_python(monkeypatch, Path(__file__).parent / "fake_backend")
+    use_this_python(monkeypatch, FAKE_CHILD)
     queue.outcomes.clear()
     queue.info = {}
     blender_primdiffusion.register()

@@ -1,10 +1,11 @@
-"""Edits of humans in the scene, written and shown at once."""
+"""Edits of humans in the scene, written and shown at once, and pictures of the scene."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import bpy
+import numpy as np
 
 from blender_primdiffusion.scene.edit import Replaced, edit_destination, replace_person
 from blender_primdiffusion.scene.human_npz import write_now
@@ -12,3 +13,13 @@ from blender_primdiffusion.scene.human_npz import write_now
 
 def replace(collection: bpy.types.Collection, human_npz: Path, person: Path) -> Replaced:
     return replace_person(collection, write_now(human_npz, edit_destination(collection)), person)
+
+
+def render(path: Path) -> np.ndarray:
+    """The picture [H, W, 4], linear and premultiplied, top row first."""
+    scene = bpy.context.scene
+    scene.render.image_settings.file_format = "OPEN_EXR"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    image = bpy.data.images.load(str(path))
+    return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], 4)[::-1]

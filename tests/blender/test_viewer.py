@@ -13,6 +13,7 @@ import zipfile
 from pathlib import Path
 
 import pytest
+from support.errors import refused
 
 pytest.importorskip("torch", reason="the gallery's humans are made by the backend")
 
@@ -68,9 +69,9 @@ def test_no_code_in_it_downloads_or_installs(archive):
 
 def test_a_human_too_large_for_the_gallery_is_rejected(gallery, tmp_path):
     save_human(tmp_path / "Big.human", person())
-    with pytest.raises(build_addon.BuildError, match=r"Big\.human is larger than 3 MB"):
+    with refused(build_addon.BuildError, "Big.human", "3 MB"):
         build_addon.viewer_contents(tmp_path)
-    with pytest.raises(build_addon.BuildError, match=r"no \.human files"):
+    with refused(build_addon.BuildError, ".human"):
         build_addon.viewer_contents(gallery / "none")
 
 

@@ -14,13 +14,11 @@ from pathlib import Path
 import psutil
 from chaos.kills import Tally
 from chaos.results import leftovers
+from support.fake_child import DIES, FAKE_CHILD
 
 from blender_primdiffusion.backend.client import BackendClient, Silent
 from blender_primdiffusion.backend.requests import Backend, ChildRequest
 
-FAKE = Path(__file__).resolve().parents[1] / "blender" / "fake_backend"
-DIES = 1
-"""A seed at which the fake child ends by itself in the middle of a request."""
 SEED = 10
 SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGKILL, signal.SIGSEGV, signal.SIGTERM, signal.SIGABRT)
 TICK_S = 0.01
@@ -48,7 +46,7 @@ class Deaths:
     def _fake(self) -> Generator[None, None, BackendClient]:
         yield
         human = {"FAKE_HUMAN": str(self._human)}
-        return BackendClient(Path(sys.executable), FAKE, human, silence_s=NOTICED_S)
+        return BackendClient(Path(sys.executable), FAKE_CHILD, human, silence_s=NOTICED_S)
 
     def killed(self) -> None:
         """A request whose child dies at a random time, by a random signal or by itself."""

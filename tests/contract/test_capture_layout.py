@@ -15,6 +15,7 @@ from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.formats import camera_files, camera_rig, capture_layout, picture_files
 from primdiffusion.geometry.camera import look_at
 from scipy.spatial.transform import Rotation
+from support.errors import refused
 
 from blender_primdiffusion.motion import poses as motion_poses
 
@@ -77,7 +78,7 @@ def test_a_camera_straight_above_is_possible():
 
 @pytest.mark.parametrize("wrong", [{"count": 0}, {"vertical_fov": 0.0}, {"width": 0}, {"elevations": (90.0,)}])
 def test_impossible_rigs_are_rejected(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with refused(ValueError, next(iter(wrong))):
         camera_rig.Rig(**wrong)
 
 
@@ -123,11 +124,11 @@ def test_smpl_parameters_are_read_plain_and_as_the_released_code_does(tmp_path):
 def test_a_folder_is_claimed_once(tmp_path):
     capture_layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
     capture_layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
-    with pytest.raises(capture_layout.CaptureFolderError, match="its seed is 1, wanted is 2"):
+    with refused(capture_layout.CaptureFolderError, "seed is 1", "wanted is 2"):
         capture_layout.claim(tmp_path / "a", {"seed": 2, "size": (3, 4)})
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "thesis.tex").touch()
-    with pytest.raises(capture_layout.CaptureFolderError, match="not empty"):
+    with refused(capture_layout.CaptureFolderError):
         capture_layout.claim(tmp_path / "b", {"seed": 1})
 
 
@@ -156,7 +157,7 @@ def test_damage_is_found(tmp_path):
 
 
 def test_nothing_is_left_of_a_file_that_failed(tmp_path):
-    with pytest.raises(ValueError, match="uint8"):
+    with refused(ValueError, "uint8"):
         picture_files.write_png(tmp_path / "a.png", np.zeros((2, 2)))
     assert list(tmp_path.iterdir()) == []
 

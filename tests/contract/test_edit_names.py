@@ -9,6 +9,7 @@ from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoi
 from primdiffusion.diffusion.samplers import SAMPLERS as BACKENDS_SAMPLERS
 from primdiffusion.editing.regions import parts_of, region_of
 from primdiffusion.formats.requests import PARTS, SAMPLERS
+from support.errors import refused
 
 from blender_primdiffusion.backend.vocabulary import read_vocabulary
 
@@ -39,7 +40,7 @@ def test_means_that_no_quantity_has_are_rejected(tmp_path):
     header = json.dumps({"__metadata__": {"architecture": json.dumps({"vocabulary": vocabulary})}}).encode()
     path = tmp_path / "a.safetensors"
     path.write_bytes(len(header).to_bytes(8, "little") + header)
-    with pytest.raises(ValueError, match=r"a\.safetensors is damaged"):
+    with refused(ValueError, "a.safetensors"):
         read_vocabulary(path)
 
 
@@ -50,5 +51,5 @@ DAMAGED = [b"", b"PK\x03\x04", b"\xff" * 64, b"\x02" + bytes(7) + b"{}", b"\x09"
 def test_a_file_that_is_no_checkpoint_is_rejected_with_its_path(tmp_path, contents):
     path = tmp_path / "broken.safetensors"
     path.write_bytes(contents)
-    with pytest.raises(ValueError, match=r"broken\.safetensors is damaged or no checkpoint"):
+    with refused(ValueError, "broken.safetensors"):
         read_vocabulary(path)

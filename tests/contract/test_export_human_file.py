@@ -6,6 +6,7 @@ import torch
 from export_people import person
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.reshaping import reshaped as reshape_in_backend
+from support.errors import refused
 
 from blender_primdiffusion.scene.human_file import (
     HumanMotion,
@@ -51,7 +52,7 @@ def test_a_reshaped_person_in_a_file_is_the_backends_reshaped_person(saved, tmp_
 
 
 def test_boxes_of_another_body_are_rejected(saved):
-    with pytest.raises(ValueError, match=r"not F32\[5, 3\]; choose a .human file"):
+    with refused(ValueError, "[5, 3]", ".human"):
         reshaped(read_tensors(saved), np.zeros(10), np.ones((5, 3)))
 
 
@@ -77,7 +78,7 @@ def test_a_damaged_motion_is_rejected_with_a_sentence(saved, damage):
         human.arrays["motion.frames"] = ("F32", (), bytes(4))
     if damage == "fps":
         human.metadata["motion"] = '{"fps": "fast"}'
-    with pytest.raises(ValueError, match="export the human again"):
+    with refused(ValueError, "human"):
         motion_in(human, "b.human")
 
 
@@ -85,7 +86,7 @@ def test_a_damaged_motion_is_rejected_with_a_sentence(saved, damage):
 def test_a_motion_with_a_matrix_that_is_not_a_rotation_is_rejected_by_frame_and_joint(saved, change):
     motion = walk()
     motion.rotations[2, 4] = change
-    with pytest.raises(ValueError, match=r"'b\.human' holds a matrix for joint left_knee in frame 2 that is not a rot"):
+    with refused(ValueError, "b.human", "left_knee", "frame 2"):
         motion_in(with_motion(read_tensors(saved), motion), "b.human")
 
 
@@ -93,7 +94,7 @@ def test_a_motion_with_a_matrix_that_is_not_a_rotation_is_rejected_by_frame_and_
 def test_what_is_no_person_is_rejected_with_a_sentence(tmp_path, data):
     path = tmp_path / "x.human"
     path.write_bytes(data)
-    with pytest.raises(ValueError, match="no human"):
+    with refused(ValueError, "human"):
         read_tensors(path)
 
 

@@ -12,6 +12,7 @@ from fuzz.reader_targets import read_by_both
 from primdiffusion import tensor_file
 from primdiffusion.human import generate
 from primdiffusion.human_file import save_human
+from support.errors import refused
 from tiny_model import tiny_model
 
 Tensors = dict[str, torch.Tensor]
@@ -56,5 +57,5 @@ def test_both_readers_give_one_verdict(whole, tmp_path, change, is_read):
     if is_read:
         read_by_both(path)
     else:
-        with pytest.raises(ValueError, match=r"a\.human"):  # Garbage, of one reader alone, is no ValueError
+        with refused(ValueError, "a.human"):  # Garbage, of one reader alone, is no ValueError
             read_by_both(path)

@@ -14,8 +14,6 @@ import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
-BACKEND = Path(__file__).parent / "setup_backend"
-
 
 def write_wheel(folder: Path, name: str, text: str, version: str = "1.0") -> Path:
     """A wheel of one module."""
@@ -39,7 +37,7 @@ def _digest(content: str) -> str:
 
 
 def write_packages(folder: Path, problem: str | None = None) -> list[Path]:
-    """What the tiny backend needs: torch and tiny."""
+    """What the fake child needs: torch and tiny."""
     return [
         write_wheel(folder, "tiny", f"PROBLEM = {problem!r}\n"),
         write_wheel(folder, "torch", "__version__ = '0-tiny'\n"),

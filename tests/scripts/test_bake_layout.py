@@ -11,6 +11,7 @@ import torch
 from primdiffusion.body.model import default_body
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import GRID
+from support.errors import refused
 
 pytest.importorskip("igl", reason="libigl comes with the `bake` extra")
 SCRIPT = pathlib.Path(__file__).parents[2] / "scripts/bake_layout"
@@ -105,7 +106,7 @@ def test_a_cut_doubles_the_vertices_inside_it_and_the_loop_passes_both_copies():
 def test_a_ring_is_no_disc():
     _, faces = sheet_of(3, 3)
     inner = np.isin(faces, [5, 6, 9, 10]).sum(1) == 3
-    with pytest.raises(ValueError, match="not a disc"):
+    with refused(ValueError, "disc"):
         outline(faces[~inner])
 
 
@@ -166,7 +167,7 @@ def test_the_charts_tile_the_grid():
 
 
 def test_a_lopsided_body_is_rejected():
-    with pytest.raises(ValueError, match="mirror image"):
+    with refused(ValueError, "mirror"):
         mirror_vertices(np.array([[0.1, 0, 0], [-0.2, 0, 0]]))
 
 

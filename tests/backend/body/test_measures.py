@@ -2,6 +2,7 @@ import pytest
 import torch
 from primdiffusion.body.measures import betas_of_measures, measure
 from primdiffusion.body.model import default_body as load_default_body
+from support.errors import refused
 
 
 @pytest.fixture(scope="module")
@@ -40,5 +41,5 @@ def test_a_change_follows_the_shapes_that_people_have(default_body):
 
 
 def test_bodies_that_no_human_has_are_rejected(default_body):
-    with pytest.raises(ValueError, match=r"2\.60 m.*30 kg"):
+    with refused(ValueError, "2.60", "30 kg"):
         betas_of_measures(torch.zeros(10), torch.eye(10), default_body, 2.6, 30.0)

@@ -15,6 +15,7 @@ from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.body.smpl_pickle import BodyFileError, UnsafePickleError
 from smplx.lbs import lbs
+from support.errors import refused
 
 V, F = 60, 116
 PARENTS = [2**32 - 1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21]
@@ -141,7 +142,7 @@ def test_without_texture_coordinates_the_body_is_unwrapped(tmp_path):
 
 def test_without_xatlas_a_body_without_texture_coordinates_is_rejected_with_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
-    with pytest.raises(BodyFileError, match="give them by a second file"):
+    with refused(BodyFileError):
         load_body(pickled(tmp_path, smpl_arrays()))
 
 
@@ -159,7 +160,7 @@ def test_obj_texture_coordinates_follow_the_bodys_face_order(tmp_path, uv_pair):
     np.testing.assert_array_equal(body.uv_faces, ft)
     np.testing.assert_allclose(body.uv, vt, rtol=1e-6)
     (tmp_path / "uv.obj").write_text("\n".join(lines[:-1]))
-    with pytest.raises(BodyFileError, match="lacks a face of the body"):
+    with refused(BodyFileError):
         load_body(tmp_path / "SMPL_NEUTRAL.pkl", uv=tmp_path / "uv.obj")
 
 
@@ -220,24 +221,24 @@ NAN = np.where(np.arange(V * 3).reshape(V, 3) == 7, np.nan, 0.0)
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "name"),
     [
-        ({k: v for k, v in smpl_arrays().items() if k != "posedirs"}, "'posedirs' is missing"),
-        (spoiled("shapedirs", np.zeros((V, 3))), "'shapedirs' has shape 60 x 3 where 60 x 3 x N"),
-        (spoiled("weights", np.zeros((V, 52))), "'weights' has shape 60 x 52 where 60 x 24"),
-        (spoiled("weights", np.zeros((V, J))), "'weights' has rows that are no weights"),
-        (spoiled("v_template", NAN), "'v_template' holds NaN"),
-        (spoiled("v_template", np.full((V, 3), 9e8)), "'v_template' has vertices more than 1000 m away"),
-        (spoiled("f", np.full((F, 3), V)), "'f' holds numbers that are not whole and from 0 to 59"),
-        (spoiled("f", np.full((F, 3), 0.5)), "'f' holds numbers that are not whole"),
-        (spoiled("kintree_table", np.array([PARENTS[::-1], range(J)])), "'kintree_table' is not a tree"),
-        (spoiled("J_regressor", "text"), "'J_regressor' cannot be read .a str stands"),
-        (spoiled("v_template", np.array([["a"] * 3] * V)), "'v_template' cannot be read .an array holds elements"),
-        ([1, 2], "no dictionary of named arrays but a list"),
+        ({k: v for k, v in smpl_arrays().items() if k != "posedirs"}, "'posedirs'"),
+        (spoiled("shapedirs", np.zeros((V, 3))), "'shapedirs'"),
+        (spoiled("weights", np.zeros((V, 52))), "'weights'"),
+        (spoiled("weights", np.zeros((V, J))), "'weights'"),
+        (spoiled("v_template", NAN), "'v_template'"),
+        (spoiled("v_template", np.full((V, 3), 9e8)), "'v_template'"),
+        (spoiled("f", np.full((F, 3), V)), "'f'"),
+        (spoiled("f", np.full((F, 3), 0.5)), "'f'"),
+        (spoiled("kintree_table", np.array([PARENTS[::-1], range(J)])), "'kintree_table'"),
+        (spoiled("J_regressor", "text"), "'J_regressor'"),
+        (spoiled("v_template", np.array([["a"] * 3] * V)), "'v_template'"),
+        ([1, 2], "list"),
     ],
 )
-def test_broken_content_is_named(tmp_path, uv_pair, content, message):
-    with pytest.raises(BodyFileError, match=message):
+def test_broken_content_is_named(tmp_path, uv_pair, content, name):
+    with refused(BodyFileError, name):
         load_body(pickled(tmp_path, content), uv=uv_pair)
 
 
@@ -250,32 +251,32 @@ def test_files_cut_short_are_named(tmp_path, uv_pair, kind, keep):
         np.savez(path, **{k: v for k, v in smpl_arrays().items() if k != "J_regressor"})
     whole = path.read_bytes()
     path.write_bytes(whole[: int(keep * len(whole))])
-    with pytest.raises(BodyFileError, match=path.name):
+    with refused(BodyFileError, path.name):
         load_body(path, uv=uv_pair)
 
 
 def test_npz_with_pickled_objects_is_rejected(tmp_path, uv_pair):
     np.savez(tmp_path / "body.npz", **spoiled("v_template", np.array([Hostile(print, "ran")] * V)))
-    with pytest.raises(BodyFileError, match="'v_template' cannot be read"):
+    with refused(BodyFileError, "v_template"):
         load_body(tmp_path / "body.npz", uv=uv_pair)
 
 
 def test_wrong_paths_and_texture_files_are_named(tmp_path, uv_pair):
-    with pytest.raises(FileNotFoundError, match=r"no body model at .*nowhere\.pkl"):
+    with refused(FileNotFoundError, "nowhere.pkl"):
         load_body(tmp_path / "nowhere.pkl")
     (tmp_path / "body.fbx").write_bytes(b"")
-    with pytest.raises(BodyFileError, match=r"ends in '\.fbx'"):
+    with refused(BodyFileError, ".fbx"):
         load_body(tmp_path / "body.fbx")
     path = pickled(tmp_path, smpl_arrays())
     np.save(tmp_path / "short.npy", np.zeros((F - 1, 3), int))
-    with pytest.raises(BodyFileError, match="do not fit a body of 116 faces"):
+    with refused(BodyFileError, "116"):
         load_body(path, uv=(uv_pair[0], tmp_path / "short.npy"))
     np.save(tmp_path / "far.npy", np.full((F, 3), 70))
-    with pytest.raises(BodyFileError, match="out of range"):
+    with refused(BodyFileError):
         load_body(path, uv=(uv_pair[0], tmp_path / "far.npy"))
     np.savez(tmp_path / "texts.npz", vt=np.full((F, 2), "a"), ft=np.zeros((F, 3), int))
-    with pytest.raises(BodyFileError, match="must be numbers"):
+    with refused(BodyFileError):
         load_body(path, uv=tmp_path / "texts.npz")
     np.save(tmp_path / "objects.npy", np.array([Hostile(print, "ran")]), allow_pickle=True)
-    with pytest.raises(BodyFileError, match=r"objects\.npy holds pickled Python objects"):
+    with refused(BodyFileError, "objects.npy"):
         load_body(path, uv=(uv_pair[0], tmp_path / "objects.npy"))

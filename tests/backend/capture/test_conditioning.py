@@ -24,6 +24,7 @@ from primdiffusion.capture.smpl_parameters import SmplParameters
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.capture_layout import picture_path, write_smpl
 from primdiffusion.geometry.textured_mesh import TexturedMesh
+from support.errors import refused
 
 FIRST = "person_000000"
 
@@ -62,7 +63,7 @@ def test_all_cameras_are_taken_where_there_are_no_more(tmp_path):
 
 
 def test_less_than_one_view_is_rejected(tmp_path):
-    with pytest.raises(ConditioningError, match="0 views were requested"):
+    with refused(ConditioningError, "0 views"):
         spread_cameras(ring(tmp_path, 5), 0, 0)
 
 
@@ -96,25 +97,25 @@ def test_a_subjects_own_folder_needs_no_name(dataset):
 
 
 def test_several_subjects_and_none_named_is_an_error_that_names_some(dataset):
-    with pytest.raises(ConditioningError, match=r"several subjects: name one of them \(person_000000, person_000001\)"):
+    with refused(ConditioningError, "person_000000", "person_000001"):
         choose_subject(dataset)
 
 
 def test_an_unknown_subject_is_an_error_that_names_the_nearest_first(dataset):
-    with pytest.raises(ConditioningError, match=r"'person_00001'.* choose from person_000001, person_000000"):
+    with refused(ConditioningError, "person_00001", "person_000001", "person_000000"):
         choose_subject(dataset, "person_00001")
 
 
 @pytest.mark.parametrize("frame", [-1, 2])
 def test_a_frame_that_was_not_captured_is_rejected(dataset, frame):
-    with pytest.raises(ConditioningError, match=f"frames 0 to 1, not {frame}"):
+    with refused(ConditioningError, str(frame)):
         captured_person(dataset, FIRST, frame)
 
 
 def test_a_missing_picture_is_named(folder):
     path = picture_path(folder / FIRST, "img", 2, 1)
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=str(path)):
+    with refused(FileNotFoundError, str(path)):
         captured_person(folder, FIRST, 1)
     assert captured_person(folder, FIRST, 0).cameras == (0, 1, 2, 3)
 
@@ -122,14 +123,14 @@ def test_a_missing_picture_is_named(folder):
 def test_a_mask_of_another_size_is_named(folder):
     path = picture_path(folder / FIRST, "mask", 1, 0)
     Image.new("L", (16, 32), 255).save(path)
-    with pytest.raises(CaptureFileError, match=f"{path} has 16 x 32 pixels, its camera 32 x 32"):
+    with refused(CaptureFileError, str(path)):
         captured_person(folder, FIRST)
 
 
 def test_empty_masks_are_rejected(folder):
     for camera in range(4):
         Image.new("L", (32, 32), 0).save(picture_path(folder / FIRST, "mask", camera, 0))
-    with pytest.raises(ConditioningError, match="shows a human"):
+    with refused(ConditioningError):
         captured_person(folder, FIRST)
 
 
@@ -141,13 +142,13 @@ def rewrite_betas(folder, betas) -> None:
 
 def test_more_betas_than_the_default_body_has_are_rejected(folder):
     rewrite_betas(folder, np.zeros(300))
-    with pytest.raises(ConditioningError, match=r"300 betas.* at most 10 of the default body.*render the human again"):
+    with refused(ConditioningError, "300 betas"):
         captured_person(folder, FIRST)
 
 
 def test_betas_whose_body_has_other_joints_than_were_noted_are_rejected(folder):
     rewrite_betas(folder, [4.0, -4.0, 4.0, 0, 0, 0, 0, 0, 0, 0])
-    with pytest.raises(ConditioningError, match=r"cm from the default body's.*another body model"):
+    with refused(ConditioningError):
         captured_person(folder, FIRST)
 
 
@@ -174,7 +175,7 @@ def test_cameras_that_look_past_the_body_are_rejected(folder):
     for about in cameras.values():
         about["T"] = [5.0, 0.0, 0.0]
     path.write_text(json.dumps(cameras))
-    with pytest.raises(ConditioningError, match="do not belong together"):
+    with refused(ConditioningError):
         captured_person(folder, FIRST)
 
 

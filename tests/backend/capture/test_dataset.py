@@ -12,6 +12,7 @@ from primdiffusion.capture.dataset import CaptureDataset, Position, SampleSettin
 from primdiffusion.capture.reader import Window, full_window, open_captures, resample, windowed_view
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.records import TensorRecord
+from support.errors import refused
 
 SETTINGS = SampleSettings(conditioning=2, targets=1, size=16)
 
@@ -150,7 +151,7 @@ def test_crops_lie_in_the_picture_and_see_the_person(captures):
 
 @pytest.mark.parametrize("wrong", [{"conditioning": 0}, {"targets": -1}, {"size": 0}])
 def test_samples_without_views_are_rejected(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
+    with refused(ValueError, next(iter(wrong))):
         SampleSettings(**wrong)
 
 
@@ -159,5 +160,5 @@ def test_a_missing_picture_is_named_by_a_worker(tmp_path):
     for path in root.rglob("img/*/0000.jpg"):
         path.unlink()
         path.with_name("0001.jpg").write_bytes(b"")
-    with pytest.raises((ValueError, FileNotFoundError), match=r"000[01]\.jpg"):
+    with refused((ValueError, FileNotFoundError), "000", ".jpg"):
         first(1, CaptureDataset(open_captures(root), SETTINGS), 1, workers=1)

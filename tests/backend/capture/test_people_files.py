@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from capture_scenes import save_person
 from primdiffusion.capture.people_files import GlbError, read_person
+from support.errors import refused
 
 FLOAT, BYTE = 5126, 5120
 
@@ -45,7 +46,7 @@ def test_numbers_that_no_mesh_has_are_rejected(person, name, kind, value):
     tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(values)})
     about.update(bufferView=len(tree["bufferViews"]) - 1, componentType=kind, byteOffset=0)
     write(path, tree, binary + values)
-    with pytest.raises(GlbError, match=r"person\.glb"):
+    with refused(GlbError, "person.glb"):
         read_person(path)
 
 
@@ -53,7 +54,7 @@ def test_a_small_file_cannot_name_endless_parts(person):
     path, tree, binary = person
     tree["nodes"] += [node for node in tree["nodes"] if "mesh" in node] * 50_000
     write(path, tree, binary)
-    with pytest.raises(GlbError, match="more than 100 parts"):
+    with refused(GlbError, "100"):
         read_person(path)
 
 
@@ -76,5 +77,5 @@ def test_textures_that_a_file_of_its_size_cannot_have_are_not_decoded(person, mo
     monkeypatch.setattr("primdiffusion.capture.people_files.decoded_bytes", lambda _size: 4)
     monkeypatch.setattr("primdiffusion.capture.people_files.Glb.picture", lambda *_: pytest.fail("decoded"))
     monkeypatch.setattr("primdiffusion.capture.people_files.Glb.picture_texels", lambda *_: 2)
-    with pytest.raises(GlbError, match="more than the 1 texels that a file of its size may have"):
+    with refused(GlbError, "1 texels"):
         read_person(path)

@@ -10,6 +10,7 @@ from primdiffusion.capture.poses import MotionFileError, built_in_poses, choose_
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import ArrayFileError
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from support.errors import refused
 
 THETA = np.random.default_rng(0).uniform(-0.5, 0.5, (5, 72))
 
@@ -78,13 +79,10 @@ def test_fingers_are_not_taken_for_smpls_hand_joints(tmp_path, numbers):
     assert_turns(read_motion(tmp_path / "a.npy"), np.pad(THETA[:, :66], ((0, 0), (0, 6))))
 
 
-@pytest.mark.parametrize(
-    ("moves", "message"),
-    [([[0, 0, 0]] * 4, r"a\.json has 5 frames"), ([[0, 0, float("nan")]] * 5, r"a\.json .* NaN")],
-)
-def test_translations_that_do_not_fit_are_rejected_by_name(tmp_path, moves, message):
+@pytest.mark.parametrize(("moves", "fault"), [([[0, 0, 0]] * 4, "5 frames"), ([[0, 0, float("nan")]] * 5, "NaN")])
+def test_translations_that_do_not_fit_are_rejected_by_name(tmp_path, moves, fault):
     (tmp_path / "a.json").write_text(json.dumps({"poses": THETA.tolist(), "trans": moves}))
-    with pytest.raises(MotionFileError, match=message):
+    with refused(MotionFileError, "a.json", fault):
         read_motion(tmp_path / "a.json")
 
 
@@ -95,12 +93,12 @@ def test_translations_that_do_not_fit_are_rejected_by_name(tmp_path, moves, mess
 )  # fmt: skip
 def test_files_that_are_no_poses_are_rejected_by_name(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises((MotionFileError, ArrayFileError), match=name):
+    with refused((MotionFileError, ArrayFileError), name):
         read_motion(tmp_path / name)
 
 
 def test_a_missing_file_is_named():
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.npz"):
+    with refused(FileNotFoundError, "nowhere.npz"):
         read_motion("nowhere.npz")
 
 
@@ -118,7 +116,7 @@ def test_few_poses_are_chosen_to_differ_and_the_choice_is_the_seeds(tmp_path):
 
 
 def test_more_poses_than_there_are_are_rejected():
-    with pytest.raises(ValueError, match="there are 20"):
+    with refused(ValueError, "there are 20"):
         choose_poses([], 21, 0)
-    with pytest.raises(ValueError, match="0 poses"):
+    with refused(ValueError, "0 poses"):
         choose_poses([], 0, 0)

@@ -26,6 +26,7 @@ from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.capture_repair import verify
 from primdiffusion.formats.removing import OutsideFolderError
 from primdiffusion.raster.multisample import render_view
+from support.errors import refused
 
 NAME = "person_000000"
 
@@ -89,7 +90,7 @@ def test_joints_project_to_where_the_file_says(root):
 def test_passes_that_are_no_names_are_rejected(root, passes):
     path = root / capture_layout.DATASET_FILE
     path.write_text(json.dumps({**json.loads(path.read_text()), "passes": passes}))
-    with pytest.raises(capture_layout.CaptureFolderError, match="names no passes"):
+    with refused(capture_layout.CaptureFolderError):
         open_captures(root)
 
 
@@ -98,7 +99,7 @@ def test_cameras_as_far_as_no_camera_is_are_rejected(root):
     cameras = json.loads(path.read_text())
     cameras["camera0001"]["K"][0][2] = 2.0**63
     path.write_text(json.dumps(cameras))
-    with pytest.raises(CaptureFileError, match="camera 1 is not finite"):
+    with refused(CaptureFileError, "camera 1"):
         open_captures(root).view(NAME, 1, 2)
 
 
@@ -145,7 +146,7 @@ def test_a_pickle_that_would_run_code_is_rejected(root, tmp_path):
     as_released(root)
     path = root / NAME / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE
     np.savez(path, smpl=np.array({"global_orient": Trap()}, dtype=object))
-    with pytest.raises(UnsafePickleError, match="open"):
+    with refused(UnsafePickleError, "open"):
         open_captures(root).subject(NAME)
     assert not (tmp_path / "trapped").exists()
 
@@ -155,14 +156,14 @@ def test_a_pickle_without_parameters_is_rejected_by_name(root, content):
     as_released(root)
     path = root / NAME / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE
     np.savez(path, smpl=np.array(content, dtype=object))
-    with pytest.raises(ArrayFileError, match=capture_layout.SMPL_FILE):
+    with refused(ArrayFileError, capture_layout.SMPL_FILE):
         open_captures(root).subject(NAME)
 
 
 @pytest.mark.parametrize("name", ["../../etc", "/etc", ".ssh", "a/b", "..", "a b"])
 def test_a_list_that_names_folders_outside_is_rejected(root, name):
     (root / capture_layout.LIST_FILE).write_text(f"{NAME}\n{name}\n")
-    with pytest.raises(CaptureFileError, match=capture_layout.LIST_FILE):
+    with refused(CaptureFileError, capture_layout.LIST_FILE):
         open_captures(root)
 
 
@@ -196,7 +197,7 @@ def test_an_npz_that_claims_petabytes_is_rejected(tmp_path):
     with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive, archive.open("x.npy", "w") as member:
         about = {"descr": "<f8", "fortran_order": False, "shape": (1 << 50,)}
         np.lib.format.write_array_header_1_0(member, about)
-    with pytest.raises(ArrayFileError, match=r"a\.npz"):
+    with refused(ArrayFileError, "a.npz"):
         read_numbers(tmp_path / "a.npz", ("x",))
 
 
@@ -230,15 +231,15 @@ def test_wrong_and_missing_files_are_named(root, file, content, why):
 
 
 def test_no_captures_are_no_captures(tmp_path):
-    with pytest.raises(FileNotFoundError, match="check the path"):
+    with refused(FileNotFoundError, "path"):
         open_captures(tmp_path / "nowhere")
-    with pytest.raises(FileNotFoundError, match="no finished captures"):
+    with refused(FileNotFoundError, "finished"):
         open_captures(tmp_path)
 
 
 def test_frames_and_cameras_that_are_not_there_are_rejected(root):
     for frame, camera in ((3, 0), (0, 4), (-1, 0)):
-        with pytest.raises(IndexError, match="3 frames and 4 cameras"):
+        with refused(IndexError, "3 frames", "4 cameras"):
             open_captures(root).view(NAME, frame, camera)
 
 
@@ -281,7 +282,7 @@ def test_info_and_sheet_say_and_show_what_is_there(root, tmp_path, capsys):
 def test_depth_with_several_channels_is_rejected(root, mode):
     path = capture_layout.picture_path(root / NAME, "depth", 0, 0)
     Image.new(mode, Image.open(path).size).save(path)
-    with pytest.raises(CaptureFileError, match="channels"):
+    with refused(CaptureFileError, "channels"):
         open_captures(root).view(NAME, 0, 0)
 
 
@@ -312,14 +313,14 @@ def claim_pixels(root, width, height, padding=0):
 
 def test_passes_of_a_view_are_limited_together_before_any_is_decoded(root):
     claim_pixels(root, 6400, 6400)  # each alone would be decoded
-    with pytest.raises(CaptureFileError, match="4 images of 6400 x 6400 pixels of one view") as error:
+    with refused(CaptureFileError, "6400 x 6400 pixels") as error:
         open_captures(root).view(NAME, 0, 0)
     assert str(root / NAME) in str(error.value)
     claim_pixels(root, 6400, 6400, padding=1_500_000)
-    with pytest.raises(CaptureFileError, match="not a complete image"):
+    with refused(CaptureFileError):
         open_captures(root).view(NAME, 0, 0)
     claim_pixels(root, 5700, 5700)
-    with pytest.raises(CaptureFileError, match="not a complete image"):
+    with refused(CaptureFileError):
         open_captures(root).view(NAME, 0, 0)
 
 

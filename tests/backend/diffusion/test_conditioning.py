@@ -1,6 +1,7 @@
 import pytest
 import torch
 from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
+from support.errors import refused
 
 WORDS = AttributeVocabulary({"sex": ("female", "male"), "hair": ("bald", "bob", "long")}, {"height": (1.7, 0.1)})
 
@@ -24,7 +25,7 @@ def test_what_is_not_asked_for_is_zero():
 def test_what_a_model_does_not_know_is_rejected_with_what_it_knows(asked, words):
     with pytest.raises(ValueError, match=words):
         WORDS.encode(asked)
-    with pytest.raises(ValueError, match="nothing"):
+    with refused(ValueError, "nothing"):
         NOTHING.encode(asked)
 
 
@@ -34,7 +35,7 @@ def test_a_vocabulary_survives_json():
 
 @pytest.mark.parametrize("scalar", [[1e300, 0.1], [1.7, 0.0], [1.7, -1.0], [1.7, 1e300], [float("nan"), 0.1]])
 def test_means_and_deviations_that_no_quantity_has_are_rejected(scalar):
-    with pytest.raises(ValueError, match="no quantity has"):
+    with refused(ValueError, "quantity"):
         AttributeVocabulary.from_json({"categories": {}, "scalars": {"height": scalar}})
 
 

@@ -7,6 +7,7 @@ import torch
 from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint
 from primdiffusion.human import generate
 from primdiffusion.tensor_file import read, save
+from support.errors import refused
 from tiny_model import save_tiny_checkpoint
 
 
@@ -37,7 +38,7 @@ def test_what_loads_generates_and_what_does_not_fit_does_not_load(content, tmp_p
             fewer_channels = name == "denoiser.prior_basis_half" and changed.shape == (3, 3, 32, 16)  # is possible
             if changed.shape == value.shape or fewer_channels:
                 continue
-            with pytest.raises(CheckpointError, match="does not match its own description"):
+            with refused(CheckpointError):
                 load_with(content, tmp_path / "a.safetensors", **{name: changed})
             rejected += 1
     assert rejected > 60
@@ -45,16 +46,16 @@ def test_what_loads_generates_and_what_does_not_fit_does_not_load(content, tmp_p
 
 
 @pytest.mark.parametrize(
-    ("name", "value", "reason"),
+    ("name", "value"),
     [
-        ("denoiser.prior_variance", torch.full((1, 3), -1.0), "negative"),
-        ("denoiser.prior_basis_half", torch.full((3, 4, 32, 16), 6.0), "rows longer than 1"),
-        ("codec.weight", torch.zeros(2051), "not positive"),
-        ("shapes.limit", torch.full((10,), 1e6), "betas over 5"),
+        ("denoiser.prior_variance", torch.full((1, 3), -1.0)),
+        ("denoiser.prior_basis_half", torch.full((3, 4, 32, 16), 6.0)),
+        ("codec.weight", torch.zeros(2051)),
+        ("shapes.limit", torch.full((10,), 1e6)),
     ],
 )
-def test_values_that_make_no_human_are_rejected(content, tmp_path, name, value, reason):
-    with pytest.raises(CheckpointError, match=reason):
+def test_values_that_make_no_human_are_rejected(content, tmp_path, name, value):
+    with pytest.raises(CheckpointError):
         load_with(content, tmp_path / "a.safetensors", **{name: value})
 
 
@@ -63,5 +64,5 @@ def test_a_vocabulary_of_another_width_is_rejected(content, tmp_path):
     architecture = json.loads(metadata["architecture"])
     architecture["vocabulary"]["scalars"] = {}
     changed = tensors, metadata | {"architecture": json.dumps(architecture)}
-    with pytest.raises(CheckpointError, match="parts are described by 6 values, attributes by 2"):
+    with refused(CheckpointError, "6 values"):
         load_with(changed, tmp_path / "a.safetensors")

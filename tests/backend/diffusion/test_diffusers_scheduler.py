@@ -5,6 +5,7 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from primdiffusion.diffusion.diffusers_scheduler import PrimDiffusionScheduler
 from primdiffusion.diffusion.model import sample
+from support.errors import refused
 from tiny_model import tiny_model
 
 SHAPE = (2, 3, 4, 4)
@@ -73,9 +74,9 @@ def test_settings_are_saved_and_loaded_as_diffusers_does(tmp_path):
 
 
 def test_wrong_names_and_steps_are_refused():
-    with pytest.raises(ValueError, match="choose one of ddim, ddpm, dpmpp_2m"):
+    with refused(ValueError, "dpmpp_2m"):
         PrimDiffusionScheduler(sampler="euler")
     scheduler = PrimDiffusionScheduler()
     scheduler.set_timesteps(10)
-    with pytest.raises(ValueError, match="timestep 3 is not one of this scheduler's 10"):
+    with refused(ValueError, "timestep 3"):
         scheduler.step(noise(1), 3, noise(1))

@@ -9,6 +9,7 @@ from primdiffusion.diffusion.model import STANDARD_SHAPES, sample, seeded
 from primdiffusion.diffusion.schedule import trailing_steps
 from primdiffusion.human import generate_batch
 from primdiffusion.primitives.primitives import GRID, K, S
+from support.errors import refused
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +97,7 @@ def test_wrong_settings_are_named(model, settings, word):
 
 @pytest.mark.parametrize("seed", [-1, 2**63])
 def test_seeds_out_of_range_are_rejected(model, seed):
-    with pytest.raises(ValueError, match="seed"):
+    with refused(ValueError, "seed"):
         sample(model, [seed])
 
 
@@ -133,7 +134,7 @@ def test_asking_draws_the_start_from_those_who_have_it(model):
     starts = model.start([seeded(seed) for seed in range(300)], 0, condition)
     c = model.denoiser.prior.split(starts)[0]
     assert torch.allclose(c.mean(0), model.denoiser.prior.centre[0, 1], atol=1.0)
-    with pytest.raises(ValueError, match="jeans, suit"):
+    with refused(ValueError, "jeans"):
         model.condition({"outfit": "robe"})
 
 
@@ -150,5 +151,5 @@ def test_a_region_s_mask_covers_its_primitives(model):
     assert slab.shape == (GRID * S, GRID * S)
     assert slab.sum() == 2 * S * S
     assert slab[8:16, 8:16].all()
-    with pytest.raises(ValueError, match="1024"):
+    with refused(ValueError, "1024"):
         model.cell_mask(region[:7])

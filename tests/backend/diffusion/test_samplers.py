@@ -14,6 +14,7 @@ from primdiffusion.diffusion.schedule import (
     sqrt_linear,
     trailing_steps,
 )
+from support.errors import refused
 
 F64 = torch.float64
 CENTRES = torch.tensor([[2.0, -1.0, 0.5], [-1.0, 1.5, 0.0], [0.0, 0.0, -2.0]], dtype=F64)
@@ -169,7 +170,7 @@ def test_steps_count_up_go_down_and_end_clean(sampler):
 @every_sampler
 @pytest.mark.parametrize("chain", [[10, 20], [10, 10], [5, CLEAN, 3]])
 def test_steps_that_do_not_go_down_are_rejected(sampler, chain):
-    with pytest.raises(ValueError, match=r"goes from t to an earlier"):
+    with refused(ValueError, "earlier"):
         list(sampler(of_mixture(linear()), linear(), start(), chain, torch.Generator()))
 
 
@@ -220,7 +221,7 @@ def test_one_generator_draws_a_whole_batch_at_once():
 
 
 def test_too_few_generators_are_rejected():
-    with pytest.raises(ValueError, match=r"3 samples.*2"):
+    with refused(ValueError, "3 samples"):
         gaussian_noise(torch.zeros(3, 4), seeded(1, 2))
 
 

@@ -16,6 +16,7 @@ from primdiffusion.diffusion.schedule import (
     trailing_steps,
 )
 from scipy.stats import kstest
+from support.errors import refused
 
 
 @pytest.mark.parametrize(("ours", "theirs"), [(linear, "linear"), (sqrt_linear, "scaled_linear")])
@@ -104,20 +105,20 @@ def test_the_fine_schedule_ends_as_the_paper_s_and_begins_with_less_noise():
 
 @pytest.mark.parametrize("steps", [0, 1001, -3])
 def test_impossible_numbers_of_steps_are_rejected(steps):
-    with pytest.raises(ValueError, match=str(steps)):
+    with refused(ValueError, str(steps)):
         trailing_steps(1000, steps)
-    with pytest.raises(ValueError, match=str(steps)):
+    with refused(ValueError, str(steps)):
         dense_steps(1000, steps)
-    with pytest.raises(ValueError, match=str(steps)):
+    with refused(ValueError, str(steps)):
         early_steps(1000, steps)
 
 
 def test_steps_forward_and_noise_of_a_clean_sample_are_rejected():
-    with pytest.raises(ValueError, match="t_prev=5"):
+    with refused(ValueError, "t_prev=5"):
         linear().posterior_std(5, 5)
-    with pytest.raises(ValueError, match="t_prev=7"):
+    with refused(ValueError, "t_prev=7"):
         linear().half_log_snr_gain(5, 7)
-    with pytest.raises(ValueError, match="clean"):
+    with refused(ValueError, "clean"):
         linear().epsilon(torch.zeros(1), torch.zeros(1), CLEAN)
 
 
@@ -136,5 +137,5 @@ def test_half_log_snr_without_a_signal_is_minus_infinite():
 
 
 def test_betas_outside_their_range_are_rejected():
-    with pytest.raises(ValueError, match="beta"):
+    with refused(ValueError, "beta"):
         linear(last=1.5)

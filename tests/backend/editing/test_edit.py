@@ -20,6 +20,7 @@ from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, FileFingerprint
 from primdiffusion.primitives.primitives import K
+from support.errors import refused
 from tiny_model import tiny_model
 
 FIELDS = ("rgb", "density", "delta_scale")
@@ -156,15 +157,15 @@ def test_masked_sampling_has_two_modes_and_the_file_says_which(human):
     for masking in ("repaint", "released"):
         edited = inpaint(model, human, TOP, steps=2, masking=masking)
         assert edited.provenance["edits"][-1]["masking"] == masking
-    with pytest.raises(ValueError, match="masking is 'none': choose one of 'repaint', 'released'"):
+    with refused(ValueError, "masking", "none", "repaint", "released"):
         inpaint(model_that_must_not_work(), human, TOP, masking="none")
 
 
 @pytest.mark.parametrize("amount", [-0.1, 1.1, float("nan")])
 def test_an_amount_outside_0_to_1_is_rejected(human, amount):
-    with pytest.raises(ValueError, match="0 to 1"):
+    with refused(ValueError, "0 to 1"):
         vary(model_that_must_not_work(), human, amount)
-    with pytest.raises(ValueError, match="0 to 1"):
+    with refused(ValueError, "0 to 1"):
         harmonise(model_that_must_not_work(), human, TOP, amount)
 
 
@@ -184,9 +185,9 @@ def test_a_region_that_cannot_be_inpainted_is_rejected(human, region, fact):
 
 @pytest.mark.parametrize("edit", ["vary", "inpaint"])
 def test_what_the_model_does_not_know_cannot_be_asked_for(human, edit):
-    with pytest.raises(ValueError, match="knows no attribute 'species'"):
+    with refused(ValueError, "species"):
         EDITS[edit](tiny_model(), human, attributes={"species": "cat"})
-    with pytest.raises(ValueError, match="guidance is nan"):
+    with refused(ValueError, "guidance"):
         EDITS[edit](tiny_model(), human, guidance=float("nan"))
 
 
@@ -210,7 +211,7 @@ def test_a_person_of_another_density_scale_stays_as_dense(human):
 @pytest.mark.parametrize("density", [0.0, -3.0, "solid", float("nan"), True])
 def test_a_density_scale_that_is_none_is_rejected(human, density):
     odd = dataclasses.replace(human, provenance={"full_density": density})
-    with pytest.raises(ValueError, match="full_density"):
+    with refused(ValueError, "full_density"):
         vary(small_model(), odd)
 
 
@@ -249,7 +250,7 @@ def test_people_on_different_bodies_do_not_correspond(human, other):
         lambda: vary(small_model(), foreign),
         lambda: interpolate(small_model(), human, foreign),
     ):
-        with pytest.raises(ValueError, match="different bodies"):
+        with refused(ValueError, "bodies"):
             edit()
 
 
@@ -324,7 +325,7 @@ def test_an_interpolation_out_of_range_is_rejected(human, other, wrong, fact):
 
 def test_people_of_different_density_scales_are_not_interpolated(human, other):
     thin = dataclasses.replace(other, provenance={"full_density": 25.5})
-    with pytest.raises(ValueError, match=r"different full densities \(100 and 25.5 1/m\)"):
+    with refused(ValueError, "100", "25.5"):
         interpolate(small_model(), human, thin)
 
 

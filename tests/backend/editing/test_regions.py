@@ -18,6 +18,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.primitives.anchors import attach, build_anchors, default_anchors
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import GRID, K
+from support.errors import refused
 
 
 @pytest.fixture(scope="module")
@@ -94,9 +95,9 @@ def test_hair_covers_the_crown_and_the_back_of_the_head_but_no_cheek(rest, joint
 
 
 def test_an_unknown_part_is_rejected_with_the_choices():
-    with pytest.raises(ValueError, match=r"'hat': choose from face, hair"):
+    with refused(ValueError, "hat"):
         region_of(["top", "hat"])
-    with pytest.raises(ValueError, match="face, hair"):
+    with refused(ValueError, "face"):
         region_of([])
 
 
@@ -146,7 +147,7 @@ def test_unusable_paint_is_rejected(weights, fact):
 
 @pytest.mark.parametrize("threshold", [0.0, 1.5, float("nan")])
 def test_a_threshold_outside_0_to_1_is_rejected(threshold):
-    with pytest.raises(ValueError, match="threshold"):
+    with refused(ValueError, "threshold"):
         region_from_weights(torch.ones(12196), threshold)
 
 
@@ -185,5 +186,5 @@ def test_another_bodys_people_have_parts_too():
 @pytest.mark.parametrize("weights", [np.array([np.nan]), np.full(3, 1e39), np.array("text"), np.zeros((2, 2))])
 def test_painted_weights_are_finite_numbers(tmp_path, weights):
     np.savez(tmp_path / "weights.npz", weights=weights)
-    with pytest.raises(ValueError, match=r"weights\.npz"):
+    with refused(ValueError, "weights.npz"):
         read_weights(tmp_path / "weights.npz")

@@ -5,6 +5,7 @@ import json
 
 import pytest
 from primdiffusion.encoder.config import PRESETS, config_from_json
+from support.errors import refused
 from tiny_encoder import TINY
 
 
@@ -16,9 +17,9 @@ def test_configurations_come_back_from_json(preset):
 
 def test_unknown_and_missing_settings_are_rejected_by_name():
     tree = dataclasses.asdict(TINY)
-    with pytest.raises(ValueError, match="differs in colour_of_eyes: use the release"):
+    with refused(ValueError, "colour_of_eyes"):
         config_from_json({**tree, "colour_of_eyes": "blue"})
-    with pytest.raises(ValueError, match="differs in motion"):
+    with refused(ValueError, "differs"):
         config_from_json({name: value for name, value in tree.items() if name != "motion"})
 
 

@@ -12,6 +12,7 @@ from primdiffusion.encoder.network import Encoder
 from primdiffusion.encoder.unproject import unproject_voxels
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.primitives.primitives import Frames, K, S
+from support.errors import refused
 from tiny_encoder import TINY, tiny_encoder
 
 
@@ -41,14 +42,14 @@ def test_pictures_without_the_person_still_give_finite_values():
 
 @pytest.mark.parametrize("betas", [torch.zeros(9), torch.zeros(2, 10), torch.full((10,), torch.nan)])
 def test_betas_of_another_body_are_rejected(betas):
-    with pytest.raises(ValueError, match="needs 10 finite numbers"):
+    with refused(ValueError, "10 finite"):
         look_up(TINY, blank_views(), betas.reshape(-1) if betas.ndim > 1 else betas)
 
 
 def test_poses_that_are_not_finite_are_rejected():
     views = blank_views()
     broken = dataclasses.replace(views, pose=views.pose.map(lambda tensor: tensor * torch.nan))
-    with pytest.raises(ValueError, match="NaN"):
+    with refused(ValueError, "NaN"):
         encode(Encoder(TINY), broken, torch.zeros(10))
 
 

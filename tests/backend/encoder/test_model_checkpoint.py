@@ -10,6 +10,7 @@ from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
+from support.errors import refused
 from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
 
 
@@ -41,48 +42,44 @@ def test_an_encoder_comes_back_with_its_settings_card_and_weights_to_half_precis
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nothing\.safetensors"):
+    with refused(FileNotFoundError, "nothing.safetensors"):
         load_encoder(tmp_path / "nothing.safetensors")
 
 
 @pytest.mark.parametrize("kept", [0, 5, 400, -100])
 def test_a_truncated_file_is_rejected(saved, tmp_path, kept):
     (tmp_path / "cut").write_bytes(saved.read_bytes()[:kept])
-    with pytest.raises(CheckpointError, match="is damaged"):
+    with refused(CheckpointError):
         load_encoder(tmp_path / "cut")
 
 
 @pytest.mark.parametrize(
-    ("metadata", "message"),
+    "metadata",
     [
-        ({"format": "pt"}, "format 'pt'"),
-        ({"format_version": "9"}, "format version 9"),
-        ({"config": json.dumps({"stem": [2, 2, 4]})}, "configuration differs in"),
-        ({"config": "{"}, "does not match its own description"),
-        ({"config": None}, "does not match its own description"),
-        ({"card": "["}, "does not match its own description"),
-        ({"config": json.dumps(dataclasses.asdict(dataclasses.replace(TINY, fused=8)))}, "does not match its own"),
-        ({"config": json.dumps(dataclasses.asdict(TINY) | {"stem": 3})}, "does not match its own description"),
-        (
-            {"config": json.dumps(dataclasses.asdict(TINY) | {"attention_blocks": 10**9})},
-            "more parameters than the file",
-        ),
-        ({"config": json.dumps(dataclasses.asdict(TINY) | {"fused": 10**6})}, "more parameters than the file"),
+        {"format": "pt"},
+        {"format_version": "9"},
+        {"config": json.dumps({"stem": [2, 2, 4]})},
+        {"config": "{"},
+        {"config": None},
+        {"card": "["},
+        {"config": json.dumps(dataclasses.asdict(dataclasses.replace(TINY, fused=8)))},
+        {"config": json.dumps(dataclasses.asdict(TINY) | {"stem": 3})},
+        {"config": json.dumps(dataclasses.asdict(TINY) | {"attention_blocks": 10**9})},
+        {"config": json.dumps(dataclasses.asdict(TINY) | {"fused": 10**6})},
     ],
 )
-def test_a_file_that_is_something_else_is_rejected_in_one_line(saved, tmp_path, metadata, message):
-    with pytest.raises(CheckpointError, match=message) as error:
+def test_a_file_that_is_something_else_is_rejected_in_one_line(saved, tmp_path, metadata):
+    with refused(CheckpointError, str(tmp_path / "other")) as error:
         load_encoder(changed(saved, tmp_path / "other", **metadata))
     assert "\n" not in str(error.value)
-    assert str(tmp_path / "other") in str(error.value)
 
 
 def test_weights_that_are_missing_or_not_finite_are_rejected(saved, tmp_path):
     tensors = load_file(saved)
     key = next(iter(tensors))
-    with pytest.raises(CheckpointError, match="Missing key"):
+    with refused(CheckpointError):
         load_encoder(changed(saved, tmp_path / "less", {k: v for k, v in tensors.items() if k != key}))
-    with pytest.raises(CheckpointError, match="NaN"):
+    with refused(CheckpointError, "NaN"):
         load_encoder(changed(saved, tmp_path / "nan", {**tensors, key: torch.full_like(tensors[key], float("nan"))}))
 
 
@@ -93,7 +90,7 @@ def test_weights_that_half_precision_cannot_hold_replace_no_file(saved, tmp_path
     encoder = Encoder(TINY)
     with torch.no_grad():
         encoder.scale_out.bias[0, 0, 0] = bad
-    with pytest.raises(CheckpointError, match=r"scale_out\.bias"):
+    with refused(CheckpointError, "scale_out.bias"):
         save_encoder(path, EncoderModel(encoder, {}))
     assert path.read_bytes() == saved.read_bytes()
     assert [file.name for file in tmp_path.iterdir()] == [path.name]

@@ -13,6 +13,7 @@ from primdiffusion.encoder.unproject import Unprojected
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import GRID, K, Payload, S
 from primdiffusion.primitives.slab import pack
+from support.errors import refused
 from tiny_encoder import TINY
 
 SMALL = {
@@ -371,16 +372,16 @@ def test_each_output_channel_of_a_convolution_has_one_gain(resize, shape):
 
 def test_what_another_kind_of_encoder_looks_up_is_rejected():
     texels = dataclasses.replace(TINY, appearance="texels")
-    with pytest.raises(ValueError, match="as for voxels"):
+    with refused(ValueError, "voxels"):
         Encoder(TINY)(seen_from(texels), poses())
-    with pytest.raises(ValueError, match="as for texels"):
+    with refused(ValueError, "texels"):
         Encoder(texels)(seen_from(TINY), poses())
-    with pytest.raises(ValueError, match="stack subjects"):
+    with refused(ValueError, "subjects"):
         Encoder(TINY)(seen_from(TINY).map(lambda tensor: tensor[0]), poses())
-    with pytest.raises(ValueError, match=r"256, 256\]"):
+    with refused(ValueError, "256"):
         Encoder(TINY)(seen_from(TINY).map(lambda tensor: tensor[..., ::2, :]), poses())
 
 
 def test_poses_must_be_as_many_as_people():
-    with pytest.raises(ValueError, match=r"2 subjects, .* give \[2, 24, 3\]"):
+    with refused(ValueError, "2 subjects", "[2, 24, 3]"):
         Encoder(TINY)(seen_from(TINY, 2), poses(1))

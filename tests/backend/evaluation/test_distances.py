@@ -19,6 +19,7 @@ from primdiffusion.evaluation.attribute_network import (
 )
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance, nearest, precision_recall
 from primdiffusion.evaluation.generation import nearest_other
+from support.errors import refused
 from torchmetrics.image.kid import poly_mmd
 
 
@@ -99,12 +100,12 @@ def test_nearest_other_is_of_another_geometry():
 )
 def test_sets_that_cannot_be_compared_are_named(first, second):
     for distance in (frechet_distance, kernel_distance):
-        with pytest.raises(ValueError, match=r"\[n, d\]"):
+        with refused(ValueError, "[n, d]"):
             distance(torch.zeros(first), torch.zeros(second))
 
 
 def test_precision_needs_more_people_than_neighbours():
-    with pytest.raises(ValueError, match="3 neighbours"):
+    with refused(ValueError, "3 neighbours"):
         precision_recall(draws(3, 2, 0), draws(9, 2, 1))
 
 
@@ -171,8 +172,8 @@ def test_network_is_stored_with_its_attributes(trained, tmp_path):
 
 
 def test_another_file_is_no_network(tmp_path):
-    with pytest.raises(FileNotFoundError, match="none\\.safetensors"):
+    with refused(FileNotFoundError, "none.safetensors"):
         load_attribute_network(tmp_path / "none.safetensors")
     (tmp_path / "other.safetensors").write_bytes(b"nothing")
-    with pytest.raises(ValueError, match="other\\.safetensors"):
+    with refused(ValueError, "other.safetensors"):
         load_attribute_network(tmp_path / "other.safetensors")

@@ -17,6 +17,7 @@ from primdiffusion.evaluation.image_metrics import (
 from primdiffusion.evaluation.pretrained_networks import ALEXNET, VGG16, PictureFeatures, WeightsFileError
 from safetensors.torch import save_file
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+from support.errors import refused
 from torch import nn
 from torchmetrics.functional.image import lpips as torchmetrics_lpips
 
@@ -78,14 +79,14 @@ def test_metrics_take_any_batch_and_none():
 
 @pytest.mark.parametrize("metric", [psnr, ssim])
 def test_pictures_of_two_shapes_are_rejected(metric):
-    with pytest.raises(ValueError, match=r"\[\.\.\., H, W, 3\]"):
+    with refused(ValueError, "[..., H, W, 3]"):
         metric(torch.zeros(20, 20, 3), torch.zeros(20, 21, 3))
-    with pytest.raises(ValueError, match=r"\[\.\.\., H, W, 3\]"):
+    with refused(ValueError, "[..., H, W, 3]"):
         metric(torch.zeros(3, 20, 20), torch.zeros(3, 20, 20))
 
 
 def test_ssim_says_what_it_needs_of_small_pictures():
-    with pytest.raises(ValueError, match="10 x 20 pixels"):
+    with refused(ValueError, "10 x 20 pixels"):
         ssim(torch.zeros(20, 10, 3), torch.zeros(20, 10, 3))
 
 
@@ -155,26 +156,26 @@ def test_gradients_of_lpips_are_finite_also_in_black():
 def test_files_of_another_network_are_rejected(tmp_path):
     torch.save(PictureFeatures(VGG16, ["relu5_3"]).state_dict(), tmp_path / "vgg16.pth")
     alex = torchmetrics_lpips.__file__.removesuffix("lpips.py") + "lpips_models/alex.pth"
-    with pytest.raises(WeightsFileError, match=r"'linear\.0\.weight'"):
+    with refused(WeightsFileError, "linear.0.weight"):
         load_lpips([tmp_path / "vgg16.pth"])
-    with pytest.raises(WeightsFileError, match=r"linear\.1\.weight.*\(1, 192, 1, 1\), not \(1, 128, 1, 1\)"):
+    with refused(WeightsFileError, "linear.1.weight", "(1, 192, 1, 1)", "(1, 128, 1, 1)"):
         load_lpips([tmp_path / "vgg16.pth", alex])
-    with pytest.raises(WeightsFileError, match="no backbone"):
+    with refused(WeightsFileError):
         load_lpips([alex])
 
 
 def test_damaged_missing_and_foreign_files_are_named(tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"nothing\.pth"):
+    with refused(FileNotFoundError, "nothing.pth"):
         load_lpips([tmp_path / "nothing.pth"])
     for name, held in (("half.pth", b"PK\x03\x04"), ("empty.pth", b""), ("half.safetensors", b"12345678{")):
         (tmp_path / name).write_bytes(held)
         with pytest.raises(WeightsFileError, match=name):
             load_lpips([tmp_path / name])
     torch.save(nn.Linear(2, 2), tmp_path / "pickled.pth")
-    with pytest.raises(WeightsFileError, match=r"state_dict"):
+    with refused(WeightsFileError, "state_dict"):
         load_lpips([tmp_path / "pickled.pth"])
     torch.save([1, 2], tmp_path / "list.pth")
-    with pytest.raises(WeightsFileError, match="named tensors"):
+    with refused(WeightsFileError):
         load_lpips([tmp_path / "list.pth"])
 
 

@@ -6,6 +6,7 @@ import torch
 from primdiffusion.evaluation.onnx_networks import open_depth_network, open_onnx, open_pose_network
 from primdiffusion.evaluation.pose_depth_metrics import depth_error
 from primdiffusion.evaluation.shots import SIDE, Shot
+from support.errors import refused
 
 onnx = pytest.importorskip("onnx", reason="onnx is not installed: pip install onnx onnxruntime")
 pytest.importorskip("onnxruntime", reason="onnxruntime is not installed: pip install onnxruntime")
@@ -103,19 +104,19 @@ def test_a_depth_network_that_sees_brightness_has_no_error(shot, tmp_path, value
 
 
 def test_files_that_do_not_fit_are_one_sentence(shot, tmp_path):
-    with pytest.raises(FileNotFoundError, match=r"missing\.onnx"):
+    with refused(FileNotFoundError, "missing.onnx"):
         open_onnx(tmp_path / "missing.onnx", (8, 8))
     (tmp_path / "text.onnx").write_text("no network")
-    with pytest.raises(ValueError, match=r"text\.onnx is not a readable ONNX file"):
+    with refused(ValueError, "text.onnx", "ONNX"):
         open_onnx(tmp_path / "text.onnx", (8, 8))
     large = save(tmp_path / "large.onnx", [onnx.helper.make_node("Neg", ["picture"], ["a"])], ["a"], size=(64, 10**7))
-    with pytest.raises(ValueError, match="10000000 x 64 pixels, over 2048"):
+    with refused(ValueError, "10000000 x 64 pixels", "2048"):
         open_onnx(large, (8, 8))
     few = always(tmp_path / "few.onnx", heatmap=np.zeros((1, 5, 64, 48), np.float32))
-    with pytest.raises(ValueError, match="finds 5 keypoints"):
+    with refused(ValueError, "5 keypoints"):
         open_pose_network(few).joints(shot)
     flat = always(tmp_path / "flat.onnx", numbers=np.zeros((1, 5), np.float32))
-    with pytest.raises(ValueError, match="SimCC or heatmap"):
+    with refused(ValueError, "heatmap"):
         open_pose_network(flat).joints(shot)
-    with pytest.raises(ValueError, match="network of depth"):
+    with refused(ValueError, "network"):
         open_depth_network(few, "imagenet", "inverted").inverted(shot)

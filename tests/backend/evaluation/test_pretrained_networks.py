@@ -14,6 +14,7 @@ from primdiffusion.evaluation.pretrained_networks import (
     load_inception,
 )
 from safetensors.torch import save_file
+from support.errors import refused
 from torch import nn
 from torch.nn import functional
 
@@ -116,7 +117,7 @@ def test_clip_is_found_in_a_file_with_the_text_network(clip, tmp_path):
 @pytest.mark.parametrize("load", [load_inception, load_clip_vision])
 def test_a_file_of_another_network_is_named(load, tmp_path):
     save_file({"layer.weight": torch.zeros(3)}, tmp_path / "other.safetensors")
-    with pytest.raises(WeightsFileError, match=r"other\.safetensors has no '"):
+    with refused(WeightsFileError, "other.safetensors"):
         load(tmp_path / "other.safetensors")
     with pytest.raises(FileNotFoundError):
         load(tmp_path / "none.pth")

@@ -21,6 +21,7 @@ from primdiffusion.evaluation.tables import (
     judge,
     table,
 )
+from support.errors import refused
 from tiny_model import tiny_model
 
 
@@ -91,17 +92,17 @@ def test_empty_columns_say_why():
 
 
 def test_ten_fakes_against_five_reals_are_one_sentence(tmp_path):
-    with pytest.raises(ValueError, match="10 generated and 5 real pictures"):
+    with refused(ValueError, "10 generated", "5 real"):
         check_counts(10, 5)
     fake, real = folder(tmp_path / "fake", 10, 0), folder(tmp_path / "real", 5, 1)
-    with pytest.raises(ValueError, match="10 generated and 5 real pictures"):
+    with refused(ValueError, "10 generated", "5 real"):
         command.run(["generation", "--table", "1", "--fake", str(fake), "--real", str(real)])
 
 
 def test_weights_with_nan_are_one_sentence():
     fake = judged(10, 1)
     fake.features["inception"][0, 0] = torch.nan
-    with pytest.raises(ValueError, match="inception network gives NaN"):
+    with refused(ValueError, "NaN"):
         compare_pictures(fake, judged(10, 0), 5, 8, 0)
 
 
@@ -155,5 +156,5 @@ def test_a_model_has_all_of_our_own_measures_and_a_frame_rate(tmp_path, monkeypa
 
 
 def test_without_a_table_the_people_are_asked_for():
-    with pytest.raises(ValueError, match="--people and --reference"):
+    with refused(ValueError, "--people", "--reference"):
         command.run(["generation"])

@@ -9,6 +9,7 @@ from primdiffusion import cli
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.export.denoiser_onnx import export_denoiser
 from primdiffusion.failures import MissingPackageError, describe
+from support.errors import refused
 from tiny_model import save_tiny_checkpoint, tiny_model
 
 
@@ -47,5 +48,5 @@ def test_onnxruntime_agrees_with_torch_at_every_level_and_batch(tmp_path, capsys
 
 
 def test_another_ending_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"ends in \.onnx"):
+    with refused(ValueError, ".onnx"):
         cli.run(["export-onnx", "--out", str(tmp_path / "a.pt")])

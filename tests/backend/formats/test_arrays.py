@@ -23,6 +23,7 @@ from primdiffusion.formats.arrays import (
     write_deflated,
     write_stored,
 )
+from support.errors import refused
 
 
 def npy(descr: str = "'<f4'", shape: str = "(3,)", data: bytes = b"") -> bytes:
@@ -96,7 +97,7 @@ def test_a_bomb_is_not_unpacked(tmp_path):
 def test_megabytes_of_zeros_are_not_unpacked(tmp_path):
     size = 65 * 2**20
     path = npz(tmp_path / "bomb.npz", npy("'|u1'", f"({size},)", bytes(size)))
-    with pytest.raises(ArrayFileError, match="65 MB of the same"):
+    with refused(ArrayFileError, "65 MB"):
         read_arrays(path, ("pose",))
 
 
@@ -104,7 +105,7 @@ def test_arrays_of_one_call_share_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr("primdiffusion.formats.arrays.LARGEST_BYTES", 1000)
     path = tmp_path / "two.npz"
     np.savez(path, a=np.zeros(100), b=np.zeros(100, np.uint8))
-    with pytest.raises(ArrayFileError, match="unpacks to"):
+    with refused(ArrayFileError):
         read_arrays(path, ("a", "b"))
     assert len(read_arrays(path, ("b",))["b"]) == 100
 
@@ -115,7 +116,7 @@ def test_a_long_list_of_names_is_not_read(tmp_path):
     end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, len(entry) * count, 0, 0)
     path = tmp_path / "many.npz"
     path.write_bytes(entry * count + end)
-    with pytest.raises(ArrayFileError, match="too many names"):
+    with refused(ArrayFileError):
         array_names(path)
 
 
@@ -124,14 +125,14 @@ def test_folders_and_pipes_are_not_opened(tmp_path, read):
     with pytest.raises(IsADirectoryError):
         read(tmp_path)
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(PermissionError, match="not a regular file"):
+    with refused(PermissionError, "regular"):
         read(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])
 def test_numbers_fit_float32(tmp_path, value):
     np.savez(tmp_path / "a.npz", uv=np.array([0.0, value]))
-    with pytest.raises(ArrayFileError, match="NaN or infinite"):
+    with refused(ArrayFileError, "NaN"):
         read_numbers(tmp_path / "a.npz", ("uv",))
 
 
@@ -146,7 +147,7 @@ def test_what_is_written_is_read(tmp_path, write):
 
 def test_a_shape_beyond_the_file_is_rejected_without_reading(tmp_path):
     path = npz(tmp_path / "people.npz", npy("'|u1'", "(50000000, 1024, 8, 8, 8, 4)"))
-    with pytest.raises(ArrayFileError, match="cut short"):
+    with refused(ArrayFileError):
         array_shape(path, "pose")
 
 
@@ -154,7 +155,7 @@ def test_a_shape_beyond_the_file_is_rejected_without_reading(tmp_path):
 def test_a_full_disk_is_one_error(write):
     if not os.path.exists("/dev/full"):
         pytest.skip("no device that is always full")
-    with pytest.raises(OSError, match="No space") as raised:
+    with refused(OSError, "space") as raised:
         write("/dev/full", {"a": np.random.default_rng(0).random(100_000)})
     assert raised.value.__context__ is None or isinstance(raised.value.__context__, (OSError, ValueError))
 
@@ -176,7 +177,7 @@ def test_numbers_of_half_precision_are_checked_without_a_warning():
 def test_the_smallest_integer_is_too_large(tmp_path):
     assert not all_finite(np.array([0, -(2**63)]))
     np.savez(tmp_path / "a.npz", a=np.array([-(2**63)]))
-    with pytest.raises(ArrayFileError, match="NaN or infinite"):
+    with refused(ArrayFileError, "NaN"):
         read_numbers(tmp_path / "a.npz", ("a",))
 
 
@@ -184,21 +185,21 @@ def test_the_smallest_integer_is_too_large(tmp_path):
 def test_sides_of_a_shape_are_integers(tmp_path, shape):
     head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
-    with pytest.raises(ArrayFileError, match=r"a\.npy is not an array"):
+    with refused(ArrayFileError, "a.npy"):
         read_npy(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize("values", [np.ones(2, complex), np.zeros(2, "M8[s]"), np.zeros(2, [("a", "f4")])])
 def test_neither_complex_numbers_nor_dates_nor_records_are_read(tmp_path, values):
     np.save(tmp_path / "a.npy", values)
-    with pytest.raises(ArrayFileError, match="not numbers or text"):
+    with refused(ArrayFileError):
         read_npy(tmp_path / "a.npy")
 
 
 def test_a_text_whose_size_wraps_is_rejected(tmp_path):
     head = b"{'descr': '<U1000000000', 'fortran_order': False, 'shape': (), }".ljust(117) + b"\n"
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
-    with pytest.raises(ArrayFileError, match=r"a\.npy"):
+    with refused(ArrayFileError, "a.npy"):
         read_npy(tmp_path / "a.npy")
 
 
@@ -216,7 +217,7 @@ def test_two_arrays_of_one_name_are_rejected(tmp_path, names):
         for name in names:
             archive.writestr(name, npy())
     for read in (read_arrays, array_names, lambda path: array_shape(path, "pose")):
-        with pytest.raises(ArrayFileError, match="holds 'pose' twice"):
+        with refused(ArrayFileError, "pose"):
             read(tmp_path / "a.npz")
 
 
@@ -243,7 +244,7 @@ def test_what_is_no_longer_a_regular_file_when_it_is_opened_is_not_read(tmp_path
     keep_open = os.open(path, os.O_RDWR)  # or open waits for a writer
     monkeypatch.setattr(regular_files, "check_regular", lambda _: status)
     try:
-        with pytest.raises(PermissionError, match="not a regular file"):
+        with refused(PermissionError, "regular"):
             read_arrays(path, ["pose"])
     finally:
         os.close(keep_open)

@@ -14,6 +14,7 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.capture_repair import list_subjects, repair, verify
 from primdiffusion.formats.picture_files import write_png
 from primdiffusion.formats.removing import OutsideFolderError
+from support.errors import refused
 
 
 @pytest.fixture
@@ -97,7 +98,7 @@ def test_a_mark_that_cannot_be_used_leaves_its_subject_unfinished(root, text):
 def test_a_dataset_that_cannot_be_is_named(root, about):
     file = root / capture_layout.DATASET_FILE
     file.write_text(json.dumps({**json.loads(file.read_text()), **about}))
-    with pytest.raises(capture_layout.CaptureFolderError, match=r"dataset\.json"):
+    with refused(capture_layout.CaptureFolderError, "dataset.json"):
         verify(root)
 
 

@@ -4,6 +4,7 @@ import os
 
 import pytest
 from primdiffusion.formats.removing import OutsideFolderError, check_unlinked, remove_file, remove_folder
+from support.errors import refused
 
 
 @pytest.fixture
@@ -39,13 +40,13 @@ def test_a_folder_that_is_reached_by_a_link_is_emptied(linked):
 def test_links_to_folders_are_found_before_anything_is_written(linked):
     check_unlinked(linked.parent / "outside")
     for folder in (linked, linked / "extra"):
-        with pytest.raises(OutsideFolderError, match="link to another folder"):
+        with refused(OutsideFolderError):
             check_unlinked(folder)
 
 
 def test_links_in_a_circle_are_an_error_of_files(tmp_path):
     (tmp_path / "circle").symlink_to("circle")
-    with pytest.raises(OSError, match="circle"):
+    with refused(OSError, "circle"):
         remove_file(tmp_path / "circle" / "x", tmp_path)
     remove_file(tmp_path / "circle", tmp_path)
     assert not os.path.lexists(tmp_path / "circle")

@@ -6,6 +6,7 @@ import pytest
 import torch
 from jaxtyping import Float
 from primdiffusion.geometry.records import TensorRecord, check_shapes
+from support.errors import refused
 from torch import Tensor
 
 
@@ -38,5 +39,5 @@ def test_a_name_is_one_size_in_all_records():
     ],
 )
 def test_other_shapes_and_types_are_named(records, name):
-    with pytest.raises(ValueError, match=f"^{name} has shape"):
+    with refused(ValueError, name):
         check_shapes(*records)

@@ -6,6 +6,7 @@ from primdiffusion.people.colours import bytes_from_lab, hair_colour, lab_from_b
 from primdiffusion.people.fitting import connected_faces, uv_islands
 from primdiffusion.people.garments import PATTERNS, SHOULDER_X, SHOULDER_Y, hanging_height
 from primdiffusion.raster.uv_atlas import texel_map
+from support.errors import refused
 
 SQUARE = np.array([[[0.0, 0], [0.5, 0], [0.5, 0.5]], [[0, 0], [0.5, 0.5], [0, 0.5]]])
 
@@ -40,7 +41,7 @@ def test_texels_outside_take_the_nearest_island():
 
 
 def test_mesh_without_texture_coordinates_is_rejected():
-    with pytest.raises(ValueError, match="no texture coordinates"):
+    with refused(ValueError, "coordinates"):
         texel_map(np.zeros((3, 3, 2)), 16)
 
 

@@ -13,6 +13,7 @@ from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.gltf import Skeleton, UnwritableMesh, glb
+from support.errors import refused
 
 COMPONENTS = {5126: "<f4", 5121: "<u1", 5123: "<u2", 5125: "<u4"}
 WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -156,5 +157,5 @@ def test_numbers_that_are_none_are_rejected(where):
         bones.positions[3] = np.nan
     else:
         mesh.parts[1].vertices[2, 1] = np.inf
-    with pytest.raises(UnwritableMesh, match=rf"{where}.*NaN or infinite"):
+    with refused(UnwritableMesh, where):
         glb(mesh, bones, {})

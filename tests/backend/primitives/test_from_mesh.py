@@ -2,7 +2,6 @@ import dataclasses
 import math
 
 import numpy as np
-import pytest
 import torch
 import trimesh
 from primdiffusion.geometry.camera import look_at
@@ -12,6 +11,7 @@ from primdiffusion.primitives.primitives import Frames, Primitives
 from primdiffusion.raster.rasterise import RasterImage, rasterise
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
+from support.errors import refused
 
 RADIUS = 0.3
 
@@ -215,13 +215,13 @@ def test_unusable_input_is_rejected():
     ball, frames = two_coloured_ball(), frames_on_ball(8)
     part = ball.parts[0]
     broken = dataclasses.replace(part, vertices=np.full_like(part.vertices, np.nan))
-    with pytest.raises(UnusableMesh, match="NaN or infinite values in vertices"):
+    with refused(UnusableMesh, "NaN"):
         from_mesh(TexturedMesh((broken,)), frames)
-    with pytest.raises(UnusableMesh, match="no triangles"):
+    with refused(UnusableMesh):
         from_mesh(TexturedMesh(()), frames)
-    with pytest.raises(UnusableMesh, match="empty texture"):
+    with refused(UnusableMesh):
         from_mesh(TexturedMesh((dataclasses.replace(part, texture=np.zeros((0, 0, 4), np.uint8)),)), frames)
-    with pytest.raises(ValueError, match="frames hold NaN"):
+    with refused(ValueError, "frames", "NaN"):
         from_mesh(ball, dataclasses.replace(frames, position=frames.position * float("nan")))
-    with pytest.raises(ValueError, match=r"shape \(1, 8, 3\)"):
+    with refused(ValueError, "(1, 8, 3)"):
         from_mesh(ball, frames.map(lambda tensor: tensor[None]))

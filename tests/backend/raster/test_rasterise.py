@@ -8,6 +8,7 @@ import trimesh
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
 from primdiffusion.raster.rasterise import OrthographicView, rasterise, view_along
+from support.errors import refused
 
 
 def part(vertices, faces, texture=((255, 255, 255, 255),), corner_uv=None, name="part") -> TexturedPart:
@@ -188,13 +189,13 @@ def test_a_view_along_a_direction_holds_the_whole_box():
 def test_unusable_meshes_are_rejected():
     good = part([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     broken = dataclasses.replace(good, vertices=np.full((3, 3), np.nan))
-    with pytest.raises(UnusableMesh, match=r"no triangles in its 0 parts"):
+    with refused(UnusableMesh, "0 parts"):
         rasterise(TexturedMesh(()), FRONT)
-    with pytest.raises(UnusableMesh, match="9 NaN or infinite values in vertices"):
+    with refused(UnusableMesh, "vertices"):
         rasterise(TexturedMesh((broken,)), FRONT)
-    with pytest.raises(UnusableMesh, match="vertices 0 to 7, but only 3"):
+    with refused(UnusableMesh, "0 to 7"):
         rasterise(TexturedMesh((dataclasses.replace(good, faces=np.array([[0, 1, 7]], np.int32)),)), FRONT)
-    with pytest.raises(UnusableMesh, match="empty texture"):
+    with refused(UnusableMesh):
         rasterise(TexturedMesh((dataclasses.replace(good, texture=np.zeros((0, 4, 4), np.uint8)),)), FRONT)
-    with pytest.raises(ValueError, match="supersample is 0"):
+    with refused(ValueError, "supersample is 0"):
         rasterise(TexturedMesh((good,)), FRONT, 0)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from primdiffusion.raster.uv_atlas import closest_in_uv, rasterise_uv
+from support.errors import refused
 
 UV = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
 SQUARE = np.array([[0, 1, 2], [0, 2, 3]])
@@ -60,5 +61,5 @@ def test_the_closest_chart_point_is_no_farther_than_any_sampled_one():
 
 
 def test_a_closed_uv_map_has_no_outline_to_be_closest_to():
-    with pytest.raises(ValueError, match="boundary edges"):
+    with refused(ValueError, "boundary"):
         closest_in_uv(UV[np.array([[0, 1, 2], [0, 2, 1]])], np.array([[0, 1, 2], [0, 2, 1]]), np.array([[2.0, 2.0]]))

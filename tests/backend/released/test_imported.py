@@ -25,6 +25,7 @@ from primdiffusion.primitives.anchors import build_anchors
 from primdiffusion.primitives.body_setup import BodySetupError, body_setup_from_files
 from primdiffusion.primitives.primitives import K, Payload
 from released_files import TINY, body_arrays, random_network, save_body, save_released, state, template
+from support.errors import refused
 
 
 def line(folder: Path, *more: str) -> list[str]:
@@ -165,10 +166,10 @@ def test_a_body_that_is_gone_changed_or_moved(copied):
     checkpoint, smpl = copied / "imported.safetensors", copied / "SMPL_NEUTRAL.pkl"
     content = smpl.read_bytes()
     smpl.unlink()
-    with pytest.raises(BodySetupError, match=r"SMPL_NEUTRAL\.pkl is missing"):
+    with refused(BodySetupError, "SMPL_NEUTRAL.pkl"):
         load_checkpoint(checkpoint)
     smpl.write_bytes(content[:-1] + b"!")
-    with pytest.raises(BodySetupError, match=r"SMPL_NEUTRAL\.pkl has changed"):
+    with refused(BodySetupError, "SMPL_NEUTRAL.pkl"):
         load_checkpoint(checkpoint)
     smpl.unlink()
     elsewhere = copied / "elsewhere"
@@ -188,14 +189,14 @@ def test_a_missing_body_is_named_by_its_file(copied, person):
     body["smpl"]["sha256"] = "0" * 64
     tensors = safetensors.torch.load_file(saved)
     safetensors.torch.save_file(tensors, saved, {**metadata, "body": json.dumps(body)})
-    with pytest.raises(HumanFileError, match=r"person\.human.*has changed"):
+    with refused(HumanFileError, "person.human"):
         load_human(saved)
     safetensors.torch.save_file(tensors, saved, {**metadata, "body": "{}"})
-    with pytest.raises(HumanFileError, match="'smpl'"):
+    with refused(HumanFileError, "smpl"):
         load_human(saved)
     del tensors["rest_half_extent"]
     safetensors.torch.save_file(tensors, saved, metadata)
-    with pytest.raises(HumanFileError, match="rest extents"):
+    with refused(HumanFileError):
         load_human(saved)
 
 
@@ -206,14 +207,14 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
     tensors = safetensors.torch.load_file(path)
     moved = {**tensors, "stand.face": tensors["stand.face"].flip(0).contiguous()}
     safetensors.torch.save_file(moved, path, metadata)
-    with pytest.raises(BodySetupError, match="anchors"):
+    with refused(BodySetupError, "anchors"):
         load_checkpoint(path)
     safetensors.torch.save_file({**tensors, "stand.betas": torch.zeros(9)}, path, metadata)
-    with pytest.raises(CheckpointError, match=r"imported\.safetensors.*betas have shape \(9,\)"):
+    with refused(CheckpointError, "imported.safetensors", "(9,)"):
         load_checkpoint(path)
     del tensors["denoiser.time_embed.0.bias"]
     safetensors.torch.save_file(tensors, path, metadata)
-    with pytest.raises(CheckpointError, match=r"time_embed\.0\.bias"):
+    with refused(CheckpointError, "time_embed.0.bias"):
         load_checkpoint(path)
 
 

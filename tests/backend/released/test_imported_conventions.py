@@ -16,6 +16,7 @@ from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY
 from primdiffusion.released.imported import Reference, reference_extents, rest_half_extent
 from primdiffusion.render.march import MarchSettings, march
 from released_files import save_body
+from support.errors import refused
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +124,7 @@ def test_stray_delta_scales_give_bounded_boxes_and_boxes_without_size_are_reject
     stray.view(S, 7, GRID * S, GRID * S)[:, 4:] = -3
     payload = ReleasedSlab().to_payload(network_values(stray), 25.5)
     assert payload.delta_scale.max() == pytest.approx(1 / SMALLEST_DELTA_S)
-    with pytest.raises(ValueError, match="reciprocal"):
+    with refused(ValueError, "reciprocal"):
         ReleasedSlab().from_payload(Payload(payload.rgb, payload.density, 0 * payload.delta_scale), 25.5)
 
 
@@ -166,5 +167,5 @@ def test_released_chains():
     assert released_steps(1000, 1000) == list(range(999, -1, -1))
     assert released_steps(1000, 30)[0] == 958
     assert max(released_steps(1000, steps)[0] for steps in range(1, 501)) < sqrt_linear().length
-    with pytest.raises(ValueError, match=r"steps is 700.*up to 500"):
+    with refused(ValueError, "steps", "700", "500"):
         released_steps(1000, 700)

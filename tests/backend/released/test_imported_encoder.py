@@ -33,6 +33,7 @@ from released_files import (
     template,
 )
 from stage_one_twin import StageOneTwin
+from support.errors import refused
 
 
 def line(folder: Path, out: str = "imported.safetensors", *more: str) -> list[str]:
@@ -138,7 +139,7 @@ def test_captures_on_the_default_body_are_rejected(folder, encoder_file, tmp_pat
     joints = np.zeros((2, 24, 3))
     joints[:, :, 1] = 1
     np.savez(other / "joints.npz", world=joints)
-    with pytest.raises(ConditioningError, match=r"encoder's body.*fitted to the SMPL file"):
+    with refused(ConditioningError, "SMPL"):
         captured_person(other, body=model.body)
 
 
@@ -150,11 +151,11 @@ def test_a_body_file_that_has_changed_is_named(folder, encoder_file, tmp_path):
     body["smpl"]["path"] = str(tmp_path / "none.pkl")
     tensors = safetensors.torch.load_file(encoder_file)
     safetensors.torch.save_file(tensors, copy, {**metadata, "body": json.dumps(body)})
-    with pytest.raises(BodySetupError, match=r"none\.pkl is missing"):
+    with refused(BodySetupError, "none.pkl"):
         load_encoder(copy)
     del tensors["stand.rest_half_extent"]
     safetensors.torch.save_file(tensors, copy, metadata)
-    with pytest.raises(ValueError, match="rest_half_extent"):
+    with refused(ValueError, "rest_half_extent"):
         load_encoder(copy)
 
 
@@ -196,7 +197,7 @@ def test_layers_are_recognised_by_shape_and_natural_order_whatever_their_names_a
 
 def test_layers_that_nothing_tells_apart_are_refused(stage):
     other = renamed(stage, {"decoder_motion.0": "decoder_motion.enter", "decoder_motion.3": "decoder_motion.leave"})
-    with pytest.raises(ReleasedFileError, match=r"'decoder_motion\.enter' and 'decoder_motion\.leave' have the same"):
+    with refused(ReleasedFileError, "decoder_motion.enter", "decoder_motion.leave"):
         account_stage_one(other, "")
 
 
@@ -248,6 +249,6 @@ def test_a_damaged_stage_1_is_rejected_in_a_sentence_and_nothing_written(tmp_pat
 
 
 def test_both_stages_cannot_be_written_to_one_file(folder, capsys):
-    with pytest.raises(ValueError, match="give --encoder another name"):
+    with refused(ValueError, "--encoder"):
         cli.run(line(folder, "both.safetensors", "--encoder", str(folder / "both.safetensors")))
     assert not (folder / "both.safetensors").exists()

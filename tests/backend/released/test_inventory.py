@@ -11,6 +11,7 @@ from primdiffusion.released.imported import SCHEDULE
 from primdiffusion.released.inventory import take_inventory
 from primdiffusion.released.reading import ReleasedFileError, read_weights
 from released_files import SMALL, T, blank, save_released, schedule_buffers, stage_one, state, template
+from support.errors import refused
 
 EVERY = pytest.mark.parametrize("every", [7, pytest.param(1, marks=pytest.mark.slow)])
 """Which tensors are tried: all of them by the slow tests."""
@@ -106,7 +107,7 @@ def test_each_tensor_of_another_shape_is_named(released, every):
 
 def test_a_transformer_of_another_width_is_rejected(released):
     key = "bodydecoder.transformer.transformer_blocks.1.ff.net.2.weight"
-    with pytest.raises(ReleasedFileError, match=r"ff\.net\.2\.weight' has shape \(256, 512\), not \(256, 1024\)"):
+    with refused(ReleasedFileError, "ff.net.2.weight", "(256, 512)", "(256, 1024)"):
         take_inventory({**released, key: blank(256, 512)})
 
 
@@ -114,13 +115,13 @@ def test_a_transformer_of_another_width_is_rejected(released):
 def test_a_schedule_buffer_that_does_not_follow_from_the_schedule_is_named(released, name):
     wrong = released[name].clone()
     wrong[500] *= 1.001
-    with pytest.raises(ReleasedFileError, match=rf"'{name}' is .* at step 500"):
+    with refused(ReleasedFileError, f"'{name}'", "step 500"):
         take_inventory({**released, name: wrong})
 
 
 def test_the_linear_schedule_is_not_taken_for_the_released_one(released):
     other = {**released, "alphas_cumprod": linear().alpha_bar.float()}
-    with pytest.raises(ReleasedFileError, match="alphas_cumprod"):
+    with refused(ReleasedFileError, "alphas_cumprod"):
         take_inventory(other)
     assert SCHEDULE == "sqrt_linear"
 
@@ -204,5 +205,5 @@ def test_what_is_no_released_checkpoint_is_rejected_in_one_sentence(tmp_path, mo
 
 
 def test_a_missing_file_is_said_to_be_missing(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no checkpoint"):
+    with refused(FileNotFoundError, "checkpoint"):
         read_weights(tmp_path / "none.pt")

@@ -15,6 +15,7 @@ from primdiffusion.tensor_file import save
 from primdiffusion.training.config import TrainingConfig, check_resumable, to_json
 from released_files import random_network
 from safetensors import safe_open
+from support.errors import refused
 from torch import Tensor
 from torch.nn import functional
 
@@ -189,7 +190,7 @@ def test_runs_of_the_first_versions_resume_with_their_own_attention(tmp_path):
 
     old = without_the_entry(to_json(settings()))
     check_resumable(old, settings(unet=UNetConfig(attention_context="input")))
-    with pytest.raises(ValueError, match=r"unet\.attention_context \(input, not tokens\)"):
+    with refused(ValueError, "unet.attention_context"):
         check_resumable(old, settings())
     usual = TrainingConfig(tmp_path / "people", tmp_path / "run")
     check_resumable(without_the_entry(to_json(usual)), usual)

@@ -14,6 +14,7 @@ from primdiffusion.render.cpu import _scene, _view, count_samples, march_cpu
 from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings, Span
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
+from support.errors import refused
 
 FACE_STEP = 3.4e-4
 """The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
@@ -119,25 +120,25 @@ def test_boxes_without_extent_draw_nothing_and_disturb_nothing():
 def test_nan_is_rejected_by_name(render, name):
     boxes, camera = random_boxes(2).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
     getattr(boxes, name).view(-1)[-1] = torch.nan
-    with pytest.raises(ValueError, match=rf"primitives\.{name} holds NaN"):
+    with refused(ValueError, f"primitives.{name}", "NaN"):
         render(boxes, camera)
 
 
 def test_negative_density_broken_shapes_and_cameras_are_rejected():
     boxes, camera = random_boxes(2).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
-    with pytest.raises(ValueError, match="smallest density is -1"):
+    with refused(ValueError, "density is -1"):
         march(dataclasses.replace(boxes, density=boxes.density * 0 - 1), camera)
-    with pytest.raises(ValueError, match="give a batch to `march`"):
+    with refused(ValueError, "batch"):
         march_cpu(boxes.map(lambda tensor: tensor[None]), camera)
-    with pytest.raises(ValueError, match=r"camera\.intrinsics"):
+    with refused(ValueError, "camera.intrinsics"):
         march(boxes, dataclasses.replace(camera, intrinsics=camera.intrinsics * torch.nan))
-    with pytest.raises(ValueError, match="0 x 20 pixels"):
+    with refused(ValueError, "0 x 20 pixels"):
         march(boxes, dataclasses.replace(camera, width=0))
-    with pytest.raises(ValueError, match="scales or shears"):
+    with refused(ValueError, "scales"):
         march_cpu(boxes, dataclasses.replace(camera, world_to_camera=2 * camera.world_to_camera))
-    with pytest.raises(ValueError, match="half_extent"):
+    with refused(ValueError, "half_extent"):
         march_cpu(dataclasses.replace(boxes, half_extent=boxes.half_extent * -torch.inf), camera)
-    with pytest.raises(ValueError, match="strides"):
+    with refused(ValueError, "strides"):
         MarchSettings(strides=(4, 3))
 
 
@@ -226,9 +227,9 @@ def test_spans_that_meet_put_a_picture_together():
 def test_a_span_of_the_wrong_shape_or_with_nan_is_rejected():
     boxes, camera = random_boxes(3).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
     near, far = torch.zeros(20, 24), torch.ones(20, 24)
-    with pytest.raises(ValueError, match=r"span\.far"):
+    with refused(ValueError, "span.far"):
         march_cpu(boxes, camera, span=Span(near, far[:, :3]))
-    with pytest.raises(ValueError, match=r"span\.near holds NaN"):
+    with refused(ValueError, "span.near", "NaN"):
         march_cpu(boxes, camera, span=Span(near / 0, far))
 
 

@@ -16,6 +16,7 @@ from primdiffusion.render.cpu_linear import (
     apply,
     linearise,
 )
+from support.errors import refused
 
 GREY = 0.2
 
@@ -102,6 +103,6 @@ def test_room_grows_with_the_matrix(scene, monkeypatch):
 
 def test_other_boxes_are_named():
     boxes = random_boxes(2, size=4).to(dtype=torch.float32)
-    with pytest.raises(ValueError, match=r"8\^3"):
+    with refused(ValueError, "8^3"):
         linearise(boxes, camera_at((0.0, 0.0, 0.6)).to(dtype=torch.float32), GREY)
     assert VOXELS == 512

@@ -17,6 +17,7 @@ from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference
+from support.errors import refused
 
 FIELDS = ("rgb", "alpha", "depth", "first_hit")
 
@@ -91,7 +92,7 @@ def test_the_background_fills_what_the_boxes_leave():
     empty = plain.alpha == 0
     assert empty.any()
     assert torch.equal(behind.rgb[empty], picture[empty])
-    with pytest.raises(ValueError, match=r"background has shape \(4,\)"):
+    with refused(ValueError, "background", "(4,)"):
         march(boxes, camera, background=(1.0, 1.0, 1.0, 1.0))
 
 
@@ -177,33 +178,33 @@ def test_reflected_frames_mirror_what_is_in_the_box():
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_broken_scenes_are_rejected_with_a_way_out(dtype):
     boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
-    with pytest.raises(ValueError, match=r"of box [012] is not a rotation: R\^T R differs from the identity by 3"):
+    with refused(ValueError, "rotation"):
         march(dataclasses.replace(boxes, rotation=boxes.rotation * 2), camera)
-    with pytest.raises(ValueError, match="do not broadcast"):
+    with refused(ValueError, "broadcast"):
         march(people(0, 1).to(dtype=dtype), views(3).to(dtype=dtype))
-    with pytest.raises(ValueError, match="leading dimensions of Primitives do not broadcast"):
+    with refused(ValueError, "dimensions"):
         march(broken(people(0, 1), rgb=people(0, 1, 2).rgb), camera)
-    with pytest.raises(ValueError, match="is empty"):
+    with refused(ValueError, "empty"):
         march(people(0, 1).map(lambda tensor: tensor[:0]).to(dtype=dtype), camera)
-    with pytest.raises(ValueError, match=r"span.near has shape \(5, 5\)"):
+    with refused(ValueError, "span.near", "(5, 5)"):
         march(boxes, camera, span=Span(torch.zeros(5, 5), torch.zeros(5, 5)))
-    with pytest.raises(ValueError, match=r"span\.far holds NaN"):
+    with refused(ValueError, "span.far", "NaN"):
         march(boxes, camera, span=Span(torch.zeros(20, 24), torch.full((20, 24), torch.nan)))
-    with pytest.raises(ValueError, match=r"primitives.rgb has shape \(3, 1, 8, 8, 8\)"):
+    with refused(ValueError, "primitives.rgb", "(3, 1, 8, 8, 8)"):
         march(broken(boxes, rgb=boxes.rgb[:, :1]), camera)
-    with pytest.raises(ValueError, match=r"its fields need .* dimensions"):
+    with refused(ValueError, "dimensions"):
         march(broken(boxes, density=boxes.density[0, 0]), camera)
-    with pytest.raises(ValueError, match=r"lie on \['cpu', 'meta'\]"):
+    with refused(ValueError, "cpu", "meta"):
         march(dataclasses.replace(boxes, rgb=boxes.rgb.to("meta")), camera)
-    with pytest.raises(ValueError, match="compositing is 'nearest'; choose from"):
+    with refused(ValueError, "compositing", "nearest"):
         MarchSettings(compositing="nearest")  # pyright: ignore[reportArgumentType]
     for strides in ((), (1, 2), (4, 3), (4, 2, 0), (2.5,), (2**40, 1)):
-        with pytest.raises(ValueError, match="divisor of the previous one"):
+        with refused(ValueError, "previous"):
             MarchSettings(strides=strides)  # pyright: ignore[reportArgumentType]
     for step in (0.0, -1.0, float("nan"), float("inf")):
-        with pytest.raises(ValueError, match=r"the step is .* m; it must be positive and finite"):
+        with refused(ValueError, "step", "positive"):
             MarchSettings(step=step)
-    with pytest.raises(ValueError, match="pixel_centre is nan"):
+    with refused(ValueError, "pixel_centre"):
         MarchSettings(pixel_centre=float("nan"))
 
 
@@ -212,12 +213,12 @@ def test_cameras_whose_rays_start_nowhere_are_rejected(dtype):
     boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
     flat = torch.tensor([1.0, 1.0, 0.0], dtype=dtype)[:, None]
     for change in (2.0, 0.0, flat):
-        with pytest.raises(ValueError, match=r"world_to_camera .* scales or shears"):
+        with refused(ValueError, "world_to_camera"):
             march(boxes, dataclasses.replace(camera, world_to_camera=camera.world_to_camera * change))
     for axis in (0, 1):
         lens = camera.intrinsics.clone()
         lens[axis, axis] = 0
-        with pytest.raises(ValueError, match=r"focal lengths are .* must not be 0"):
+        with refused(ValueError, "focal lengths"):
             march(boxes, dataclasses.replace(camera, intrinsics=lens))
 
 
@@ -225,7 +226,7 @@ def test_cameras_whose_rays_start_nowhere_are_rejected(dtype):
 def test_boxes_that_would_take_hours_are_rejected(dtype):
     boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
     boxes.half_extent[1] = 1e9
-    with pytest.raises(ValueError, match=r"box 1 has half extents .* choose a larger step"):
+    with refused(ValueError, "box 1"):
         march(boxes, camera)
     assert march(boxes, camera, MarchSettings(step=1e8)).alpha.shape == (20, 24)
 

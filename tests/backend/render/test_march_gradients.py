@@ -11,6 +11,7 @@ from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, Span
 from primdiffusion.render.reference import march_reference
+from support.errors import refused
 from torch import Tensor
 
 INDEX_ORDER = MarchSettings(compositing="index_order")
@@ -176,7 +177,7 @@ def test_a_second_derivative_is_rejected():
     camera = camera_at((0.2, 0.1, 0.6), fov=0.5).to(dtype=torch.float32)
     density = boxes.density.clone().requires_grad_()
     loss = objective(march_cpu(dataclasses.replace(boxes, density=density), camera))
-    with pytest.raises(RuntimeError, match="cannot be differentiated twice"):
+    with refused(RuntimeError, "differentiated"):
         torch.autograd.grad(loss, [density], create_graph=True)
 
 

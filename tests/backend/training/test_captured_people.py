@@ -16,6 +16,7 @@ from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, frames_of_looks, read_cards
 from primdiffusion.training.shards import INDEX
 from primdiffusion.training.stored_people import PersonFolder, read_person
+from support.errors import refused
 from tiny_encoder import save_tiny_encoder, tiny_encoder
 
 AS_ENCODED = EncodeSettings()
@@ -118,13 +119,13 @@ def test_a_damaged_card_is_named(root, tmp_path):
     (tmp_path / FIRST / "person.glb").write_bytes((root / "people" / FIRST / "person.glb").read_bytes())
     assert read_cards(tmp_path) == {}
     (tmp_path / FIRST / "person.json").write_text("{")
-    with pytest.raises(ValueError, match=r"person\.json is damaged"):
+    with refused(ValueError, "person.json"):
         read_cards(tmp_path)
 
 
 @pytest.mark.parametrize("settings", [{"views": 0}, {"looks": 0}, {"refine_steps": -1}])
 def test_settings_that_cannot_be_are_rejected(settings):
-    with pytest.raises(ValueError, match=next(iter(settings))):
+    with refused(ValueError, next(iter(settings))):
         EncodeSettings(**settings)
 
 

@@ -33,6 +33,7 @@ from primdiffusion.training.shards import INDEX, pack_people
 from primdiffusion.training.slabs import SlabTrainee
 from primdiffusion.training.stored_people import PersonFolder
 from safetensors.torch import load_file
+from support.errors import refused
 
 DIES_IN_THE_FIFTH_SAVE = """
 import os, signal, sys
@@ -55,13 +56,6 @@ def write(path, content):
 Path.write_bytes = write
 train(settings(Path(sys.argv[1]), Path(sys.argv[2]), save_every=0.0))
 """
-
-
-@pytest.fixture(scope="module")
-def people(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("people")
-    write_people(folder, geometries=16, variants=3)
-    return folder
 
 
 @pytest.fixture(scope="module")
@@ -206,10 +200,10 @@ def test_more_people_are_learned_from_beside_the_others(people, few, whole, tmp_
 
 
 def test_a_checkpoint_of_other_slabs_or_densities_is_no_start(people, few, paper, whole, tmp_path):
-    with pytest.raises(ValueError, match="no checkpoint of the default preset"):
+    with refused(ValueError, "checkpoint"):
         train(settings(people, tmp_path / "run", start_from=paper / MODEL))
     denser = dataclasses.replace(load_checkpoint(whole / MODEL), full_density=1.0)
-    with pytest.raises(ValueError, match=r"full densities \[1\.0, "):
+    with refused(ValueError, "1.0"):
         prepare(settings(people, tmp_path / "other"), PersonFolder(people), [0, 1], [2], denser)
 
 
@@ -241,7 +235,7 @@ def test_a_damaged_shard_ends_the_run_and_is_named(people, tmp_path):
     path = tmp_path / "packed" / "shard_0002.safetensors"
     path.write_bytes(path.read_bytes()[:-1])
     assert (tmp_path / "packed" / INDEX).exists()
-    with pytest.raises(ValueError, match="shard_0002") as error:
+    with refused(ValueError, "shard_0002") as error:
         train(settings(tmp_path / "packed", tmp_path / "run"))
     sentence(error.value)
     assert not (tmp_path / "run" / "prepared.safetensors").exists()
@@ -249,12 +243,12 @@ def test_a_damaged_shard_ends_the_run_and_is_named(people, tmp_path):
 
 def test_other_people_or_settings_in_the_same_folder_are_rejected(people, few, run):
     train(settings(people, run, minutes=0.0))
-    with pytest.raises(ValueError, match=r"another training set .*\(16 and 3 humans\)"):
+    with refused(ValueError, "(16 and 3 humans)"):
         train(settings(few, run))
-    with pytest.raises(ValueError, match=r"preset \(default, not paper\)"):
+    with refused(ValueError, "default"):
         train(settings(people, run, preset="paper"))
     slower = PhaseConfig(steps=6, batch=16, learning_rate=1e-5)
-    with pytest.raises(ValueError, match=r"person\.learning_rate"):
+    with refused(ValueError, "person.learning_rate"):
         train(settings(people, run, person=slower))
 
 
@@ -263,14 +257,14 @@ def test_a_damaged_file_of_the_run_is_named(people, whole, tmp_path, name):
     shutil.copytree(whole, tmp_path / "run")
     path = tmp_path / "run" / name
     path.write_bytes(path.read_bytes()[:30])
-    with pytest.raises(ValueError, match="damaged") as error:
+    with refused(ValueError, "damaged") as error:
         train(settings(people, tmp_path / "run"))
     assert str(tmp_path / "run") in sentence(error.value)
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_with_a_sentence(people, run, monkeypatch):
     monkeypatch.setattr(CellTrainee, "loss", lambda self, name, generator: self.denoiser.person.outer.weight.sum() / 0)
-    with pytest.raises(ValueError, match=r"loss of 'person' at step 0 .*--person\.learning-rate") as error:
+    with refused(ValueError, "person", "step 0", "--person.learning-rate") as error:
         train(settings(people, run))
     sentence(error.value)
     assert not (run / "person.state.safetensors").exists()
@@ -282,7 +276,7 @@ def test_memory_that_runs_out_names_a_batch_to_try(people, run, monkeypatch):
         raise RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 99 bytes")
 
     monkeypatch.setattr(CellTrainee, "loss", greedy)
-    with pytest.raises(ValueError, match=r"batch of 16: try --person\.batch 8"):
+    with refused(ValueError, "--person.batch 8"):
         train(settings(people, run))
 
 

@@ -29,6 +29,7 @@ from primdiffusion.training.fit_losses import volume_loss
 from primdiffusion.training.fit_run import MODEL, STATE, FitState
 from primdiffusion.training.run_folder import METRICS, PICTURES
 from safetensors.torch import load_file
+from support.errors import refused
 
 ROOT = Path(__file__).parents[3]
 
@@ -133,10 +134,10 @@ def test_the_perceptual_loss_is_read_from_its_file_and_counted(captures, tmp_pat
 
 
 def test_a_perceptual_weight_without_a_file_is_rejected_and_a_missing_file_named(captures, tmp_path):
-    with pytest.raises(ValueError, match=r"--loss.perceptual-weights"):
+    with refused(ValueError, "--loss.perceptual-weights"):
         settings(captures, tmp_path / "run", loss=LossConfig(perceptual=1.0))
     loss = LossConfig(perceptual=1.0, perceptual_weights=tmp_path / "nowhere.pth")
-    with pytest.raises(FileNotFoundError, match=r"nowhere\.pth"):
+    with refused(FileNotFoundError, "nowhere.pth"):
         fit(settings(captures, tmp_path / "run", loss=loss))
 
 
@@ -152,15 +153,15 @@ def test_settings_that_cannot_be_are_named(captures, tmp_path, change):
 
 
 def test_losses_without_colour_are_rejected():
-    with pytest.raises(ValueError, match="colours"):
+    with refused(ValueError, "colours"):
         LossConfig(rgb=0.0)
-    with pytest.raises(ValueError, match=r"loss\.volume"):
+    with refused(ValueError, "loss.volume"):
         LossConfig(volume=-1.0)
 
 
 def test_captures_without_people_are_rejected(tmp_path):
     (tmp_path / "captures").mkdir()
-    with pytest.raises(FileNotFoundError, match="no finished captures"):
+    with refused(FileNotFoundError, "finished"):
         fit(settings(tmp_path / "captures", tmp_path / "run"))
     assert not (tmp_path / "run").exists()
 
@@ -185,7 +186,7 @@ def test_a_picture_that_goes_missing_is_named(own, tmp_path, workers):
 def test_a_mask_of_another_size_is_named(own, tmp_path):
     for path in own.glob("person_000000/mask/*/*.png"):
         Image.new("L", (30, 30)).save(path)
-    with pytest.raises(ValueError, match=r"mask.*30 x 30 pixels, its camera 32 x 32"):
+    with refused(ValueError, "30 x 30 pixels"):
         fit(settings(own, tmp_path / "run"))
 
 
@@ -195,10 +196,10 @@ def test_a_human_on_another_body_is_named_before_training_begins(own, tmp_path):
     with np.load(plain) as arrays:
         changed = {**arrays, "betas": np.zeros((1, 16))}
     np.savez(plain, **changed)
-    with pytest.raises(ValueError, match=r"person_000001 has 16 betas"):
+    with refused(ValueError, "person_000001", "16 betas"):
         fit(settings(own, tmp_path / "run"))
     assert not (tmp_path / "run").exists()
-    with pytest.raises(ValueError, match=r"person_000001 has 16 betas"):
+    with refused(ValueError, "person_000001", "16 betas"):
         fit(settings(own, tmp_path / "run", held=own))
 
 

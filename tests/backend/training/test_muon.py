@@ -8,6 +8,7 @@ from primdiffusion.training import phase
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.phase import PhaseState
 from primdiffusion.training.state import accelerator_of
+from support.errors import refused
 from torch import nn
 
 
@@ -93,5 +94,5 @@ def test_a_device_that_is_slow_in_bfloat16_takes_adamw(monkeypatch, tmp_path):
     assert all("exp_avg" in slow.optimiser.state[parameter] for parameter in slow.network.parameters())
     slow.save(tmp_path / "adamw.safetensors")
     started().load(tmp_path / "adamw.safetensors")
-    with pytest.raises(ValueError, match="trained with muon"):
+    with refused(ValueError, "trained"):
         slow.load(tmp_path / "muon.safetensors")

@@ -6,6 +6,7 @@ import pytest
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
 from primdiffusion.training.folder_lock import FolderInUseError, lock_folder
+from support.errors import refused
 
 
 @pytest.mark.parametrize(
@@ -18,5 +19,5 @@ from primdiffusion.training.folder_lock import FolderInUseError, lock_folder
 )
 def test_a_second_run_in_a_folder_is_rejected(tmp_path, start):
     run = tmp_path / "run"
-    with lock_folder(run), pytest.raises(FolderInUseError, match="another process works in"):
+    with lock_folder(run), refused(FolderInUseError):
         start(tmp_path / "data", run)

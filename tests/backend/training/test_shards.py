@@ -15,6 +15,7 @@ from primdiffusion.primitives.primitives import K
 from primdiffusion.training import shards
 from primdiffusion.training.shards import INDEX, PackedPeople, ShardError, damaged_shards, open_people, pack_people
 from primdiffusion.training.stored_people import PersonFolder, read_person
+from support.errors import refused
 
 
 @pytest.fixture(scope="module")
@@ -90,7 +91,7 @@ def test_a_damaged_shard_is_named_before_anything_of_it_is_used(copied, harm):
         path.write_bytes(content if harm == "a flipped bit" else content[: len(content) // 2])
     people = open_people(copied)
     people.person(0)
-    with pytest.raises((ShardError, FileNotFoundError), match=r"shard_0001.*pack"):
+    with refused((ShardError, FileNotFoundError), "shard_0001"):
         people.variant(2, 0)
     assert [("shard_0001" in found) for found in damaged_shards(copied)] == [True]
 
@@ -105,24 +106,24 @@ def test_a_shard_is_checked_once(packed, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("content", "word"),
+    "content",
     [
-        ("{", "damaged"),
-        ("[]", "not the index"),
-        ('{"format": "primdiffusion-payloads", "version": 9}', "version 9"),
-        ('{"format": "primdiffusion-payloads", "version": 1, "full_density": 100}', "damaged"),
+        "{",
+        "[]",
+        '{"format": "primdiffusion-payloads", "version": 9}',
+        '{"format": "primdiffusion-payloads", "version": 1, "full_density": 100}',
     ],
 )
-def test_an_index_that_cannot_be_used_is_rejected(copied, content, word):
+def test_an_index_that_cannot_be_used_is_rejected(copied, content):
     (copied / INDEX).write_text(content)
-    with pytest.raises(ShardError, match=word):
+    with pytest.raises(ShardError):
         open_people(copied)
 
 
 def test_shards_without_people_are_named(copied):
     index = json.loads((copied / INDEX).read_text())
     (copied / INDEX).write_text(json.dumps({**index, "shards": []}))
-    with pytest.raises(FileNotFoundError, match="lists 0 humans"):
+    with refused(FileNotFoundError, "0 humans"):
         open_people(copied)
 
 
@@ -133,7 +134,7 @@ def test_a_damaged_person_is_named_and_leaves_no_index(folder, tmp_path):
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 255
     path.write_bytes(content)
-    with pytest.raises(ValueError, match="person_000003"):
+    with refused(ValueError, "person_000003"):
         list(pack_people(tmp_path, tmp_path / "out", people_each=2))
     assert not (tmp_path / "out" / INDEX).exists()
 
@@ -148,7 +149,7 @@ def test_a_full_disk_while_packing_is_named_and_leaves_nothing(folder, tmp_path,
         return write(path, data)
 
     monkeypatch.setattr(pathlib.Path, "write_bytes", until_full)
-    with pytest.raises(OSError, match="No space left") as full:
+    with refused(OSError, "space") as full:
         list(pack_people(folder, tmp_path / "out", people_each=2))
     assert full.value.filename == str(tmp_path / "out" / ("shard_0001.safetensors" if written == 1 else INDEX))
     assert not (tmp_path / "out").exists()
@@ -156,7 +157,7 @@ def test_a_full_disk_while_packing_is_named_and_leaves_nothing(folder, tmp_path,
 
 def test_packing_into_packed_people_is_rejected(folder, copied):
     before = (copied / INDEX).read_bytes()
-    with pytest.raises(ShardError, match="already"):
+    with refused(ShardError, "already"):
         list(pack_people(folder, copied))
     assert (copied / INDEX).read_bytes() == before
 
@@ -165,7 +166,7 @@ def test_packing_again_removes_what_a_kill_left_beside_the_finished_shards(folde
     left = temporary_name(copied / "files")
     left = left.with_name(left.name.replace(str(os.getpid()), "9999999"))  # above any process' number
     left.mkdir()
-    with pytest.raises(ShardError, match="already"):
+    with refused(ShardError, "already"):
         list(pack_people(folder, copied))
     assert not left.exists()
 
@@ -175,14 +176,14 @@ def test_people_of_several_densities_are_rejected(folder, tmp_path):
         (tmp_path / path.name).write_bytes(path.read_bytes())
     with np.load(tmp_path / "person_000001.npz") as file:
         np.savez(tmp_path / "person_000001.npz", **{**file, "full_density": np.array(25.5)})
-    with pytest.raises(ValueError, match=r"25\.5, 100"):
+    with refused(ValueError, "25.5", "100"):
         open_people(tmp_path)
 
 
 def test_delta_scales_of_another_shape_are_rejected(folder, tmp_path):
     with np.load(folder / "person_000001.npz") as file:
         np.savez(tmp_path / "person.npz", **file, delta_scale=np.ones((1, K, 3), np.float16))
-    with pytest.raises(ValueError, match="holds delta_scale"):
+    with refused(ValueError, "delta_scale"):
         read_person(tmp_path / "person.npz")
 
 
@@ -198,7 +199,7 @@ def test_an_index_names_only_files_beside_it(copied, name):
     index = json.loads((copied / INDEX).read_text())
     index["shards"][0]["file"] = name
     (copied / INDEX).write_text(json.dumps(index))
-    with pytest.raises(ShardError, match="index"):
+    with refused(ShardError, "index"):
         PackedPeople(copied)
 
 
@@ -217,20 +218,20 @@ def test_a_shard_with_the_right_checksum_and_other_tensors_is_rejected(copied, n
     index = json.loads((copied / INDEX).read_text())
     index["shards"][0]["sha256"] = shards.digest_of(path)
     (copied / INDEX).write_text(json.dumps(index))
-    with pytest.raises(ShardError, match="shard_0000"):
+    with refused(ShardError, "shard_0000"):
         PackedPeople(copied).person(0)
 
 
 def test_a_shard_that_is_listed_twice_is_rejected(tmp_path):
     index = _changed_index(tmp_path, lambda shards: shards.append(shards[0]))
-    with pytest.raises(ShardError, match=r"lists the shard 'shard_0000\.safetensors' more than once"):
+    with refused(ShardError, "shard_0000.safetensors"):
         PackedPeople(index.parent)
 
 
 @pytest.mark.parametrize("variants", [0, -3, 1.5, "1", True])
 def test_a_number_of_colourings_that_is_none_is_rejected(tmp_path, variants):
     index = _changed_index(tmp_path, lambda shards: shards[0]["people"][0].update(variants=variants))
-    with pytest.raises(ShardError, match="colourings"):
+    with refused(ShardError, "colourings"):
         PackedPeople(index.parent)
 
 

@@ -7,6 +7,7 @@ import torch
 from primdiffusion import tensor_file
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.state import TrainingState, learning_rate_factor
+from support.errors import refused
 
 
 def state_of_a_line(seed=0):
@@ -55,7 +56,7 @@ def test_a_damaged_or_foreign_state_is_rejected(tmp_path):
     with pytest.raises(ValueError, match="does not fit"):
         other.load(tmp_path / "state")
     (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:100])
-    with pytest.raises(ValueError, match="damaged"):
+    with refused(ValueError, "damaged"):
         state_of_a_line().load(tmp_path / "state")
 
 
@@ -65,13 +66,13 @@ def test_impossible_numbers_in_a_state_are_rejected(tmp_path, number):
     state_of_a_line().save(path)
     tensors, place = tensor_file.read(path)
     path.write_bytes(tensor_file.save({**tensors, "average.bias": torch.tensor([number])}, place))
-    with pytest.raises(ValueError, match=r"'average.bias' holds NaN or infinite values, or numbers above"):
+    with refused(ValueError, "average.bias", "NaN"):
         state_of_a_line().load(path)
 
 
 def test_a_gradient_that_is_not_finite_stops_the_run():
     state = state_of_a_line()
-    with pytest.raises(FloatingPointError, match="step 0"):
+    with refused(FloatingPointError, "step 0"):
         state.update(state.network(torch.full((1, 3), float("nan"))).sum())
 
 

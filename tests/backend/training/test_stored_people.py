@@ -7,20 +7,21 @@ import zipfile
 import numpy as np
 import pytest
 from primdiffusion.training.stored_people import find_people, read_outline, read_person
+from support.errors import refused
 
 
 def test_a_damaged_person_is_named(tmp_path, people):
     path = tmp_path / "person_000009.npz"
     path.write_bytes((people / "person_000000.npz").read_bytes()[:2000])
-    with pytest.raises(ValueError, match="person_000009"):
+    with refused(ValueError, "person_000009"):
         read_person(path)
     np.savez(path, voxels=np.zeros((1, 3), np.uint8), betas=np.zeros(10), attributes=np.array("{}"), full_density=100.0)
-    with pytest.raises(ValueError, match="voxels"):
+    with refused(ValueError, "voxels"):
         read_person(path)
 
 
 def test_an_empty_folder_is_rejected(tmp_path):
-    with pytest.raises(FileNotFoundError, match="primdiffusion payloads"):
+    with refused(FileNotFoundError, "primdiffusion"):
         find_people(tmp_path)
 
 
@@ -42,7 +43,7 @@ def test_content_that_cannot_be_a_human_is_one_sentence(tmp_path, people, change
     with np.load(people / "person_000000.npz") as stored:
         np.savez(tmp_path / "person_000009.npz", **{**stored, **change})
     for read in (read_person, read_outline):
-        with pytest.raises(ValueError, match=r"person_000009\.npz") as raised:
+        with refused(ValueError, "person_000009.npz") as raised:
             read(tmp_path / "person_000009.npz")
         assert len(str(raised.value)) - len(str(tmp_path)) < 300
 
@@ -55,5 +56,5 @@ def test_a_header_that_promises_many_humans_is_not_believed(tmp_path, people):
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("voxels.npy", b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
     for read in (read_person, read_outline):
-        with pytest.raises(ValueError, match="cut short"):
+        with refused(ValueError, "short"):
             read(path)

@@ -10,6 +10,7 @@ import pytest
 import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load
+from support.errors import refused
 
 from blender_primdiffusion.capture.bind import join_surface, surface_weights, unpose
 from blender_primdiffusion.capture.body import skin
@@ -139,30 +140,30 @@ def test_loose_cloth_takes_the_weights_of_what_it_hangs_on(tmp_path, empty_scene
 def test_a_scan_without_parameters_is_named(tmp_path, empty_scene):
     path = write_scan(tmp_path / "anna.obj")
     path.with_suffix(".npz").rename(tmp_path / "other.txt")
-    with pytest.raises(ScanError, match=r"has no skeleton, and no SMPL parameters are beside it: put anna\.npz"):
+    with refused(ScanError, "SMPL", "anna.npz"):
         load(path)
     path.with_suffix(".pkl").write_bytes(b"")
-    with pytest.raises(ScanError, match="pickles are never read"):
+    with refused(ScanError):
         load(path)
     assert len(bpy.data.objects) == 0
 
 
 @pytest.mark.any_blender
 @pytest.mark.parametrize(
-    ("changes", "message"),
+    ("changes", "name"),
     [
-        ({"body_pose": None, "global_orient": None}, "holds no pose"),
-        ({"body_pose": np.full((1, 69), np.nan)}, "NaN or infinite"),
-        ({"betas": np.full((1, 10), np.inf)}, "'betas' holds something else than finite numbers"),
-        ({"betas": np.full((1, 10), 1e300)}, "'betas' holds something else than finite numbers"),
-        ({"betas": np.array([{"a": 1}], object)}, "pickled Python objects"),
-        ({"scale": np.array(0.0)}, "'scale' is 0, not positive"),
-        ({"body_pose": np.zeros((1, 30))}, "poses of 11 joints"),
+        ({"body_pose": None, "global_orient": None}, "pose"),
+        ({"body_pose": np.full((1, 69), np.nan)}, "NaN"),
+        ({"betas": np.full((1, 10), np.inf)}, "'betas'"),
+        ({"betas": np.full((1, 10), 1e300)}, "'betas'"),
+        ({"betas": np.array([{"a": 1}], object)}, "pickled"),
+        ({"scale": np.array(0.0)}, "'scale'"),
+        ({"body_pose": np.zeros((1, 30))}, "11 joints"),
     ],
 )
-def test_parameters_that_are_none_are_named(tmp_path, empty_scene, changes, message):
+def test_parameters_that_are_none_are_named(tmp_path, empty_scene, changes, name):
     path = write_scan(tmp_path / "anna.obj", **changes)
-    with pytest.raises(ScanError, match=message):
+    with refused(ScanError, name):
         load(path)
     assert len(bpy.data.objects) == 0
 
@@ -171,7 +172,7 @@ def test_parameters_that_are_none_are_named(tmp_path, empty_scene, changes, mess
 def test_parameters_of_another_scan_are_named(tmp_path, empty_scene):
     lying = from_axis_angle(np.random.default_rng(9).normal(0, 1.2, (24, 3)))
     path = write_scan(tmp_path / "anna.obj", body_pose=to_axis_angle(lying)[1:].reshape(1, 69))
-    with pytest.raises(ScanError, match=r"does not match .*: its surface is .* cm"):
+    with refused(ScanError):
         load(path)
 
 

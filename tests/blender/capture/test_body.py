@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic
+from support.errors import refused
 
 from blender_primdiffusion.capture.body import BodyError, read_body
 
@@ -76,28 +77,28 @@ def test_betas_that_lack_are_zero_and_betas_too_many_are_rejected(body):
     few, _ = body.rest([1.0, -1.0])
     all_of_them, _ = body.rest([1.0, -1.0, *[0.0] * 30])
     np.testing.assert_array_equal(few, all_of_them)
-    with pytest.raises(BodyError, match="11 betas were given"):
+    with refused(BodyError, "11 betas"):
         body.rest(np.ones(11))
 
 
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("change", "name"),
     [
-        ({"weights": None}, "holds no 'weights'"),
-        ({"v_template": np.full((30, 3), np.nan)}, "'v_template' has shape"),
-        ({"J_regressor": np.ones((55, 30))}, "'J_regressor' has shape"),
-        ({"f": np.full((20, 3), 30)}, "vertices that are not there"),
-        ({"kintree_table": np.zeros((2, 24), np.int64)}, "not SMPL's 24"),
-        ({"shapedirs": np.array({"a": 1}, object)}, "pickled Python objects"),
+        ({"weights": None}, "'weights'"),
+        ({"v_template": np.full((30, 3), np.nan)}, "'v_template'"),
+        ({"J_regressor": np.ones((55, 30))}, "'J_regressor'"),
+        ({"f": np.full((20, 3), 30)}, "vertices"),
+        ({"kintree_table": np.zeros((2, 24), np.int64)}, "24"),
+        ({"shapedirs": np.array({"a": 1}, object)}, "pickled"),
     ],
 )
-def test_a_body_of_another_form_is_named(tmp_path, change, message):
+def test_a_body_of_another_form_is_named(tmp_path, change, name):
     content = {key: value for key, value in (arrays() | change).items() if value is not None}
     np.savez(tmp_path / "body.npz", **content)
-    with pytest.raises(BodyError, match=message):
+    with refused(BodyError, name):
         read_body(tmp_path / "body.npz")
 
 
 def test_a_missing_body_is_named(tmp_path):
-    with pytest.raises(BodyError, match="there is no body model"):
+    with refused(BodyError):
         read_body(tmp_path / "none.npz")

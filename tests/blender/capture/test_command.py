@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 
 import pytest
+from support.errors import refused
 
 from blender_primdiffusion.capture import command
 from blender_primdiffusion.capture.options import parse, settings_of
@@ -66,5 +67,5 @@ def test_the_estimate_grows_with_pixels_and_samples_and_counts_the_shards_own_pe
 
 @pytest.mark.parametrize("seed", ["-1", str(2**63)])
 def test_a_seed_out_of_range_is_named(tmp_path, seed):
-    with pytest.raises(UsageError, match=rf"seed {seed} is outside 0 \.\.\. 2\^63-1"):
+    with refused(UsageError, str(seed)):
         parse(["--out", str(tmp_path), f"--seed={seed}"])

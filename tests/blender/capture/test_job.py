@@ -29,6 +29,7 @@ from blender_primdiffusion.formats.capture_repair import repair, verify
 from blender_primdiffusion.formats.whole_files import writer
 from capture_child import PEOPLE, small
 from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
+from support.errors import refused
 
 from blender_primdiffusion.capture import passes
 from blender_primdiffusion.capture.job import CaptureError, _name_reference, run
@@ -258,7 +259,7 @@ def test_the_released_codes_reference_is_written_on_request(empty_scene, tmp_pat
 @pytest.mark.parametrize("change", [{"seed": 5}, {"samples": 3}, {"light": "dome"}, {"passes": ("img",)}])
 def test_a_folder_with_other_captures_is_rejected(copy, empty_scene, change):
     before = files_of(copy)
-    with pytest.raises(CaptureFolderError, match="another folder"):
+    with refused(CaptureFolderError):
         capture(empty_scene, small(copy, **change))
     assert files_of(copy) == before
 
@@ -273,7 +274,7 @@ def test_other_poses_are_rejected_before_anything_is_overwritten(copy, empty_sce
 def test_poses_that_are_not_finite_are_rejected(empty_scene, tmp_path):
     rotations = POSES.rotations.copy()
     rotations[1, 3] = np.nan
-    with pytest.raises(CaptureError, match="not finite"):
+    with refused(CaptureError):
         capture(empty_scene, small(tmp_path / "a"), poses=Motion(rotations, POSES.translations, 1.0, "walk.npz"))
     assert not (tmp_path / "a").exists()
 
@@ -320,7 +321,7 @@ def test_a_full_disk_ends_the_batch_with_an_error(empty_scene, tmp_path, monkeyp
     monkeypatch.setattr(passes, "write_png", full)
     report = Report()
     steps = run(empty_scene, small(tmp_path), PEOPLE, report, poses=POSES, load=load_painted)
-    with pytest.raises(OSError, match="No space left"):
+    with refused(OSError, "space"):
         list(steps)
     assert [failure["subject"] for failure in report.failed] == ["anna"]
     monkeypatch.undo()

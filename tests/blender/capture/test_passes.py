@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.errors import refused
 
 from blender_primdiffusion.capture.passes import ExrError, read_colours, read_exr
 
@@ -62,6 +63,6 @@ def test_lines_are_read_in_any_order_and_nan_is_black(tmp_path):
 )  # fmt: skip
 def test_a_damaged_picture_is_one_sentence(tmp_path, content):
     path = written(tmp_path / "a.exr", content)
-    with pytest.raises(ExrError, match=r"a\.exr .*: render it again") as error:
+    with refused(ExrError, "a.exr") as error:
         read_colours(path)
     assert len(str(error.value)) - len(str(tmp_path)) < 300

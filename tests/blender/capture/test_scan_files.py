@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import scan_fixtures
 from loaded_scans import BETAS, BODY, load
+from support.errors import refused
 
 from blender_primdiffusion.capture.registration import unit_of
 from blender_primdiffusion.capture.scan import ScanError, find_scans
@@ -68,15 +69,15 @@ def test_the_released_parameters_and_a_lone_npz_are_found(tmp_path):
 
 
 def test_folders_and_files_without_scans_are_named(tmp_path):
-    with pytest.raises(ScanError, match="there is no folder of scans"):
+    with refused(ScanError):
         find_scans(tmp_path / "none")
-    with pytest.raises(ScanError, match="holds no scans"):
+    with refused(ScanError):
         find_scans(tmp_path)
     touch(tmp_path / "people" / "person_000007" / "person.human.safetensors")
-    with pytest.raises(ScanError, match=r"export these as \.glb"):
+    with refused(ScanError, ".glb"):
         find_scans(tmp_path / "people")
     touch(tmp_path / "a.blend")
-    with pytest.raises(ScanError, match="is no scan: give a"):
+    with refused(ScanError):
         find_scans(tmp_path / "a.blend")
 
 
@@ -95,7 +96,7 @@ def test_people_are_between_half_a_metre_and_two_and_a_half(height, scale):
 
 @pytest.mark.parametrize("height", [0.0, 0.3, 3.5, 1e6, float("nan")])
 def test_other_heights_are_rejected(height):
-    with pytest.raises(ScanError, match="no change of units"):
+    with refused(ScanError):
         unit_of(height, "x")
 
 

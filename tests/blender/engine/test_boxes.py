@@ -12,6 +12,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from engine_stage import PYTHON, ROOT
+from support.errors import refused
 
 from blender_primdiffusion.engine.boxes import EarlierVersionError, boxes_of
 from blender_primdiffusion.engine.picture import PosedHuman
@@ -80,7 +81,7 @@ def test_the_bodys_file_gives_the_model_back(person):
 
 def test_a_body_of_an_earlier_version_is_rejected_in_a_sentence(plain, tmp_path):
     early = dataclasses.replace(plain.model, skin_weights=None, rest_half_extent=None)
-    with saved_body_file(early, tmp_path) as name, pytest.raises(ValueError, match="earlier version"):
+    with saved_body_file(early, tmp_path) as name, refused(ValueError, "version"):
         boxes_of(posed(plain, body=tmp_path / name))
     with pytest.raises(EarlierVersionError):
         boxes_of(posed(plain, body=None))
@@ -95,10 +96,10 @@ def test_a_body_with_another_number_of_boxes_is_rejected(plain, tmp_path):
 
 def test_what_is_scaled_to_zero_is_rejected_by_name(plain):
     human = posed(plain)
-    with pytest.raises(ValueError, match="mean scale is 0"):
+    with refused(ValueError, "scale is 0"):
         boxes_of(dataclasses.replace(human, object_to_world=human.object_to_world * [0, 0, 0, 1]))
     human.joints[4, :, :3] = 0
-    with pytest.raises(ValueError, match="left_knee"):
+    with refused(ValueError, "left_knee"):
         boxes_of(human)
 
 
@@ -165,7 +166,7 @@ def test_a_damaged_file_is_rejected_in_one_sentence(plain, tmp_path, how):
     path = tmp_path / "bad.human.safetensors"
     path.write_bytes(plain.file.read_bytes())
     damaged(path, how)
-    with pytest.raises(ValueError, match=r"bad\.human\.safetensors") as error:
+    with refused(ValueError, "bad.human.safetensors") as error:
         read_payload(path)
     assert "\n" not in str(error.value)
     assert len(str(error.value)) < 250

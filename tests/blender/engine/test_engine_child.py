@@ -17,6 +17,8 @@ import pytest
 from backend_python import use_this_python
 from blender_primdiffusion.formats.whole_files import writer
 from engine_stage import pixels, set_up_render
+from support.errors import refused
+from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.backend.environment import BackendPython
@@ -25,7 +27,6 @@ from blender_primdiffusion.engine.frames import CHANNELS, SharedFrames
 
 pytestmark = pytest.mark.any_blender
 
-FAKE = Path(__file__).parents[1] / "fake_backend"
 SIZE = (40, 32)
 COLOUR = np.round(255 * np.array([0.5372549, 0.7372549, 0.88235295, 1.0]))
 """(.25, .5, .75) as sRGB: what the fake child fills frames with."""
@@ -34,7 +35,7 @@ COLOUR = np.round(255 * np.array([0.5372549, 0.7372549, 0.88235295, 1.0]))
 @pytest.fixture
 def stage(saved_scene, tmp_path, monkeypatch):
     """The engine on the fake child, with a camera."""
-    use_this_python(monkeypatch, FAKE)
+    use_this_python(monkeypatch, FAKE_CHILD)
     blender_primdiffusion.register()
     scene = saved_scene.scene
     set_up_render(scene, SIZE, (0, 0, 0), (0, 0, 0))
@@ -88,7 +89,7 @@ def test_a_second_picture_uses_the_same_child_and_the_same_file(stage):
 
 
 def test_progress_and_seconds_left_are_reported_band_by_band(stage, monkeypatch):
-    monkeypatch.setenv("FAKE_BAND_S", "0.15")
+    monkeypatch.setenv("FAKE_STEP_S", "0.15")
     engine = Engine()
     drawing = final.render_layer(engine, bpy.context.evaluated_depsgraph_get())
     assert drawing.state == "done"
@@ -99,7 +100,7 @@ def test_progress_and_seconds_left_are_reported_band_by_band(stage, monkeypatch)
 
 
 def test_a_cancel_ends_the_picture_within_a_band(stage, monkeypatch):
-    monkeypatch.setenv("FAKE_BAND_S", "0.3")
+    monkeypatch.setenv("FAKE_STEP_S", "0.3")
     render()
     engine = Engine(stop_after_s=0.1)
     drawing = final.render_layer(engine, bpy.context.evaluated_depsgraph_get())
@@ -118,7 +119,7 @@ def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, m
 
 
 def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
-    monkeypatch.setenv("FAKE_BAND_S", "0.2")
+    monkeypatch.setenv("FAKE_STEP_S", "0.2")
     render()
     began, busy = time.monotonic(), time.thread_time()
     final.render_layer(Engine(), bpy.context.evaluated_depsgraph_get())
@@ -126,12 +127,12 @@ def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
 
 
 def test_a_child_that_dies_is_one_error_and_the_next_render_works(stage, monkeypatch):
-    monkeypatch.setenv("FAKE_DRAW", "dies")
-    with pytest.raises(RuntimeError, match=r"ended by itself.*Render again") as caught:
+    monkeypatch.setenv("FAKE_ORDER", "dies")
+    with refused(RuntimeError, "Render") as caught:
         render()
     assert str(caught.value).count("Error:") == 1
     assert not stage.out.exists()
-    monkeypatch.delenv("FAKE_DRAW")
+    monkeypatch.delenv("FAKE_ORDER")
     assert render() == {"FINISHED"}
 
 
@@ -145,17 +146,17 @@ def test_a_child_killed_between_pictures_is_replaced_silently(stage):
 
 
 def test_an_error_of_the_child_keeps_its_remedy_and_ends_an_animation(stage, monkeypatch, tmp_path):
-    monkeypatch.setenv("FAKE_DRAW", "no memory")
+    monkeypatch.setenv("FAKE_ORDER", "fails")
     stage.scene.frame_end = 3
     stage.scene.render.filepath = str(tmp_path / "frame_")
-    with pytest.raises(RuntimeError, match=r"There is not enough memory\. Draw fewer pixels\."):
+    with refused(RuntimeError, "checkpoint"):
         bpy.ops.render.render(animation=True)
     assert not list(tmp_path.glob("frame_*"))
 
 
 def test_without_a_backend_the_error_names_what_was_tried(stage, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.backend.environment.search", find_nothing)
-    with pytest.raises(RuntimeError, match="extension's preferences"):
+    with refused(RuntimeError, "preferences"):
         render()
 
 
@@ -172,32 +173,32 @@ def test_an_unsupported_camera_is_one_clear_error(stage, kind):
     else:
         stage.scene.camera = bpy.data.objects.new("lamp", bpy.data.lights.new("lamp", "SPOT"))
         stage.scene.collection.objects.link(stage.scene.camera)
-    with pytest.raises(RuntimeError, match=f"of type {kind.lower()}.*perspective and orthographic"):
+    with refused(RuntimeError, kind.lower()):
         render()
 
 
 def test_a_camera_that_shows_nothing_is_one_clear_error(stage):
     camera = stage.scene.camera
     camera.data.clip_start, camera.data.clip_end = 5.0, 1.0
-    with pytest.raises(RuntimeError, match="clips everything, from 5 m to 1 m"):
+    with refused(RuntimeError, "5 m", "1 m"):
         render()
     camera.data.clip_end, camera.scale = 100.0, (0, 0, 0)
-    with pytest.raises(RuntimeError, match="scaled to zero: give it a scale"):
+    with refused(RuntimeError, "scaled"):
         render()
 
 
 def test_blender_itself_rejects_a_picture_without_camera_or_pixels_and_the_next_one_works(stage):
     camera, settings = stage.scene.camera, stage.scene.render
     stage.scene.camera = None
-    with pytest.raises(RuntimeError, match="no camera"):
+    with refused(RuntimeError, "camera"):
         render()
     stage.scene.camera, settings.use_border = camera, True
     for edges in ((0.5, 0.5), (0.5, 0.501), (0.7, 0.3)):
         settings.border_min_x, settings.border_max_x = edges
-        with pytest.raises(RuntimeError, match="too small"):
+        with refused(RuntimeError, "small"):
             render()
     settings.use_border, settings.resolution_percentage = False, 1
-    with pytest.raises(RuntimeError, match="too small"):
+    with refused(RuntimeError, "small"):
         render()
     settings.resolution_percentage = 100
     assert render() == {"FINISHED"}
@@ -245,7 +246,7 @@ EXIT_WHILE_DRAWING = """
 import sys, os, threading, time
 from pathlib import Path
 import bpy, blender_primdiffusion as b, pytest
-sys.path.insert(0, str(Path(sys.argv[1]).parent))
+sys.path.insert(0, "tests/blender")
 from backend_python import use_this_python
 use_this_python(pytest.MonkeyPatch(), Path(sys.argv[1]))
 b.register()
@@ -262,8 +263,8 @@ if sys.argv[2] == "killed":
 
 @pytest.mark.parametrize("how", ["quit", "killed"])
 def test_ending_blender_during_a_picture_leaves_no_process_and_no_memory(how):
-    command = [sys.executable, "-c", EXIT_WHILE_DRAWING, str(FAKE), how]
-    root, environment = Path(__file__).parents[3], {**os.environ, "FAKE_BAND_S": "1.0"}
+    command = [sys.executable, "-c", EXIT_WHILE_DRAWING, str(FAKE_CHILD), how]
+    root, environment = Path(__file__).parents[3], {**os.environ, "FAKE_STEP_S": "1.0"}
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=60, check=False)
     pid, folder = done.stdout.strip().splitlines()[-1].split()
     end = time.monotonic() + 8

@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 import pytest
 from engine_stage import add_human, cube, material, render_exr, render_png, set_up_render
+from support.errors import refused
 
 from blender_primdiffusion.engine.solids import SceneSolids, base_colour, changed_by, scene_solids, stored
 
@@ -134,7 +135,7 @@ def test_the_file_is_named_by_its_content_and_written_once(stage, tmp_path):
 
 def test_a_mesh_with_nan_is_an_error_that_names_the_object(stage):
     cube("broken").data.vertices[0].co.z = float("nan")
-    with pytest.raises(RuntimeError, match=r"'broken' holds NaN.*repair its mesh"):
+    with refused(RuntimeError, "broken", "NaN"):
         render_png(stage.out)
 
 

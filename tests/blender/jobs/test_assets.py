@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
 import pytest
 import synthetic
+from support.errors import refused
+from support.fake_child import PICTURE
 
 from blender_primdiffusion.jobs.assets import SIDE, clay_figure, picture_of_file
 from blender_primdiffusion.motion.pose_library import builtin_poses, current_pose
@@ -18,7 +19,6 @@ from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file, volume_path
 from blender_primdiffusion.ui import export_panel
 
-PICTURE = Path(__file__).parents[1] / "fake_backend" / "primdiffusion" / "picture.png"
 ops = bpy.ops.primdiffusion
 
 
@@ -102,7 +102,7 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
     assert armature_of(person).pose.bones["head"]
     assert (person.library is not None) == link
     if link:
-        with pytest.raises(RuntimeError, match="is linked from"):
+        with refused(RuntimeError, "linked"):
             ops.mark_as_asset(picture=str(PICTURE))
         with bpy.context.temp_override(id=person):
             assert not bpy.ops.asset.clear_single.poll()
@@ -158,7 +158,7 @@ def test_the_built_in_poses_become_a_library_and_the_open_file_stays(addon, tmp_
 
 
 def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
-    with pytest.raises(RuntimeError, match=r"poll\(\) .*no human in the scene"):
+    with refused(RuntimeError, "human"):
         ops.mark_as_asset()
     ops.generate(seed=7, steps=1)
     (tmp_path / "text.png").write_text("no picture")
@@ -176,7 +176,7 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     (person,) = humans(addon.scene)
     assert person.asset_data is None
     person_file(person).unlink()
-    with pytest.raises(RuntimeError, match="file of the human 'Human' is missing"):
+    with refused(RuntimeError, "Human"):
         ops.mark_as_asset()
 
 

@@ -9,6 +9,7 @@ import bpy
 import pytest
 import synthetic_shape
 from jobs_driven import drive, error_of, notice_of
+from support.fake_child import GIVES_GARBAGE
 
 import blender_primdiffusion
 from blender_primdiffusion.jobs import follow as follow_module
@@ -19,7 +20,6 @@ from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.body_file import shape_model_of
 from blender_primdiffusion.scene.human import folder_of, humans, person_file, volume_path
 
-GIVES_GARBAGE = 3
 """A seed that the fake child takes as an order."""
 COUNT = 12
 """Primitives of the synthetic person."""

@@ -11,6 +11,7 @@ import bpy
 import pytest
 import synthetic_shape
 from jobs_driven import drive, error_of, notice_of
+from support.fake_child import GIVES_GARBAGE
 
 import blender_primdiffusion
 from blender_primdiffusion.jobs.edit import RedressJob, RegenerateJob, RestoreJob, VaryJob, made_from_seed
@@ -23,7 +24,7 @@ from blender_primdiffusion.scene.missing import missing_files
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
-GIVES_GARBAGE, FINE = 3, 8
+FINE = 8
 """Seeds that the fake child takes as orders, and one that it does not."""
 COUNT = 12
 """Primitives of the synthetic person."""

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import synthetic
 from jobs_driven import drive, error_of, until_running
+from support.fake_child import DIES, TAKES_LONG
 
 import blender_primdiffusion
 from blender_primdiffusion.engine import billboard
@@ -22,7 +23,6 @@ from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.build import build_human
 
 pytestmark = pytest.mark.any_blender
-DIES, TAKES_LONG = 1, 4
 """Seeds that the fake child takes as orders."""
 LEVEL = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """A view along +y."""

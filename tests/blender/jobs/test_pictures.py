@@ -10,6 +10,7 @@ from pathlib import Path
 import bpy
 import pytest
 from jobs_driven import drive, until_running
+from support.fake_child import TAKES_LONG
 
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
@@ -17,7 +18,6 @@ from blender_primdiffusion.jobs.pictures import SoFar, so_far
 from blender_primdiffusion.jobs.queue import queue
 
 pytestmark = pytest.mark.any_blender
-TAKES_LONG = 4
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 

@@ -11,6 +11,8 @@ from pathlib import Path
 import bpy
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
+from support.errors import refused
+from support.fake_child import DIES, FAILS, IGNORES_CANCEL, NO_MEMORY, TAKES_LONG
 
 from blender_primdiffusion.jobs import follow as follow_module
 from blender_primdiffusion.jobs.follow import follow, watch
@@ -22,7 +24,6 @@ from blender_primdiffusion.ui.jobs_panel import PRIMDIFFUSION_PT_jobs
 
 pytestmark = pytest.mark.any_blender
 
-DIES, FAILS, TAKES_LONG, IGNORES_CANCEL, NO_MEMORY = 1, 2, 4, 105, 106
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
@@ -63,9 +64,9 @@ def test_one_that_waits_can_be_taken_out_and_the_others_are_done(addon):
 
 def test_a_job_that_is_not_queued_cannot_be_cancelled(addon):
     number = ask(11)
-    with pytest.raises(RuntimeError, match="no job is running"):
+    with refused(RuntimeError, "running"):
         ops.cancel()
-    with pytest.raises(RuntimeError, match="is no longer queued"):
+    with refused(RuntimeError, "queued"):
         ops.cancel(number=number + 1)
 
 
@@ -116,7 +117,7 @@ def test_a_child_that_dies_between_jobs_is_noticed(addon):
 
 
 def test_out_of_memory_names_the_setting_to_lower_and_not_the_steps(addon):
-    with pytest.raises(RuntimeError, match=r"smaller Checkpoint in the preferences \(fewer Steps would not help\)"):
+    with refused(RuntimeError, "preferences"):
         ops.generate(seed=NO_MEMORY, steps=1)
 
 
@@ -247,7 +248,7 @@ def test_try_again_asks_for_the_same(addon):
     assert not ops.try_again.poll()
     ask(DIES)
     drive()
-    with pytest.raises(RuntimeError, match="ended by itself"):
+    with refused(RuntimeError, "ended"):
         ops.try_again(kind="generate")
-    with pytest.raises(RuntimeError, match="no job 'vary' has failed"):
+    with refused(RuntimeError, "vary"):
         ops.try_again(kind="vary")

@@ -7,13 +7,13 @@ import errno
 import bpy
 import pytest
 from jobs_driven import shown
+from support.fake_child import DIES, NO_MEMORY
 
 from blender_primdiffusion.backend.requests import RequestError
 from blender_primdiffusion.jobs import remedies
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 
 pytestmark = pytest.mark.any_blender
-DIES, NO_MEMORY = 1, 106
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 

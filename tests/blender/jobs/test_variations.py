@@ -8,6 +8,8 @@ from pathlib import Path
 import bpy
 import pytest
 from jobs_driven import drive, error_of, shown, until_running
+from support.errors import refused
+from support.fake_child import FAILS, TAKES_LONG
 
 from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
@@ -15,7 +17,6 @@ from blender_primdiffusion.jobs.variations import Sheet, VariationsJob, sheet
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.ui import variations_panel
 
-FAILS, TAKES_LONG = 2, 4
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
@@ -101,7 +102,7 @@ def test_build_all_builds_all_in_edit_mode_too(addon, shown_people):
 
 def test_whom_files_are_missing_of_is_not_built_and_those_before_stay(addon, shown_people):
     sheet.variations[1].human.unlink()
-    with pytest.raises(RuntimeError, match="1 of 4 humans were built"):
+    with refused(RuntimeError, "1 of 4"):
         ops.build_variation(build_all=True)
     assert len(humans(addon.scene)) == 1
 
@@ -110,19 +111,19 @@ def test_nothing_selected_a_wrong_number_and_no_sheet_are_rejected(addon):
     for operator in (ops.build_variation, ops.select_variation):
         assert not operator.poll()
     for call in (more_like, use_seed):
-        with pytest.raises(RuntimeError, match="no variations: press Show Variations first"):
+        with refused(RuntimeError, "Show Variations"):
             call()
     ops.variations(seed=11, count=2, steps=1)
-    with pytest.raises(RuntimeError, match="no variation is selected"):
+    with refused(RuntimeError, "variation"):
         ops.build_variation()
-    with pytest.raises(RuntimeError, match="there is no variation 2: there are 2, counted from 0"):
+    with refused(RuntimeError, "variation 2"):
         ops.select_variation(index=2)
     for index in (0, 1):
         ops.select_variation(index=index)
     for call in (more_like, use_seed):
-        with pytest.raises(RuntimeError, match="2 variations are selected: select"):
+        with refused(RuntimeError, "2 variations"):
             call()
-    with pytest.raises(RuntimeError, match="2 seeds from 2147483647 on go beyond"):
+    with refused(RuntimeError, "2 seeds", "2147483647"):
         ops.variations(seed=2**31 - 1, count=2)
 
 
@@ -134,7 +135,7 @@ def test_more_like_this_requests_variants_of_the_chosen_human(addon, shown_peopl
     assert (asked["person"], asked["amount"], asked["steps"]) == (str(kept), 0.25, 4)
     assert seeds() == [20, 21, 22]
     assert sheet.title == "Like seed 12"
-    with pytest.raises(RuntimeError, match="cannot be generated from a seed alone"):
+    with refused(RuntimeError, "generated"):
         use_seed(index=0)
 
 
@@ -144,11 +145,11 @@ def test_a_seed_is_put_into_the_panel_and_locked(addon, shown_people):
 
 
 def test_a_failure_leaves_the_sheet_that_was_there(addon, shown_people):
-    with pytest.raises(RuntimeError, match=r"not enough memory\. "):
+    with refused(RuntimeError, "checkpoint"):
         ops.variations(seed=FAILS, count=2, steps=1)
     assert seeds() == [11, 12, 13, 14]
     assert all(variation.human.is_file() for variation in sheet.variations)
-    assert "memory" in error_of("variations")
+    assert "damaged" in error_of("variations")
 
 
 def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the_old_sheet(
@@ -227,7 +228,7 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("blender_primdiffusion.jobs.variations.shutil.move", full)
-    with pytest.raises(RuntimeError, match="No space left"):
+    with refused(RuntimeError, "space"):
         ops.variations(seed=40, count=2, steps=1)
     assert seeds() == [11, 12, 13, 14]
     assert len(files_left()) == 1
@@ -253,6 +254,6 @@ def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
     own.clear()
     assert not folder.exists()
     Path(person["human"]).write_text("")
-    with pytest.raises(OSError, match="person"):
+    with refused(OSError, "person"):
         own.fill([person], "")
     assert mine.read_text() == "mine"

@@ -7,6 +7,7 @@ import pytest
 import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from bvh_files import motion_of, write_bvh
+from support.errors import refused
 
 from blender_primdiffusion.motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample
 from blender_primdiffusion.motion.files import MotionFileError, read_motion
@@ -90,7 +91,7 @@ def test_a_given_up_axis_is_turned_up(tmp_path, axis):
 
 def test_an_axis_that_is_none_is_rejected(tmp_path):
     np.save(tmp_path / "p.npy", np.zeros(72))
-    with pytest.raises(MotionFileError, match="the axis 'w' cannot be up"):
+    with refused(MotionFileError, "w"):
         read_motion(tmp_path / "p.npy", "w")
 
 
@@ -118,5 +119,5 @@ def test_bones_chosen_by_hand_are_as_good_as_known_names(tmp_path):
     np.testing.assert_allclose(to_axis_angle(b.rotations[:, body]), to_axis_angle(a.rotations[:, body]), atol=1e-6)
     assert b.detected.rig == "chosen by hand"
     assert b.detected.bones == own
-    with pytest.raises(MotionFileError, match="'tail', which is no joint of SMPL"):
+    with refused(MotionFileError, "tail", "SMPL"):
         read_motion(strange, bones={**own, "tail": "bone 1"})

@@ -9,6 +9,7 @@ import zipfile
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.arrays import ArrayFileError, read_arrays
+from support.errors import refused
 
 from blender_primdiffusion.motion.files import DEFAULT_FPS, MotionFileError, read_motion
 from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
@@ -111,7 +112,7 @@ def test_a_matrix_is_a_rotation_within_a_thousandth_or_a_sentence(tmp_path, endi
     if is_read:
         np.testing.assert_allclose(read_motion(path).rotations, from_axis_angle(THETA), atol=1e-3)
     else:
-        with pytest.raises(MotionFileError, match=rf"p\.{ending} .*joint left_knee in frame 1 that is not a rotation"):
+        with refused(MotionFileError, f"p.{ending}", "left_knee", "frame 1"):
             read_motion(path)
 
 
@@ -156,7 +157,7 @@ def test_the_released_plain_twin_is_read_and_the_pickled_one_rejected(tmp_path):
     write_smpl(tmp_path, THETA[:, 0], THETA[:, 1:].reshape(FRAMES, 69), np.zeros(10), MOVE)
     motion = read_motion(tmp_path / SMPL_FOLDER / SMPL_PLAIN_FILE)
     np.testing.assert_allclose(motion.axis_angle(), THETA, atol=1e-6)
-    with pytest.raises(MotionFileError, match="pickled objects, which are never read"):
+    with refused(MotionFileError):
         read_motion(tmp_path / SMPL_FOLDER / SMPL_FILE)
 
 
@@ -166,49 +167,48 @@ def test_one_translation_serves_all_frames(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arrays", "message"),
+    ("arrays", "name"),
     [
-        ({"poses": np.full((3, 72), np.nan), "trans": np.zeros((3, 3))}, "'poses' holds NaN or infinite"),
-        ({"poses": np.zeros((3, 72)), "trans": np.full((3, 3), np.inf)}, "'trans' holds NaN or infinite"),
-        ({"poses": np.zeros((3, 60))}, "poses of 20 joints"),
-        ({"poses": np.zeros((3, 71))}, "72 axis-angle numbers"),
-        ({"poses": np.zeros((0, 72))}, "holds no frame"),
-        ({"poses": np.array(["a"] * 72)[None]}, "instead of numbers"),
-        ({"poses": np.zeros((3, 72)), "trans": np.zeros((4, 3))}, "translations of shape"),
-        ({"poses": np.array([{"a": 1}], object)}, "pickled Python objects"),
-        ({"body_pose": np.zeros((3, 69)), "global_orient": np.zeros((2, 3))}, "2 frames of global_orient but 3"),
-        ({"body_pose": np.ones((3, 23, 3, 3))}, "joint left_hip in frame 0 that is not a rotation"),
-        ({"marker_data": np.zeros((3, 72))}, "it holds 'marker_data' and needs 'poses'"),
+        ({"poses": np.full((3, 72), np.nan), "trans": np.zeros((3, 3))}, "'poses'"),
+        ({"poses": np.zeros((3, 72)), "trans": np.full((3, 3), np.inf)}, "'trans'"),
+        ({"poses": np.zeros((3, 60))}, "20 joints"),
+        ({"poses": np.zeros((3, 71))}, "72"),
+        ({"poses": np.zeros((0, 72))}, "no frame"),
+        ({"poses": np.array(["a"] * 72)[None]}, "numbers"),
+        ({"poses": np.zeros((3, 72)), "trans": np.zeros((4, 3))}, "translations"),
+        ({"poses": np.array([{"a": 1}], object)}, "pickled"),
+        ({"body_pose": np.zeros((3, 69)), "global_orient": np.zeros((2, 3))}, "global_orient"),
+        ({"body_pose": np.ones((3, 23, 3, 3))}, "left_hip"),
+        ({"marker_data": np.zeros((3, 72))}, "'marker_data'"),
     ],
 )
-def test_arrays_that_are_no_poses_are_named(tmp_path, arrays, message):
+def test_arrays_that_are_no_poses_are_named(tmp_path, arrays, name):
     np.savez(tmp_path / "bad.npz", **arrays)
-    with pytest.raises(MotionFileError, match=message):
+    with refused(MotionFileError, name):
         read_motion(tmp_path / "bad.npz")
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "message"),
+    ("name", "content"),
     [
-        ("a.npz", b"PK\x03\x04 not a zip", "not a whole .npz"),
-        ("a.npy", b"\x93NUMPY\x01\x00 nothing", "not an array of numpy's format"),
-        ("a.json", b"{", "is not JSON"),
-        ("a.json", b'{"pose": [1, 2, [3]]}', "lists of numbers"),
-        ("a.json", b'{"angles": [1]}', "holds no poses"),
-        ("a.json", b"[NaN" + b", 0" * 71 + b"]", "NaN or infinite"),
-        ("a.bvh", b"HIERARCHY\nROOT hip\n{\n OFFSET 0 0 0\n", "not a BVH file"),
-        ("a.pkl", b"", "is no pose file"),
+        ("a.npz", b"PK\x03\x04 not a zip"),
+        ("a.npy", b"\x93NUMPY\x01\x00 nothing"),
+        ("a.json", b"{"),
+        ("a.json", b'{"pose": [1, 2, [3]]}'),
+        ("a.json", b'{"angles": [1]}'),
+        ("a.json", b"[NaN" + b", 0" * 71 + b"]"),
+        ("a.bvh", b"HIERARCHY\nROOT hip\n{\n OFFSET 0 0 0\n"),
+        ("a.pkl", b""),
     ],
 )
-def test_files_that_are_broken_are_named(tmp_path, name, content, message):
+def test_files_that_are_broken_are_named(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(MotionFileError, match=message) as caught:
+    with refused(MotionFileError, str(tmp_path / name)):
         read_motion(tmp_path / name)
-    assert str(tmp_path / name) in str(caught.value)
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(MotionFileError, match="there is no pose file"):
+    with refused(MotionFileError):
         read_motion(tmp_path / "none.npz")
 
 
@@ -222,10 +222,10 @@ def bomb(claimed: tuple[int, ...], size: int) -> bytes:
 def test_an_array_larger_than_its_file_is_rejected_before_memory_is_taken(tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive:
         archive.writestr("poses.npy", bomb((10**9, 72), 100))
-    with pytest.raises(MotionFileError, match="its header promises 576000000000 bytes"):
+    with refused(MotionFileError, "576000000000"):
         read_motion(tmp_path / "bomb.npz")
     (tmp_path / "bomb.npy").write_bytes(bomb((10**9, 72), 100))
-    with pytest.raises(MotionFileError, match="cut short"):
+    with refused(MotionFileError):
         read_motion(tmp_path / "bomb.npy")
 
 
@@ -237,14 +237,14 @@ def test_a_zip_bomb_is_rejected(tmp_path):
         for _ in range(700):
             member.write(bytes(2**20))
     assert (tmp_path / "bomb.npz").stat().st_size < 2**20
-    with pytest.raises(MotionFileError, match="unpacks to 700 MB"):
+    with refused(MotionFileError, "700"):
         read_motion(tmp_path / "bomb.npz")
 
 
 def test_names_with_paths_in_them_write_nothing(tmp_path):
     with zipfile.ZipFile(tmp_path / "evil.npz", "w") as archive:
         archive.writestr("../../escaped.npy", bomb((1,), 8))
-    with pytest.raises(MotionFileError, match="holds no poses"):
+    with refused(MotionFileError):
         read_motion(tmp_path / "evil.npz")
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["evil.npz"]
     assert list(read_arrays(tmp_path / "evil.npz", ["../../escaped"])) == ["../../escaped"]
@@ -255,28 +255,28 @@ def test_a_damaged_member_is_named(tmp_path):
     content = bytearray((tmp_path / "m.npz").read_bytes())
     content[400:440] = bytes(40)
     (tmp_path / "m.npz").write_bytes(content)
-    with pytest.raises(ArrayFileError, match="damaged"):
+    with refused(ArrayFileError, "damaged"):
         read_arrays(tmp_path / "m.npz", ["poses"])
 
 
 @pytest.mark.parametrize(
-    ("arrays", "message"),
+    "arrays",
     [
-        ({"poses": np.full((2, 72), 1e300)}, "above 1e\\+06"),
-        ({"poses": np.zeros((2, 72)), "trans": np.full((2, 3), 1e300)}, "above 1e\\+06"),
-        ({"poses": np.zeros((2, 72)), "fps": np.array(1e-300)}, "frames per second"),
-        ({"poses": np.zeros((2, 72)), "fps": np.array(1e9)}, "above 1e\\+06"),
+        {"poses": np.full((2, 72), 1e300)},
+        {"poses": np.zeros((2, 72)), "trans": np.full((2, 3), 1e300)},
+        {"poses": np.zeros((2, 72)), "fps": np.array(1e-300)},
+        {"poses": np.zeros((2, 72)), "fps": np.array(1e9)},
     ],
 )
-def test_numbers_that_cannot_be_a_motion_are_rejected(tmp_path, arrays, message):
+def test_numbers_that_cannot_be_a_motion_are_rejected(tmp_path, arrays):
     np.savez(tmp_path / "motion.npz", **arrays)
-    with pytest.raises(MotionFileError, match=message):
+    with pytest.raises(MotionFileError):
         read_motion(tmp_path / "motion.npz")
 
 
 @pytest.mark.parametrize("text", ["[" * 100_000, "[" + ",".join(["1" * 400] * 72) + "]", "[1e999]", "[NaN]"])
 def test_json_that_overflows_is_one_sentence(tmp_path, text):
     (tmp_path / "pose.json").write_text(text)
-    with pytest.raises(MotionFileError, match=r"pose\.json") as caught:
+    with refused(MotionFileError, "pose.json") as caught:
         read_motion(tmp_path / "pose.json")
     assert len(str(caught.value)) < 300

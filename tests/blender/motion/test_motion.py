@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from support.errors import refused
 
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.motion.motion import Motion
@@ -104,7 +105,7 @@ def test_joints_of_a_skeleton_are_those_of_skinning():
 
 
 def test_a_motion_of_unlike_lengths_is_rejected():
-    with pytest.raises(ValueError, match="a motion of 2 frames"):
+    with refused(ValueError, "2 frames"):
         Motion(np.tile(np.eye(3), (2, 24, 1, 1)), np.zeros((3, 3)), 30.0, "x")
 
 
@@ -163,7 +164,7 @@ def test_no_built_in_pose_puts_a_hand_or_a_forearm_into_the_trunk():
 
 
 def test_more_poses_than_are_built_in_are_rejected():
-    with pytest.raises(ValueError, match="poses, not 21"):
+    with refused(ValueError, "poses, not 21"):
         built_in_poses(21)
 
 
@@ -197,7 +198,7 @@ def test_the_same_seed_picks_the_same_poses_of_a_long_motion():
 
 
 def test_too_few_frames_are_rejected():
-    with pytest.raises(ValueError, match="20 poses cannot be picked from 3"):
+    with refused(ValueError, "20 poses"):
         pick_poses([random_motion(3, 0)], 20)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from support.errors import refused
 
 from blender_primdiffusion.jobs.assets import clay_figure, picture_of_file
 from blender_primdiffusion.motion.own_poses import PoseFileError, delete_pose, load_pose, own_poses, save_pose
@@ -80,7 +81,7 @@ def test_half_of_a_pose_is_half_of_each_turn(armature):
 
 def test_only_selected_bones_turn(addon, armature):
     addon.view_layer.objects.active = armature
-    with pytest.raises(RuntimeError, match="no bone of 'Ann' is selected"):
+    with refused(RuntimeError, "Ann"):
         ops.apply_pose(pose_name="A", only_selected=True)
     bone = armature.pose.bones["left_shoulder"]
     (bone if bpy.app.version >= (5, 0, 0) else bone.bone).select = True
@@ -125,12 +126,12 @@ def test_a_saved_pose_is_in_the_library_and_comes_back_exactly(addon, armature, 
     ops.apply_pose(pose_name="Kniend, müde")
     np.testing.assert_allclose(current_pose(armature)[0], rotations, atol=1e-5)
     np.testing.assert_allclose(current_pose(armature)[1], translation, atol=1e-5)
-    with pytest.raises(RuntimeError, match="there is a pose 'Kniend, müde' already"):
+    with refused(RuntimeError, "Kniend, müde"):
         ops.save_pose(pose_name="Kniend, müde")
     assert ops.save_pose(delete=True, pose_name="Kniend, müde") == {"FINISHED"}
     assert addon.scene.primdiffusion_motion.pose == "T"
     assert not list((tmp_path / "eigene Dateien").rglob("*.*"))
-    with pytest.raises(RuntimeError, match="no pose 'Kniend, müde' in the library"):
+    with refused(RuntimeError, "Kniend, müde"):
         ops.apply_pose(pose_name="Kniend, müde")
 
 
@@ -188,10 +189,10 @@ def test_names_that_cannot_be_are_rejected(armature, name):
 
 
 def test_a_built_in_pose_cannot_be_deleted(armature):
-    with pytest.raises(RuntimeError, match="'T'"):
+    with refused(RuntimeError, "T"):
         ops.save_pose(delete=True, pose_name="T")
     ops.save_pose(pose_name="mine")
-    with pytest.raises(RuntimeError, match="'T'"):
+    with refused(RuntimeError, "T"):
         ops.save_pose(delete=True, pose_name="T")
     assert ops.save_pose(delete=True) == {"FINISHED"}, "the panel's pose"
 
@@ -203,14 +204,14 @@ def test_a_damaged_pose_file_is_named(armature, tmp_path, content):
     folder = tmp_path / "eigene Dateien" / "poses"
     folder.mkdir(parents=True)
     (folder / "bad.pose.json").write_text(content)
-    with pytest.raises(RuntimeError, match=r"bad\.pose\.json"):
+    with refused(RuntimeError, "bad.pose.json"):
         ops.apply_pose(pose_name="bad")
     np.testing.assert_allclose(current_pose(armature)[0], REST, atol=1e-5)
 
 
 def test_a_folder_that_cannot_be_written_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(PoseFileError, match="could not be written"):
+    with refused(PoseFileError):
         save_pose(tmp_path / "file", "a", np.zeros((24, 3)), np.zeros(3))
     path = save_pose(tmp_path / "poses", "a", np.ones((24, 3)), np.arange(3.0))
     np.testing.assert_array_equal(load_pose(path)[1], [0, 1, 2])
@@ -218,7 +219,7 @@ def test_a_folder_that_cannot_be_written_is_reported(tmp_path):
 
 
 def test_poses_of_wrong_shape_are_rejected(armature):
-    with pytest.raises(ValueError, match="24 axis-angle vectors"):
+    with refused(ValueError, "24 axis-angle vectors"):
         apply_pose(armature, np.zeros((23, 3)))
 
 
@@ -230,14 +231,14 @@ def test_edit_mode_and_a_renamed_bone_are_rejected(addon, armature):
         (ops.apply_pose, {"what": "REST"}),
         (ops.key_pose, {}),
     ):
-        with pytest.raises(RuntimeError, match="Edit Mode"):
+        with refused(RuntimeError, "Edit Mode"):
             operator(**given)
-    with pytest.raises(RuntimeError, match="Edit Mode"):
+    with refused(RuntimeError, "Edit Mode"):
         ops.apply_pose()
     bpy.ops.object.mode_set(mode="OBJECT")
     armature.data.bones["neck"].name = "Hals"
     for operator in (ops.apply_pose, ops.save_pose):
-        with pytest.raises(RuntimeError, match="no bone 'neck'"):
+        with refused(RuntimeError, "neck"):
             operator()
 
 

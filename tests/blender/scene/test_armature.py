@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 from oracle import TOLERANCE_M, Z_UP, blended_vertices
+from support.errors import refused
 
 from blender_primdiffusion.scene.armature import build_armature, keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_body_mesh
@@ -107,7 +108,7 @@ def test_bone_matrices_are_smpls_skinning_transforms(armature, seed):
 
 def test_posing_an_armature_without_smpl_bones_names_the_missing_one(empty_scene):
     other = bpy.data.objects.new("Rig", bpy.data.armatures.new("Rig"))
-    with pytest.raises(ValueError, match="'Rig' has no bone 'pelvis'"):
+    with refused(ValueError, "Rig", "pelvis"):
         pose_from_joint_rotations(other, np.tile(np.eye(3), (24, 1, 1)))
 
 
@@ -135,7 +136,7 @@ def test_a_long_motion_is_keyed_on_every_frame(armature):
 
 @pytest.mark.parametrize("frames", [[1, 1], [2, 1], [1, 2, 3]])
 def test_frames_that_do_not_increase_or_do_not_match_are_rejected(armature, frames):
-    with pytest.raises(ValueError, match="frame"):
+    with refused(ValueError, "frame"):
         keyframe_poses(armature, np.array(frames), np.tile(np.eye(3), (2, 24, 1, 1)), np.zeros((2, 3)))
     assert len(bpy.data.actions) == 0
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from scene_stage import render
 
 from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.engine.solids import scene_solids
@@ -27,16 +28,6 @@ def person(saved_scene, tmp_path):
     kept = tmp_path / "person.human.safetensors"
     kept.write_bytes(b"kept")
     return build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz", COUNT), keep=[kept])
-
-
-def render(path) -> np.ndarray:
-    """The picture [H, W, 4], linear and premultiplied, top row first."""
-    scene = bpy.context.scene
-    scene.render.image_settings.file_format = "OPEN_EXR"
-    scene.render.filepath = str(path)
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(str(path))
-    return np.array(image.pixels[:]).reshape(image.size[1], image.size[0], 4)[::-1]
 
 
 def box_grid(voxel: float, low: tuple, high: tuple, density: float, colour: tuple) -> MergedGrid:

@@ -15,6 +15,7 @@ import bpy
 import pytest
 from blend_tampering import HOLDERS, PREFERENCES, SETTINGS
 from shown_words import classes
+from support.errors import refused
 
 import blender_primdiffusion
 from blender_primdiffusion.scene import blend_values
@@ -204,7 +205,7 @@ def test_folders_of_users_have_any_name(holder, tmp_path):
 
 @pytest.mark.parametrize("stored", ["captures", "../x", r"\\host\share", "https://host/x", "/" + "x" * 300, "a\nb"])
 def test_a_setting_that_is_no_whole_path_is_named_in_one_sentence(saved_scene, stored):
-    with pytest.raises(ValueError, match=r"^Captures is .* not the whole path .*: choose it again$") as caught:
+    with refused(ValueError, "Captures") as caught:
         setting_path(stored, "Captures")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 300
@@ -215,7 +216,7 @@ def test_settings_may_be_relative_to_a_saved_file_or_absolute_or_empty(saved_sce
     assert setting_path(f"{tmp_path}/", "Captures") == f"{tmp_path}/"
     assert setting_path("", "Captures") == ""
     bpy.ops.wm.read_homefile(use_empty=True)
-    with pytest.raises(ValueError, match="Captures is '//captures'"):
+    with refused(ValueError, "//captures"):
         setting_path("//captures", "Captures")
 
 

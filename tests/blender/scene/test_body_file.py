@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from support.errors import refused
 
 from blender_primdiffusion.scene import build, collect
 from blender_primdiffusion.scene.body_file import body_file_name, read_body_file, saved_body_file, shape_model_of
@@ -56,7 +57,7 @@ def test_a_broken_field_is_named_in_one_sentence(tmp_path, sentence):
 
 
 def test_a_file_of_version_2_without_its_fields_is_rejected(tmp_path):
-    with pytest.raises(HumanNpzError, match="no field 'template'"):
+    with refused(HumanNpzError, "template"):
         read_human(synthetic.write(tmp_path / "human.npz", 4, format_version=np.array(2)))
 
 
@@ -77,7 +78,7 @@ def test_people_on_one_body_share_its_file_and_nothing_else_is_left_beside_them(
 
 def test_a_human_of_an_earlier_version_has_to_be_generated_again(saved_scene, tmp_path):
     person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
-    with pytest.raises(ValueError, match=r"'Human' was made by an earlier version"):
+    with refused(ValueError, "Human"):
         shape_model_of(person)
     assert not list(folder_of(person).parent.glob("body_*"))
 
@@ -87,10 +88,10 @@ def test_a_missing_or_damaged_file_is_named_with_what_to_do(person):
     whole = path.read_bytes()
     read_body_file.cache_clear()
     path.write_bytes(whole[:1000])
-    with pytest.raises(ValueError, match=r"body_.*damaged.*generate the human again"):
+    with refused(ValueError, "damaged"):
         shape_model_of(person)
     path.unlink()
-    with pytest.raises(FileNotFoundError, match=r"missing.*body_.*put it back"):
+    with refused(FileNotFoundError, "missing"):
         shape_model_of(person)
     (folder_of(person) / path.name).write_bytes(whole)
     assert shape_model_of(person).template.shape == (736, 3)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic
+from support.errors import refused
 
 from blender_primdiffusion.scene.human_npz import HumanNpzError, read_human
 
@@ -52,7 +53,7 @@ def test_a_missing_field_is_named(tmp_path):
     arrays = synthetic.arrays(4)
     del arrays["density"]
     np.savez(tmp_path / "human.npz", **arrays)
-    with pytest.raises(HumanNpzError, match="no field 'density'"):
+    with refused(HumanNpzError, "density"):
         read_human(tmp_path / "human.npz")
 
 
@@ -61,7 +62,7 @@ def test_a_truncated_file_is_damaged(tmp_path, keep):
     path = synthetic.write(tmp_path / "human.npz", 4)
     contents = path.read_bytes()
     path.write_bytes(contents[: keep if isinstance(keep, int) else int(len(contents) * keep)])
-    with pytest.raises(HumanNpzError, match="damaged"):
+    with refused(HumanNpzError, "damaged"):
         read_human(path)
 
 
@@ -70,16 +71,16 @@ def test_a_flipped_byte_inside_an_array_is_damaged(tmp_path):
     contents = bytearray(path.read_bytes())
     contents[len(contents) // 2] ^= 255
     path.write_bytes(contents)
-    with pytest.raises(HumanNpzError, match="damaged"):
+    with refused(HumanNpzError, "damaged"):
         read_human(path)
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(HumanNpzError, match=r"no human file at .*nobody\.npz"):
+    with refused(HumanNpzError, "nobody.npz"):
         read_human(tmp_path / "nobody.npz")
 
 
 def test_pickles_are_never_opened(tmp_path):
     np.savez(tmp_path / "human.npz", **{**synthetic.arrays(4), "betas": np.array([{"a": 1}], dtype=object)})
-    with pytest.raises(HumanNpzError, match="damaged"):
+    with refused(HumanNpzError, "damaged"):
         read_human(tmp_path / "human.npz")

@@ -8,6 +8,7 @@ import shutil
 import bpy
 import pytest
 from human_stage import build_posed, named, places, whole
+from support.errors import refused
 
 from blender_primdiffusion.scene.collect import collect_files
 from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, humans_folder, person_file, volume_path
@@ -133,10 +134,10 @@ def test_a_full_disk_while_saving_or_collecting_leaves_people_as_they_are(person
     assert "humans of this file depend on files elsewhere" in capsys.readouterr().out
     before = {volume.name: volume.filepath for volume in bpy.data.volumes}
     copied.clear()
-    with pytest.raises(VolumeWriteError, match="free space"):
+    with refused(VolumeWriteError):
         collect_files()
     copied.clear()
-    with pytest.raises(RuntimeError, match="No space left"):
+    with refused(RuntimeError, "space"):
         ops.collect_files()
     assert {volume.name: volume.filepath for volume in bpy.data.volumes} == before
     assert not [path for path in (other / "b_humans").rglob("*") if path.is_file()]
@@ -149,7 +150,7 @@ def test_a_read_only_folder_is_reported(person, tmp_path):
     other.mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(other / "b.blend"))
     other.chmod(0o500)
-    with pytest.raises(RuntimeError, match="write permission"):
+    with refused(RuntimeError, "permission"):
         ops.collect_files()
     assert whole(named())
 

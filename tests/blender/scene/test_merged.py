@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.requests import DENSITY_GAIN
+from support.errors import refused
 
 from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
@@ -174,9 +175,9 @@ def test_files_of_earlier_merges_are_unused_and_those_of_a_shown_sequence_are_no
 def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
     digest = write_grid(grid(), tmp_path / "grid.vdb")
     (tmp_path / "file").write_text("in the way")
-    with pytest.raises(VolumeWriteError, match="write permission"):
+    with refused(VolumeWriteError):
         publish([tmp_path / "grid.vdb"], [digest], tmp_path / "file" / "folder")
-    with pytest.raises(VolumeWriteError, match="save the"):
+    with refused(VolumeWriteError):
         publish([tmp_path / "grid.vdb", tmp_path / "missing.vdb"], [digest, "x"], tmp_path / "new")
     assert not list((tmp_path / "new").iterdir())
 
@@ -184,7 +185,7 @@ def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
 @pytest.mark.parametrize("content", [b"PK\x03\x04 no more", b""])
 def test_a_damaged_grid_is_rejected_with_what_to_do(tmp_path, content):
     (tmp_path / "grid.npz").write_bytes(content)
-    with pytest.raises(ValueError, match=r"damaged.*merge again"):
+    with refused(ValueError, "damaged"):
         read_grid(tmp_path / "grid.npz")
 
 
@@ -224,7 +225,7 @@ def test_a_material_without_the_factor_is_rejected(person):
         if obj.type == "VOLUME":
             obj.data.materials[0] = other
     assert density_gain(person) is None
-    with pytest.raises(ValueError, match=r"Smoke.*Density Gain"):
+    with refused(ValueError, "Density Gain"):
         set_density_gain(person, 1.5)
 
 
@@ -250,7 +251,7 @@ def test_a_grid_of_impossible_numbers_is_rejected(tmp_path, change):
     arrays["voxel"] = np.array(0.01)
     (name, value), *_ = change.items()
     np.savez(tmp_path / "merged.npz", **{**arrays, name: np.full_like(arrays[name], value)})
-    with pytest.raises(ValueError, match=r"merged\.npz"):
+    with refused(ValueError, "merged.npz"):
         read_grid(tmp_path / "merged.npz")
 
 

@@ -12,6 +12,7 @@ import synthetic_shape
 from human_stage import make_earlier
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
 from scene_stage import replace
+from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import set_attachment
@@ -225,7 +226,7 @@ def test_a_linked_person_is_rejected_with_what_to_do(person, tmp_path):
     with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
         wanted.collections = ["Human"]
     bpy.context.scene.collection.children.link(wanted.collections[0])
-    with pytest.raises(ValueError, match=r"'Human' is linked from .*shot\.blend.*Make Local"):
+    with refused(ValueError, "Human", "shot.blend", "Make Local"):
         reshape(wanted.collections[0], SHAPE)
 
 
@@ -283,7 +284,7 @@ def test_an_edit_gives_people_of_an_earlier_version_a_shape_to_change(saved_scen
     keep.parent.mkdir()
     keep.write_bytes(b"first")
     old = build_human(saved_scene, synthetic_shape.write(tmp_path / "old.npz", format_version=np.array(1)), keep=[keep])
-    with pytest.raises(ValueError, match="earlier version"):
+    with refused(ValueError, "version"):
         reshape(old, SHAPE)
     replace(old, *edited_file(tmp_path, generated_betas(old)))
     reshape(old, SHAPE)

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from support.errors import refused
 
 pytest.importorskip("torch", reason="the backend has another Python than this Blender")
 
@@ -91,7 +92,7 @@ def test_bodies_of_given_measures_are_the_backends(model, height, weight):
 
 
 def test_impossible_measures_are_rejected_and_named(model):
-    with pytest.raises(ValueError, match=r"a height of 3\.00 m with a weight of 40 kg.*more usual"):
+    with refused(ValueError, "3.00", "40 kg"):
         betas_of_measures(model, np.zeros(10), 3.0, 40.0)
 
 

@@ -11,6 +11,7 @@ from unittest.mock import MagicMock
 import bpy
 import pytest
 from blender_primdiffusion.formats.requests import PARTS
+from support.errors import refused
 
 from blender_primdiffusion.scene.human import humans, person_file
 from blender_primdiffusion.ui import attributes, edit_panel
@@ -47,7 +48,7 @@ def test_menus_hold_what_the_checkpoint_knows_and_any(known):
     assert [item[1] for item in attributes.menu("outfit")] == ["Any", "Suit", "Fitted tee and jeans"]
     assert [item[0] for item in attributes.menu("hair")] == ["ANY"]
     known.outfit = "fitted tee and jeans"
-    with pytest.raises(TypeError, match="dress"):
+    with refused(TypeError, "dress"):
         known.outfit = "dress"
 
 
@@ -71,7 +72,7 @@ def test_a_script_asks_past_the_panel(addon, known):
     assert (asked["guidance"], asked["sampler"]) == (3.0, "ddpm")
     bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="")
     assert "attributes" not in sent(addon)
-    with pytest.raises(RuntimeError, match="'tall' is not name=value"):
+    with refused(RuntimeError, "tall"):
         bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="tall")
 
 

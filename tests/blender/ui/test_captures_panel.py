@@ -17,6 +17,7 @@ import pytest
 from blender_primdiffusion.formats.capture_layout import picture_path
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from capture_person import FACES, _few_faces, chequers, files_of
+from support.errors import refused
 
 import blender_primdiffusion
 from blender_primdiffusion.capture import launch
@@ -120,7 +121,7 @@ def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(exte
     assert json.loads((out / "dataset.json").read_text())["frames"] == 2
     assert bpy.ops.primdiffusion.verify_captures(out=str(out)) == {"FINISHED"}
     picture_path(out / "anna", "depth", 1, 1).unlink()
-    with pytest.raises(RuntimeError, match=r"1 problems; the first: .*0001.png: missing"):
+    with refused(RuntimeError, "1 problems", "0001.png"):
         bpy.ops.primdiffusion.verify_captures(out=str(out))
     assert bpy.ops.primdiffusion.verify_captures(out=str(out), repair=True) == {"FINISHED"}
     assert bpy.ops.primdiffusion.render_captures(people=str(only_good), out=str(out), options=SMALL) == {"FINISHED"}
@@ -129,17 +130,17 @@ def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(exte
 
 def test_the_operator_reports_an_error_in_one_sentence(extension, people, tmp_path):
     render = bpy.ops.primdiffusion.render_captures
-    with pytest.raises(RuntimeError, match="choose a folder of people first"):
+    with refused(RuntimeError, "folder"):
         render()
-    with pytest.raises(RuntimeError, match="there is no folder of scans"):
+    with refused(RuntimeError, "folder"):
         render(people=str(tmp_path / "nobody"), out=str(tmp_path / "a"))
-    with pytest.raises(RuntimeError, match="--size"):
+    with refused(RuntimeError, "--size"):
         render(people=str(people), out=str(tmp_path / "a"), options="--size big")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").touch()
-    with pytest.raises(RuntimeError, match="not empty"):
+    with refused(RuntimeError, "empty"):
         render(people=str(people), out=str(tmp_path / "full"), options=SMALL)
-    with pytest.raises(RuntimeError, match="no pose file"):
+    with refused(RuntimeError, "pose"):
         render(people=str(people), out=str(tmp_path / "a"), options=f"{SMALL} --pose-files {tmp_path / 'none.npz'}")
 
 
@@ -286,7 +287,7 @@ def test_the_panels_defaults_are_the_commands(extension, tmp_path):
 def test_cameras_of_the_scene_are_taken_by_name(extension, tmp_path):
     scene, asked = extension.scene, extension.scene.primdiffusion_captures
     asked.arrangement, asked.width, asked.height = "custom", 80, 60
-    with pytest.raises(ValueError, match="no camera"):
+    with refused(ValueError, "camera"):
         words_of(asked, extension, tmp_path, "people", "out")
     asked.cameras = bpy.data.collections.new("rig")
     scene.collection.children.link(asked.cameras)
@@ -322,7 +323,7 @@ def test_hostile_camera_files_are_rejected(tmp_path):
     stretched = json.dumps({"a": {"K": eye, "R": twice, "T": [0, 0, 0]}})
     for content in ("[]", "{}", "no json", '{"a": {"K": 1}}', stretched):
         path.write_text(content)
-        with pytest.raises(ValueError, match=r"cameras\.json"):
+        with refused(ValueError, "cameras.json"):
             settings_of(parse(["--out", "a", "--camera-file", str(path)]))
 
 

@@ -9,6 +9,8 @@ import bpy
 import numpy as np
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
+from support.errors import refused
+from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.follow import follow
@@ -17,7 +19,6 @@ from blender_primdiffusion.scene.edit import painted_weights
 from blender_primdiffusion.scene.human import armature_of, body_of, humans, person_file, remove_human
 from blender_primdiffusion.ui import edit_panel
 
-DIES, FAILS, GIVES_GARBAGE, TAKES_LONG = 1, 2, 3, 4
 """Seeds that the fake child takes as orders."""
 FINE = 8
 ops = bpy.ops.primdiffusion
@@ -132,7 +133,7 @@ def test_a_painted_region_travels_as_weights_of_all_vertices(person):
     assert ops.paint_region() == {"FINISHED"}
     assert (body.mode, bpy.context.object, body.hide_viewport) == ("WEIGHT_PAINT", body, False)
     assert bpy.context.scene.primdiffusion_edit.region == "PAINTED"
-    with pytest.raises(RuntimeError, match="nothing is painted in the vertex group 'PrimDiffusion Region'"):
+    with refused(RuntimeError, "PrimDiffusion Region"):
         ops.redress(seed=FINE, steps=1)
     body.vertex_groups["PrimDiffusion Region"].add([3, 5], 0.75, "REPLACE")
     assert ops.redress(seed=FINE, steps=1) == {"FINISHED"}
@@ -143,18 +144,18 @@ def test_a_painted_region_travels_as_weights_of_all_vertices(person):
     assert body.mode == "WEIGHT_PAINT"
     assert ops.paint_region(finish=True) == {"FINISHED"}
     assert (body.mode, body.hide_viewport) == ("OBJECT", True)
-    with pytest.raises(RuntimeError, match="no region is being painted"):
+    with refused(RuntimeError, "painted"):
         ops.paint_region(finish=True)
 
 
 def test_a_vertex_group_that_is_not_there_is_named(person):
-    with pytest.raises(RuntimeError, match="no vertex group 'sleeve'"):
+    with refused(RuntimeError, "sleeve"):
         ops.redress(vertex_group="sleeve", seed=FINE)
-    with pytest.raises(ValueError, match="no vertex group 'sleeve'"):
+    with refused(ValueError, "sleeve"):
         painted_weights(body_of(person), "sleeve")
     bpy.data.objects.remove(body_of(person))
     for edit in (ops.paint_region, lambda: ops.redress(vertex_group="sleeve", seed=FINE)):
-        with pytest.raises(RuntimeError, match="body mesh of 'Human' was deleted"):
+        with refused(RuntimeError, "Human"):
             edit()
 
 
@@ -287,7 +288,7 @@ def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tm
             edit()
         assert not queue.busy
     person_file(humans(addon.scene)[0]).unlink()
-    with pytest.raises(RuntimeError, match="file of the human 'Human' is missing"):
+    with refused(RuntimeError, "Human"):
         ops.vary(human="Human")
 
 

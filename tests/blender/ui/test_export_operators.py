@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import synthetic
 from backend_python import use_this_python
+from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.armature import keyframe_poses
@@ -31,12 +32,12 @@ OPERATORS = bpy.ops.primdiffusion
 
 @pytest.fixture
 def store(saved_scene, tmp_path, monkeypatch):
-    """The add-on registered on an interpreter that runs the child of this file."""
+    """The add-on registered on an interpreter that runs the fake child."""
     folder = tmp_path / "store"
     folder.mkdir()
     exporting.write_store(folder)
-    monkeypatch.setenv("EXPORT_FOLDER", str(folder))
-    use_this_python(monkeypatch, Path(__file__).parents[1] / "export_backend")
+    monkeypatch.setenv("FAKE_HUMAN", str(folder / "human.npz"))
+    use_this_python(monkeypatch, FAKE_CHILD)
     blender_primdiffusion.register()
     yield folder
     blender_primdiffusion.unregister()
@@ -84,8 +85,8 @@ def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name, give
 
 def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
     before = everything()
-    monkeypatch.setenv("EXPORT_FAILS", "1")
-    assert_rejected("too thin", OPERATORS.export, filepath=str(out / "a.glb"))
+    monkeypatch.setenv("FAKE_ORDER", "fails")
+    assert_rejected("checkpoint is damaged", OPERATORS.export, filepath=str(out / "a.glb"))
     assert everything() == before
     assert not list(out.iterdir())
 

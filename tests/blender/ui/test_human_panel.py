@@ -13,6 +13,7 @@ import synthetic
 import synthetic_shape
 from jobs_driven import shown
 from oracle import evaluated_matrices
+from support.errors import refused
 
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.armature import keyframe_poses
@@ -89,7 +90,7 @@ def test_impossible_heights_leave_the_human_unchanged(person, capsys):
     settings(person).height = 2.9
     assert surface(person) == before
     assert "no body of this model has a height of 2.90 m" in capsys.readouterr().out
-    with pytest.raises(RuntimeError, match=r"no body of this model has a height of 2\.90 m"):
+    with refused(RuntimeError, "2.90"):
         ops.reshape(height=2.9)
 
 
@@ -115,7 +116,7 @@ def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_wh
     settings(person).betas = TALL
     assert list(armature_of(person)[BETAS]) == before
     assert "Edit Mode: leave it" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
-    with pytest.raises(RuntimeError, match="Edit Mode: leave it"):
+    with refused(RuntimeError, "Edit Mode"):
         ops.reshape(to="GENERATED")
     bpy.ops.object.mode_set(mode="OBJECT")
 
@@ -123,7 +124,7 @@ def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_wh
 def test_humans_of_earlier_versions_have_to_be_generated_again(addon, tmp_path):
     build_human(addon, synthetic.write(tmp_path / "old.npz", 8))
     assert "generate the human again" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
-    with pytest.raises(RuntimeError, match="generate the human again"):
+    with refused(RuntimeError, "human"):
         ops.reshape(to="RANDOM")
 
 
@@ -184,7 +185,7 @@ def test_a_script_gives_betas_and_measures(person):
     np.testing.assert_allclose(betas_of(person), TALL)
     ops.reshape(height=1.7)
     assert height(person) == pytest.approx(1.7, abs=2e-4)
-    with pytest.raises(RuntimeError, match="from -5 to 5"):
+    with refused(RuntimeError, "-5 to 5"):
         ops.reshape(betas=[9.0] * 10)
 
 
@@ -211,7 +212,7 @@ def test_an_empty_name_is_rejected_and_a_taken_one_gets_a_number(person, other, 
 
 
 def test_choosing_a_person_makes_their_armature_active(person, other, addon):
-    with pytest.raises(RuntimeError, match="2 humans are in the scene"):
+    with refused(RuntimeError, "2 humans"):
         ops.select_human()
     assert "2 humans are in the scene: select" in shown(PRIMDIFFUSION_PT_human, addon)
     assert shown(PRIMDIFFUSION_MT_people, addon).count("primdiffusion.select_human") == 2
@@ -220,13 +221,13 @@ def test_choosing_a_person_makes_their_armature_active(person, other, addon):
     assert list(addon.selected_objects) == [armature_of(other)]
     ops.select_human(human="Human")
     assert list(addon.selected_objects) == [armature_of(person)]
-    with pytest.raises(RuntimeError, match="'Eve' is not in the scene"):
+    with refused(RuntimeError, "Eve"):
         ops.select_human(human="Eve")
 
 
 def test_a_person_outside_the_view_layer_cannot_be_selected(person, addon):
     addon.view_layer.layer_collection.children["Human"].exclude = True
-    with pytest.raises(RuntimeError, match="not in this view layer"):
+    with refused(RuntimeError, "layer"):
         ops.select_human()
 
 
@@ -234,7 +235,7 @@ def test_a_view_is_needed_to_frame_a_human(person, addon):
     for window in addon.window_manager.windows:
         for area in window.screen.areas:
             area.type = "CONSOLE"
-    with pytest.raises(RuntimeError, match="no 3D viewport is open"):
+    with refused(RuntimeError, "viewport"):
         ops.select_human(frame=True)
 
 
@@ -306,7 +307,7 @@ def test_deleting_leaves_the_twin_the_files_and_nothing_else(person, addon):
     assert not bpy.data.armatures
     assert not bpy.data.volumes
     assert sorted((files[0].parent).rglob("*")) == files
-    with pytest.raises(RuntimeError, match="no human in the scene"):
+    with refused(RuntimeError, "human"):
         ops.delete_human()
 
 
@@ -324,7 +325,7 @@ def linked(tmp_path):
 )
 def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name, given):
     linked(tmp_path)
-    with pytest.raises(RuntimeError, match="linked"):
+    with refused(RuntimeError, "linked"):
         getattr(ops, name)(**given)
 
 

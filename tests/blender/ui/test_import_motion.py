@@ -13,6 +13,7 @@ import synthetic
 from amass_files import feet, write_amass
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from bvh_files import motion_of, write_bvh
+from support.errors import refused
 
 from blender_primdiffusion.motion.files import read_motion
 from blender_primdiffusion.motion.pose_library import current_pose
@@ -59,7 +60,7 @@ def test_every_source_frame_can_be_kept_and_the_rate_corrected(addon, armature, 
 def test_part_of_a_file_and_every_second_frame(addon, armature, tmp_path):
     ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), timing="SOURCE", first=11, last=20, stride=3)
     assert len(action_curves(armature)[0].keyframe_points) == 4
-    with pytest.raises(RuntimeError, match="frames 40 to 31 in 31"):
+    with refused(RuntimeError, "40 to 31"):
         ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), first=40)
 
 
@@ -98,9 +99,9 @@ def test_bad_files_are_rejected_in_a_sentence_and_leave_nothing(addon, armature,
 
 
 def test_an_npz_that_is_something_else_is_rejected(addon, armature, tmp_path):
-    with pytest.raises(RuntimeError, match="holds no poses"):
+    with refused(RuntimeError, "poses"):
         ops.import_motion(filepath=str(synthetic.write(tmp_path / "human.npz", 4)))
-    with pytest.raises(RuntimeError, match="no file was chosen"):
+    with refused(RuntimeError, "chosen"):
         ops.import_motion()
 
 
@@ -108,11 +109,11 @@ def test_edit_mode_renamed_bones_and_linked_armatures_are_rejected_by_name(addon
     path = write_amass(tmp_path / "m.npz")
     addon.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode="EDIT")
-    with pytest.raises(RuntimeError, match="Edit Mode"):
+    with refused(RuntimeError, "Edit Mode"):
         ops.import_motion(filepath=path)
     bpy.ops.object.mode_set(mode="OBJECT")
     armature.data.bones["left_knee"].name = "Knie"
-    with pytest.raises(RuntimeError, match="no bone 'left_knee'"):
+    with refused(RuntimeError, "left_knee"):
         ops.import_motion(filepath=path)
     armature.data.bones["Knie"].name = "left_knee"
     bpy.data.libraries.write(str(tmp_path / "lib.blend"), {armature})
@@ -121,7 +122,7 @@ def test_edit_mode_renamed_bones_and_linked_armatures_are_rejected_by_name(addon
     linked = next(obj for obj in target.objects if obj.type == "ARMATURE")
     addon.scene.collection.objects.link(linked)
     addon.view_layer.objects.active = linked
-    with pytest.raises(RuntimeError, match="linked from another file"):
+    with refused(RuntimeError, "linked"):
         ops.import_motion(filepath=path)
 
 
@@ -134,7 +135,7 @@ def test_any_armature_with_smpls_joints_can_be_moved(addon, tmp_path):
 
 
 def test_a_scene_without_humans_is_reported(addon, tmp_path):
-    with pytest.raises(RuntimeError, match="no human in the scene"):
+    with refused(RuntimeError, "human"):
         ops.import_motion(filepath=write_amass(tmp_path / "m.npz"))
 
 
@@ -143,7 +144,7 @@ def test_of_two_people_the_named_one_moves(addon, armature, tmp_path):
     ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Bob")
     assert armature.animation_data is None or armature.animation_data.action is None
     assert armature_of(other).animation_data.action is not None
-    with pytest.raises(RuntimeError, match="'Eve' is not in the scene"):
+    with refused(RuntimeError, "Eve"):
         ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Eve")
 
 
@@ -151,16 +152,16 @@ def test_bones_can_be_chosen_for_an_unknown_rig(addon, armature, tmp_path):
     names = {name: f"b{number}" for number, name in enumerate(JOINT_NAMES)}
     rotations, moves = motion_of(0.2)
     path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, REST_JOINTS[0] + moves, names, frame_time="0.0416667")
-    with pytest.raises(RuntimeError, match="no bone is known to be"):
+    with refused(RuntimeError, "bone"):
         ops.import_motion(filepath=str(path))
     assert "b3" in look_at(str(path)).bones
     chosen = {f"bone_{joint}": bone for joint, bone in names.items()}
     ops.import_motion(filepath=str(path), bones="CHOSEN", start=1, timing="SOURCE", **chosen)
     addon.scene.frame_set(3)
     np.testing.assert_allclose(current_pose(armature)[0][16], rotations[2, 16], atol=1e-3)
-    with pytest.raises(RuntimeError, match="'nose' for head"):
+    with refused(RuntimeError, "nose"):
         ops.import_motion(filepath=str(path), bones="CHOSEN", **{**chosen, "bone_head": "nose"})
-    with pytest.raises(RuntimeError, match="no bone for 'left_knee'"):
+    with refused(RuntimeError, "left_knee"):
         ops.import_motion(filepath=str(path), bones="CHOSEN", **{**chosen, "bone_left_knee": ""})
 
 

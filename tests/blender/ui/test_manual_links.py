@@ -11,6 +11,7 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
+from support.errors import refused
 
 import build_addon
 import build_manual
@@ -129,5 +130,5 @@ def test_pages_have_tables_anchors_and_no_links_out_of_the_manual(tmp_path):
 @pytest.mark.parametrize("text", ["[gone](gone.md)", "![gone](gone.png)"])
 def test_links_that_lead_nowhere_stop_the_build(tmp_path, text):
     (tmp_path / "page.md").write_text(text)
-    with pytest.raises(build_manual.ManualError, match=r"page\.md .* gone"):
+    with refused(build_manual.ManualError, "page.md"):
         build_manual.manual(tmp_path)

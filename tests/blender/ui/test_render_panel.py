@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
 from jobs_driven import drive, error_of, notice_of, shown, until_running
+from support.errors import refused
 
-from blender_primdiffusion import places
 from blender_primdiffusion.jobs import merge
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
@@ -38,7 +36,6 @@ ops = bpy.ops.primdiffusion
 @pytest.fixture
 def person(addon, tmp_path, monkeypatch):
     """Somebody in shot.blend whom there is to merge."""
-    monkeypatch.setattr(places, "backend_module_path", lambda: Path(__file__).parents[1] / "merge_backend")
     kept = tmp_path / "person.human.safetensors"
     kept.write_bytes(b"kept")
     person = build_human(addon, synthetic_shape.write(tmp_path / "human.npz", 6), keep=[kept])
@@ -134,13 +131,13 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
 
 
 def test_a_range_that_is_none_is_rejected(person):
-    with pytest.raises(RuntimeError, match="frames 7 to 7 are no sequence"):
+    with refused(RuntimeError, "7 to 7"):
         ops.merge(what="FRAMES", frame_start=7, frame_end=7)
     assert merged_of(person) is None
 
 
 def test_a_cancelled_sequence_leaves_nothing(person, monkeypatch):
-    monkeypatch.setenv("FAKE_MERGE", "takes long")
+    monkeypatch.setenv("FAKE_ORDER", "takes long")
     moment = Moment.now(person)
     before = sorted(folder_of(person).iterdir())
     queue.add(bpy.context, MergeFramesJob(HumanTarget.of(person), [moment, moment], 1, 0.02))
@@ -164,11 +161,11 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
 
 
 @pytest.mark.parametrize(
-    ("order", "message"), [("fails", "large grid"), ("gives garbage", "damaged"), ("dies", "ended")]
+    ("order", "message"), [("fails", "checkpoint is damaged"), ("gives garbage", "damaged"), ("dies", "ended")]
 )
 @pytest.mark.parametrize("what", ["POSE", "FRAMES"])
 def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypatch, order, message, what):
-    monkeypatch.setenv("FAKE_MERGE", order)
+    monkeypatch.setenv("FAKE_ORDER", order)
     before = sorted(folder_of(person).iterdir())
     with pytest.raises(RuntimeError, match=message):
         ops.merge(what=what)
@@ -186,22 +183,22 @@ def test_a_human_removed_meanwhile_is_not_merged(person):
 
 def test_a_renamed_bone_is_rejected_with_what_to_do(person):
     armature_of(person).data.bones["left_knee"].name = "knee"
-    with pytest.raises(RuntimeError, match=r"no bone 'left_knee': give it this name again"):
+    with refused(RuntimeError, "left_knee"):
         ops.merge()
 
 
 def test_a_missing_file_of_the_person_is_named(person):
     (folder_of(person) / "person.human.safetensors").unlink()
-    with pytest.raises(RuntimeError, match=r"person\.human\.safetensors"):
+    with refused(RuntimeError, "person.human.safetensors"):
         ops.merge()
 
 
 def test_set_attachment_reports_what_stands_in_the_way(person):
-    with pytest.raises(RuntimeError, match="press Merge"):
+    with refused(RuntimeError, "Merge"):
         ops.set_attachment(mode="MERGED")
-    with pytest.raises(RuntimeError, match="no merged volume"):
+    with refused(RuntimeError, "merged"):
         ops.merge(what="NOTHING")
-    with pytest.raises(RuntimeError, match="'Nobody' is not in the scene"):
+    with refused(RuntimeError, "Nobody"):
         ops.set_attachment(mode="SURFACE", human="Nobody")
 
 
@@ -269,7 +266,7 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
 
 
 def test_a_scene_without_humans_is_rejected(addon):
-    with pytest.raises(RuntimeError, match="no human in the scene"):
+    with refused(RuntimeError, "human"):
         ops.add_camera()
     assert not ops.merge.poll()
     assert not bpy.data.cameras

@@ -12,6 +12,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from support.fake_child import FAILS, TAKES_LONG
 
 from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
@@ -21,7 +22,6 @@ from blender_primdiffusion.ui.batch.running import NoBackend, ask
 
 pytestmark = pytest.mark.any_blender
 
-DIES, FAILS, TAKES_LONG = 1, 2, 4
 """Seeds that the fake child takes as orders."""
 
 

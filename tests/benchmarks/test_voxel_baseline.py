@@ -1,8 +1,5 @@
 """People as grids of voxels, and the baseline that diffuses them."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -12,30 +9,28 @@ from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, march
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
+from support.errors import refused
 from voxel_baseline import (
     BLOCKS,
+    BOUNDS,
+    SIDE,
     VALUES,
     VoxelCodec,
     VoxelModel,
     VoxelUNetConfig,
     fit_voxel_codec,
     load_voxel_model,
+    primitives_of,
     save_voxel_model,
     voxel_denoiser,
+    voxelise,
+    voxelise_payload,
 )
-from voxel_grid import BOUNDS, SIDE, primitives_of, voxelise, voxelise_payload
 
 FULL = 100.0
 
 
-@pytest.fixture(autouse=True, scope="module")
-def _one_thread():
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)
+pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def boxes(*centres: tuple[float, float, float], half: float = 0.25) -> Frames:
@@ -196,7 +191,7 @@ def test_baseline_is_stored_whole(model, tmp_path):
 
 
 def test_another_file_is_no_baseline(tmp_path):
-    with pytest.raises(FileNotFoundError, match="no voxel baseline"):
+    with refused(FileNotFoundError, "baseline"):
         load_voxel_model(tmp_path / "none.safetensors")
     (tmp_path / "other.safetensors").write_bytes(b"nothing at all")
     with pytest.raises(ValueError, match="train it again"):

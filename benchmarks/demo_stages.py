@@ -1,14 +1,16 @@
-"""The demo inside Blender: install the zip, press the button, walk, measure the volumes' motion, save, render.
+"""The stages of the demo that run in processes of their own.
 
-`person` installs the extension and generates through its own operator and the real child process; `cycles` opens
-the saved file and renders one frame. Blender's settings are in a temporary folder, so those of an installed Blender do
-not change.
+`person` installs the extension in Blender, presses the button, walks, measures the volumes' motion and saves; it
+generates through the extension's own operator and the real child process. `cycles` opens the saved file and renders
+one frame. `march` draws the generated human: rest, walking, side view, depth, primitives as boxes. Blender's settings
+are in a temporary folder, so those of an installed Blender do not change.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import sys
 import time
@@ -20,15 +22,23 @@ import bpy
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.drawing.draw import draw
+from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors
+from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
+from primdiffusion.render.march import march
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
+from walk import walk_and_wave
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "examples"))
-from walk import walk_and_wave  # noqa: E402
 
 MODULE = "bl_ext.user_default.primdiffusion"
 SEED = 7
+BACKGROUND = (0.72, 0.72, 0.72)
+SIDE_VIEW = math.radians(70)
 
 
 def person(arguments: argparse.Namespace) -> dict[str, float]:
@@ -131,8 +141,44 @@ def main() -> None:
     drawing.add_argument("--size", type=int, default=384)
     drawing.add_argument("--samples", type=int, default=1)
     drawing.add_argument("--yaw", type=float, default=0.5, help="radians around the person, 0 is the front")
+    marching = stages.add_parser("march")
+    marching.set_defaults(stage=march_pictures)
+    for name in ("human", "out", "json"):
+        marching.add_argument(f"--{name}", type=Path, required=True)
+    marching.add_argument("--frames", type=int, required=True)
+    marching.add_argument("--frame", type=int, required=True, help="frame of the walk, counted from 0")
     arguments = parser.parse_args()
     arguments.json.write_text(json.dumps(arguments.stage(arguments)))
+
+
+def share_on_body(position: torch.Tensor) -> float:
+    """Share of the grid's cells with a distinct point on the body: on a face, 1 mm or more from all others."""
+    distance = torch.cdist(position.double(), position.double())
+    distance.fill_diagonal_(torch.inf)
+    body, anchors = default_body(), default_anchors()
+    on_a_face = (anchors.face >= 0) & (anchors.face < body.faces.shape[0]) & (anchors.barycentric >= -1e-6).all(-1)
+    return float((on_a_face & (distance.amin(-1) >= 1e-3)).float().mean())
+
+
+def march_pictures(arguments: argparse.Namespace) -> dict[str, float]:
+    """Draw the human at rest and in a frame of the walk."""
+    human = load_human(arguments.human)
+    rotation = torch.from_numpy(walk_and_wave(arguments.frames)[arguments.frame]).float()
+    rest = place(human, None)
+    walking = place(human, BodyPose(rotation, torch.zeros(3)))
+    front = framing(rest)
+    march(rest, front)  # compiles, or loads the compiled code
+    start = time.perf_counter()
+    rendering = march(rest, front)
+    seconds = time.perf_counter() - start
+
+    to_png(arguments.out / "march_rest.png", rendering, BACKGROUND)
+    depth_to_png(arguments.out / "march_depth.png", rendering)
+    to_png(arguments.out / "march_posed.png", march(walking, framing(walking)), BACKGROUND)
+    to_png(arguments.out / "march_side.png", march(walking, framing(walking, yaw=SIDE_VIEW)), BACKGROUND)
+    boxes = draw(Scene(rest, chart=default_anchors().chart), front, ViewSettings("boxes"))
+    rgba_to_png(arguments.out / "march_boxes.png", torch.from_numpy(boxes.combined), BACKGROUND)
+    return {"seconds_march_512": seconds, "grid_share_on_body": share_on_body(rest.position)}
 
 
 if __name__ == "__main__":

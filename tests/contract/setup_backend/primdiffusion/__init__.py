@@ -1,3 +1,0 @@
-"""A backend without requirements, for environments made of tiny wheels."""
-
-__version__ = "0-tiny"

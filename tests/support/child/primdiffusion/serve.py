@@ -1,0 +1,253 @@
+"""Answers each method as ANSWERS declares: first the steps with their progress, then what makes the result.
+
+Humans are copies of the file FAKE_HUMAN, their proxies of the files beside it. The child misbehaves if one of the names
+in ERRORS and seeds.json is in FAKE_ORDER, or if its seed is asked for. A step takes FAKE_STEP_S seconds.
+"""
+
+import json
+import os
+import shutil
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+try:
+    import numpy as np
+except ModuleNotFoundError:  # an environment of tests/contract/tiny_packages.py
+    import tiny
+
+    PROBLEM = tiny.PROBLEM
+else:
+    PROBLEM = None
+
+HERE = Path(__file__).parent
+HUMAN = Path(os.environ.get("FAKE_HUMAN", os.devnull))
+ORDER, STEP_S = os.environ.get("FAKE_ORDER", ""), float(os.environ.get("FAKE_STEP_S", "0.02"))
+ORDERS = {seed: order for order, seed in json.loads((HERE / "seeds.json").read_text()).items()}
+ERRORS = {
+    "fails": ("the checkpoint is damaged", "CheckpointError", "choose another checkpoint"),
+    "no memory": ("the machine ran out of memory", "out_of_memory", "close other programs"),
+}
+"""Message, kind and remedy."""
+GARBAGE = b"PK\x03\x04 no more"
+LONG = 100
+"""Times as many steps as usual."""
+BANDS = 4
+COLOUR, DEPTH = (0.25, 0.5, 0.75, 1.0), 3.0
+Steps = Iterator[dict]
+_lock = threading.Lock()
+_cancelled = threading.Event()
+
+
+def say(**message) -> None:
+    with _lock:
+        print(json.dumps({"jsonrpc": "2.0", **message}), flush=True)
+
+
+def say_error(id: int, message: str, kind: str, remedy: str = "") -> None:
+    say(id=id, error={"code": -32002, "message": message, "data": {"kind": kind, "remedy": remedy}})
+
+
+def order_of(params: dict) -> str:
+    seeds = params.get("seeds", [params.get("seed")])
+    return ORDER or next((ORDERS[seed] for seed in seeds if seed in ORDERS), "")
+
+
+def steps(stage: str, count: Callable[[dict], int], eta_s: float | None = None) -> Callable[[dict], Steps]:
+    """Steps that do nothing; those of generate show a picture if one is asked for."""
+
+    def run(params: dict) -> Steps:
+        total = count(params)
+        shown = {"picture": str(HERE / "picture.png")} if params.get("picture_px") else {}
+        for step in range(total * (LONG if order_of(params) == "takes long" else 1)):
+            yield {"stage": stage, "step": min(step, total), "total": total, "eta_s": eta_s, **shown}
+
+    return run
+
+
+def sheet_steps(params: dict) -> Steps:
+    """A step for each human, which shows its picture."""
+    out = Path(params["out_dir"])
+    out.mkdir(parents=True, exist_ok=True)
+    for index, seed in enumerate(params["seeds"]):
+        picture = out / f"{seed}.png"
+        shutil.copyfile(HERE / "picture.png", picture)
+        for step in range(LONG if ORDERS.get(seed) == "takes long" else 1):
+            about = {"stage": "sample", "step": step, "total": params["steps"], "eta_s": 1.0}
+            yield {**about, "picture": str(picture), "index": index}
+
+
+def bands(params: dict) -> Steps:
+    """Fills the frame with COLOUR and DEPTH from the top."""
+    _, _, width, height = params["region"] or [0, 0, params["width"], params["height"]]
+    frame = np.memmap(params["frame"], np.float32, "r+")
+    combined = frame[: width * height * 4].reshape(height, width, 4)
+    depth = frame[width * height * 4 :].reshape(height, width)
+    for band in range(BANDS):
+        low, high = height * (BANDS - 1 - band) // BANDS, height * (BANDS - band) // BANDS
+        combined[low:high], depth[low:high] = COLOUR, DEPTH
+        yield {"stage": "draw", "step": height - low, "total": height, "eta_s": 1.0}
+
+
+def human(params: dict) -> dict:
+    """The prepared human, or an edit of it, beside what was asked for."""
+    out = Path(params["out_dir"])
+    out.mkdir(parents=True, exist_ok=True)
+    npz, person = out / "human.npz", out / "person.human.safetensors"
+    if order_of(params) == "gives garbage":
+        npz.write_bytes(GARBAGE)
+    elif "person" in params:
+        write_edited(npz, params)
+    else:
+        shutil.copyfile(HUMAN, npz)
+    person.write_bytes(json.dumps(params).encode())
+    files = {"human": str(npz), "person": str(person)}
+    warnings = ["only one view"] if params.get("views") == 1 else []
+    return {**files, "seed": params.get("seed"), "steps": params.get("steps"), "warnings": warnings}
+
+
+def write_edited(path: Path, params: dict) -> None:
+    """Another colour for primitives 1 and 2, for all where no region is given; another body for a blend."""
+    with np.load(HUMAN) as archive:
+        arrays = dict(archive)
+    arrays["rgb"] = arrays["rgb"].copy()
+    region = [1, 2] if "region" in params else slice(None)
+    arrays["rgb"][region] = arrays["rgb"][region] * 0.5 + 0.1 * (params.get("seed", 0) % 5)
+    if "fraction" in params:
+        arrays["betas"] = arrays["betas"] + 1
+        for name in ("joints", "vertices", "position"):
+            arrays[name] = arrays[name] * 1.1
+    if "weights" in (params.get("region") or ()):
+        with np.load(params["region"]["weights"]) as weights:
+            arrays["meta"] = np.array(json.dumps({"painted": weights["weights"].tolist()}))
+    np.savez(path, **arrays)
+
+
+def sheet(params: dict) -> dict:
+    people = []
+    for seed in params["seeds"]:
+        files = {"human": f"{seed}.human.npz", "person": f"{seed}.human.safetensors", "picture": f"{seed}.png"}
+        files = {name: Path(params["out_dir"]) / file for name, file in files.items()}
+        shutil.copyfile(HUMAN, files["human"])
+        files["person"].write_bytes(json.dumps({**params, "seed": seed}).encode())
+        people.append({"seed": seed, **{name: str(path) for name, path in files.items()}})
+    return {"people": people}
+
+
+def human_npz(params: dict) -> dict:
+    """Whoever is asked for, they are FAKE_HUMAN's."""
+    npz, person = (Path(params["out_dir"]) / name for name in ("human.npz", "person.human.safetensors"))
+    shutil.copyfile(HUMAN, npz)
+    shutil.copyfile(params["person"], person)
+    return {"human": str(npz), "person": str(person)}
+
+
+def picture(params: dict) -> dict:
+    """Always the same; what was asked for is beside FAKE_HUMAN."""
+    shutil.copyfile(HERE / "picture.png", params["out"])
+    HUMAN.with_name("rendered.json").write_text(json.dumps(params))
+    return {"out": params["out"]}
+
+
+def merged(params: dict) -> dict:
+    write_grid(Path(params["out"]), params["people"][0], params)
+    return {"out": params["out"], "shape": [8, 6, 10]}
+
+
+def merged_frames(params: dict) -> dict:
+    files = [Path(params["out_dir"]) / f"{index:04d}.npz" for index in range(len(params["people"]))]
+    for path, person in zip(files, params["people"], strict=True):
+        write_grid(path, person, params)
+    return {"files": [str(path) for path in files]}
+
+
+def write_grid(path: Path, person: dict, params: dict) -> None:
+    """A small grid whose density tells how wide the left arm is raised, at the human's place."""
+    density = np.zeros((8, 6, 10), np.float16)
+    density[2:6, 2:4, 2:8] = 10 + 10 * abs(np.array(person["joints"])[16, 0, 1])
+    origin = np.array([row[3] for row in person["object"]])
+    unfinished = path.with_suffix(".part")
+    with unfinished.open("wb") as file:
+        if order_of(params) == "gives garbage":
+            file.write(GARBAGE)
+        else:
+            colour = np.full((*density.shape, 3), 0.5, np.float16)
+            np.savez(file, density=density, colour=colour, origin=origin, voxel=np.float64(params["voxel"]))
+    os.replace(unfinished, path)
+
+
+def proxy(params: dict) -> dict:
+    out = Path(params["out_dir"])
+    out.mkdir(parents=True)
+    for name in ("proxy.npz", "proxy.png"):
+        shutil.copyfile(HUMAN.with_name(name), out / name)
+    files = {"proxy": str(out / "proxy.npz"), "texture": str(out / "proxy.png")}
+    return {**files, "triangles": params["triangles"], "betas": params["betas"]}
+
+
+def gaussians(params: dict) -> dict:
+    Path(params["out"]).write_text(json.dumps(params))
+    return {"out": params["out"], "gaussians": 7}
+
+
+def nothing(_params: dict) -> dict:
+    return {"seconds_place": 0.0, "seconds_march": 0.0}
+
+
+at_once = steps("export", lambda _: 0)
+edit = (steps("sample", lambda params: params["steps"], 1.0), human)
+merging = steps("merge", lambda _: 1)
+ANSWERS: dict[str, tuple[Callable[[dict], Steps], Callable[[dict], dict]]] = {
+    **dict.fromkeys(("generate", "vary", "interpolate", "inpaint", "transfer"), edit),
+    "variations": (sheet_steps, sheet),
+    "reconstruct": (steps("encode", lambda _: 4), human),
+    "human_npz": (at_once, human_npz),
+    "render": (at_once, picture),
+    "draw": (bands, nothing),
+    "merge": (merging, merged),
+    "merge_frames": (merging, merged_frames),
+    "proxy": (at_once, proxy),
+    "gaussians": (at_once, gaussians),
+}
+
+
+def answer(id: int, method: str, params: dict) -> None:
+    if PROBLEM:
+        say_error(id, PROBLEM, "environment")
+        return
+    order = order_of(params)
+    run, make = ANSWERS[method]
+    for progress in run(params):
+        say(method="progress", params={"id": id, **progress})
+        time.sleep(60.0 if order == "ignores cancel" else STEP_S)
+        if _cancelled.is_set():
+            say(id=id, error={"code": -32001, "message": "cancelled"})
+            return
+    if order == "dies":
+        os._exit(9)
+    if order in ERRORS:
+        say_error(id, *ERRORS[order])
+    else:
+        say(id=id, result={"seconds": 0.1, **make(params)})
+
+
+for line in sys.stdin:
+    request = json.loads(line)
+    id, method = request["id"], request["method"]
+    if method == "hello":
+        say(id=id, result={"version": "0-fake", "device_name": None})
+        about = {"ready": True, "problem": PROBLEM, "device": "cpu", "device_name": "fake device"}
+        say(method="ready", params=about)
+    elif method in ANSWERS:
+        _cancelled.clear()
+        threading.Thread(target=answer, args=(id, method, request["params"]), daemon=True).start()
+    elif method == "cancel":
+        _cancelled.set()
+        say(id=id, result={})
+    elif method == "shutdown":
+        say(id=id, result={})
+        break
+    else:  # release_memory
+        say(id=id, result={})
