@@ -1,6 +1,7 @@
 """draw, as the protocol promises it to anyone: a frame in a file, filled from the top, stopped when asked."""
 
 import itertools
+import math
 from pathlib import Path
 
 import numpy as np
