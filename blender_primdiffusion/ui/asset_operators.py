@@ -8,7 +8,8 @@ import bpy
 
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget
-from .on_person import SKIP, OnPerson
+from .declared import SKIP
+from .on_person import OnPerson
 
 _ITEMS = (
     (

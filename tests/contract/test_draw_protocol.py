@@ -148,7 +148,7 @@ def test_drawing_needs_no_checkpoint(request_for):
         ({"view": "x-ray"}, "draw.view"),
         ({"world_to_camera": [[float("nan")] * 4] * 3}, "draw.world_to_camera"),
         (
-            {"people": [{"human": "h", "object": STILL, "joints": [[[float("nan")] * 4] * 3] * 24}]},
+            {"people": [{"human": "h", "object": STILL, "joints": [[[math.nan] * 4] * 3] * 24}]},
             "draw.people[0].joints",
         ),
         ({"people": [{"human": "h"}]}, "draw.people[0].object"),

@@ -39,7 +39,6 @@ class GenerateCommand(GenerateRequest):
     out_dir: OutDir
     """Output folder; with --count above 1, of a folder for each human."""
     seed: Seed = 0
-    """The same seed gives the same human."""
     count: Count = 1
     """Number of humans, with consecutive seeds."""
     batch: Count = 1
@@ -110,7 +109,7 @@ class ExportCommand(ProxySettings, PoseOptions):
     out: Annotated[Path, Ending((".glb", ".obj", ".ply"))]
     """.glb: textured mesh with a skeleton; .obj: the mesh alone, with .mtl and .png; .ply: 3D Gaussians."""
     gaussians: Count = GaussiansRequest.limit
-    """Largest number of Gaussians."""
+    """Largest number of Gaussians; about 130,000 of a human are visible."""
 
     def check(self) -> None:
         """Raise FieldError for a pose of a format that stores none, and as `PoseOptions`."""

@@ -86,7 +86,8 @@ class Conditioning:
     """Attributes, NAME=VALUE: sex=female "outfit=blouse and skirt" height=1.7. `info` lists the names and values that a
     checkpoint knows."""
     guidance: Annotated[float, Range(0, 20), Slider(1, 5)] = 1.5
-    """How strongly attributes are followed: 1 as in the training data, more exaggerates and costs variety."""
+    """How strongly attributes are followed: 1 as in the training data; more exaggerates and costs variety. No effect
+    without attributes."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -112,7 +113,7 @@ class GenerateRequest(StepPreviews, Conditioning):
     """Generate a human: human.npz for Blender, person.human.safetensors, and previews."""
 
     seed: Seed
-    """The same seed gives the same human."""
+    """Another seed gives another human; the same seed gives the same human."""
     sampler: Sampler = "ddim"
     """ddim: few steps; dpmpp_2m: even fewer; ddpm: the paper's, needs hundreds."""
 
@@ -131,7 +132,7 @@ class VariationsRequest(Sampling, Conditioning):
     person: Path | None = None
     """A .human.safetensors file: generate variants of this human, as `vary` does, instead of new humans."""
     amount: Share = 0.5
-    """Strength of the variation, as in `vary`."""
+    """How much variants differ from this human: 0 not at all, 1 almost completely."""
 
     def check(self) -> None:
         """Raise FieldError for a seed that is given twice."""
@@ -160,9 +161,9 @@ class VaryRequest(EditRequest, Conditioning):
     """Generate a variant of a human: the same body with other clothes and another face."""
 
     amount: Share = 0.5
-    """How much the variant may differ: 0 not at all, 1 almost completely."""
+    """How much the new human may differ from this one: 0 not at all, 1 almost completely."""
     seed: Seed = 0
-    """Selects the variant."""
+    """Another seed gives another result; the same seed gives the same result."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -172,7 +173,7 @@ class InterpolateRequest(EditRequest):
     other: Person
     """A second .human.safetensors file."""
     fraction: Share = 0.5
-    """Share of the other human: 0 is exactly the first, 1 exactly the second."""
+    """Share of the other human: 0 is exactly this human, 1 exactly the other."""
 
     def check(self) -> None:
         """Raise FieldError for a single step."""
@@ -189,7 +190,7 @@ class RegionRequest(EditRequest):
     weights: Path | None = None
     """Instead of region: an .npz with `weights`, a number from 0 to 1 for each vertex of human.npz's body."""
     seed: Seed = 0
-    """Selects one of the possible results."""
+    """Another seed gives another result; the same seed gives the same result."""
 
     def check(self) -> None:
         """Raise FieldError unless the region is given in exactly one way."""
@@ -231,9 +232,9 @@ class ReconstructRequest(Previews):
     subject: str | None = None
     """Name of the subject; not needed if there is only one."""
     frame: Annotated[int, Range(0)] = 0
-    """Frame to encode; 0 is near the T pose, which has the least occlusion."""
+    """Captured pose to use; 0 is near the T pose, which shows most of a human."""
     views: Annotated[int, Range(1)] = 8
-    """Number of cameras, spread around the subject; all if there are fewer."""
+    """Number of cameras, spread around the human; all if there are fewer."""
     checkpoint: Path | None = None
     """Trained encoder (.safetensors); the default is the one in the package."""
 
@@ -388,7 +389,7 @@ class GaussiansRequest:
     betas: list[float] | None = None
     """Shape coefficients; None for those of the file."""
     limit: Annotated[int, Range(1)] = 400_000
-    """Largest number of Gaussians."""
+    """Largest number of Gaussians; about 130,000 of a human are visible."""
 
     def check(self) -> None:
         """Raise FieldError for one of object and joints without the other."""

@@ -19,7 +19,7 @@ import functools
 import inspect
 import itertools
 import math
-import textwrap
+import sys
 import types
 import typing
 from collections.abc import Mapping
@@ -182,11 +182,16 @@ def descriptions(record: type) -> dict[str, str]:
     """The strings below the fields of a record, each as one line."""
     found: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(record.__mro__)):
-        body = ast.parse(textwrap.dedent(inspect.getsource(base))).body[0].body  # type: ignore[attr-defined]
-        for field, below in itertools.pairwise(body):
+        for field, below in itertools.pairwise(_classes(base.__module__)[base.__name__].body):
             if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
                 found[ast.unparse(field.target)] = " ".join(ast.literal_eval(below.value).split())
     return found
+
+
+@functools.cache
+def _classes(module: str) -> dict[str, ast.ClassDef]:
+    tree = ast.parse(inspect.getsource(sys.modules[module]))
+    return {node.name: node for node in tree.body if isinstance(node, ast.ClassDef)}
 
 
 def split(kind: Any) -> tuple[Any, tuple[Any, ...]]:
