@@ -47,16 +47,15 @@ class EditJob(Job):
     """Past participle for the message: Varied."""
 
     target: HumanTarget
-    steps: int
     asked: Mapping[str, Any]
-    """The method's other parameters. A region {"painted": [V numbers]} holds weights, and travels as a file."""
+    """Fields of the request. A region {"painted": [V numbers]} holds weights, and travels as a file."""
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
 
     @classmethod
-    def of(cls, person: bpy.types.Collection, steps: int, asked: Mapping[str, Any]) -> EditJob:
+    def of(cls, person: bpy.types.Collection, asked: Mapping[str, Any]) -> EditJob:
         """Raises ValueError for a human that cannot be edited, FileNotFoundError for one whose file is missing."""
         person_file(person)
-        return cls(HumanTarget.of(person), steps, asked)
+        return cls(HumanTarget.of(person), asked)
 
     @property
     def label(self) -> str:
@@ -69,9 +68,8 @@ class EditJob(Job):
             np.savez(folder / "region.npz", weights=np.asarray(painted, np.float32))
             asked["weights"] = str(folder / "region.npz")
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
-        params = {**asked, "person": self.target.file_now(), "steps": self.steps, "size": PREVIEW_PX}
-        params["picture_px"] = _STEP_PICTURE_PX
-        return {**params, **checkpoint, "out_dir": str(folder)}
+        previews = {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
+        return {**asked, "person": self.target.file_now(), **previews, **checkpoint, "out_dir": str(folder)}
 
     def place(self) -> Destination:
         return edit_destination(self.target.found())

@@ -61,10 +61,8 @@ class GenerateJob(Job):
     new_person = "Human"
 
     seed: int
-    steps: int
-    sampler: str = "ddim"
-    asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Attributes and guidance, where given."""
+    sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Other fields of `GenerateRequest`: steps, sampler, attributes, guidance."""
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
     next_seed: int | None = None
     """What the panel's seed becomes with this human; None where it was not used, or is locked."""
@@ -74,10 +72,9 @@ class GenerateJob(Job):
         return f"Human, seed {self.seed}"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        params = {"seed": self.seed, "steps": self.steps, "sampler": self.sampler, **self.asked}
-        params |= {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
-        return {**params, **checkpoint, "out_dir": str(folder)}
+        previews = {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
+        return {"seed": self.seed, **self.sampling, **previews, **checkpoint, "out_dir": str(folder)}
 
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         notice = build_person(context, result, "Generated")[1]

@@ -103,10 +103,8 @@ class VariationsJob(Job):
     kind = method = "variations"
 
     seeds: tuple[int, ...]
-    steps: int
-    sampler: str
-    asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Attributes and guidance, where given."""
+    sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Other fields of `VariationsRequest`: steps, sampler, attributes, guidance."""
     person: str = ""
     """File of the human to vary; empty for new humans."""
     amount: float = 0.5
@@ -118,7 +116,7 @@ class VariationsJob(Job):
         return f"{len(self.seeds)} Variations"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        params: dict[str, Any] = {"seeds": list(self.seeds), "steps": self.steps, "sampler": self.sampler, **self.asked}
+        params: dict[str, Any] = {"seeds": list(self.seeds), **self.sampling}
         if self.person:
             if not Path(self.person).is_file():
                 raise FileNotFoundError("the human to vary was cleared: show variations again")

@@ -16,7 +16,7 @@ import bpy
 from ..backend.child_streams import Output
 from ..backend.child_variables import BLENDER, COMPUTING, passed_on
 from ..console import CANCELLED, DONE
-from ..formats.answers import CapturesLine, CapturesProgress
+from ..formats.answers import CapturesProgress
 from ..formats.json_files import parse_message
 from ..formats.removing import remove_folder
 from ..formats.schema import read
@@ -128,13 +128,12 @@ class CaptureSession:
         if not line.startswith(MARK):
             return  # printed by Blender
         try:
-            message = parse_message(line[len(MARK) :])
-            progress = read(CapturesLine if "line" in message else CapturesProgress, message)
-        except (ValueError, TypeError) as fault:
+            progress = read(CapturesProgress, parse_message(line[len(MARK) :]))
+        except ValueError as fault:
             self._fault = f"Blender was ended because it sent a malformed message ({fault}): render again"
             self._process.kill()
             return
-        if isinstance(progress, CapturesLine):
+        if progress.line is not None:
             self.lines.append(progress.line)
             return
         self.lines.extend(progress.news)

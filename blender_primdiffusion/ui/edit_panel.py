@@ -135,8 +135,8 @@ class _Edit(OnPerson):
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         from ..jobs import edit  # needs numpy
 
-        steps = self.chosen("steps", context.scene.primdiffusion)
-        return submit(self, context, getattr(edit, self.job).of(person, steps, self.params(context, person)))
+        params = {"steps": self.chosen("steps", context.scene.primdiffusion), **self.params(context, person)}
+        return submit(self, context, getattr(edit, self.job).of(person, params))
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         """The edit's parameters of the child's method: see `EditJob.asked`."""

@@ -124,13 +124,13 @@ class GenerateOptions(Reporting):
         return self.properties.is_property_set(name)
 
     def sampling(self, settings: bpy.types.PropertyGroup) -> dict[str, Any]:
-        """Fields `steps`, `sampler` and `asked` of a job. Raises ValueError for attributes that are not name=value."""
+        """Fields of `GenerateRequest` besides the seed. Raises ValueError for attributes that are not name=value."""
         wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
         guidance = self.guidance if self.given("guidance") else settings.guidance
         return {
             "steps": self.steps or settings.steps,
             "sampler": self.sampler if self.given("sampler") else settings.sampler,
-            "asked": {"attributes": wanted, "guidance": guidance} if wanted else {},
+            **({"attributes": wanted, "guidance": guidance} if wanted else {}),
         }
 
 
@@ -188,7 +188,7 @@ class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
         for each in range(seed, last + 1):
             renew_seed = from_panel and not settings.keep_seed and each == last
             next_seed = random_seed() if renew_seed else None
-            if submit(self, context, GenerateJob(each, **sampling, next_seed=next_seed)) == {"CANCELLED"}:
+            if submit(self, context, GenerateJob(each, sampling, next_seed=next_seed)) == {"CANCELLED"}:
                 return {"CANCELLED"}
         return {"FINISHED"}
 

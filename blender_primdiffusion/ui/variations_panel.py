@@ -104,14 +104,14 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
             clear_before_loading()
             redraw()
             return {"FINISHED"}
-        sampling = self._sampling_of_sheet(context)
+        sampling, like = self._sampling_of_sheet(context), {}
         if self.like:
             around = _only(_targets(self.index), "select only the one to vary")
             amount = self.amount if self.given("amount") else context.scene.primdiffusion_variations.amount
-            sampling |= {"person": str(around.person), "amount": amount, "title": f"Like seed {around.seed}"}
+            like = {"person": str(around.person), "amount": amount, "title": f"Like seed {around.seed}"}
         from_panel = context.scene.primdiffusion_variations.seeds != "RANDOM" and not self.like
         first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
-        return submit(self, context, VariationsJob(self._seeds(context, first), **sampling))
+        return submit(self, context, VariationsJob(self._seeds(context, first), sampling, **like))
 
     def _seeds(self, context: bpy.types.Context, first: int) -> tuple[int, ...]:
         """Seeds from `first` on, random ones where it is negative. Raises ValueError."""

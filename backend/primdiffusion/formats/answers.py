@@ -247,18 +247,12 @@ NOTIFICATIONS: dict[str, type] = {"ready": Ready, "progress": Progress, "heartbe
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class CapturesProgress(Open):
-    """Progress of the Blender that renders captures."""
+    """Progress of the Blender that renders captures, or a line for the user alone."""
 
-    subject: str
-    done: Count
-    total: Count
-    eta_s: Seconds | None
-    news: list[str]
+    subject: str = ""
+    done: Count = 0
+    total: Count = 0
+    eta_s: Seconds | None = None
+    news: list[str] = dataclasses.field(default_factory=list)
     """Lines for the user."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class CapturesLine(Open):
-    """A line for the user of the Blender that renders captures."""
-
-    line: str
+    line: str | None = None

@@ -146,6 +146,8 @@ _NAMES = {
 def read(record: type[Record], values: Mapping[str, Any], *path: str | int) -> Record:
     """Make a record of values of JSON or of a command line. Raises FieldError, whose fields begin with `path`."""
     known = annotations(record)
+    if not isinstance(values, Mapping):
+        raise FieldError(path, f"is {values!r:.80}: give an object")
     if (unknown := sorted(set(values) - set(known))) and not issubclass(record, Open):
         raise FieldError((*path, f"{unknown[0]:.60}"), f"is unknown: choose from {', '.join(known) or 'no fields'}")
     for field in dataclasses.fields(record):  # type: ignore[arg-type]

@@ -108,8 +108,8 @@ def test_reports_tell_the_rows_that_are_done_and_the_frame_is_filled_that_far(pa
     assert reports[0] == ("draw", 0, HEIGHT, None)
     assert reports[-1] == ("draw", HEIGHT, HEIGHT, 0.0)
     assert {(stage, total) for stage, _, total, _ in reports} == {("draw", HEIGHT)}
-    assert 0 < result["seconds_march"] < result["seconds"]
-    assert 0 < result["seconds_place"] < result["seconds"]
+    assert 0 < result.seconds_march < result.seconds
+    assert 0 < result.seconds_place < result.seconds
 
 
 def test_the_first_band_is_small_where_samples_or_people_are_many(params):

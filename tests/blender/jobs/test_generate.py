@@ -27,7 +27,7 @@ FAKE = Path(__file__).parents[1] / "fake_backend"
 
 
 def ask(context, seed: int, steps: int) -> None:
-    queue.add(context, GenerateJob(seed, steps))
+    queue.add(context, GenerateJob(seed, {"steps": steps}))
 
 
 def panel_texts(context) -> list[str]:

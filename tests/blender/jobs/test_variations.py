@@ -156,7 +156,7 @@ def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the
 ):
     drawn = []
     monkeypatch.setattr(variations_panel, "_draw_picture", lambda _cell, path, _units: drawn.append(path))
-    queue.add(addon, VariationsJob((31, TAKES_LONG, 33), 3, "ddim"))
+    queue.add(addon, VariationsJob((31, TAKES_LONG, 33), {"steps": 3}))
     until_running()
     while len(queue.request.pictures) < 2:
         queue.tick()
@@ -216,7 +216,7 @@ def test_files_and_pictures_go_when_it_is_cleared_another_file_is_loaded_or_the_
 
 
 def test_a_person_cleared_before_its_turn_is_named(addon, shown_people):
-    queue.add(addon, VariationsJob((1,), 1, "ddim", person=str(sheet.variations[0].person)))
+    queue.add(addon, VariationsJob((1,), {"steps": 1}, person=str(sheet.variations[0].person)))
     ops.variations(clear=True)
     drive()
     assert "the human to vary was cleared" in error_of("variations").lower()
