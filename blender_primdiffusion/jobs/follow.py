@@ -15,6 +15,7 @@ import bpy
 
 from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import in_words, sentence
+from ..formats.answers import HumanAnswer
 from ..places import backend_is_named, missing_packages
 from .late_volumes import keep_writing
 from .memory import release_when_idle

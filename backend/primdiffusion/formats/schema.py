@@ -39,8 +39,14 @@ class FieldError(ValueError):
 
     def __init__(self, path: Names, problem: str):
         self.path, self.problem = path, problem
-        self.field = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in path).removeprefix(".")
+        self.field = "".join(map(_part, path)).removeprefix(".")
         super().__init__(f"{self.field} {problem}")
+
+
+def _part(name: str | int) -> str:
+    if isinstance(name, int):
+        return f"[{name}]"
+    return f".{name}" if name.isidentifier() else f".{name!r:.60}"
 
 
 class Open:
@@ -149,7 +155,7 @@ def read(record: type[Record], values: Mapping[str, Any], *path: str | int) -> R
     if not isinstance(values, Mapping):
         raise FieldError(path, f"is {values!r:.80}: give an object")
     if (unknown := sorted(set(values) - set(known))) and not issubclass(record, Open):
-        raise FieldError((*path, f"{unknown[0]:.60}"), f"is unknown: choose from {', '.join(known) or 'no fields'}")
+        raise FieldError((*path, unknown[0]), f"is unknown: choose from {', '.join(known) or 'no fields'}")
     for field in dataclasses.fields(record):  # type: ignore[arg-type]
         required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
         if required and field.name not in values:

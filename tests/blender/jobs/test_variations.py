@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 import pytest
+from blender_primdiffusion.formats.answers import VariationFiles
 from jobs_driven import drive, error_of, shown, until_running
 
 from blender_primdiffusion.jobs.pictures import icons
@@ -242,17 +243,16 @@ def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
     mine = tmp_path / "outside" / "mine"
     mine.parent.mkdir()
     mine.write_text("mine")
-    person = {"seed": 7}
-    for name in ("human", "person", "picture"):
-        person[name] = str(tmp_path / name)
-        Path(person[name]).symlink_to(mine)
+    person = VariationFiles(seed=7, **{name: tmp_path / name for name in ("human", "person", "picture")})
+    for link in (person.human, person.person, person.picture):
+        link.symlink_to(mine)
     own = Sheet()
     own.fill([person], "")
     (own.variations[0].folder / "more").symlink_to(mine.parent)
     folder = own.variations[0].folder.parent
     own.clear()
     assert not folder.exists()
-    Path(person["human"]).write_text("")
+    person.human.write_text("")
     with pytest.raises(OSError, match="person"):
         own.fill([person], "")
     assert mine.read_text() == "mine"
