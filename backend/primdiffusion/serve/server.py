@@ -197,7 +197,7 @@ class Server:
         """Import torch and what needs it; an import error becomes the error of every later request."""
         try:
             # after `hello` can be answered
-            from primdiffusion.commands import generate, render  # noqa: F401  the usual first requests
+            from primdiffusion.commands import frame_drawer, output  # noqa: F401  loaded before the first request
             from primdiffusion.commands.session import Session
 
             session = Session()
