@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from ..formats.schema import Range, Slider, annotations, descriptions, split
+from ..formats.schema import Range, Slider, descriptions, field_types, split
 
 SKIP = {"SKIP_SAVE"}
 PANELS = "Not given: the panel's"
@@ -18,7 +18,7 @@ _MAKERS = {int: bpy.props.IntProperty, float: bpy.props.FloatProperty}
 
 def declared(record: type, field: str, **changes: Any) -> Any:
     """A property for an integer or a number of a record, with `changes` to what is declared."""
-    kind, marks = split(annotations(record)[field])
+    kind, marks = split(field_types(record)[field])
     settings: dict[str, Any] = {
         "name": field.replace("_", " ").title(),
         "description": descriptions(record).get(field, "").rstrip("."),

@@ -8,7 +8,7 @@ from typing import Annotated, Any, TypeVar, get_origin
 
 import tyro
 
-from primdiffusion.formats.schema import Option, Range, annotations, descriptions, read, split
+from primdiffusion.formats.schema import Option, Range, descriptions, field_types, read, split
 
 Record = TypeVar("Record")
 
@@ -21,7 +21,7 @@ def parse(record: type[Record], arguments: Sequence[str], command: str) -> Recor
 
 def _with_options(record: type) -> type:
     """A subclass whose annotations tyro understands."""
-    about, kinds = descriptions(record), annotations(record)
+    about, kinds = descriptions(record), field_types(record)
     fields = {field.name: field for field in dataclasses.fields(record)}
     namespace: dict[str, Any] = {
         "__annotations__": {name: _with_option(kind, about.get(name, "")) for name, kind in kinds.items()},

@@ -52,8 +52,8 @@ def gaussians(request: GaussiansRequest, session: Session, report: ReportProgres
     if request.object is None or request.joints is None:
         primitives = place(human)
     else:
-        matrices = (torch.tensor(numbers, dtype=torch.float32) for numbers in (request.joints, request.object))
-        primitives = place_skinned(human, *matrices)
+        joints, matrix = (torch.tensor(numbers, dtype=torch.float32) for numbers in (request.joints, request.object))
+        primitives = place_skinned(human, joints, matrix)
     report("gaussians", 1, 2, None)
     splats = gaussians_of(primitives, request.limit)
     report("write", 2, 2, 0.0)

@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,7 +45,7 @@ class OutputFiles:
     side: str = "side.png"
     depth: str = "depth.png"
 
-    def in_folder(self, folder: Path) -> dict[str, Path]:
+    def in_folder(self, folder: Path) -> dict[str, Any]:
         """Return the paths by their names in answers."""
         names = {"human": self.blender, "person": self.human, "preview": self.front, "side": self.side}
         return {name: folder / file for name, file in {**names, "depth": self.depth}.items()}

@@ -183,7 +183,7 @@ class Done(Open):
 class Progress(Open):
     """Notification: a running request has come to a step of a stage."""
 
-    id: int | str | float
+    id: int | str | float | None
     """The request's."""
     stage: str
     step: Count

@@ -151,7 +151,7 @@ _NAMES = {
 
 def read(record: type[Record], values: Mapping[str, Any], *path: str | int) -> Record:
     """Make a record of values of JSON or of a command line. Raises FieldError, whose fields begin with `path`."""
-    known = annotations(record)
+    known = field_types(record)
     if not isinstance(values, Mapping):
         raise FieldError(path, f"is {values!r:.80}: give an object")
     if (unknown := sorted(set(values) - set(known))) and not issubclass(record, Open):
@@ -161,9 +161,10 @@ def read(record: type[Record], values: Mapping[str, Any], *path: str | int) -> R
         if required and field.name not in values:
             raise FieldError((*path, field.name), f"is missing: give {_expected(known[field.name])}")
     made = record(**{name: _value(known[name], values[name], (*path, name)) for name in known if name in values})
-    if hasattr(made, "check"):
+    check = getattr(made, "check", None)
+    if check is not None:
         try:
-            made.check()
+            check()
         except FieldError as error:
             raise FieldError((*path, *error.path), error.problem) from None
     return made
@@ -179,7 +180,7 @@ def written(value: Any) -> Any:
 
 
 @functools.cache
-def annotations(record: type) -> dict[str, Any]:
+def field_types(record: type) -> dict[str, Any]:
     """Types of a record's fields by name, with their limits."""
     hints = typing.get_type_hints(record, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(record)}
@@ -189,7 +190,7 @@ def annotations(record: type) -> dict[str, Any]:
 def descriptions(record: type) -> dict[str, str]:
     """The strings below the fields of a record, each as one line."""
     found: dict[str, str] = {}
-    for base in filter(dataclasses.is_dataclass, reversed(record.__mro__)):
+    for base in [base for base in reversed(record.__mro__) if dataclasses.is_dataclass(base)]:
         for field, below in itertools.pairwise(_classes(base.__module__)[base.__name__].body):
             if isinstance(field, ast.AnnAssign) and isinstance(below, ast.Expr):
                 found[ast.unparse(field.target)] = " ".join(ast.literal_eval(below.value).split())

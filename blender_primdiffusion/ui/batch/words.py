@@ -11,7 +11,7 @@ from typing import NoReturn, get_args
 from ...console import UsageError
 from ...formats.regular_files import real_path
 from ...formats.requests import GenerateRequest
-from ...formats.schema import FieldError, annotations, descriptions, read, split
+from ...formats.schema import FieldError, descriptions, field_types, read, split
 
 ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
 """Names of render engines on the command line -> Blender's."""
@@ -99,7 +99,7 @@ def _parser(name: str, description: str) -> argparse.ArgumentParser:
 
 
 def _add_declared(made: argparse.ArgumentParser, field: str, option: str) -> None:
-    kind, _ = split(annotations(GenerateRequest)[field])
+    kind, _ = split(field_types(GenerateRequest)[field])
     choices, default = get_args(kind) or None, getattr(GenerateRequest, field)
     about = f"{descriptions(GenerateRequest)[field].rstrip('.')} (default %(default)s)"
     made.add_argument(option, dest=field, type=type(default), choices=choices, default=default, help=about)

@@ -16,8 +16,8 @@ from primdiffusion.formats.schema import (
     Open,
     Range,
     Shape,
-    annotations,
     descriptions,
+    field_types,
     read,
     written,
 )
@@ -163,4 +163,4 @@ def test_defaults_of_requests_are_within_their_own_limits(method):
     required = [field.name for field in dataclasses.fields(record) if field.default is dataclasses.MISSING]
     made = read(record, {name: given[name] for name in required if name in given})
     assert read(record, json.loads(json.dumps(written(made)))) == made
-    assert set(annotations(record)) == set(vars(made))
+    assert set(field_types(record)) == set(vars(made))

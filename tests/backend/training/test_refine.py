@@ -231,7 +231,7 @@ def test_a_cancelled_command_leaves_nothing(line, tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("primdiffusion.training.refine.refine", interrupted)
+    monkeypatch.setattr("primdiffusion.commands.reconstruct.refine", interrupted)
     with pytest.raises(SystemExit) as end:
         cli.main(line)
     assert end.value.code == 130

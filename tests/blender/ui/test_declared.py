@@ -2,7 +2,7 @@
 
 import bpy
 import pytest
-from blender_primdiffusion.formats.schema import Range, Slider, annotations, descriptions, split
+from blender_primdiffusion.formats.schema import Range, Slider, descriptions, field_types, split
 
 from blender_primdiffusion.formats import requests
 
@@ -21,7 +21,7 @@ SETTINGS = {
 def test_a_setting_has_the_limits_of_its_request(addon, group, field):
     record = SETTINGS[group][0]
     shown = getattr(addon.scene, group).bl_rna.properties[field]
-    _, marks = split(annotations(record)[field])
+    _, marks = split(field_types(record)[field])
     limits = next(mark for mark in marks if isinstance(mark, Range))
     assert (shown.hard_min, shown.hard_max) == (limits.least, min(limits.most, LARGEST))
     for slider in (mark for mark in marks if isinstance(mark, Slider)):
@@ -38,6 +38,6 @@ def test_an_operator_has_the_limits_of_its_request(addon):
         ("transfer_texture", requests.TransferRequest, "harmonise"),
     ):
         shown = getattr(bpy.ops.primdiffusion, name).get_rna_type().properties[field]
-        limits = next(mark for mark in split(annotations(record)[field])[1] if isinstance(mark, Range))
+        limits = next(mark for mark in split(field_types(record)[field])[1] if isinstance(mark, Range))
         assert (shown.hard_min, shown.hard_max) == (limits.least, limits.most)
         assert shown.is_skip_save
