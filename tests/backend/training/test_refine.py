@@ -246,7 +246,7 @@ def test_a_cancelled_command_leaves_nothing(line, tmp_path, monkeypatch):
         (("--start", "missing.human.safetensors"), "no human file missing"),
         (("--start", "missing.glb"), "missing.glb"),
         (("--hold-out-cameras", "4"), "cannot be held out"),
-        (("--size", "0"), "0 pixels"),
+        (("--size", "0"), "size is 0"),
         (("--steps", "0"), "steps"),
         (("--minutes", "-1"), "seconds"),
     ],
