@@ -40,7 +40,7 @@ class FieldError(ValueError):
     def __init__(self, path: Names, problem: str):
         self.path, self.problem = path, problem
         self.field = "".join(map(_part, path)).removeprefix(".")
-        super().__init__(f"{self.field} {problem}")
+        super().__init__(f"{self.field or 'it'} {problem}")
 
 
 def _part(name: str | int) -> str:
