@@ -28,7 +28,7 @@ from primdiffusion.editing.regions import DISJOINT, region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.requests import PARTS, STEPS
+from primdiffusion.formats.requests import PARTS, Sampling
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.machine import best_device
@@ -186,7 +186,7 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="3 steps per edit")
     parser.add_argument("--out", type=Path, required=True, help="PNG to write")
     arguments = parser.parse_args()
-    studio = Studio(load_checkpoint(arguments.checkpoint, best_device()), 3 if arguments.quick else STEPS)
+    studio = Studio(load_checkpoint(arguments.checkpoint, best_device()), 3 if arguments.quick else Sampling.steps)
     rows = []
     for heading, shown in (
         (f"regions: {len(DISJOINT)} parts without common primitives, {len(PARTS)} names", studio.parts()),

@@ -21,11 +21,10 @@ import psutil
 import torch
 from mathutils import Matrix
 from primdiffusion.body.model import BodyPose
-from primdiffusion.commands.frame import PosedPerson
-from primdiffusion.commands.merge import MergeRequest
+from primdiffusion.commands import merge as commands
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.formats.requests import DENSITY_GAIN
+from primdiffusion.formats.requests import DENSITY_GAIN, MergeRequest, PosedPerson
 from primdiffusion.human import body_of, framing, generate, place_skinned, pose_body
 from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.primitives.anchors import attach
@@ -173,7 +172,7 @@ def main() -> None:
     posed = PosedPerson(folder / "person.human.safetensors", raised.tolist(), joints[:, :3].tolist())
     session = Session()
     began = time.perf_counter()
-    MergeRequest(people=[posed], out=folder / "grid.npz").run(session, lambda *_, **__: None)
+    commands.merge(MergeRequest(people=[posed], out=folder / "grid.npz"), session, lambda *_, **__: None)
     figures["seconds_merge"] = time.perf_counter() - began
     grid = merging.read_grid(folder / "grid.npz")
     began = time.perf_counter()

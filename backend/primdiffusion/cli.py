@@ -14,9 +14,10 @@ import os
 import sys
 import traceback
 from collections.abc import Sequence
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from primdiffusion import __version__
+from primdiffusion.commands.options import OPTIONS
 from primdiffusion.failures import describe
 from primdiffusion.machine import DEVICES, choose_device, share_processors
 
@@ -27,10 +28,10 @@ DEFECT = 70
 INTERRUPTED = 130
 COMMANDS = {
     "generate": ("commands.generate:run", "Generate humans: for Blender, as files, and previews"),
-    "vary": ("commands.edit:run_vary", "Generate a variant of a human"),
-    "interpolate": ("commands.edit:run_interpolate", "Interpolate between two humans"),
-    "inpaint": ("commands.edit:run_inpaint", "Resample a region of a human: other clothes or hair"),
-    "transfer": ("commands.edit:run_transfer", "Copy the appearance of a region from another human"),
+    "vary": ("commands.edit:run", "Generate a variant of a human"),
+    "interpolate": ("commands.edit:run", "Interpolate between two humans"),
+    "inpaint": ("commands.edit:run", "Resample a region of a human: other clothes or hair"),
+    "transfer": ("commands.edit:run", "Copy the appearance of a region from another human"),
     "reconstruct": ("commands.reconstruct:run", "Reconstruct a human from captures: images from several sides"),
     "refine": ("commands.reconstruct:run_refine", "Optimise a captured human to match the images"),
     "render": ("commands.render:run", "Render a human in a pose"),
@@ -51,7 +52,9 @@ COMMANDS = {
         "Convert the authors' primdiffusion.pt, with your SMPL file, to a checkpoint and an encoder",
     ),
 }
-"""The function of each command, imported when it is used, because several take a second to import; and its summary."""
+"""The function of each command, imported when it is used, because several take a second to import; and its summary.
+
+It gets the record of `OPTIONS`, or the arguments of a command that is not there."""
 
 
 def help_text() -> str:
@@ -79,8 +82,13 @@ def run(arguments: Sequence[str]) -> None:
     if name not in COMMANDS:
         print(f"primdiffusion: there is no command {name!r}: choose from {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(USAGE)
+    given: Any = arguments[1:]
+    if name in OPTIONS:
+        from primdiffusion.commands.command_line import parse  # `primdiffusion --help` does not need tyro
+
+        given = parse(OPTIONS[name], given, name)
     module, _, function = COMMANDS[name][0].partition(":")
-    getattr(importlib.import_module(f"primdiffusion.{module}"), function)(arguments[1:])
+    getattr(importlib.import_module(f"primdiffusion.{module}"), function)(given)
 
 
 def _with_device(arguments: Sequence[str]) -> list[str]:

@@ -76,11 +76,11 @@ class Human(TensorRecord):
 def generate(
     model: DiffusionModel,
     seed: int,
-    steps: int = requests.STEPS,
-    sampler: str = requests.SAMPLERS[0],
+    steps: int = requests.Sampling.steps,
+    sampler: str = requests.GenerateRequest.sampler,
     on_step: Callable[[SamplerStep], None] | None = None,
     attributes: Attributes = MappingProxyType({}),
-    guidance: float = requests.GUIDANCE,
+    guidance: float = requests.Conditioning.guidance,
 ) -> Human:
     """A new human, on the CPU, determined by model, seed, steps, sampler, attributes and guidance.
 
@@ -98,11 +98,11 @@ def generate(
 def generate_batch(
     model: DiffusionModel,
     seeds: Sequence[int],
-    steps: int = requests.STEPS,
-    sampler: str = requests.SAMPLERS[0],
+    steps: int = requests.Sampling.steps,
+    sampler: str = requests.GenerateRequest.sampler,
     on_step: Callable[[SamplerStep], None] | None = None,
     attributes: Attributes = MappingProxyType({}),
-    guidance: float = requests.GUIDANCE,
+    guidance: float = requests.Conditioning.guidance,
 ) -> list[Human]:
     """One human per seed, sampled as a batch; equal to `generate` up to rounding. Raises the same errors."""
     condition = model.condition(attributes)

@@ -17,9 +17,11 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from ..formats.answers import ANSWERS, NOTIFICATIONS, ErrorData, Message
+from ..formats.json_files import parse_message
+from ..formats.schema import FieldError, read
 from .child_streams import LOG_LINES, LONGEST_LINE, Input, Output
 from .child_variables import COMPUTING, passed_on
-from .messages import MessageError, fault_of, parsed
 
 PROGRAM = "primdiffusion"
 """The backend's package, and its command line."""
@@ -37,15 +39,16 @@ LISTEN_S = 0.01
 class Response:
     """A request went well."""
 
-    id: int | None
+    id: int
     result: Any
+    """A record of `formats.answers`; an object of JSON for a method that is not there."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ErrorResponse:
     """A request went wrong; `kind` and `remedy` as the backend states them ("" where it does not)."""
 
-    id: int | None
+    id: int
     code: int
     message: str
     kind: str
@@ -57,7 +60,8 @@ class Notification:
     """News that answers no request: progress, ready."""
 
     method: str
-    params: dict[str, Any]
+    params: Any
+    """A record of `formats.answers`; an object of JSON for a method that is not there."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,6 +81,10 @@ class Silent:
 
 
 Event = Response | ErrorResponse | Notification | Died | Silent
+
+
+class MalformedMessage(ValueError):
+    """A message of the child that is not what the protocol promises; its text names the fault."""
 
 
 def is_program(path: Path) -> bool:
@@ -215,13 +223,13 @@ class BackendClient:
             self._input.flush()
         exit_code = self._process.poll()  # before reading: then all that it wrote is there
         try:
-            for message in self._arrived():
+            for event in self._arrived():
                 self._silence, self._reported_silence = 0.0, False
-                if message.get("id") in self._abandoned and "method" not in message:
-                    self._abandoned.discard(message["id"])
-                elif message.get("method") != "heartbeat":
-                    events.append(self._event(message))
-        except MessageError as fault:
+                if isinstance(event, Response | ErrorResponse) and event.id in self._abandoned:
+                    self._abandoned.discard(event.id)
+                elif not (isinstance(event, Notification) and event.method == "heartbeat"):
+                    events.append(event)
+        except MalformedMessage as fault:
             return [*events, *self._give_up(str(fault))]
         if exit_code is not None and not self._lines and self._output is not None and self._output.at_end:
             events.extend(self._end(exit_code))
@@ -278,56 +286,60 @@ class BackendClient:
 
     # what has arrived
 
-    def _arrived(self) -> Iterator[dict[str, Any]]:
-        """Messages, for POLL_S at most. Raises MessageError for a malformed one."""
+    def _arrived(self) -> Iterator[Event]:
+        """Messages, for POLL_S at most. Raises MalformedMessage."""
         end = time.monotonic() + POLL_S
         while self._output is not None:
             if not self._lines:
                 self._lines.extend(self._output.lines())
                 if self._output.lost_message:
-                    raise MessageError(f"longer than {LONGEST_LINE >> 20} MB")
+                    raise MalformedMessage(f"longer than {LONGEST_LINE >> 20} MB")
                 if not self._lines:
                     return
             line = self._lines.popleft()
-            message = parsed(line)
-            if message is not None:
-                yield self._checked(message)
+            if line.lstrip().startswith(b"{"):
+                yield self._event(line)
             elif line.strip():
                 self._stray.append(f"[not a message] {line[:300].decode('utf-8', 'replace').rstrip()}")
             if time.monotonic() > end:
                 return
 
-    def _checked(self, message: dict[str, Any]) -> dict[str, Any]:
-        if fault := fault_of(message, self._asked):
-            raise MessageError(fault)
-        if "method" not in message:
-            del self._asked[message["id"]]
-        return message
+    def _event(self, line: bytes) -> Event:
+        """Read a message. Raises MalformedMessage."""
+        try:
+            return self._read(read(Message, parse_message(line)))
+        except FieldError as fault:
+            raise MalformedMessage(fault.field) from fault
+        except ValueError as error:
+            raise MalformedMessage("not JSON") from error
 
-    def _event(self, message: dict[str, Any]) -> Event:
-        method, params, id = message.get("method"), message.get("params") or {}, message.get("id")
-        if isinstance(method, str):
-            if method == "ready":
-                self.info = {**self.info, **params}
-            return Notification(method, params)
-        if "error" in message:
-            error = message["error"]
-            data = error.get("data") or {}
-            return ErrorResponse(
-                id, error.get("code", 0), error.get("message", ""), data.get("kind", ""), data.get("remedy", "")
-            )
-        result = message.get("result")
-        if id == self._hello and isinstance(result, dict):
-            self.info = {**result, **{name: value for name, value in self.info.items() if value is not None}}
-        return Response(id, result)
+    def _read(self, message: Message) -> Event:
+        """Raises FieldError."""
+        if message.method is not None:
+            params = _record(NOTIFICATIONS.get(message.method), message.params or {})
+            if message.method == "ready":
+                self.info |= _given(params)
+            return Notification(message.method, params)
+        method = self._asked.pop(message.id or 0, None)
+        if message.id is None or method is None:
+            raise FieldError(("id",), "is of no open request")  # it was answered before, or our line was not understood
+        if message.error is not None:
+            data = message.error.data or ErrorData()
+            return ErrorResponse(message.id, message.error.code, message.error.message, data.kind, data.remedy)
+        if message.result is None:
+            raise FieldError(("result",), "is missing")
+        result = _record(ANSWERS.get(method), message.result)
+        if message.id == self._hello:
+            self.info = _given(result) | self.info
+        return Response(message.id, result)
 
     def _end(self, exit_code: int) -> Iterator[Event]:
         """The end of the child, once, after its last messages."""
         self._ended = True
-        with contextlib.suppress(MessageError):  # cut off by its death
-            last = parsed(self._output.rest()) if self._output is not None else None
-            if last is not None:
-                yield self._event(self._checked(last))
+        last = self._output.rest() if self._output is not None else b""
+        if last.lstrip().startswith(b"{"):
+            with contextlib.suppress(MalformedMessage):  # cut off by its death
+                yield self._event(last)
         self._close_streams()
         if not self._expected_to_end:
             yield Died(exit_code, death_sentence(exit_code), self.stderr)
@@ -352,6 +364,14 @@ class BackendClient:
     def _send(self, message: dict[str, Any]) -> None:
         if self._input is not None:
             self._input.send(json.dumps(message).encode("utf-8") + b"\n")
+
+
+def _record(record: type | None, values: dict[str, Any]) -> Any:
+    return values if record is None else read(record, values)
+
+
+def _given(record: Any) -> dict[str, Any]:
+    return {name: value for name, value in vars(record).items() if value is not None}
 
 
 def death_sentence(exit_code: int) -> str:

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Generator, Mapping
 from typing import Any, Literal
 
+from ..formats.answers import DrawAnswer
 from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
 from .requests import CANCELLED_CODE, Backend, RequestError, connecting_error
 
@@ -35,7 +36,7 @@ class Drawing:
         """Finished rows, from the top."""
         self.eta_s: float | None = None
         """Seconds left, None while unknown."""
-        self.result: dict[str, Any] = {}
+        self.result = DrawAnswer()
         """Once done: the seconds it took, by stage."""
         self.error: RequestError | None = None
         self.cancel_asked_at: float | None = None
@@ -196,8 +197,8 @@ class DrawingChild:
 
 
 def _take(event: Event, client: BackendClient, request: int, drawing: Drawing) -> None:
-    if isinstance(event, Notification) and event.method == "progress" and event.params.get("id") == request:
-        drawing.become("drawing", rows=int(event.params["step"]), eta_s=event.params.get("eta_s"))
+    if isinstance(event, Notification) and event.method == "progress" and event.params.id == request:
+        drawing.become("drawing", rows=event.params.step, eta_s=event.params.eta_s)
     elif isinstance(event, Response) and event.id == request:
         drawing.become("done", result=event.result, eta_s=0.0)
     elif isinstance(event, ErrorResponse) and event.id == request:

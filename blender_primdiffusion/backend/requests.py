@@ -9,6 +9,7 @@ from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from ..formats.answers import Progress
 from ..formats.whole_files import remove_of_process
 from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
 
@@ -222,8 +223,8 @@ class ChildRequest:
         """A PNG of the human so far."""
         self.pictures: dict[int, Path] = {}
         """PNGs by index, of a method that generates several humans."""
-        self.result: dict[str, Any] | None = None
-        """The child's."""
+        self.result: Any = None
+        """The child's answer: a record of `formats.answers`."""
         self.error: RequestError | None = None
         self._connecting = backend.connecting()
         if not backend.admit(self):
@@ -299,7 +300,7 @@ class ChildRequest:
     # following
 
     def _take(self, event: Event) -> None:
-        if isinstance(event, Notification) and event.method == "progress" and event.params.get("id") == self._id:
+        if isinstance(event, Notification) and event.method == "progress" and event.params.id == self._id:
             self._take_progress(event.params)
         elif isinstance(event, Response) and event.id == self._id:
             self.result = event.result
@@ -323,21 +324,20 @@ class ChildRequest:
             message = f"the backend hung: it sent nothing for {event.seconds:.0f} s and was ended"
             self._fail(RequestError(message, "Try again", "hung", self._log()))
 
-    def _take_progress(self, params: dict[str, Any]) -> None:
+    def _take_progress(self, progress: Progress) -> None:
         if self._cancel_asked_at is not None:
             return
-        stage = params.get("stage", "")
         self.state = "running"
-        self.message = STAGES.get(stage, stage.capitalize())
-        self.eta_s = params.get("eta_s")
-        if params.get("picture") and "index" in params:
-            self.pictures[params["index"]] = Path(params["picture"])
-        elif params.get("picture"):
-            self.picture = Path(params["picture"])
+        self.message = STAGES.get(progress.stage, progress.stage.capitalize())
+        self.eta_s = progress.eta_s
+        if progress.picture is not None and progress.index is not None:
+            self.pictures[progress.index] = progress.picture
+        elif progress.picture is not None:
+            self.picture = progress.picture
         samples = "steps" in self._params
-        if not samples or stage == "sample":
-            self.step, self.total = params["step"], params["total"]
-        if samples and stage == "sample":
+        if not samples or progress.stage == "sample":
+            self.step, self.total = progress.step, progress.total
+        if samples and progress.stage == "sample":
             self.message = f"{self.message}: step {self.step} of {self.total}"
 
     def _lose_patience(self) -> None:
@@ -382,8 +382,8 @@ class ChildRequest:
 class FinishedRequest(ChildRequest):
     """A request whose result Blender has computed itself; no child is started."""
 
-    def __init__(self, backend: Backend, method: str, result: Mapping[str, Any]):
-        """`result` as the child's method returns it."""
+    def __init__(self, backend: Backend, method: str, result: Any):
+        """`result`: the record that the child's method answers with."""
         super().__init__(backend, method, {})
-        self.result, self.step = dict(result), self.total
+        self.result, self.step = result, self.total
         self._end("done", "Done")

@@ -148,7 +148,7 @@ class Refinement:
 
     def _pace(self, drawing: Drawing) -> None:
         """Choose how coarse pictures are while the scene moves, from the time of the last one."""
-        seconds = drawing.result.get("seconds")
+        seconds = drawing.result.seconds
         if seconds is None or self.shown is None or self.shown.coarseness != self._moving:
             return
         index = COARSENESS.index(self._moving)

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.answers import RenderAnswer
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.regular_files import check_regular
 from ..formats.whole_files import written_whole
@@ -96,7 +97,7 @@ class HumanAssetJob(Job):
         pose[JOINT_NAMES.index("right_shoulder"), 2] = _ARMS_DOWN
         return _drawing(self.target.found(), pose, folder)
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: RenderAnswer, folder: Path) -> str:
         return mark_human(self.target.found(), folder / _PICTURE)
 
 
@@ -129,7 +130,7 @@ class PoseAssetJob(Job):
     def params(self, folder: Path) -> dict[str, Any]:
         return _drawing(self.target.found(), to_axis_angle(np.array(self.rotations)), folder)
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: RenderAnswer, folder: Path) -> str:
         return self.marked(folder / _PICTURE)
 
     def marked(self, picture: Path) -> str:

@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 
 from ..backend.requests import sentence
+from ..formats.answers import HumanAnswer
 from ..scene.attachment import in_viewport
 from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_warning_in
@@ -28,11 +29,10 @@ _STEP_PICTURE_PX = 256
 """Of the picture after each step, for the panel."""
 
 
-def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, result: dict[str, Any]) -> Replaced:
+def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, result: HumanAnswer) -> Replaced:
     """Show the human of the child's `result` in place of `person`. Raises as `replace_person` does."""
-    human, file = Path(result["human"]), Path(result["person"])
-    written = building.take(human)
-    done = replace_person(person, written or write_now(human, edit_destination(person)), file)
+    written = building.take(result.human) or write_now(result.human, edit_destination(person))
+    done = replace_person(person, written, result.person)
     if in_viewport(person):
         context.view_layer.update()  # evaluated data holds the old grids
         free_unused_grids()
@@ -47,16 +47,15 @@ class EditJob(Job):
     """Past participle for the message: Varied."""
 
     target: HumanTarget
-    steps: int
     asked: Mapping[str, Any]
-    """The method's other parameters. A region {"painted": [V numbers]} holds weights, and travels as a file."""
+    """Fields of the request. A region {"painted": [V numbers]} holds weights, and travels as a file."""
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
 
     @classmethod
-    def of(cls, person: bpy.types.Collection, steps: int, asked: Mapping[str, Any]) -> EditJob:
+    def of(cls, person: bpy.types.Collection, asked: Mapping[str, Any]) -> EditJob:
         """Raises ValueError for a human that cannot be edited, FileNotFoundError for one whose file is missing."""
         person_file(person)
-        return cls(HumanTarget.of(person), steps, asked)
+        return cls(HumanTarget.of(person), asked)
 
     @property
     def label(self) -> str:
@@ -65,24 +64,22 @@ class EditJob(Job):
     def params(self, folder: Path) -> dict[str, Any]:
         asked = dict(self.asked)
         if isinstance(asked.get("region"), Mapping):
-            np.savez(folder / "region.npz", weights=np.asarray(asked["region"]["painted"], np.float32))
-            asked["region"] = {"weights": str(folder / "region.npz")}
+            painted = asked.pop("region")["painted"]
+            np.savez(folder / "region.npz", weights=np.asarray(painted, np.float32))
+            asked["weights"] = str(folder / "region.npz")
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
-        params = {**asked, "person": self.target.file_now(), "steps": self.steps, "size": PREVIEW_PX}
-        params["picture_px"] = _STEP_PICTURE_PX
-        return {**params, **checkpoint, "out_dir": str(folder)}
+        previews = {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
+        return {**asked, "person": self.target.file_now(), **previews, **checkpoint, "out_dir": str(folder)}
 
     def place(self) -> Destination:
         return edit_destination(self.target.found())
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         person = self.target.found()
         done = show_in_place(context, person, result)
         shape = ", the body's shape too" if done.reshaped else ""
-        message = (
-            f"{self.made} in {result['seconds']:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
-        )
-        warnings = (*result.get("warnings", ()), done.warning, overlap_warning_in(context.scene, person))
+        message = f"{self.made} in {result.seconds:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
+        warnings = (done.warning, overlap_warning_in(context.scene, person))
         return " ".join([f"{message}{shape}.", *(sentence(text) for text in warnings if text)])
 
 
@@ -132,18 +129,18 @@ class RestoreJob(Job):
     def params(self, folder: Path) -> dict[str, Any]:
         return {"person": self.file, "out_dir": str(folder), "size": PREVIEW_PX}
 
-    def result_here(self, folder: Path) -> dict[str, Any] | None:
+    def result_here(self, folder: Path) -> HumanAnswer | None:
         return opened(Path(self.file), folder)
 
     def place(self) -> Destination:
         return restore_destination(self.target.found())
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        person, human, file = self.target.found(), Path(result["human"]), Path(self.file)
-        written = building.take(human) or write_now(human, restore_destination(person))
-        count = restore_volumes(person, written, file)
+    def finish(self, _context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
+        person = self.target.found()
+        written = building.take(result.human) or write_now(result.human, restore_destination(person))
+        count = restore_volumes(person, written, Path(self.file))
         look()
-        return f"{count} volumes of {person.name} restored from their file in {result['seconds']:.1f} s"
+        return f"{count} volumes of {person.name} restored from their file in {result.seconds:.1f} s"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -171,10 +168,10 @@ class RegenerateJob(Job):
     def place(self) -> Destination:
         return edit_destination(self.target.found())
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         """Raises ValueError where another checkpoint has generated another human."""
-        person, human = self.target.found(), Path(result["human"])
-        made, before = read_human(human).meta, provenance_of(person)
+        person = self.target.found()
+        made, before = read_human(result.human).meta, provenance_of(person)
         for name in ("checkpoint_sha256", "checkpoint"):
             if name in before and made.get(name) != before[name]:
                 other = as_shown(before.get("checkpoint"))
@@ -185,7 +182,7 @@ class RegenerateJob(Job):
                 )
         show_in_place(context, person, result)
         look()
-        return f"{person.name} generated again from seed {self.made['seed']} in {result['seconds']:.1f} s"
+        return f"{person.name} generated again from seed {self.made['seed']} in {result.seconds:.1f} s"
 
 
 def made_from_seed(person: bpy.types.Collection) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
+from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
 from ..formats.removing import remove_file
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import rest_joints
@@ -81,10 +82,10 @@ class ProxyJob(Job):
             "triangles": self.triangles,
         }
 
-    def built(self, person: bpy.types.Collection, result: dict[str, Any]) -> bpy.types.Object:
+    def built(self, person: bpy.types.Collection, result: ProxyAnswer) -> bpy.types.Object:
         """The proxy as an object, in no collection, with the current shape of the body."""
-        made = np.array(result["betas"], np.float64)
-        proxy = build_proxy(person, read_proxy(Path(result["proxy"])), Path(result["texture"]), made)
+        made = np.array(result.betas, np.float64)
+        proxy = build_proxy(person, read_proxy(result.proxy), result.texture, made)
         if stored_body_name(person) is not None:
             follow_shape(person, proxy, betas_of(person))
         return proxy
@@ -104,7 +105,7 @@ class ExportMeshJob(ProxyJob):
     def label(self) -> str:
         return f"Export {self.target.name} to {self.path.name}"
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: ProxyAnswer, _folder: Path) -> str:
         person = self.target.found()
         armature = armature_of(person)
         check_ready(armature)
@@ -115,7 +116,7 @@ class ExportMeshJob(ProxyJob):
             remove_proxy(proxy)
         size = self.path.stat().st_size / 1e6
         frames = f", {self.frames.last - self.frames.first + 1} frames" if self.frames.animated else ""
-        return f"Exported {person.name} to {self.path.name}: {result['triangles']} triangles{frames}, {size:.1f} MB"
+        return f"Exported {person.name} to {self.path.name}: {result.triangles} triangles{frames}, {size:.1f} MB"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -129,7 +130,7 @@ class AddProxyJob(ProxyJob):
     def label(self) -> str:
         return f"Mesh Proxy of {self.target.name}"
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, _context: bpy.types.Context, result: ProxyAnswer, _folder: Path) -> str:
         person = self.target.found()
         proxy = self.built(person, result)
         earlier = proxy_of(person)
@@ -138,7 +139,7 @@ class AddProxyJob(ProxyJob):
         person.objects.link(proxy)
         show(person, "VIEWPORT")
         show_textures_in_solid()
-        return f"Mesh proxy of {result['triangles']} triangles for {person.name} in {result['seconds']:.1f} s"
+        return f"Mesh proxy of {result.triangles} triangles for {person.name} in {result.seconds:.1f} s"
 
 
 def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
@@ -234,10 +235,10 @@ class ExportGaussiansJob(Job):
         pose = {name: self.person[name] for name in ("object", "joints", "betas")}
         return {"person": self.target.file_now(), **pose, "limit": self.limit, "out": str(folder / "gaussians.ply")}
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        put(Path(result["out"]), self.path)
+    def finish(self, _context: bpy.types.Context, result: GaussiansAnswer, _folder: Path) -> str:
+        put(result.out, self.path)
         size = self.path.stat().st_size / 1e6
-        return f"Exported {self.target.name} to {self.path.name}: {result['gaussians']} Gaussians, {size:.1f} MB"
+        return f"Exported {self.target.name} to {self.path.name}: {result.gaussians} Gaussians, {size:.1f} MB"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -265,12 +266,12 @@ class ExportVdbSequenceJob(Job):
         people = [{**person, "human": file} for person in self.people]
         return {"people": people, "voxel": self.voxel, "out_dir": str(folder)}
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+    def finish(self, _context: bpy.types.Context, result: MergeFramesAnswer, folder: Path) -> str:
         written = []
-        for index, grid in enumerate(result["files"]):
+        for index, grid in enumerate(result.files):
             name = f"{self.stem}_{self.first + index:04d}.vdb"
-            write_grid(_for_other_programs(read_grid(Path(grid))), folder / name)
-            remove_file(Path(grid), Path(grid).parent)
+            write_grid(_for_other_programs(read_grid(grid)), folder / name)
+            remove_file(grid, grid.parent)
             written.append(folder / name)
         size = sum(path.stat().st_size for path in written) / 1e6
         for path in written:
@@ -301,10 +302,10 @@ class ImportHumanJob(Job):
     def params(self, folder: Path) -> dict[str, Any]:
         return {"person": self.path, "out_dir": str(folder), "size": PREVIEW_PX}
 
-    def result_here(self, folder: Path) -> dict[str, Any] | None:
+    def result_here(self, folder: Path) -> HumanAnswer | None:
         return opened(Path(self.path), folder)
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         motion = motion_in(read_tensors(Path(self.path)), Path(self.path).name)
         person, notice = build_person(context, result, "Imported", name_of(self.path))
         armature = armature_of(person)

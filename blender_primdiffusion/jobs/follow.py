@@ -15,6 +15,7 @@ import bpy
 
 from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import in_words, sentence
+from ..formats.answers import HumanAnswer
 from ..places import backend_is_named, missing_packages
 from .late_volumes import keep_writing
 from .memory import release_when_idle
@@ -58,17 +59,17 @@ class Building:
         before, self._shown = self._shown, int(_SHOWN_STEPS * self.fraction)
         return self._shown != before
 
-    def begin(self, entry: Entry, result: dict[str, Any]) -> None:
-        """Start on the human of the child's `result`, if it has one; once for each entry."""
+    def begin(self, entry: Entry, result: Any) -> None:
+        """Start on the human of the child's answer, if it has one; once for each entry."""
         if entry is self._entry:
             return
         self.close()
         self._entry = entry
-        place = _place(entry.job) if "human" in result else None
+        place = _place(entry.job) if isinstance(result, HumanAnswer) else None
         if place is not None:
             from ..scene.human_npz import VolumeWriter  # needs numpy
 
-            self._human = Path(result["human"])
+            self._human = result.human
             self._writing = VolumeWriter(self._human, place)
 
     def advance(self, *, may_work: bool) -> bool:
@@ -267,7 +268,7 @@ def _wait_for(entry: Entry) -> JobOutcome:
 
 def _advance() -> bool:
     """Build some of the result, and let it enter the scene when built; True when something visible changed."""
-    building.begin(queue.current, queue.request.result or {})
+    building.begin(queue.current, queue.request.result)
     blocked = bool(in_the_way())
     if building.advance(may_work=not blocked):
         return building.moved()

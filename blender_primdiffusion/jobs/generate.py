@@ -11,6 +11,7 @@ from typing import Any
 import bpy
 
 from ..backend.requests import sentence
+from ..formats.answers import HumanAnswer, ReconstructAnswer
 from ..scene.build import build_written, next_folder
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import select_human
@@ -26,26 +27,24 @@ FIRST_HUMAN_SHARE = 0.25
 
 
 def build_person(
-    context: bpy.types.Context, result: dict[str, Any], made: str, name: str = "Human"
+    context: bpy.types.Context, result: HumanAnswer, made: str, name: str = "Human"
 ) -> tuple[bpy.types.Collection, str]:
     """Build the human of the child's `result`; returns the collection and the message ("Generated in 1.2 s.").
 
     Raises as `build_human` does, and then leaves nothing.
     """
-    keep = [Path(result["person"])] if "person" in result else []  # which the engine draws
-    human = Path(result["human"])
-    written = building.take(human) or write_now(human, Destination(next_folder(name)))
-    collection = build_written(context, written, name, keep)
+    written = building.take(result.human) or write_now(result.human, Destination(next_folder(name)))
+    collection = build_written(context, written, name, [result.person])  # which the engine draws
     stand_at_cursor(context, collection, eye())
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, collection)
         others = [human for human in humans(context.scene) if human != collection]
         bones = [obj for human in others for obj in human.objects if obj.type == "ARMATURE"]
         bring_into_view(armature_of(collection), 0.0 if others else FIRST_HUMAN_SHARE, bones)
-    warnings = list(result.get("warnings", ()))
+    warnings = list(result.warnings) if isinstance(result, ReconstructAnswer) else []
     if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)
-    notice = f"{made} in {result['seconds'] + time.monotonic() - written.began:.1f} s"
+    notice = f"{made} in {result.seconds + time.monotonic() - written.began:.1f} s"
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])
 
 
@@ -62,10 +61,8 @@ class GenerateJob(Job):
     new_person = "Human"
 
     seed: int
-    steps: int
-    sampler: str = "ddim"
-    asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Attributes and guidance, where given."""
+    sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Other fields of `GenerateRequest`: steps, sampler, attributes, guidance."""
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
     next_seed: int | None = None
     """What the panel's seed becomes with this human; None where it was not used, or is locked."""
@@ -75,12 +72,11 @@ class GenerateJob(Job):
         return f"Human, seed {self.seed}"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        params = {"seed": self.seed, "steps": self.steps, "sampler": self.sampler, **self.asked}
-        params |= {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
-        return {**params, **checkpoint, "out_dir": str(folder)}
+        previews = {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
+        return {"seed": self.seed, **self.sampling, **previews, **checkpoint, "out_dir": str(folder)}
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         notice = build_person(context, result, "Generated")[1]
         if self.next_seed is not None:
             context.scene.primdiffusion.seed = self.next_seed
@@ -112,5 +108,5 @@ class ReconstructJob(Job):
         optional = {"subject": self.subject, "checkpoint": self.checkpoint}
         return {**params, **{k: v for k, v in optional.items() if v}, "out_dir": str(folder)}
 
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
+    def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         return build_person(context, result, "Reconstructed")[1]

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
+from ..formats.answers import MergeAnswer, MergeFramesAnswer
 from ..formats.joints import JOINT_NAMES
 from ..formats.removing import remove_file
 from ..scene.attachment import set_attachment
@@ -63,14 +64,14 @@ class MergeJob(Job):
         people = [{**self.moment.params, "human": self.target.file_now()}]
         return {"people": people, "voxel": self.voxel, "out": str(folder / "grid.npz")}
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+    def finish(self, _context: bpy.types.Context, result: MergeAnswer, folder: Path) -> str:
         person = self.target.found()
-        digest = write_grid(read_grid(Path(result["out"])), folder / "grid.vdb")
+        digest = write_grid(read_grid(result.out), folder / "grid.vdb")
         files = publish([folder / "grid.vdb"], [digest], merged_folder(person))
         show_merged(person, files, MergedState((self.moment.digest,), self.voxel))
         set_attachment(person, "MERGED")
         size = files[0].stat().st_size / 1e6
-        return f"Merged {person.name} at {self.voxel * 1e3:.3g} mm in {result['seconds']:.1f} s, {size:.1f} MB"
+        return f"Merged {person.name} at {self.voxel * 1e3:.3g} mm in {result.seconds:.1f} s, {size:.1f} MB"
 
 
 @dataclasses.dataclass
@@ -113,7 +114,7 @@ class MergeFramesJob(Job):
             self._error = error
         return _grid(folder, len(self._digests)).is_file()
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
+    def finish(self, _context: bpy.types.Context, result: MergeFramesAnswer, folder: Path) -> str:
         person = self.target.found()
         while self.advance(folder):
             pass
@@ -124,7 +125,7 @@ class MergeFramesJob(Job):
         show_merged(person, files, MergedState(tuple(m.digest for m in self.moments), self.voxel, self.start))
         set_attachment(person, "MERGED")
         size = sum(path.stat().st_size for path in files) / 1e6
-        return f"Merged {len(files)} frames of {person.name} in {result['seconds']:.1f} s, {size:.0f} MB"
+        return f"Merged {len(files)} frames of {person.name} in {result.seconds:.1f} s, {size:.0f} MB"
 
 
 def _grid(folder: Path, index: int) -> Path:

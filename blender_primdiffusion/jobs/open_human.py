@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.answers import HumanAnswer
 from ..formats.arrays import read_arrays
 from ..formats.body_layout import half_extents, read_layout, stencils
 from ..formats.human_metadata import provenance_of
@@ -21,8 +22,8 @@ from ..scene.human_npz import FORMAT_VERSION
 from ..scene.shape import ShapeModel
 
 
-def opened(source: Path, folder: Path) -> dict[str, Any] | None:
-    """Write human.npz and the human's own file, without a motion, into `folder`; the result is that of `human_npz`.
+def opened(source: Path, folder: Path) -> HumanAnswer | None:
+    """Write human.npz and the human's own file, without a motion, into `folder`; the answer is that of `human_npz`.
 
     None for files that only the backend can read: humans on a body of the user's files, and files of other kinds.
     Raises ValueError for a damaged human, OSError.
@@ -38,7 +39,7 @@ def opened(source: Path, folder: Path) -> dict[str, Any] | None:
     npz, person = folder / NPZ_FILE, folder / PERSON_FILE
     np.savez(npz, **arrays)
     write_tensors(person, with_motion(human, None))
-    return {"human": str(npz), "person": str(person), "seconds": time.monotonic() - began}
+    return HumanAnswer(human=npz, person=person, seconds=time.monotonic() - began)
 
 
 def rest_arrays(source: Path) -> dict[str, Any]:

@@ -54,15 +54,15 @@ class Job(abc.ABC):
         after `finish`. Raises ValueError or OSError where the job is no longer possible."""
 
     @abc.abstractmethod
-    def finish(self, context: bpy.types.Context, result: dict[str, Any], folder: Path) -> str:
-        """Put the child's result into the scene of `context`; returns a message for the panel.
+    def finish(self, context: bpy.types.Context, result: Any, folder: Path) -> str:
+        """Put the child's answer, a record of `formats.answers`, into the scene; returns a message for the panel.
 
         Runs inside an operator, in object mode where `undo` is given; that operator makes the undo step. ValueError,
         OSError and RuntimeError become the panel's error, and must leave the scene as it was.
         """
 
-    def result_here(self, folder: Path) -> dict[str, Any] | None:
-        """The result where Blender can compute it itself, in less than a second; None to request it from the child.
+    def result_here(self, folder: Path) -> Any:
+        """The answer where Blender can compute it itself, in less than a second; None to request it from the child.
 
         `folder` as in `params`. Raises ValueError or OSError."""
         return None
@@ -211,7 +211,7 @@ class Queue:
             raise RuntimeError("no result is ready: call tick until ready")
         notice, error = "", None
         try:
-            notice = entry.job.finish(context, self.request.result or {}, self._folder)
+            notice = entry.job.finish(context, self.request.result, self._folder)
         except (ValueError, OSError, RuntimeError) as e:
             error = error_in_the_scene(e)
         except Exception as e:

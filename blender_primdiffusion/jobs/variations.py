@@ -11,6 +11,7 @@ from typing import Any
 
 import bpy
 
+from ..formats.answers import VariationFiles, VariationsAnswer
 from ..formats.removing import remove_folder
 from .pictures import icons
 from .queue import Job, chosen_checkpoint
@@ -51,7 +52,7 @@ class Sheet:
         """They are variants of one human."""
         self._folder: Path | None = None
 
-    def fill(self, people: Sequence[Mapping[str, Any]], title: str, *, around: bool = False) -> None:
+    def fill(self, people: Sequence[VariationFiles], title: str, *, around: bool = False) -> None:
         """Move the files of the child's `people` here, replacing those before. Raises OSError before any change."""
         folder = Path(tempfile.mkdtemp(prefix="variation_sheet_", dir=bpy.app.tempdir or None))
         made = []
@@ -60,8 +61,8 @@ class Sheet:
                 own = folder / f"{number:02d}"
                 own.mkdir()
                 for name, file in NAMES.items():
-                    shutil.move(person[name], own / file)
-                made.append(Variation(int(person["seed"]), own))
+                    shutil.move(getattr(person, name), own / file)
+                made.append(Variation(person.seed, own))
         except OSError:
             remove_folder(folder, folder.parent)
             raise
@@ -102,10 +103,8 @@ class VariationsJob(Job):
     kind = method = "variations"
 
     seeds: tuple[int, ...]
-    steps: int
-    sampler: str
-    asked: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    """Attributes and guidance, where given."""
+    sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    """Other fields of `VariationsRequest`: steps, sampler, attributes, guidance."""
     person: str = ""
     """File of the human to vary; empty for new humans."""
     amount: float = 0.5
@@ -117,7 +116,7 @@ class VariationsJob(Job):
         return f"{len(self.seeds)} Variations"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        params: dict[str, Any] = {"seeds": list(self.seeds), "steps": self.steps, "sampler": self.sampler, **self.asked}
+        params: dict[str, Any] = {"seeds": list(self.seeds), **self.sampling}
         if self.person:
             if not Path(self.person).is_file():
                 raise FileNotFoundError("the human to vary was cleared: show variations again")
@@ -126,7 +125,7 @@ class VariationsJob(Job):
             params["checkpoint"] = self.checkpoint
         return {**params, "size": PICTURE_PX, "out_dir": str(folder)}
 
-    def finish(self, _context: bpy.types.Context, result: dict[str, Any], _folder: Path) -> str:
-        sheet.fill(result["people"], self.title, around=bool(self.person))
+    def finish(self, _context: bpy.types.Context, result: VariationsAnswer, _folder: Path) -> str:
+        sheet.fill(result.people, self.title, around=bool(self.person))
         icons.free()  # of the steps
-        return f"{len(self.seeds)} humans in {result['seconds']:.1f} s"
+        return f"{len(self.seeds)} humans in {result.seconds:.1f} s"

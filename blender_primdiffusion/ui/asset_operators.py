@@ -9,7 +9,8 @@ import bpy
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget
 from ..scene.human import armature_of
-from .on_person import SKIP, OnPerson
+from .declared import SKIP
+from .on_person import OnPerson
 
 _ITEMS = (
     (

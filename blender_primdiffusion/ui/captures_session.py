@@ -15,9 +15,11 @@ import bpy
 
 from ..backend.child_streams import Output
 from ..backend.child_variables import BLENDER, COMPUTING, passed_on
-from ..backend.messages import MessageError, captures_message
 from ..console import CANCELLED, DONE
+from ..formats.answers import CapturesProgress
+from ..formats.json_files import parse_message
 from ..formats.removing import remove_folder
+from ..formats.schema import read
 
 PATIENCE_S = 0.7
 """After this a child that was asked to stop is killed: its views are written whole or not at all."""
@@ -126,18 +128,18 @@ class CaptureSession:
         if not line.startswith(MARK):
             return  # printed by Blender
         try:
-            progress = captures_message(line[len(MARK) :])
-        except MessageError as fault:
+            progress = read(CapturesProgress, parse_message(line[len(MARK) :]))
+        except ValueError as fault:
             self._fault = f"Blender was ended because it sent a malformed message ({fault}): render again"
             self._process.kill()
             return
-        if "line" in progress:
-            self.lines.append(progress["line"])
+        if progress.line is not None:
+            self.lines.append(progress.line)
             return
-        self.lines.extend(progress["news"])
+        self.lines.extend(progress.news)
         if self._asked_to_stop_at is None:
-            self.fraction, self.eta_s = progress["done"] / max(progress["total"], 1), progress["eta_s"]
-            self.message = f"{progress['subject']}: view {progress['done']} of {progress['total']}"
+            self.fraction, self.eta_s = progress.done / max(progress.total, 1), progress.eta_s
+            self.message = f"{progress.subject}: view {progress.done} of {progress.total}"
 
     def _finish(self, code: int) -> None:
         self.exit_code, stopped = code, self._asked_to_stop_at is not None

@@ -6,14 +6,23 @@ from typing import Any
 
 import bpy
 
-from ..formats.requests import AMOUNT, FRACTION, PARTS, SIDED_PARTS, STEPS, TRANSFERS, WHOLE_PARTS
+from ..formats.requests import (
+    PARTS,
+    SIDED_PARTS,
+    TRANSFERS,
+    WHOLE_PARTS,
+    InterpolateRequest,
+    TransferRequest,
+    VaryRequest,
+)
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import selected_person
 from ..places import backend_is_named
 from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
+from .declared import PANELS, SKIP, declared, not_given
 from .drawing import draw_job, property_columns
-from .on_person import PANELS, SKIP, HumanPanel, OnPerson, other_human
+from .on_person import HumanPanel, OnPerson, other_human
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
@@ -53,20 +62,8 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
             ("BLEND", "Blend", "More like another human"),
         ],
     )
-    seed: bpy.props.IntProperty(
-        name="Seed",
-        description="Another seed gives another result; the same seed gives the same result",
-        default=1,
-        min=0,
-    )
-    amount: bpy.props.FloatProperty(
-        name="Amount",
-        description="How much the new human may differ from this one: 0 not at all, 1 completely",
-        default=AMOUNT,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
+    seed: declared(VaryRequest, "seed", default=1)
+    amount: declared(VaryRequest, "amount")
     region: bpy.props.EnumProperty(
         name="Region",
         description="Where to change the human; everything else stays exactly as it is",
@@ -84,22 +81,8 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
         name="Other Human", description="The other human", type=bpy.types.Collection, poll=_may_be_other
     )
     what: bpy.props.EnumProperty(name="Transfer", description="What the human gets", items=TRANSFER_ITEMS)
-    harmonise: bpy.props.FloatProperty(
-        name="Harmonise",
-        description="How much the region is denoised again to match the rest of the human: 0 copies it exactly",
-        default=0.0,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
-    fraction: bpy.props.FloatProperty(
-        name="Fraction",
-        description="Share of the other human: 0 is this human, 1 the other",
-        default=FRACTION,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
+    harmonise: declared(TransferRequest, "harmonise")
+    fraction: declared(InterpolateRequest, "fraction")
 
 
 class PRIMDIFFUSION_OT_paint_region(Reporting, bpy.types.Operator):
@@ -146,14 +129,14 @@ class _Edit(OnPerson):
 
     job: str
     """Class of `jobs.edit`."""
-    seed: bpy.props.IntProperty(name="Seed", min=0, description=PANELS, options=SKIP)
-    steps: bpy.props.IntProperty(name="Steps", min=1, max=1000, default=STEPS, description=PANELS, options=SKIP)
+    seed: not_given(VaryRequest, "seed")
+    steps: not_given(VaryRequest, "steps")
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         from ..jobs import edit  # needs numpy
 
-        steps = self.chosen("steps", context.scene.primdiffusion)
-        return submit(self, context, getattr(edit, self.job).of(person, steps, self.params(context, person)))
+        params = {"steps": self.chosen("steps", context.scene.primdiffusion), **self.params(context, person)}
+        return submit(self, context, getattr(edit, self.job).of(person, params))
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         """The edit's parameters of the child's method: see `EditJob.asked`."""
@@ -197,11 +180,11 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
     bl_label = "Vary"
     job = "VaryJob"
 
-    amount: bpy.props.FloatProperty(name="Amount", min=0.0, max=1.0, description=PANELS, options=SKIP)
+    amount: not_given(VaryRequest, "amount")
     attributes: bpy.props.StringProperty(
         name="Attributes", description="For example sex=female, height=1.7; empty: no restriction", options=SKIP
     )
-    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
+    guidance: not_given(VaryRequest, "guidance")
 
     def params(self, context: bpy.types.Context, _person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
@@ -222,7 +205,7 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
     attributes: bpy.props.StringProperty(
         name="Attributes", description=f"For example outfit=suit. {PANELS}", options=SKIP
     )
-    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=PANELS, options=SKIP)
+    guidance: not_given(VaryRequest, "guidance")
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
@@ -243,7 +226,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
 
     source: bpy.props.StringProperty(name="Source", description=f"Name of the other human. {PANELS}", options=SKIP)
     what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=PANELS, options=SKIP)
-    harmonise: bpy.props.FloatProperty(name="Harmonise", min=0.0, max=1.0, description=PANELS, options=SKIP)
+    harmonise: not_given(TransferRequest, "harmonise")
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
@@ -264,7 +247,7 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
     job = "BlendJob"
 
     other: bpy.props.StringProperty(name="Other", description=f"Name of the other human. {PANELS}", options=SKIP)
-    fraction: bpy.props.FloatProperty(name="Fraction", min=0.0, max=1.0, description=PANELS, options=SKIP)
+    fraction: not_given(InterpolateRequest, "fraction")
 
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit

@@ -9,12 +9,13 @@ from typing import TYPE_CHECKING
 
 import bpy
 
-from ..formats import requests
+from ..formats.requests import GaussiansRequest, MergeFramesRequest, ProxyRequest
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget
 from ..scene.human import armature_of
+from .declared import PANELS, SKIP, declared, not_given
 from .drawing import property_columns
-from .on_person import PANELS, SKIP, OnPerson
+from .on_person import OnPerson
 
 if TYPE_CHECKING:
     from ..jobs.queue import Job
@@ -99,26 +100,14 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
         name="Texture",
         description="Pixels a side of the mesh proxy's texture",
         items=[(str(px), f"{px} px", "") for px in (512, 1024, 2048, 4096)],
-        default=str(requests.TEXTURE_SIZE),
+        default=str(ProxyRequest.texture_px),
     )
-    triangles: bpy.props.IntProperty(
-        name="Triangles",
-        description="Maximum number of triangles of the mesh proxy",
-        default=requests.TRIANGLES,
-        min=500,
-        max=1_000_000,
-    )
-    gaussians: bpy.props.IntProperty(
-        name="Gaussians",
-        description="Maximum number of Gaussians; about 130,000 of a human are visible",
-        default=requests.GAUSSIANS,
-        min=1000,
-        max=1_000_000,
-    )
+    triangles: declared(ProxyRequest, "triangles")
+    gaussians: declared(GaussiansRequest, "limit", name="Gaussians")
     voxel: bpy.props.FloatProperty(
         name="Voxel Size",
         description="Voxel size of the VDB sequence: half the size takes eight times the memory",
-        default=requests.VOXEL,
+        default=MergeFramesRequest.voxel,
         min=0.002,
         max=0.05,
         precision=3,
@@ -164,9 +153,9 @@ class PRIMDIFFUSION_OT_export(_Export, bpy.types.Operator):
     motion: bpy.props.BoolProperty(name="With Motion", description=PANELS, options=SKIP)
     compact: bpy.props.BoolProperty(name="Compact", description=PANELS, options=SKIP)
     animation: bpy.props.BoolProperty(name="Animation", description=PANELS, options=SKIP)
-    texture_px: bpy.props.IntProperty(name="Texture", description=PANELS, min=64, max=8192, options=SKIP)
-    triangles: bpy.props.IntProperty(name="Triangles", description=PANELS, min=500, max=1_000_000, options=SKIP)
-    gaussians: bpy.props.IntProperty(name="Gaussians", description=PANELS, min=1, options=SKIP)
+    texture_px: not_given(ProxyRequest, "texture_px", name="Texture")
+    triangles: not_given(ProxyRequest, "triangles")
+    gaussians: not_given(GaussiansRequest, "limit", name="Gaussians")
     voxel: bpy.props.FloatProperty(name="Voxel Size", description=PANELS, min=0.002, max=0.05, options=SKIP)
     first: bpy.props.IntProperty(name="First Frame", description=f"Of a VDB sequence. {_SCENES}", options=SKIP)
     last: bpy.props.IntProperty(name="Last Frame", description=f"Of a VDB sequence. {_SCENES}", options=SKIP)
@@ -263,8 +252,8 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
     bl_idname = "primdiffusion.add_proxy"
     bl_label = "Add Mesh Proxy"
 
-    texture_px: bpy.props.IntProperty(name="Texture", description=PANELS, min=64, max=8192, options=SKIP)
-    triangles: bpy.props.IntProperty(name="Triangles", description=PANELS, min=500, max=1_000_000, options=SKIP)
+    texture_px: not_given(ProxyRequest, "texture_px", name="Texture")
+    triangles: not_given(ProxyRequest, "triangles")
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         # needs numpy

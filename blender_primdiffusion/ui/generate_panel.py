@@ -10,13 +10,14 @@ from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
 from ..backend.requests import sentence
-from ..formats import requests
+from ..formats.requests import SAMPLERS, GenerateRequest
 from ..jobs.follow import Reporting, submit
 from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
 from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
 from .backend_state import draw_set_up
+from .declared import PANELS, SKIP, declared, not_given
 from .drawing import BackendPanel, SidebarPanel, draw_job, draw_lines, property_columns
 from .export_panel import draw_as_mesh
 from .gallery import draw_samples
@@ -73,18 +74,13 @@ _SAMPLERS = {
     "dpmpp_2m": ("DPM-Solver++(2M)", "Second-order multistep: good with few steps"),
     "ddpm": ("DDPM", "New noise at each step; needs many steps"),
 }
-SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in requests.SAMPLERS]
+SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in SAMPLERS]
 
 
 class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     """`scene.primdiffusion`."""
 
-    seed: bpy.props.IntProperty(
-        name="Seed",
-        description="Another seed gives another human; the same seed gives the same human",
-        default=7,
-        min=0,
-    )
+    seed: declared(GenerateRequest, "seed", default=7)
     keep_seed: bpy.props.BoolProperty(
         name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each human"
     )
@@ -103,48 +99,25 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
         default="STANDARD",
         update=apply_quality,
     )
-    steps: bpy.props.IntProperty(
-        name="Steps",
-        description="Denoising steps: more take longer and add detail",
-        default=requests.STEPS,
-        min=1,
-        max=1000,
-        soft_max=100,
-        update=name_quality,
-    )
+    steps: declared(GenerateRequest, "steps", update=name_quality)
     sampler: bpy.props.EnumProperty(
         name="Sampler", description="How the noise is removed", items=SAMPLER_ITEMS, update=name_quality
     )
-    guidance: bpy.props.FloatProperty(
-        name="Guidance",
-        description="How strongly the attributes are followed: 1 as in the training data, "
-        "more exaggerates; no effect without attributes",
-        default=requests.GUIDANCE,
-        min=0.0,
-        max=20.0,
-        soft_min=1.0,
-        soft_max=5.0,
-    )
+    guidance: declared(GenerateRequest, "guidance")
     attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
-
-
-_PANELS = "Not given: the panel's"
-_SKIP = {"SKIP_SAVE"}
 
 
 class GenerateOptions(Reporting):
     """Properties of operators that generate. None is redoable: a redo slider must not start an expensive job again."""
 
-    seed: bpy.props.IntProperty(
-        name="Seed", default=-1, min=-1, max=LARGEST_SEED, description="-1: the panel's", options=_SKIP
-    )
-    steps: bpy.props.IntProperty(name="Steps", default=0, min=0, max=1000, description="0: the panel's", options=_SKIP)
-    sampler: bpy.props.EnumProperty(name="Sampler", items=SAMPLER_ITEMS, description=_PANELS, options=_SKIP)
-    guidance: bpy.props.FloatProperty(name="Guidance", min=0.0, max=20.0, description=_PANELS, options=_SKIP)
+    seed: not_given(GenerateRequest, "seed", default=-1, min=-1, description="-1: the panel's")
+    steps: not_given(GenerateRequest, "steps", default=0, min=0, description="0: the panel's")
+    sampler: bpy.props.EnumProperty(name="Sampler", items=SAMPLER_ITEMS, description=PANELS, options=SKIP)
+    guidance: not_given(GenerateRequest, "guidance")
     attributes: bpy.props.StringProperty(
         name="Attributes",
         description="For example sex=female, height=1.7; empty: no restriction. Not given: the panel's",
-        options=_SKIP,
+        options=SKIP,
     )
 
     def given(self, name: str) -> bool:
@@ -152,13 +125,13 @@ class GenerateOptions(Reporting):
         return self.properties.is_property_set(name)
 
     def sampling(self, settings: bpy.types.PropertyGroup) -> dict[str, Any]:
-        """Fields `steps`, `sampler` and `asked` of a job. Raises ValueError for attributes that are not name=value."""
+        """Fields of `GenerateRequest` besides the seed. Raises ValueError for attributes that are not name=value."""
         wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
         guidance = self.guidance if self.given("guidance") else settings.guidance
         return {
             "steps": self.steps or settings.steps,
             "sampler": self.sampler if self.given("sampler") else settings.sampler,
-            "asked": {"attributes": wanted, "guidance": guidance} if wanted else {},
+            **({"attributes": wanted, "guidance": guidance} if wanted else {}),
         }
 
 
@@ -216,7 +189,7 @@ class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
         for each in range(seed, last + 1):
             renew_seed = from_panel and not settings.keep_seed and each == last
             next_seed = random_seed() if renew_seed else None
-            if submit(self, context, GenerateJob(each, **sampling, next_seed=next_seed)) == {"CANCELLED"}:
+            if submit(self, context, GenerateJob(each, sampling, next_seed=next_seed)) == {"CANCELLED"}:
                 return {"CANCELLED"}
         return {"FINISHED"}
 

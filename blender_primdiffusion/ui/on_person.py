@@ -9,10 +9,8 @@ from ..jobs.copies import separate
 from ..jobs.follow import Reporting
 from ..jobs.target import named_person, selected_person
 from ..scene.human import armature_of, human_of, humans
+from .declared import SKIP
 from .drawing import SidebarPanel
-
-SKIP = {"SKIP_SAVE"}
-PANELS = "Not given: the panel's"
 
 
 class OnPerson(Reporting):

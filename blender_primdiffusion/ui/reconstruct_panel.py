@@ -8,10 +8,11 @@ from pathlib import Path
 
 import bpy
 
-from ..formats.requests import CAPTURE_VIEWS
+from ..formats.requests import ReconstructRequest
 from ..jobs.follow import Reporting, submit
 from ..scene.blend_values import setting_path
 from .captures_panel import DataPanel
+from .declared import declared, not_given
 from .drawing import draw_job, property_columns
 
 _CAMERAS_FILE = "cameras.json"
@@ -53,19 +54,8 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
     subject: bpy.props.StringProperty(
         name="Subject", description="Subject of the dataset; empty if there is only one", search=_search
     )
-    frame: bpy.props.IntProperty(
-        name="Frame",
-        description="Which captured pose to use; 0 is near the T-pose, which shows most of a human",
-        default=0,
-        min=0,
-    )
-    views: bpy.props.IntProperty(
-        name="Views",
-        description="How many cameras, spread around the human; all if there are fewer",
-        default=CAPTURE_VIEWS,
-        min=1,
-        soft_max=36,
-    )
+    frame: declared(ReconstructRequest, "frame")
+    views: declared(ReconstructRequest, "views")
 
 
 class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
@@ -78,8 +68,8 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
         name="Captures", description="Empty: the panel's", subtype="DIR_PATH", options={"SKIP_SAVE"}
     )
     subject: bpy.props.StringProperty(name="Subject", description="Empty: the panel's", options={"SKIP_SAVE"})
-    frame: bpy.props.IntProperty(name="Frame", default=-1, min=-1, description="-1: the panel's", options={"SKIP_SAVE"})
-    views: bpy.props.IntProperty(name="Views", default=0, min=0, description="0: the panel's", options={"SKIP_SAVE"})
+    frame: not_given(ReconstructRequest, "frame", default=-1, min=-1, description="-1: the panel's")
+    views: not_given(ReconstructRequest, "views", default=0, min=0, description="0: the panel's")
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:

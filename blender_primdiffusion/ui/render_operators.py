@@ -17,7 +17,8 @@ from ..scene.attachment import (
     show_in_viewport,
 )
 from ..scene.human import armature_of, humans
-from .on_person import SKIP, OnPerson
+from .declared import SKIP
+from .on_person import OnPerson
 
 if TYPE_CHECKING:
     from ..jobs.merge import Moment

@@ -10,8 +10,9 @@ import bpy
 from ..backend.requests import sentence
 from ..jobs.target import selected_person
 from ..scene.human import BETA_COUNT, BETAS, armature_of, humans
+from .declared import SKIP
 from .drawing import draw_lines, property_columns
-from .on_person import SKIP, HumanPanel, OnPerson, other_human
+from .on_person import HumanPanel, OnPerson, other_human
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

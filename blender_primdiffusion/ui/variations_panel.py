@@ -10,12 +10,13 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..backend.requests import sentence
-from ..formats.requests import AMOUNT
+from ..formats.requests import VariationsRequest
 from ..jobs.follow import Reporting, redraw, submit
 from ..jobs.late_volumes import keep_writing
 from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
+from .declared import SKIP, declared, not_given
 from .drawing import BackendPanel, draw_job, property_columns, row_unless
 from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed, random_seed
 
@@ -53,18 +54,10 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
             ),
         ],
     )
-    amount: bpy.props.FloatProperty(
-        name="Difference",
-        description="How much More Like This differs from the chosen human: 0 not at all, 1 completely",
-        default=AMOUNT,
-        min=0.05,
-        max=1.0,
-        subtype="FACTOR",
-    )
+    amount: declared(VariationsRequest, "amount", name="Difference", min=0.05)
 
 
 _SELECTED = "Index from 0; -1: the selected ones"
-_SKIP = {"SKIP_SAVE"}
 _OF_VARIATION = "Set the seed of the panel Generate to that of the selected human and lock it"
 _BUILD_ALL = "Add all of these humans to the scene, side by side"
 
@@ -86,19 +79,17 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
     bl_label = "Show Variations"
 
     count: bpy.props.IntProperty(
-        name="Count", default=0, min=0, max=64, description="How many humans; 0: the panel's", options=_SKIP
+        name="Count", default=0, min=0, max=64, description="How many humans; 0: the panel's", options=SKIP
     )
     like: bpy.props.BoolProperty(
-        name="More Like This", description="Variations of a human of the sheet, with the same body", options=_SKIP
+        name="More Like This", description="Variations of a human of the sheet, with the same body", options=SKIP
     )
     index: bpy.props.IntProperty(
-        name="Index", default=-1, min=-1, description=f"Of the human for More Like This. {_SELECTED}", options=_SKIP
+        name="Index", default=-1, min=-1, description=f"Of the human for More Like This. {_SELECTED}", options=SKIP
     )
-    amount: bpy.props.FloatProperty(
-        name="Difference", min=0.0, max=1.0, description="Not given: the panel's", options=_SKIP
-    )
+    amount: not_given(VariationsRequest, "amount", name="Difference")
     clear: bpy.props.BoolProperty(
-        name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=_SKIP
+        name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=SKIP
     )
 
     @classmethod
@@ -113,14 +104,14 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
             clear_before_loading()
             redraw()
             return {"FINISHED"}
-        sampling = self._sampling_of_sheet(context)
+        sampling, like = self._sampling_of_sheet(context), {}
         if self.like:
             around = _only(_targets(self.index), "select only the one to vary")
             amount = self.amount if self.given("amount") else context.scene.primdiffusion_variations.amount
-            sampling |= {"person": str(around.person), "amount": amount, "title": f"Like seed {around.seed}"}
+            like = {"person": str(around.person), "amount": amount, "title": f"Like seed {around.seed}"}
         from_panel = context.scene.primdiffusion_variations.seeds != "RANDOM" and not self.like
         first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
-        return submit(self, context, VariationsJob(self._seeds(context, first), **sampling))
+        return submit(self, context, VariationsJob(self._seeds(context, first), sampling, **like))
 
     def _seeds(self, context: bpy.types.Context, first: int) -> tuple[int, ...]:
         """Seeds from `first` on, random ones where it is negative. Raises ValueError."""
@@ -145,7 +136,7 @@ class PRIMDIFFUSION_OT_select_variation(_OnSheet, bpy.types.Operator):
     bl_label = "Select Variation"
     bl_options = {"INTERNAL"}
 
-    index: bpy.props.IntProperty(name="Index", description="Place in the sheet, from 0", min=0, options=_SKIP)
+    index: bpy.props.IntProperty(name="Index", description="Place in the sheet, from 0", min=0, options=SKIP)
 
     def act(self, _context: bpy.types.Context) -> set[str]:
         variation = sheet.at(self.index)
@@ -160,8 +151,8 @@ class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
     bl_idname = "primdiffusion.build_variation"
     bl_label = "Build Selected"
 
-    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=_SKIP)
-    build_all: bpy.props.BoolProperty(name="All", description="Build all humans of the sheet", options=_SKIP)
+    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
+    build_all: bpy.props.BoolProperty(name="All", description="Build all humans of the sheet", options=SKIP)
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
@@ -199,9 +190,9 @@ class PRIMDIFFUSION_OT_set_seed(Reporting, bpy.types.Operator):
             ("RANDOM", "Random Seed", "Set a random seed"),
             ("VARIATION", "Seed of Variation", _OF_VARIATION),
         ],
-        options=_SKIP,
+        options=SKIP,
     )
-    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=_SKIP)
+    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:

@@ -22,17 +22,18 @@ GENERATE_AND_VARY = """
 import sys
 from pathlib import Path
 import torch
-from primdiffusion.commands.edit import VaryRequest
-from primdiffusion.commands.generate import GenerateRequest
+from primdiffusion.commands.edit import edit
+from primdiffusion.commands.generate import generate
 from primdiffusion.commands.session import Session
+from primdiffusion.formats.requests import GenerateRequest, VaryRequest
 
 checkpoint, folder, threads, steps = Path(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4])
 torch.set_num_threads(threads)  # OMP_NUM_THREADS above the number of cores is cut to it
 session, silent = Session(), lambda *_, **__: None
 shared = {"checkpoint": checkpoint, "steps": steps, "size": 32}
-GenerateRequest(seed=7, out_dir=folder / "human", **shared).run(session, silent)
+generate(GenerateRequest(seed=7, out_dir=folder / "human", **shared), session, silent)
 person = folder / "human" / "person.human.safetensors"
-VaryRequest(person=person, seed=3, amount=0.6, out_dir=folder / "variant", **shared).run(session, silent)
+edit(VaryRequest(person=person, seed=3, amount=0.6, out_dir=folder / "variant", **shared), session, silent)
 assert torch.get_num_threads() == threads
 """
 

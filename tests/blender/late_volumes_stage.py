@@ -24,7 +24,7 @@ STATES = ("unwritten", "half", "written")
 
 
 def generated(seed: int = 7) -> bpy.types.Collection:
-    queue.add(bpy.context, GenerateJob(seed, 1))
+    queue.add(bpy.context, GenerateJob(seed, {"steps": 1}))
     drive()
     return humans(bpy.context.scene)[-1]
 

@@ -272,11 +272,11 @@ def test_every_operator_works_or_reports_what_is_wrong(anna, situation, monkeypa
 
 
 def _generated(_person) -> Job:
-    return GenerateJob(11, 1)
+    return GenerateJob(11, {"steps": 1})
 
 
 def _varied(person) -> Job:
-    return VaryJob.of(person, 1, {"amount": 0.5, "seed": 3})
+    return VaryJob.of(person, {"steps": 1, "amount": 0.5, "seed": 3})
 
 
 @pytest.mark.parametrize("ask", [_generated, _varied], ids=["generated", "varied"])

@@ -41,7 +41,7 @@ def handlers() -> list[str]:
 
 def one_human(context, seed: int) -> None:
     """Generate a human, undo and redo it, and remove it."""
-    queue.add(context, GenerateJob(seed, 2))
+    queue.add(context, GenerateJob(seed, {"steps": 2}))
     drive()
     for _ in range(UNDO_AND_REDO // 2):
         bpy.ops.ed.undo()

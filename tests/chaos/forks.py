@@ -170,7 +170,7 @@ def _import_all() -> None:
     for module in (*(path.partition(":")[0] for path, _ in COMMANDS.values()), *lazily):
         importlib.import_module(f"primdiffusion.{module}")
     optimisers = ("torch._dynamo", "torch.distributed.fsdp", "torch.fx.experimental.symbolic_shapes")
-    for module in ("diffuse_runs", "fit_scenes", "chaos.small_exports", *optimisers):
+    for module in ("diffuse_runs", "fit_scenes", *optimisers):
         importlib.import_module(module)
     _use_a_kernel()
 

@@ -161,8 +161,8 @@ def all_programs(given: Inputs) -> list[Program]:
             "render",
             lambda out: ["render", given.human(1), "--size", "32", "--out", out / "a.png", "--depth", out / "b.png"],
         ),
-        export(".glb", "--triangles", "500", "--texture", "64", small="chaos.small_exports"),
-        export(".obj", "--triangles", "500", "--texture", "64", small="chaos.small_exports"),
+        export(".glb", "--triangles", "500", "--texture", "64", "--spacing", "0.03"),
+        export(".obj", "--triangles", "500", "--texture", "64", "--spacing", "0.03"),
         export(".ply", "--gaussians", "100"),
         Program(
             "merge",

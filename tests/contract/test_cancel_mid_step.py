@@ -20,7 +20,7 @@ import ctypes, importlib.util, sys
 
 class LongSteps:
     def find_spec(self, name, path, target=None):
-        if name != "primdiffusion.commands.request":
+        if name != "primdiffusion.commands.progress":
             return None
         sys.meta_path.remove(self)
         spec = importlib.util.find_spec(name)

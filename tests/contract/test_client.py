@@ -24,7 +24,8 @@ from blender_primdiffusion.backend.client import (
 
 
 def sampling(event) -> bool:
-    return isinstance(event, Notification) and event.params.get("stage") == "sample" and event.params["step"] > 2
+    progress = isinstance(event, Notification) and event.method == "progress"
+    return progress and event.params.stage == "sample" and event.params.step > 2
 
 
 @pytest.fixture
@@ -179,7 +180,7 @@ def test_a_child_that_closes_its_output_and_hangs_is_silent(fake_child):
 def test_polling_a_child_that_reads_nothing_never_waits(fake_child):
     client = fake_child("time.sleep(60)")
     for _ in range(200):
-        client.request("attributes", {"padding": "x" * 10_000})  # far more than a pipe holds
+        client.request("measure", {"padding": "x" * 10_000})  # far more than a pipe holds
     assert client.poll() == []
     assert client.alive
 
@@ -219,7 +220,7 @@ def test_what_the_pipe_does_not_take_at_once_arrives_later_whole(fake_child):
             size = len(request["params"].get("padding", ""))
             print(json.dumps({"jsonrpc": "2.0", "id": request["id"], "result": {"size": size}}), flush=True)
     """)
-    ids = [client.request("attributes", {"padding": "x" * 100_000}) for _ in range(20)]
+    ids = [client.request("measure", {"padding": "x" * 100_000}) for _ in range(20)]
     seen = []
     wait_for(client, lambda e: isinstance(e, Response) and e.id == ids[-1], into=seen)
     assert [(e.id, e.result["size"]) for e in seen if e.id in ids] == [(id, 100_000) for id in ids]

@@ -58,9 +58,9 @@ def test_an_edit_takes_steps_and_leaves_another_person(backend, people, checkpoi
     follow(request, lambda request: steps.append(request.step) or request.finished)
     assert request.state == "done", request.message
     assert request.fraction == 1.0
-    before, after = load_human(people[0]), load_human(request.result["person"])
+    before, after = load_human(people[0]), load_human(request.result.person)
     assert not before.payload.rgb.equal(after.payload.rgb)
-    assert Path(request.result["human"]).is_file()
+    assert request.result.human.is_file()
 
 
 def test_a_cancelled_edit_leaves_nothing(backend, people, slow_checkpoint, tmp_path):

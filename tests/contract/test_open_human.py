@@ -43,8 +43,8 @@ def test_the_arrays_equal_the_backends(human, tmp_path):
 def test_what_is_opened_is_a_whole_human(human, tmp_path):
     save_human(tmp_path / "a.human", human, compact=True)
     result = opened(tmp_path / "a.human", tmp_path)
-    assert np.allclose(read_human(result["human"]).betas, human.betas)
-    assert load_human(result["person"]).betas.equal(human.betas)
+    assert np.allclose(read_human(result.human).betas, human.betas)
+    assert load_human(result.person).betas.equal(human.betas)
 
 
 def test_a_compact_file_is_a_quarter_of_the_size_and_the_same_to_both_programs(human, tmp_path):

@@ -328,7 +328,7 @@ def test_out_of_memory_and_a_defect_fail_their_job_and_not_the_child(checkpoint,
         ("generate", b'{"seed": 1%s, "out_dir": "x"}' % (b"0" * 400), "seed"),
         ("generate", b'{"seed": 1, "out_dir": "x", "attributes": {"height": 1e300}}', "height"),
         ("generate", b'{"seed": 1, "out_dir": "x", "size": 1000000000000}', "size"),
-        ("render", b'{"human": "h", "out": "o", "yaw": 1%s}' % (b"0" * 400), "yaw"),
+        ("render", b'{"human": "h", "out": "o.png", "yaw": 1%s}' % (b"0" * 400), "yaw"),
     ],
 )
 def test_numbers_that_overflow_are_rejected_by_the_parameters_name(child, method, params, name):

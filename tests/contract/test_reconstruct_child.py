@@ -122,8 +122,8 @@ def test_the_panels_job_runs_from_a_cold_start_to_its_files(start):
     assert messages[0] == "Starting the backend"
     assert {"Reading the pictures", "Reconstructing", "Writing the human"} <= set(messages)
     assert request.fraction == 1.0
-    assert Path(request.result["human"]).exists()
-    assert request.result["warnings"][0] == "only one view: the sides that it does not show are guessed"
+    assert request.result.human.exists()
+    assert request.result.warnings[0] == "only one view: the sides that it does not show are guessed"
 
 
 def test_an_error_of_the_backend_becomes_the_requests_error(start):

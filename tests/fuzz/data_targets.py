@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import torch
@@ -75,11 +74,11 @@ def make_weights(folder: Path) -> Path:
 
 
 def read_weights(path: Path) -> None:
-    from primdiffusion.commands.edit import Region
-    from primdiffusion.editing.regions import read_weights
+    from primdiffusion.editing.regions import read_weights, region_from_weights
 
-    finite(read_weights(path))
-    Region(weights=path).primitives(SimpleNamespace(body_setup=None))  # type: ignore[arg-type]
+    weights = read_weights(path)
+    finite(weights)
+    region_from_weights(weights)
 
 
 def make_solids(folder: Path) -> Path:

@@ -68,7 +68,7 @@ CALLS: dict[str, dict[str, Any]] = {
     "attributes": {"checkpoint": "tiny.safetensors"},
     "vary": {**SAMPLED, **PERSON, **ASKED, "amount": 0.5},
     "interpolate": {**SAMPLED, **PERSON, "other": "b.human.safetensors", "fraction": 0.5},
-    "inpaint": {**SAMPLED, **PERSON, **ASKED, "region": {"weights": "weights.npz"}, "masking": "repaint"},
+    "inpaint": {**SAMPLED, **PERSON, **ASKED, "weights": "weights.npz", "masking": "repaint"},
     "transfer": {
         **SAMPLED, **PERSON, "source": "b.human.safetensors", "region": ["top", "left_hand"], "what": "texture",
         "harmonise": 0.2, "seed": 3,

@@ -1,5 +1,5 @@
-"""Subcommands: each is a request, a frozen record with a method that runs it.
+"""Subcommands and requests: a function each, which gets a record of `formats.requests` or `options`, checked.
 
-JSON-RPC (`serve`) reads the record with `request.read_request`, the command line with tyro. Modules of records import
-torch only when a request runs, so that the child answers `hello`, and the command line --help, at once.
+`serve` and the command line import these modules, which load torch, when the first request runs, so that the child
+answers `hello`, and the command line --help, at once.
 """

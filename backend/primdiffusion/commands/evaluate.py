@@ -29,6 +29,7 @@ from primdiffusion.evaluation.gallery import (
 from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real
 from primdiffusion.evaluation.image_metrics import load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary
+from primdiffusion.formats.requests import Sampling
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import generate, place
 from primdiffusion.machine import best_device
@@ -115,7 +116,7 @@ class EvaluateGeneration:
     """Number of humans to generate, from successive seeds."""
     first_seed: int = 0
     """The first seed."""
-    steps: int = 30
+    steps: int = Sampling.steps
     """Sampling steps."""
     holdout: float = 0.05
     """Share that was held out in training."""

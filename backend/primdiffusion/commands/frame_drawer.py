@@ -13,12 +13,13 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.commands.frame import FrameSpec
-from primdiffusion.commands.request import ReportProgress
+from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
 from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
+from primdiffusion.formats.answers import DrawAnswer
 from primdiffusion.formats.arrays import read_numbers
+from primdiffusion.formats.requests import DrawRequest
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.human import Human, place_skinned
 from primdiffusion.human_file import load_human
@@ -58,7 +59,7 @@ class FrameDrawer:
         self._speed: dict[tuple[str, float, int], float] = {}
         """Pixels per second of the last frame, by view, step and number of humans."""
 
-    def draw(self, frame: FrameSpec, report: ReportProgress) -> dict[str, Any]:
+    def draw(self, frame: DrawRequest, report: ReportProgress) -> DrawAnswer:
         """Fill the frame band by band from the top, with a report after each; return the time taken.
 
         Raises as load_human and place_skinned, ValueError for a frame of the wrong size or an invalid file of solids,
@@ -77,13 +78,13 @@ class FrameDrawer:
             if out_of_memory(e):
                 raise PictureOutOfMemory(width, height) from e
             raise
-        return {
-            "seconds": round(time.perf_counter() - began, 6),
-            "seconds_place": round(placed - began, 6),
-            "seconds_march": round(seconds, 6),
-        }
+        return DrawAnswer(
+            seconds=round(time.perf_counter() - began, 6),
+            seconds_place=round(placed - began, 6),
+            seconds_march=round(seconds, 6),
+        )
 
-    def _scene(self, people: tuple[Numbers, ...], frame: FrameSpec) -> Scene:
+    def _scene(self, people: tuple[Numbers, ...], frame: DrawRequest) -> Scene:
         solids = None if frame.solids is None else self._solids(_stamp(frame.solids))
         if not people:
             return Scene(None, solids)
@@ -118,7 +119,7 @@ class FrameDrawer:
     def _load(self, file: Stamp) -> Human:
         return load_human(file[0]).to(self._device)
 
-    def _fill(self, picture: Picture, scene: Scene, frame: FrameSpec, report: ReportProgress) -> float:
+    def _fill(self, picture: Picture, scene: Scene, frame: DrawRequest, report: ReportProgress) -> float:
         """Draw the scene; return the seconds spent in the marcher."""
         look = ViewSettings(
             frame.view,
@@ -135,7 +136,7 @@ class FrameDrawer:
             report("draw", done.rows, height, round(left, 3))
         return seconds
 
-    def _camera(self, frame: FrameSpec) -> Camera:
+    def _camera(self, frame: DrawRequest) -> Camera:
         intrinsics, view = (torch.tensor(m, dtype=torch.float32) for m in (frame.intrinsics, frame.world_to_camera))
         whole = Camera(intrinsics.float(), view.float(), frame.width, frame.height).to(self._device)
         return whole if frame.region is None else whole.crop(*frame.corner, *frame.size)
@@ -158,7 +159,7 @@ def map_frame(path: Path, width: int, height: int) -> Picture:
     return Picture(combined.reshape(height, width, 4)[::-1], depth.reshape(height, width)[::-1])
 
 
-def _first_guess(frame: FrameSpec) -> float:
+def _first_guess(frame: DrawRequest) -> float:
     """A cautious estimate of pixels per second, from the number of samples and humans."""
     plain = FIRST_PIXELS / BAND_SECONDS
     return plain * min(1.0, frame.step / MarchSettings().step) / max(1, len(frame.people))

@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,10 +45,10 @@ class OutputFiles:
     side: str = "side.png"
     depth: str = "depth.png"
 
-    def in_folder(self, folder: Path) -> dict[str, str]:
-        """Return the paths by their names in responses."""
+    def in_folder(self, folder: Path) -> dict[str, Any]:
+        """Return the paths by their names in answers."""
         names = {"human": self.blender, "person": self.human, "preview": self.front, "side": self.side}
-        return {name: str(folder / file) for name, file in {**names, "depth": self.depth}.items()}
+        return {name: folder / file for name, file in {**names, "depth": self.depth}.items()}
 
 
 FILES = OutputFiles()
@@ -120,7 +121,7 @@ class PreviewFiles(contextlib.AbstractContextManager):
 
 
 @contextlib.contextmanager
-def step_previews(folder: Path, px: int, decode: Decode) -> Iterator[Callable[[SamplerStep], str | None]]:
+def step_previews(folder: Path, px: int, decode: Decode) -> Iterator[Callable[[SamplerStep], Path | None]]:
     """Yield a function to call after each step: it may draw a preview of px x px pixels and returns its path, or None.
 
     Earlier previews are removed. px = 0 draws none.
@@ -130,7 +131,7 @@ def step_previews(folder: Path, px: int, decode: Decode) -> Iterator[Callable[[S
         return
     budget = PreviewBudget()
 
-    def preview(step: SamplerStep) -> str | None:
+    def preview(step: SamplerStep) -> Path | None:
         if step.index + 1 == step.total or not budget.granted():  # the result follows the last step
             return None
         with budget.spending():
@@ -139,7 +140,7 @@ def step_previews(folder: Path, px: int, decode: Decode) -> Iterator[Callable[[S
                 return None
             path = files.next()
             draw_front(path, human, px)
-        return str(path)
+        return path
 
     with PreviewFiles(folder, PREVIEWS) as files:
         yield preview

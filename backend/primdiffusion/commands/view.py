@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 import time
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import tyro
+import torch
 from jaxtyping import Float, UInt8
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
-from primdiffusion.commands.request import check_size, parse
+from primdiffusion.body.model import BodyPose
+from primdiffusion.commands.options import ViewCommand
 from primdiffusion.failures import optional_package
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.requests import PICTURE_SIZE
-
-if TYPE_CHECKING:
-    from primdiffusion.geometry.camera import Camera
-    from primdiffusion.human import Human
-    from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import VERTICAL_FOV, Human, framing, place
+from primdiffusion.human_file import load_human
+from primdiffusion.machine import best_device
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.march import march
 
 SLIDERS = {
     "left arm": ("left_shoulder", 2, -1),
@@ -45,48 +46,10 @@ IDLE_S = 0.03
 BACKGROUND = (1.0, 1.0, 1.0)
 
 
-@dataclasses.dataclass(frozen=True)
-class ViewCommand:
-    """Show a human in a browser, with sliders for the pose."""
-
-    human: tyro.conf.Positional[Path]
-    """A .human.safetensors file."""
-    port: int = 8080
-    """Port on this machine; the next free one if it is in use."""
-    size: int = PICTURE_SIZE
-    """Height of the pictures, pixels; a third of it while the camera moves."""
-
-    def check(self) -> None:
-        """Raise ValueError for values out of range."""
-        check_size(self.size)
-        if not 0 <= self.port <= 65535:
-            raise ValueError(f"port is {self.port}: choose 0 to 65535")
-
-    def serve(self) -> None:
-        """Print the address, and draw until Ctrl-C. Raises MissingPackageError, and as load_human."""
-        viser = optional_package("viser", "viewer")
-        from primdiffusion.human_file import load_human  # torch is loaded late
-
-        human = load_human(self.human)
-        server = viser.ViserServer(host="127.0.0.1", port=self.port, verbose=False)
-        try:
-            viewer = Viewer(human, server, self.size)
-            print(f"http://127.0.0.1:{server.get_port()}  (stop with Ctrl-C)", flush=True)
-            while True:
-                if not viewer.draw():
-                    time.sleep(IDLE_S)
-        except KeyboardInterrupt:
-            pass
-        finally:
-            server.stop()
-
-
 class Viewer:
     """Sends each client of a viser server the picture from its camera: coarse at once, then sharp."""
 
     def __init__(self, human: Human, server: Any, size: int) -> None:
-        from primdiffusion.human import VERTICAL_FOV, framing  # torch is loaded late
-
         self.server, self.size = server, size
         self._drawn: dict[int, tuple[tuple, int]] = {}
         self._placed = functools.lru_cache(maxsize=1)(functools.partial(placed, human))
@@ -126,13 +89,6 @@ class Viewer:
 
 def placed(human: Human, angles: Sequence[tuple[str, float]]) -> Primitives:
     """The human's primitives, on the device that draws, with the sliders at these angles (degrees)."""
-    # torch is loaded late
-    import torch
-
-    from primdiffusion.body.model import BodyPose
-    from primdiffusion.human import place
-    from primdiffusion.machine import best_device
-
     pose = BodyPose.from_axis_angle(torch.from_numpy(theta_of(dict(angles))))
     return place(human, pose).to(best_device())
 
@@ -148,12 +104,6 @@ def theta_of(angles: Mapping[str, float]) -> Float[ndarray, "72"]:
 
 def camera_of(wxyz: Sequence[float], position: Sequence[float], fov: float, *, width: int, height: int) -> Camera:
     """The camera of a viser client: quaternion and position of the camera in the world, vertical `fov` in radians."""
-    # torch is loaded late
-    import torch
-    from scipy.spatial.transform import Rotation
-
-    from primdiffusion.geometry.camera import Camera
-
     world_from_camera = Rotation.from_quat([*wxyz[1:], wxyz[0]]).as_matrix()
     shift = -world_from_camera.T @ np.asarray(position, np.float64)
     focal = height / (2 * math.tan(fov / 2))
@@ -164,13 +114,22 @@ def camera_of(wxyz: Sequence[float], position: Sequence[float], fov: float, *, w
 
 def picture(primitives: Primitives, camera: Camera) -> UInt8[ndarray, "h w 3"]:
     """Render over white, sRGB."""
-    from primdiffusion.geometry.srgb import encode_srgb  # torch is loaded late
-    from primdiffusion.render.march import march
-
     rendering = march(primitives, camera.to(primitives.position.device), background=BACKGROUND)
     return (encode_srgb(rendering.rgb.clamp(0, 1)) * 255).round().byte().cpu().numpy()
 
 
-def run(arguments: Sequence[str]) -> None:
-    """Run a command line; raises its errors."""
-    parse(ViewCommand, arguments, "view").serve()
+def run(command: ViewCommand) -> None:
+    """Print the address, and draw until Ctrl-C. Raises MissingPackageError, and as load_human."""
+    viser = optional_package("viser", "viewer")
+    human = load_human(command.human)
+    server = viser.ViserServer(host="127.0.0.1", port=command.port, verbose=False)
+    try:
+        viewer = Viewer(human, server, command.size)
+        print(f"http://127.0.0.1:{server.get_port()}  (stop with Ctrl-C)", flush=True)
+        while True:
+            if not viewer.draw():
+                time.sleep(IDLE_S)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        server.stop()

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import torch
@@ -110,19 +110,6 @@ class AttributeVocabulary:
         if not low <= number <= high:
             raise ValueError(f"{name} is {value!r}: give a number from {low:.4g} to {high:.4g}")
         return [1.0, (number - mean) / std]
-
-
-def read_attributes(words: Sequence[str]) -> dict[str, str | float]:
-    """Parse command line arguments NAME=VALUE; ValueError for malformed arguments and repeated names."""
-    attributes: dict[str, str | float] = {}
-    for word in words:
-        name, sign, value = word.partition("=")
-        if not sign or not name or not value:
-            raise ValueError(f"{word!r} is not an attribute: write NAME=VALUE, as in outfit=suit or height=1.8")
-        if name in attributes:
-            raise ValueError(f"the attribute {name!r} is given twice: give it once")
-        attributes[name] = value
-    return attributes
 
 
 NOTHING = AttributeVocabulary({}, {})

@@ -168,10 +168,10 @@ class DiffusionModel:
 def sample(
     model: DiffusionModel,
     seeds: Sequence[int],
-    steps: int = requests.STEPS,
-    sampler: str = requests.SAMPLERS[0],
+    steps: int = requests.Sampling.steps,
+    sampler: str = requests.GenerateRequest.sampler,
     condition: Float[Tensor, "#b a"] | None = None,
-    guidance: float = requests.GUIDANCE,
+    guidance: float = requests.Conditioning.guidance,
 ) -> Iterator[SamplerStep]:
     """Generate a person for each seed, yielding every step; the last step's x0 is the result (default: 30 DDIM steps).
 

@@ -14,7 +14,6 @@ from torch import Tensor
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep
 from primdiffusion.diffusion.schedule import early_steps
-from primdiffusion.formats.requests import check_unit_interval
 from primdiffusion.human import Human
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Payload
@@ -24,6 +23,12 @@ EDIT_SEED_MASK = 0x6ED1F7A9C35B2D84
 """XORed with edit seeds: the noise a human was generated from would lead the edit back to it."""
 OnStep = Callable[[SamplerStep], None]
 """Progress callback, called after each step; an exception it raises cancels."""
+
+
+def check_unit_interval(name: str, value: float) -> None:
+    """Raise ValueError unless `value` is in [0, 1]."""
+    if not 0 <= value <= 1:
+        raise ValueError(f"{name} is {value}: choose a number from 0 to 1")
 
 
 def match_density(model: DiffusionModel, human: Human) -> DiffusionModel:

@@ -139,11 +139,11 @@ def inpaint(
     human: Human,
     region: Bool[Tensor, "k"],
     seed: int = 0,
-    steps: int = requests.STEPS,
+    steps: int = requests.Sampling.steps,
     attributes: Mapping[str, str | float] = MappingProxyType({}),
-    guidance: float = requests.GUIDANCE,
+    guidance: float = requests.Conditioning.guidance,
     on_step: OnStep | None = None,
-    masking: requests.Masking = requests.MASKINGS[0],
+    masking: requests.Masking = requests.InpaintRequest.masking,
 ) -> Human:
     """Return the human with the primitives of a region resampled to fit the others (`repaint`).
 
@@ -180,7 +180,7 @@ def harmonise(
     region: Bool[Tensor, "k"],
     amount: float = 0.3,
     seed: int = 0,
-    steps: int = requests.STEPS,
+    steps: int = requests.Sampling.steps,
     on_step: OnStep | None = None,
 ) -> Human:
     """Return the human with a region, for instance a transferred one, harmonised with the rest: noised and denoised.

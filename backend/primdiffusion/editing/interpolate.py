@@ -18,6 +18,7 @@ from primdiffusion.diffusion.schedule import Schedule
 from primdiffusion.editing.edit import (
     OnStep,
     added,
+    check_unit_interval,
     decoded,
     difference,
     encoded,
@@ -26,7 +27,6 @@ from primdiffusion.editing.edit import (
     with_edit,
 )
 from primdiffusion.formats import requests
-from primdiffusion.formats.requests import check_unit_interval
 from primdiffusion.human import Human, made_by
 from primdiffusion.primitives.primitives import Payload
 
@@ -37,7 +37,7 @@ def interpolate(
     a: Human,
     b: Human,
     fraction: float = 0.5,
-    steps: int = requests.STEPS,
+    steps: int = requests.Sampling.steps,
     on_step: OnStep | None = None,
 ) -> Human:
     """Return the human at `fraction` of the way from `a` to `b`: plausible throughout, not a cross-fade.

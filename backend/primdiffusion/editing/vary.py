@@ -32,10 +32,10 @@ def vary(
     human: Human,
     amount: float = 0.5,
     seed: int = 0,
-    steps: int = requests.STEPS,
+    steps: int = requests.Sampling.steps,
     on_step: OnStep | None = None,
     attributes: Mapping[str, str | float] = MappingProxyType({}),
-    guidance: float = requests.GUIDANCE,
+    guidance: float = requests.Conditioning.guidance,
 ) -> Human:
     """Return a variant with the same body: the latent is noised to a level that grows with `amount`, then DDIM samples.
 
@@ -56,10 +56,10 @@ def vary_batch(
     human: Human,
     amount: float,
     seeds: Sequence[int],
-    steps: int = requests.STEPS,
+    steps: int = requests.Sampling.steps,
     on_step: OnStep | None = None,
     attributes: Mapping[str, str | float] = MappingProxyType({}),
-    guidance: float = requests.GUIDANCE,
+    guidance: float = requests.Conditioning.guidance,
 ) -> list[Human]:
     """Return variants for several seeds, sampled as one batch; equal to `vary` up to rounding. Raises as `vary`."""
     generators = [edit_generator(seed) for seed in seeds]

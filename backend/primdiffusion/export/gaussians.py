@@ -19,7 +19,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from primdiffusion.export.surface import depth_below
-from primdiffusion.formats.requests import GAUSSIANS
+from primdiffusion.formats.requests import GaussiansRequest
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import encode_srgb
@@ -61,7 +61,7 @@ class Gaussians(TensorRecord):
     """Linear, in [0, 1]."""
 
 
-def gaussians_of(primitives: Primitives, limit: int = GAUSSIANS) -> Gaussians:
+def gaussians_of(primitives: Primitives, limit: int = GaussiansRequest.limit) -> Gaussians:
     """Convert the voxels of an unbatched set of boxes to at most `limit` Gaussians, the most opaque of each box.
 
     A voxel's opacity is that along the box's normal; voxels deeper than DEEPEST are left out. Raises ValueError for a

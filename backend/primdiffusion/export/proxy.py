@@ -16,8 +16,8 @@ from torch import Tensor
 
 from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
-from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.requests import ProxySettings
 from primdiffusion.formats.whole_files import staged, written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
@@ -47,26 +47,6 @@ OnStage = Callable[[str, int, int], None]
 """Progress callback: name of the current stage, stages completed, stages in total."""
 FORMAT_VERSION = 1
 ARRAYS, TEXTURE = "proxy.npz", "proxy.png"
-
-
-@dataclasses.dataclass(frozen=True)
-class ProxySettings:
-    """Resolution of the mesh."""
-
-    spacing: float = requests.VOXEL
-    """Grid spacing of the isosurface extraction, metres."""
-    triangles: int = requests.TRIANGLES
-    """Maximum number of triangles."""
-    texture_px: int = requests.TEXTURE_SIZE
-    """Width and height of the texture, pixels."""
-
-    def __post_init__(self) -> None:
-        if not 0.003 <= self.spacing <= 0.05:
-            raise ValueError(f"the grid spacing is {self.spacing} m: choose 0.003 to 0.05")
-        if not 500 <= self.triangles <= 1_000_000:
-            raise ValueError(f"the triangle limit is {self.triangles}: choose 500 to 1000000")
-        if not 64 <= self.texture_px <= 8192:
-            raise ValueError(f"the texture size is {self.texture_px} pixels: choose 64 to 8192")
 
 
 DEFAULT_PROXY = ProxySettings()

@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from collections.abc import Mapping
-from typing import Any, NoReturn
+from typing import Annotated, Any
 
 from . import compact_human
-from .json_files import LARGEST_INTEGER, parse_json, parse_message
+from .json_files import parse_json, parse_message
+from .schema import FieldError, Open, Range, read
 
-_KINDS: dict[str, tuple[str, Any]] = {
-    "seed": ("an integer", int),
-    "steps": ("an integer", int),
-    "sampler": ("a string", str),
-    "guidance": ("a number", (int, float)),
-    "checkpoint": ("a string", str),
-    "checkpoint_sha256": ("a string", str),
-    "full_density": ("a number", (int, float)),
-    "version": ("a string", str),
-}
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Edit(Open):
+    """A later edit."""
+
+    edit: str
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Provenance(Open):
+    """How a human was made; a file need not state all of it, and may state more."""
+
+    seed: int = 0
+    steps: int = 0
+    sampler: str = ""
+    guidance: float = 1.0
+    attributes: dict[str, str | float] = dataclasses.field(default_factory=dict)
+    checkpoint: str = ""
+    checkpoint_sha256: str = ""
+    full_density: Annotated[float, Range(1e-30, 1e30)] = 1.0
+    version: str = ""
+    edits: list[Edit] = dataclasses.field(default_factory=list)
 
 
 def version_fault(metadata: Mapping[str, str]) -> str | None:
@@ -54,34 +67,7 @@ def check_provenance(provenance: Any) -> None:
     """Raise ValueError, naming the entry, for one of a wrong type."""
     if not isinstance(provenance, Mapping):
         raise ValueError(f"its provenance is {provenance!r:.60}, not a JSON object: generate the human again")
-    for name, (wanted, kind) in _KINDS.items():
-        if name in provenance and not _is(provenance[name], kind):
-            _reject(name, provenance[name], wanted)
-    _check_attributes("attributes", provenance.get("attributes", {}))
-    if not provenance.get("full_density", 1) > 0:
-        _reject("full_density", provenance["full_density"], "above zero")
-    edits = provenance.get("edits", [])
-    if not isinstance(edits, list):
-        _reject("edits", edits, "a list of objects")
-    for edit in edits:
-        if not isinstance(edit, Mapping) or not _is(edit.get("edit"), str):
-            _reject("edits", edit, 'objects with a name "edit"')
-
-
-def _check_attributes(name: str, attributes: Any) -> None:
-    wanted = "an object of strings and numbers"
-    if not isinstance(attributes, Mapping):
-        _reject(name, attributes, wanted)
-    for value in attributes.values():
-        if not _is(value, (str, int, float)):
-            _reject(name, value, wanted)
-
-
-def _is(value: Any, kind: Any) -> bool:
-    if isinstance(value, bool) or (isinstance(value, float) and not math.isfinite(value)):
-        return False
-    return isinstance(value, kind) and not (isinstance(value, int) and abs(value) > LARGEST_INTEGER)
-
-
-def _reject(name: str, value: Any, wanted: str) -> NoReturn:
-    raise ValueError(f"{name!r} of its provenance is {value!r:.60}, not {wanted}: generate the human again")
+    try:
+        read(Provenance, provenance)
+    except FieldError as error:
+        raise ValueError(f"{error.field!r} of its provenance is not valid: generate the human again") from error

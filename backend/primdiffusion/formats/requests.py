@@ -1,24 +1,24 @@
-"""Values and defaults of requests: on the command line, in JSON-RPC and in the extension's panels."""
+"""Requests as the command line, JSON-RPC and the extension know them: each is declared here, once.
+
+A field's annotation holds its limits, the string below it its description (see `schema`).
+"""
 
 from __future__ import annotations
 
-from typing import Literal, get_args
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal, get_args
+
+from .joints import JOINT_NAMES
+from .schema import Ending, FieldError, Length, Option, Range, Shape, Slider
 
 Sampler = Literal["ddim", "dpmpp_2m", "ddpm"]
 SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
-"""The first is the default."""
 Transfer = Literal["texture", "garment"]
-"""What is copied from another human: colours, or shape too."""
 TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
-"""The first is the default."""
 Masking = Literal["repaint", "released"]
-"""How inpainting conditions on the part that stays: noised to each step's own level and resampled, or as released."""
-MASKINGS: tuple[Masking, ...] = get_args(Masking)
-"""The first is the default."""
 View = Literal["colour", "depth", "alpha", "boxes"]
-"""Colours, depth in false colours, alpha in grey, or the primitives as boxes."""
 VIEWS: tuple[View, ...] = get_args(View)
-"""The first is the default."""
 WHOLE_PARTS = (
     "face", "hair", "neck", "torso", "upper_arms", "forearms", "hands", "thighs", "shins", "feet", "hips",
     "head", "arms", "legs", "top", "bottom", "shoes", "clothes", "skin",
@@ -30,27 +30,12 @@ SIDED_PARTS = (
 """Left and right as seen by the human."""
 PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
 """Body parts that regions consist of."""
-
-STEPS = 30
-"""Sampler steps."""
-GUIDANCE = 1.5
-"""Weight of classifier-free guidance; 1 is plain conditioning, more costs variety."""
-AMOUNT = 0.5
-"""Strength of a variation: 0 changes nothing, 1 leaves hardly anything in common."""
-FRACTION = 0.5
-"""Position between two humans."""
 Making = Literal["fitted", "from_mesh"]
 """How payloads are made: fitted to renders of the mesh, or with the colours of the nearest surface point."""
 PASSES = ("img", "mask", "depth", "normal", "part")
 """Images of a captured view."""
 LAYOUTS = ("nerf", "opencv", "colmap")
 """Camera files of other projects beside captures; the released code's files are always written."""
-CAPTURE_VIEWS = 8
-"""Cameras whose images the encoder gets."""
-PICTURE_SIZE = 512
-"""Width and height of previews, pixels."""
-VARIATION_SIZE = 256
-"""Width and height of the previews of variations, pixels."""
 RAY_STEP = 0.004
 """Metres between samples of a ray."""
 DENSITY_GAIN = 1.6
@@ -58,36 +43,399 @@ DENSITY_GAIN = 1.6
 VOXEL = 0.006
 """Voxel size of merged grids and of the grid for proxies, metres. Half of it resolves more of the primitives' own
 voxels (2 to 14 mm) at eight times the memory."""
-TRIANGLES = 20_000
-"""Limit for a proxy."""
-TEXTURE_SIZE = 1024
-"""Width and height of a proxy's texture, pixels. Texels of 2 mm resolve the primitives' voxels: twice as many, enlarged
-from these, differ by 0.5 of 255 levels (RMS)."""
-GAUSSIANS = 400_000
-"""Limit for an export."""
-
-
-def check_unit_interval(name: str, value: float) -> None:
-    """Raise ValueError unless `value` is in [0, 1]."""
-    if not 0 <= value <= 1:
-        raise ValueError(f"{name} is {value}: choose a number from 0 to 1")
-
-
 LARGEST_SEED = 2**63 - 1
+
+Seed = Annotated[int, Range(0, LARGEST_SEED)]
+Share = Annotated[float, Range(0, 1)]
+Pixels = Annotated[int, Range(1, 65_536)]
+StepPixels = Annotated[int, Range(0, 1024), Option(hidden=True)]
+"""Larger previews would delay sampling and cancelling."""
+Voxel = Annotated[float, Range(1e-4, 10.0)]
+RayStep = Annotated[float, Range(1e-4, 1.0)]
+"""Finer steps take hours without visible gain."""
+Count = Annotated[int, Range(1)]
+Text = Annotated[str, Length(1, 200)]
+Attributes = dict[Text, Text | float]
+OutDir = Annotated[Path, Option(name="out")]
+Person = Annotated[Path, Option(positional=True)]
+Matrix = Annotated[list, Shape((3, 4))]
+JointMatrices = Annotated[list, Shape((len(JOINT_NAMES), 3, 4))]
 
 
 def check_seed(seed: int) -> None:
     """Raise ValueError outside 0 ... 2^63-1."""
     if not 0 <= seed <= LARGEST_SEED:
-        raise ValueError(f"seed {seed} is outside 0 ... 2^63-1")
+        raise FieldError(("seed",), f"{seed} is outside 0 ... 2^63-1")
 
 
-FINEST_STEP = 1e-4
-"""Metres; a finer step takes hours without visible gain."""
-COARSEST_STEP = 1.0
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Sampling:
+    """Fields of requests that denoise."""
+
+    steps: Annotated[int, Range(1, 1000), Slider(1, 100)] = 30
+    """Denoising steps: more take longer and add detail."""
+    checkpoint: Path | None = None
+    """Trained model (.safetensors); the default is the one in the package."""
 
 
-def check_step(step: float) -> None:
-    """Raise ValueError if `step`, metres between samples of a ray, is out of range."""
-    if not FINEST_STEP <= step <= COARSEST_STEP:
-        raise ValueError(f"the step is {step} m: choose {FINEST_STEP} to {COARSEST_STEP}")
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Conditioning:
+    """Fields of requests that take attributes."""
+
+    attributes: Attributes = dataclasses.field(default_factory=dict)
+    """Attributes, NAME=VALUE: sex=female "outfit=blouse and skirt" height=1.7. `info` lists the names and values that a
+    checkpoint knows."""
+    guidance: Annotated[float, Range(0, 20), Slider(1, 5)] = 1.5
+    """How strongly attributes are followed: 1 as in the training data; more exaggerates and costs variety. No effect
+    without attributes."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Previews:
+    """Fields of requests that write the files of a human."""
+
+    out_dir: OutDir
+    """Output folder, created if missing: human.npz for Blender, person.human.safetensors, and previews."""
+    size: Pixels = 512
+    """Width and height of the previews, pixels."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class StepPreviews(Sampling, Previews):
+    """Fields of requests that sample one human."""
+
+    picture_px: StepPixels = 0
+    """Width and height of previews while sampling, pixels; 0 for none."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GenerateRequest(StepPreviews, Conditioning):
+    """Generate a human: human.npz for Blender, person.human.safetensors, and previews."""
+
+    seed: Seed
+    """Another seed gives another human; the same seed gives the same human."""
+    sampler: Sampler = "ddim"
+    """ddim: few steps; dpmpp_2m: even fewer; ddpm: the paper's, needs hundreds."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VariationsRequest(Sampling, Conditioning):
+    """Generate several humans, or variants of one, as one batch, each with a preview to choose by."""
+
+    seeds: Annotated[list[Seed], Length(1, 64)]
+    """Different seeds. They are sampled as one batch: memory grows with their number."""
+    out_dir: Path
+    """Output folder, created if missing, for SEED.human.npz, SEED.human.safetensors and SEED.png of each."""
+    sampler: Sampler = "ddim"
+    size: Annotated[int, Range(2, 1024)] = 256
+    """Width and height of the previews, pixels."""
+    person: Path | None = None
+    """A .human.safetensors file: generate variants of this human, as `vary` does, instead of new humans."""
+    amount: Share = 0.5
+    """How much variants differ from this human: 0 not at all, 1 almost completely."""
+
+    def check(self) -> None:
+        """Raise FieldError for a seed that is given twice."""
+        if len(set(self.seeds)) < len(self.seeds):
+            raise FieldError(("seeds",), "has two that are equal: give each once")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AttributesRequest:
+    """Return the attributes a model can be conditioned on: values of categories, mean and deviation of scalars."""
+
+    checkpoint: Path | None = None
+    """Trained model (.safetensors); the default is the one in the package."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EditRequest(StepPreviews):
+    """Fields that all edits share."""
+
+    person: Person
+    """A .human.safetensors file; it is not changed."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VaryRequest(EditRequest, Conditioning):
+    """Generate a variant of a human: the same body with other clothes and another face."""
+
+    amount: Share = 0.5
+    """How much the new human may differ from this one: 0 not at all, 1 almost completely."""
+    seed: Seed = 0
+    """Another seed gives another result; the same seed gives the same result."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InterpolateRequest(EditRequest):
+    """Interpolate between two humans: plausible at every fraction, with a body in between."""
+
+    other: Person
+    """A second .human.safetensors file."""
+    fraction: Share = 0.5
+    """Share of the other human: 0 is exactly this human, 1 exactly the other."""
+
+    def check(self) -> None:
+        """Raise FieldError for a single step."""
+        if self.steps < 2:
+            raise FieldError(("steps",), f"is {self.steps}: interpolation takes 2 or more")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RegionRequest(EditRequest):
+    """Fields of edits of a region; everything outside stays bit-identical."""
+
+    region: list[Text] = dataclasses.field(default_factory=list)
+    """Body parts by name, such as top, bottom, shoes, hair, left_hand (docs/design/diffusion_edits.md)."""
+    weights: Path | None = None
+    """Instead of region: an .npz with `weights`, a number from 0 to 1 for each vertex of human.npz's body."""
+    seed: Seed = 0
+    """Another seed gives another result; the same seed gives the same result."""
+
+    def check(self) -> None:
+        """Raise FieldError unless the region is given in exactly one way."""
+        if bool(self.region) == (self.weights is not None):
+            raise FieldError(("region",), "and weights exclude each other: give names of parts, or a file of weights")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InpaintRequest(RegionRequest, Conditioning):
+    """Resample a region of a human so that it fits the rest, for other clothes or hair."""
+
+    masking: Masking = "repaint"
+    """repaint: the rest is noised to each step's own level, and each step is sampled twice; released: as in the
+    authors' code, the rest is pasted one level too noisy, and each step is sampled once."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class TransferRequest(RegionRequest):
+    """Copy the appearance of a region from another human. Checkpoint, seed and steps apply to harmonising."""
+
+    source: Path
+    """A .human.safetensors file to copy from."""
+    what: Transfer = "texture"
+    """texture: colours only, for garments of the same cut; garment: shape too."""
+    harmonise: Share = 0.0
+    """How much the region is denoised again to match the rest of the human: 0 copies it exactly."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReconstructRequest(Previews):
+    """Reconstruct a human from captures: human.npz for Blender, person.human.safetensors, and previews.
+
+    The encoder takes several views of one frame and needs no training per subject. Captures are those of
+    `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's layout.
+    """
+
+    capture: Path
+    """Folder of a capture dataset, or of one subject in it."""
+    subject: str | None = None
+    """Name of the subject; not needed if there is only one."""
+    frame: Annotated[int, Range(0)] = 0
+    """Captured pose to use; 0 is near the T pose, which shows most of a human."""
+    views: Annotated[int, Range(1)] = 8
+    """Number of cameras, spread around the human; all if there are fewer."""
+    checkpoint: Path | None = None
+    """Trained encoder (.safetensors); the default is the one in the package."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderRequest:
+    """Render a saved human on black."""
+
+    human: Path
+    """A .human.safetensors file."""
+    out: Annotated[Path, Ending((".png",))]
+    """Output PNG."""
+    width: Pixels = 512
+    height: Pixels = 512
+    yaw: float = 0.0
+    """Camera position around the human, radians: 0 in front, pi/2 at the human's left."""
+    pose: Path | list | None = None
+    """72 axis-angle values (24 x 3, radians), or a pose file (.json, .npz); None for the T pose."""
+    depth: Annotated[Path, Ending((".png",))] | None = None
+    """A second PNG, of the depth."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PosedPerson:
+    """A human posed by an armature."""
+
+    human: Path
+    """A person.human.safetensors file."""
+    object: Matrix
+    """[3][4] world matrix of the armature object; y up, metres."""
+    joints: JointMatrices
+    """[24][3][4] rest to posed in object space, SMPL's joint order."""
+    betas: list[float] | None = None
+    """Shape coefficients; None for those of the file."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DrawRequest:
+    """Draw posed humans into a mapped file, for the render engine and viewport. Needs no checkpoint."""
+
+    frame: Path
+    """A file of (4 + 1) w h float32 to map and fill: premultiplied linear RGBA, then depth; bottom row first. w and h
+    are those of the region."""
+    width: Pixels
+    """Width and height of the whole image, pixels."""
+    height: Pixels
+    intrinsics: Annotated[list, Shape((3, 3))]
+    """[3][3] of the whole image, in pixels from its top left corner, pixel centres at +0.5."""
+    world_to_camera: Matrix
+    """[3][4], OpenCV; y up, metres."""
+    people: list[PosedPerson]
+    region: Annotated[list[int], Length(4, 4)] | None = None
+    """[x, y, w, h], pixels from the left and from the bottom; None for the whole image."""
+    clip: Annotated[list, Shape((2,))] = dataclasses.field(default_factory=lambda: [0.0, 1e10])
+    """[start, end], metres along the optical axis."""
+    solids: Path | None = None
+    """An npz of corners [F, 3, 3], colour [F, 3] and holdout [F]."""
+    background: Annotated[list, Shape((3,))] | None = None
+    """[r, g, b], linear; None for a transparent background."""
+    view: View = "colour"
+    """Colours, depth in false colours, alpha in grey, or the primitives as boxes."""
+    step: RayStep = RAY_STEP
+    """Metres between samples of a ray through humans of natural size; scaled humans are sampled in proportion."""
+
+    def check(self) -> None:
+        """Raise FieldError for a camera that no picture has, and a region outside the picture."""
+        (fx, _, _), (below, fy, _), last = self.intrinsics
+        if not (fx > 0 and fy > 0 and below == 0 and last == [0, 0, 1]):
+            problem = f"is {self.intrinsics}: give [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] with fx and fy above zero"
+            raise FieldError(("intrinsics",), problem)
+        if not 0 <= self.clip[0] < self.clip[1]:
+            raise FieldError(("clip",), f"is {self.clip}: give [start, end] in metres with 0 <= start < end")
+        x, y, w, h = self.region or (0, 0, self.width, self.height)
+        if not (x >= 0 and y >= 0 and w >= 1 and h >= 1 and x + w <= self.width and y + h <= self.height):
+            problem = (
+                f"is {self.region}: give [x, y, w, h] with w and h of 1 or more, inside the picture of "
+                f"{self.width} x {self.height}"
+            )
+            raise FieldError(("region",), problem)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the drawn region."""
+        return (self.width, self.height) if self.region is None else (self.region[2], self.region[3])
+
+    @property
+    def corner(self) -> tuple[int, int]:
+        """The region's top left pixel in the whole image, from the left and top."""
+        return (0, 0) if self.region is None else (self.region[0], self.height - self.region[1] - self.region[3])
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MergeRequest:
+    """Merge humans into one grid, z up. Needs no checkpoint."""
+
+    people: Annotated[list[PosedPerson], Length(1)]
+    out: Annotated[Path, Ending((".npz",))]
+    """Output .npz."""
+    voxel: Voxel = VOXEL
+    """Voxel size, metres."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MergeFramesRequest:
+    """Write a grid for each frame of a human. Needs no checkpoint."""
+
+    people: Annotated[list[PosedPerson], Length(1)]
+    """The same human, once for each frame."""
+    out_dir: Path
+    """Output folder of 0000.npz, 0001.npz, ...; created if missing."""
+    voxel: Voxel = VOXEL
+    """Voxel size, metres."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ProxySettings:
+    """Resolution of the textured mesh of a human."""
+
+    spacing: Annotated[float, Range(0.003, 0.05)] = VOXEL
+    """Spacing of the grid that the surface is extracted from, metres."""
+    triangles: Annotated[int, Range(500, 1_000_000)] = 20_000
+    """Largest number of triangles of the mesh."""
+    texture_px: Annotated[int, Range(64, 8192), Option(name="texture")] = 1024
+    """Width and height of the texture, pixels. Texels of 2 mm resolve the primitives' voxels: twice as many, enlarged
+    from these, differ by 0.5 of 255 levels (RMS)."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ProxyRequest(ProxySettings):
+    """Write the textured mesh of a human in the rest pose."""
+
+    person: Path
+    """A .human.safetensors file."""
+    out_dir: Path
+    """Output folder of proxy.npz and proxy.png; created if missing."""
+    betas: list[float] | None = None
+    """Shape coefficients; None for those of the file."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GaussiansRequest:
+    """Write a human as 3D Gaussians, posed by an armature."""
+
+    person: Path
+    """A .human.safetensors file."""
+    out: Annotated[Path, Ending((".ply",))]
+    """Output .ply."""
+    object: Matrix | None = None
+    """[3][4] world matrix of the armature object; y up, metres. Without it and `joints`: the T pose at the origin."""
+    joints: JointMatrices | None = None
+    """[24][3][4] rest to posed in object space, SMPL's joint order."""
+    betas: list[float] | None = None
+    """Shape coefficients; None for those of the file."""
+    limit: Annotated[int, Range(1)] = 400_000
+    """Largest number of Gaussians; about 130,000 of a human are visible."""
+
+    def check(self) -> None:
+        """Raise FieldError for one of object and joints without the other."""
+        if (self.object is None) != (self.joints is None):
+            raise FieldError(("object",), "and joints go together: give both, or neither for the T pose")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HumanNpzRequest(Previews):
+    """Write the files of `generate` for a saved human."""
+
+    person: Path
+    """A .human.safetensors file."""
+
+
+@dataclasses.dataclass(frozen=True)
+class CancelRequest:
+    """Stop a running request."""
+
+    id: str | int | float
+    """The request's id."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NoParameters:
+    """Parameters of hello and shutdown."""
+
+
+REQUESTS: dict[str, type] = {
+    "hello": NoParameters,
+    "generate": GenerateRequest,
+    "variations": VariationsRequest,
+    "attributes": AttributesRequest,
+    "vary": VaryRequest,
+    "interpolate": InterpolateRequest,
+    "inpaint": InpaintRequest,
+    "transfer": TransferRequest,
+    "reconstruct": ReconstructRequest,
+    "render": RenderRequest,
+    "draw": DrawRequest,
+    "merge": MergeRequest,
+    "merge_frames": MergeFramesRequest,
+    "proxy": ProxyRequest,
+    "gaussians": GaussiansRequest,
+    "human_npz": HumanNpzRequest,
+    "cancel": CancelRequest,
+    "shutdown": NoParameters,
+}
+"""Requests by the method of JSON-RPC."""

@@ -26,6 +26,7 @@ from primdiffusion.formats.regular_files import (
     is_plain_path,
     real_path,
 )
+from primdiffusion.formats.schema import read
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors, build_anchors
 from primdiffusion.primitives.primitives import K
@@ -64,13 +65,9 @@ class BodyFiles:
     def from_json(cls, text: str) -> BodyFiles:
         """Parse the result of `to_json`; ValueError if malformed."""
         try:
-            tree = parse_json(text)
-            files = cls(FileFingerprint(**tree["smpl"]), tuple(FileFingerprint(**file) for file in tree["uv"]))
-            if not all(isinstance(v, str) for file in (files.smpl, *files.uv) for v in (file.path, file.sha256)):
-                raise TypeError("a path or checksum is no text")
-        except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"malformed body metadata ({type(error).__name__}: {str(error)[:100]})") from error
-        return files
+            return read(cls, parse_json(text))
+        except ValueError as error:
+            raise ValueError(f"malformed body metadata ({error!s:.100})") from error
 
 
 @dataclasses.dataclass(frozen=True)

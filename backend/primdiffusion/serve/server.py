@@ -1,7 +1,7 @@
 """The child process: JSON-RPC 2.0 on stdin and stdout, one message per line (docs/design/protocol.md).
 
     reader thread     parses lines; answers hello, cancel and shutdown itself, so that they work while a request runs
-    main thread       loads torch, then runs one request of REQUESTS at a time
+    main thread       loads torch, then runs one request of FUNCTIONS at a time
     heartbeat thread  sends a notification every 0.5 s, so that the client can tell busy from hung
 
 `hello` is answered before torch is loaded: `device` is null until the `ready` notification, which has a `problem` if
@@ -12,6 +12,7 @@ closes, because its parent has exited. File descriptor 1 is redirected to stderr
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import os
 import platform
@@ -19,20 +20,16 @@ import queue
 import sys
 import threading
 import traceback
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn, TypeVar
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from primdiffusion import __version__
-from primdiffusion.commands.edit import InpaintRequest, InterpolateRequest, TransferRequest, VaryRequest
-from primdiffusion.commands.export import GaussiansRequest, HumanNpzRequest, ProxyRequest
-from primdiffusion.commands.generate import GenerateRequest, VariationsRequest
-from primdiffusion.commands.info import AttributesRequest
-from primdiffusion.commands.merge import MergeFramesRequest, MergeRequest
-from primdiffusion.commands.reconstruct import ReconstructRequest
-from primdiffusion.commands.render import DrawRequest, RenderRequest
-from primdiffusion.commands.request import ParameterError, RequestRecord, parse, read_record, read_request
+from primdiffusion.commands.options import ServeCommand
 from primdiffusion.failures import ErrorDescription, describe, shortened
+from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
 from primdiffusion.formats.json_files import LARGEST_BYTES
+from primdiffusion.formats.requests import REQUESTS
+from primdiffusion.formats.schema import FieldError, read, written
 from primdiffusion.machine import memory, share_processors
 from primdiffusion.serve.rpc import (
     CANCELLED,
@@ -50,43 +47,30 @@ from primdiffusion.serve.rpc import (
 if TYPE_CHECKING:
     from primdiffusion.commands.session import Session
 
-R = TypeVar("R")
 PROTOCOL = 1
 HEARTBEAT_S = 0.5
 LONGEST_LINE = LARGEST_BYTES + 2
 """Bytes read of a line; a longer one is answered as no JSON, and its rest is skipped."""
-REQUESTS: dict[str, type[RequestRecord]] = {
-    "generate": GenerateRequest,
-    "variations": VariationsRequest,
-    "attributes": AttributesRequest,
-    "vary": VaryRequest,
-    "interpolate": InterpolateRequest,
-    "inpaint": InpaintRequest,
-    "transfer": TransferRequest,
-    "reconstruct": ReconstructRequest,
-    "render": RenderRequest,
-    "draw": DrawRequest,
-    "merge": MergeRequest,
-    "merge_frames": MergeFramesRequest,
-    "proxy": ProxyRequest,
-    "gaussians": GaussiansRequest,
-    "human_npz": HumanNpzRequest,
+FUNCTIONS = {
+    "generate": "generate:generate",
+    "variations": "generate:variations",
+    "attributes": "info:attributes",
+    "vary": "edit:edit",
+    "interpolate": "edit:edit",
+    "inpaint": "edit:edit",
+    "transfer": "edit:edit",
+    "reconstruct": "reconstruct:reconstruct",
+    "render": "render:render",
+    "draw": "render:draw",
+    "merge": "merge:merge",
+    "merge_frames": "merge:merge_frames",
+    "proxy": "export:proxy",
+    "gaussians": "export:gaussians",
+    "human_npz": "export:human_npz",
 }
-"""Requests by method; they run on the main thread, one at a time."""
+"""Module of `commands` and function by method; the functions run on the main thread, one at a time."""
 GRACE_S = 3.0
 """Time for a running request to stop and clean up when the parent has exited; then the process exits anyway."""
-
-
-@dataclasses.dataclass(frozen=True)
-class NoParams:
-    """Parameters of hello and shutdown."""
-
-
-@dataclasses.dataclass(frozen=True)
-class CancelParams:
-    """Parameters of cancel."""
-
-    id: str | int | float
 
 
 class Cancelled(Exception):
@@ -98,7 +82,8 @@ class Running:
     """The running request."""
 
     message: RpcRequest
-    request: RequestRecord
+    request: Any
+    """A record of `formats.requests`."""
     cancelled: threading.Event = dataclasses.field(default_factory=threading.Event)
 
 
@@ -112,12 +97,12 @@ class Server:
         self._lock = threading.Lock()
         self._running: Running | None = None
         self._ended = threading.Event()
-        self._state: dict[str, Any] = {"ready": False, "problem": None, "device": None, "device_name": None}
+        self._state = Ready()
         self._methods: dict[str, Callable[[RpcRequest], None]] = {
             "hello": self._hello,
             "cancel": self._cancel,
             "shutdown": self._shutdown,
-            **dict.fromkeys(REQUESTS, self._accept),
+            **dict.fromkeys(FUNCTIONS, self._accept),
         }
 
     def run(self) -> None:
@@ -160,26 +145,26 @@ class Server:
             self._fail(message, _as_rpc_error(e))
 
     def _hello(self, message: RpcRequest) -> None:
-        _parameters(read_record, NoParams, message)
+        _parameters(message)
         about = {"name": "primdiffusion", "version": __version__, "protocol": PROTOCOL, "pid": os.getpid()}
         python = {"python": platform.python_version(), "executable": sys.executable}
-        self._respond(message, {**about, **python, **memory(), **self._state})
+        self._respond(message, HelloAnswer(**about, **python, **memory(), **vars(self._state)))
 
     def _cancel(self, message: RpcRequest) -> None:
-        params = _parameters(read_record, CancelParams, message)
+        params = _parameters(message)
         with self._lock:  # also while responding, so that the response precedes that of the request
             found = self._running is not None and self._running.message.id == params.id
             if found and self._running is not None:
                 self._running.cancelled.set()
-            self._respond(message, {"cancelled": found})
+            self._respond(message, CancelAnswer(cancelled=found))
 
     def _shutdown(self, message: RpcRequest) -> None:
-        _parameters(read_record, NoParams, message)
-        self._respond(message, {})
+        _parameters(message)
+        self._respond(message, Done())
         self._end()
 
     def _accept(self, message: RpcRequest) -> None:
-        running = Running(message, _parameters(read_request, REQUESTS[message.method], message))
+        running = Running(message, _parameters(message))
         with self._lock:
             if self._running is not None:
                 sentence = f"the backend is running request {self._running.message.id!r}: one at a time"
@@ -218,23 +203,26 @@ class Server:
             session = Session()
         except Exception as e:
             error = _as_rpc_error(e)
-            self._state = {**self._state, "problem": str(error)}
-            self._notify("ready", **self._state)
+            self._state = Ready(problem=str(error))
+            self._notify("ready", self._state)
             return error
-        self._state = {**self._state, "ready": True, **session.device_info()}
-        self._notify("ready", **self._state)
+        self._state = Ready(ready=True, **session.device_info())
+        self._notify("ready", self._state)
         return session
 
     def _run_request(self, session: Session | RpcError, running: Running) -> None:
         def report(stage: str, step: int, total: int, eta_s: float | None, /, **more: Any) -> None:
             if running.cancelled.is_set():
                 raise Cancelled
-            self._notify("progress", id=running.message.id, stage=stage, step=step, total=total, eta_s=eta_s, **more)
+            id = running.message.id
+            self._notify("progress", Progress(id=id, stage=stage, step=step, total=total, eta_s=eta_s, **more))
 
         try:
             if isinstance(session, RpcError):
                 raise session
-            result = running.request.run(session, report)
+            module, _, function = FUNCTIONS[running.message.method].partition(":")
+            run = getattr(importlib.import_module(f"primdiffusion.commands.{module}"), function)
+            result = run(running.request, session, report)
         except Cancelled:
             outcome: Any = RpcError(CANCELLED, "cancelled")
         except Exception as e:
@@ -252,24 +240,22 @@ class Server:
 
     def _respond(self, message: RpcRequest, result: Any) -> None:
         if message.wants_response:
-            self._wire.respond(message.id, result)
+            self._wire.respond(message.id, written(result))
 
     def _fail(self, message: RpcRequest, error: RpcError) -> None:
         if message.wants_response:
             self._wire.fail(message.id, error)
 
-    def _notify(self, method: str, **params: Any) -> None:
-        self._wire.notify(method, **params)
+    def _notify(self, method: str, params: Any) -> None:
+        self._wire.notify(method, **written(params))
 
 
-def _parameters(read: Callable[[type[R], dict[str, Any], str], R], record: type[R], message: RpcRequest) -> R:
+def _parameters(message: RpcRequest) -> Any:
     """Read the parameters of a message. Raises RpcError(INVALID_PARAMS)."""
     try:
-        return read(record, message.params, message.method)
-    except ParameterError as e:
+        return read(REQUESTS[message.method], message.params, message.method)
+    except FieldError as e:
         raise RpcError(INVALID_PARAMS, shortened(str(e))) from e
-    except ValueError as e:
-        raise RpcError(INVALID_PARAMS, shortened(f"{message.method!r}: {e}")) from e
 
 
 def _as_rpc_error(error: Exception) -> RpcError:
@@ -303,21 +289,10 @@ def guard_streams() -> tuple[BinaryIO, BinaryIO]:
     return os.fdopen(source, "rb"), os.fdopen(sink, "wb")
 
 
-@dataclasses.dataclass(frozen=True)
-class ServeCommand:
-    """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
-
-    about: bool = False
-    """Print the versions of this program, torch and Python as one line of JSON, and end."""
-
-    def check(self) -> None:
-        """See `RequestRecord`."""
-
-
-def run(arguments: Sequence[str]) -> None:
+def run(command: ServeCommand) -> None:
     """`primdiffusion serve`."""
-    if parse(ServeCommand, arguments, "serve").about:
-        import torch  # loaded late
+    if command.about:
+        import torch  # `hello` is answered before it is loaded
 
         about = {"version": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}
         print(json.dumps(about))

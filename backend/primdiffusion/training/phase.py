@@ -252,7 +252,9 @@ def _memory_named(name: str, phase: PhaseConfig) -> Iterator[None]:
 
 
 @torch.no_grad()
-def write_samples(path: Path, model: DiffusionModel, seeds: Sequence[int] = SEEDS, steps: int = requests.STEPS) -> None:
+def write_samples(
+    path: Path, model: DiffusionModel, seeds: Sequence[int] = SEEDS, steps: int = requests.Sampling.steps
+) -> None:
     """Write an image of humans of `seeds`, side by side over black. Raises OSError."""
     pictures = []
     for human in generate_batch(model, seeds, steps):

@@ -23,7 +23,7 @@ from ...places import missing_packages
 from ...scene.human import NPZ_FILE, PERSON_FILE
 from ..attributes import Attributes, parsed
 from .running import Clock, NoBackend, Say, Stopped, ask, backend_of, begun, publish, reason, run, staging
-from .words import motion_name, parse_generate
+from .words import DECLARED, motion_name, parse_generate
 
 if TYPE_CHECKING:
     from .people import Movement
@@ -72,13 +72,12 @@ def person_name(seed: int) -> str:
 def _params(options: argparse.Namespace, attributes: Attributes) -> dict[str, object]:
     """Parameters of the child's method that all humans share."""
     checkpoint = real_path(options.checkpoint) if options.checkpoint is not None else chosen_checkpoint("checkpoint")
-    return {
-        "steps": options.steps,
-        "sampler": options.sampler,
-        "size": options.pictures,
-        **({"attributes": attributes, "guidance": options.guidance} if attributes else {}),
-        **({"checkpoint": str(checkpoint)} if checkpoint else {}),
-    }
+    params = {field: getattr(options, field) for field in DECLARED}
+    if attributes:
+        params["attributes"] = attributes
+    else:
+        del params["guidance"]
+    return {**params, **({"checkpoint": str(checkpoint)} if checkpoint else {})}
 
 
 def _is_there(folder: Path, blend: str | None) -> bool:

@@ -244,7 +244,7 @@ class _Drawing:
             if not (source.has_npz and npz.is_file()):
                 asked = {"person": str(source.path), "out_dir": folder, "size": 16}
                 made = opened(source.path, Path(folder)) or ask(self._backend, "human_npz", asked, self._stop)
-                npz, person = Path(made["human"]), Path(made["person"])
+                npz, person = made.human, made.person
             build_person(bpy.context, npz, person, source.name, self._movement)
         render = bpy.context.scene.render
         render.resolution_x, render.resolution_y = self._options.size or _PICTURE

@@ -103,8 +103,8 @@ def ask(
     params: Mapping[str, Any],
     stop: Stop,
     on_progress: Callable[[ChildRequest], None] = lambda _request: None,
-) -> dict[str, Any]:
-    """The child's result; `on_progress` is called with the request whenever it changes.
+) -> Any:
+    """The child's answer, a record of `formats.answers`; `on_progress` is called with the request whenever it changes.
 
     Raises NoBackend, ChildFailed, and Stopped once `stop` is set, within a second; then no file is left.
     """
@@ -119,7 +119,7 @@ def ask(
         raise Stopped
     if request.error is not None:
         raise (NoBackend if request.error.kind in {"environment", "timeout"} else ChildFailed)(str(request.error))
-    return request.result or {}
+    return request.result
 
 
 @contextmanager

@@ -6,14 +6,17 @@ import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import NoReturn, get_args
 
 from ...console import UsageError
 from ...formats.regular_files import real_path
-from ...formats.requests import GUIDANCE, PICTURE_SIZE, SAMPLERS, STEPS, check_seed
+from ...formats.requests import GenerateRequest
+from ...formats.schema import FieldError, descriptions, field_types, read, split
 
 ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
 """Names of render engines on the command line -> Blender's."""
+DECLARED = {"steps": "--steps", "sampler": "--sampler", "guidance": "--guidance", "size": "--pictures"}
+"""Options of `generate` by the field of the request that declares them."""
 _ENDS = (
     "exit codes: 0 all is done, 1 some failed (report.json says which and why), 2 usage error, 3 no Python runs the "
     "backend, 130 stopped by Ctrl-C; the same command resumes"
@@ -26,13 +29,11 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     add = made.add_argument
     add("--out", type=Path, required=True, help="folder for the humans; an unfinished one is resumed")
     add("--count", type=_whole(1), default=1, help="how many (default %(default)s)")
-    add("--seed", type=_whole(0), default=0, help="of the first; the others follow on it (default %(default)s)")
-    add("--steps", type=_whole(1), default=STEPS, help="denoising steps (default %(default)s)")
-    add("--sampler", choices=SAMPLERS, default=SAMPLERS[0], help="(default %(default)s)")
+    add("--seed", type=int, default=0, help="of the first; the others follow on it (default %(default)s)")
+    for field, option in DECLARED.items():
+        _add_declared(made, field, option)
     add("--attributes", nargs="+", default=[], metavar="NAME=VALUE", help='like sex=female height=1.7 "hair=long bob"')
-    add("--guidance", type=float, default=GUIDANCE, help="how strongly attributes are followed (default %(default)s)")
     add("--checkpoint", type=Path, help="a .safetensors file instead of the preferences' or the default one")
-    add("--pictures", type=_whole(16), default=PICTURE_SIZE, metavar="SIZE", help="pixels a side (default %(default)s)")
     blend = made.add_mutually_exclusive_group()
     blend.add_argument(
         "--blend", nargs="?", const="person.blend", metavar="NAME", help="a .blend in each folder too, called so"
@@ -42,9 +43,11 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     _add_python(made)
     add("--resume", action="store_true", help="keep humans in the folder that were generated with other settings")
     options = made.parse_args(list(argv))
+    sampling = {field: getattr(options, field) for field in DECLARED}
     try:
-        check_seed(options.seed + options.count - 1)
-    except ValueError as error:
+        for seed in (options.seed, options.seed + options.count - 1):
+            read(GenerateRequest, {"seed": seed, "out_dir": options.out, **sampling})
+    except FieldError as error:
         raise UsageError(str(error)) from error
     if options.blend is not None and (Path(options.blend).name != options.blend or not options.blend.strip(".")):
         raise UsageError(f"--blend {options.blend!r} is no file name: name one without folders")
@@ -93,6 +96,13 @@ def _parser(name: str, description: str) -> argparse.ArgumentParser:
     made = argparse.ArgumentParser(prog=f"primdiffusion {name}", description=description, epilog=_ENDS)
     made.error = _raise_usage_error
     return made
+
+
+def _add_declared(made: argparse.ArgumentParser, field: str, option: str) -> None:
+    kind, _ = split(field_types(GenerateRequest)[field])
+    choices, default = get_args(kind) or None, getattr(GenerateRequest, field)
+    about = f"{descriptions(GenerateRequest)[field].rstrip('.')} (default %(default)s)"
+    made.add_argument(option, dest=field, type=type(default), choices=choices, default=default, help=about)
 
 
 def _add_motion(made: argparse.ArgumentParser) -> None:

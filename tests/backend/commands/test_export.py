@@ -7,9 +7,10 @@ import torch
 import trimesh
 from export_people import person
 from primdiffusion import cli
-from primdiffusion.commands.export import GaussiansRequest, HumanNpzRequest, ProxyRequest
-from primdiffusion.commands.request import read_request
+from primdiffusion.commands.export import gaussians, human_npz, proxy
 from primdiffusion.commands.session import Session
+from primdiffusion.formats.requests import GaussiansRequest, HumanNpzRequest, ProxyRequest
+from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.human import place, pose_body
 from primdiffusion.human_file import save_human
 
@@ -45,9 +46,9 @@ def test_a_posed_person_becomes_gaussians(saved):
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["--out", "anna.stl"], "choose one"),
-        (["--out", "anna.glb", "--pose", "pose.json"], "cannot store a pose"),
-        (["--out", "anna.ply", "--frame", "2"], "without a pose file"),
+        (["--out", "anna.stl"], "^out is "),
+        (["--out", "anna.glb", "--pose", "pose.json"], "^pose cannot be stored"),
+        (["--out", "anna.ply", "--frame", "2"], "^frame is 2"),
         (["--out", "nowhere/anna.glb"], "there is no folder"),
     ],
 )
@@ -60,11 +61,11 @@ def test_what_cannot_be_exported_is_rejected_before_any_work(saved, monkeypatch,
 
 def test_the_childs_proxy_follows_other_betas(saved, tmp_path):
     params = {"person": saved, "triangles": 800, "texture_px": 64, "spacing": 0.02}
-    own = ProxyRequest(out_dir=tmp_path / "own", **params).run(Session(), silent)
-    tall = ProxyRequest(out_dir=tmp_path / "tall", betas=[3.0] + [0.0] * 9, **params).run(Session(), silent)
+    own = proxy(ProxyRequest(out_dir=tmp_path / "own", **params), Session(), silent)
+    tall = proxy(ProxyRequest(out_dir=tmp_path / "tall", betas=[3.0] + [0.0] * 9, **params), Session(), silent)
     heights = []
     for result in (own, tall):
-        with np.load(result["proxy"]) as arrays:
+        with np.load(result.proxy) as arrays:
             heights.append(np.ptp(arrays["vertices"][:, 1]))
             assert arrays["joint_names"][0] == "pelvis"
     assert abs(heights[1] - heights[0]) > 0.03
@@ -74,15 +75,15 @@ def test_the_childs_gaussians_stand_where_the_armature_does(saved, tmp_path):
     skinning = pose_body(person().betas).skinning[:, :3].tolist()
     moved = [[1.0, 0, 0, 2.0], [0, 1.0, 0, 0], [0, 0, 1.0, 0]]
     request = GaussiansRequest(person=saved, out=tmp_path / "p.ply", object=moved, joints=skinning, limit=2000)
-    assert request.run(Session(), silent)["gaussians"] == 2000
+    assert gaussians(request, Session(), silent).gaussians == 2000
     assert splatter.read_ply(tmp_path / "p.ply")["x"].mean() == pytest.approx(2.0, abs=0.1)
 
 
 def test_a_person_who_exists_gets_the_files_of_generate(saved, tmp_path):
-    result = HumanNpzRequest(person=saved, out_dir=tmp_path / "out", size=32).run(Session(), silent)
-    with np.load(result["human"]) as arrays:
+    result = human_npz(HumanNpzRequest(person=saved, out_dir=tmp_path / "out", size=32), Session(), silent)
+    with np.load(result.human) as arrays:
         assert torch.equal(torch.from_numpy(arrays["betas"]), person().betas)
-    assert {"human", "person", "preview", "side", "depth"} <= set(result)
+    assert all(path.is_file() for path in (result.person, result.preview, result.side, result.depth))
 
 
 def test_a_cancelled_proxy_leaves_nothing(saved, tmp_path):
@@ -92,7 +93,7 @@ def test_a_cancelled_proxy_leaves_nothing(saved, tmp_path):
 
     request = ProxyRequest(person=saved, out_dir=tmp_path / "new", triangles=800, texture_px=64, spacing=0.03)
     with pytest.raises(InterruptedError):
-        request.run(Session(), cancel)
+        proxy(request, Session(), cancel)
     assert not (tmp_path / "new").exists()
 
 
@@ -107,11 +108,11 @@ def test_a_cancelled_proxy_leaves_nothing(saved, tmp_path):
     ],
 )
 def test_impossible_parameters_are_rejected(kind, wrong):
-    with pytest.raises(ValueError):
-        read_request(kind, wrong, "export")
+    with pytest.raises(FieldError):
+        read(kind, wrong)
 
 
 def test_betas_of_another_body_are_rejected(saved, tmp_path):
     request = ProxyRequest(person=saved, out_dir=tmp_path / "out", betas=[0.0] * 3)
     with pytest.raises(ValueError, match="3 betas"):
-        request.run(Session(), silent)
+        proxy(request, Session(), silent)

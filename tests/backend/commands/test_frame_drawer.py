@@ -10,11 +10,11 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands import frame_drawer
-from primdiffusion.commands.frame import FrameSpec, PosedPerson
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.failures import describe
+from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import Primitives
@@ -37,11 +37,11 @@ def pose():
 
 
 @pytest.fixture
-def params(human, pose, tmp_path) -> FrameSpec:
+def params(human, pose, tmp_path) -> DrawRequest:
     save_human(tmp_path / "a.human.safetensors", human)
     camera = framing(place(human, pose), 0.4, WIDTH, HEIGHT)
     joints = pose_body(human.betas, pose).skinning[:, :3].tolist()
-    return FrameSpec(
+    return DrawRequest(
         frame=new_frame(tmp_path / "frame", WIDTH, HEIGHT),
         width=WIDTH,
         height=HEIGHT,
@@ -56,7 +56,7 @@ def new_frame(path, width: int, height: int) -> Path:
     return path
 
 
-def drawn(params: FrameSpec, drawer: FrameDrawer | None = None, reports: list | None = None):
+def drawn(params: DrawRequest, drawer: FrameDrawer | None = None, reports: list | None = None):
     drawer = drawer or FrameDrawer(torch.device("cpu"))
     drawer.draw(params, lambda *report: reports is None or reports.append(report))
     return map_frame(params.frame, *params.size)
@@ -108,8 +108,8 @@ def test_reports_tell_the_rows_that_are_done_and_the_frame_is_filled_that_far(pa
     assert reports[0] == ("draw", 0, HEIGHT, None)
     assert reports[-1] == ("draw", HEIGHT, HEIGHT, 0.0)
     assert {(stage, total) for stage, _, total, _ in reports} == {("draw", HEIGHT)}
-    assert 0 < result["seconds_march"] < result["seconds"]
-    assert 0 < result["seconds_place"] < result["seconds"]
+    assert 0 < result.seconds_march < result.seconds
+    assert 0 < result.seconds_place < result.seconds
 
 
 def test_the_first_band_is_small_where_samples_or_people_are_many(params):

@@ -4,9 +4,13 @@ import itertools
 from pathlib import Path
 
 import pytest
-from primdiffusion.commands import output, session
-from primdiffusion.commands.generate import GenerateRequest, run
+from primdiffusion import cli
+from primdiffusion.commands import generate as generate_module
+from primdiffusion.commands import session
+from primdiffusion.commands.generate import generate
 from primdiffusion.commands.session import Session
+from primdiffusion.formats.requests import GenerateRequest
+from primdiffusion.formats.schema import FieldError
 from tiny_model import save_tiny_checkpoint
 
 
@@ -18,15 +22,15 @@ def checkpoint(tmp_path_factory) -> Path:
 @pytest.fixture
 def only_sampling(monkeypatch):
     """Leaves out files and pictures."""
-    monkeypatch.setattr(output, "write_human", lambda *_, **__: None)
+    monkeypatch.setattr(generate_module, "write_human", lambda *_, **__: None)
 
 
 def test_time_left_is_the_mean_of_the_warm_steps_times_the_steps_left(checkpoint, tmp_path, monkeypatch, only_sampling):
     clock = itertools.chain([0.0, 10.0, 12.0, 14.0, 20.0], itertools.count(30.0))  # start, 4 steps, the rest
-    monkeypatch.setattr("primdiffusion.commands.request.time.perf_counter", lambda: next(clock))
+    monkeypatch.setattr("primdiffusion.commands.progress.time.perf_counter", lambda: next(clock))
     reports = []
     request = GenerateRequest(seed=1, out_dir=tmp_path, steps=4, checkpoint=checkpoint)
-    request.run(Session(), lambda *report: reports.append(report))
+    generate(request, Session(), lambda *report: reports.append(report))
     assert [report for report in reports if report[0] == "sample"] == [
         ("sample", 0, 4, None),
         ("sample", 1, 4, None),
@@ -44,7 +48,7 @@ def test_the_model_stays_loaded_until_another_is_asked_for(checkpoint, tmp_path,
     one = Session()
     for path in (checkpoint, checkpoint, other, checkpoint):
         request = GenerateRequest(seed=1, out_dir=tmp_path / "out", steps=1, checkpoint=path)
-        request.run(one, lambda *report: None)
+        generate(request, one, lambda *report: None)
     assert loaded == [checkpoint, other, checkpoint]
 
 
@@ -54,7 +58,7 @@ def test_a_request_can_be_ended_at_every_report(checkpoint, tmp_path):
 
     request = GenerateRequest(seed=1, out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint, size=32)
     reports = []
-    request.run(Session(), lambda *report: reports.append(report))
+    generate(request, Session(), lambda *report: reports.append(report))
     assert [report[0] for report in reports] == ["load", "sample", "sample", "sample", "write", "write"]
     for path in (tmp_path / "out").iterdir():
         path.unlink()
@@ -67,13 +71,14 @@ def test_a_request_can_be_ended_at_every_report(checkpoint, tmp_path):
                 raise Stop
 
         with pytest.raises(Stop):
-            request.run(Session(), stop)
+            generate(request, Session(), stop)
         assert not (tmp_path / "out").exists()
 
 
 def test_seeds_beyond_the_range_are_rejected_before_the_first_human(tmp_path):
-    with pytest.raises(ValueError, match=rf"seed {2**63} is outside 0 \.\.\. 2\^63-1"):
-        run(["--seed", str(2**63 - 1), "--count", "2", "--out", str(tmp_path / "out")])
+    with pytest.raises(FieldError) as error:
+        cli.run(["generate", "--seed", str(2**63 - 1), "--count", "2", "--out", str(tmp_path / "out")])
+    assert error.value.field == "count"
 
 
 def test_nothing_is_written_through_a_link_in_the_folder_of_several_humans(tmp_path):
@@ -81,13 +86,14 @@ def test_nothing_is_written_through_a_link_in_the_folder_of_several_humans(tmp_p
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "out" / "seed_000003").symlink_to(tmp_path / "elsewhere")
     with pytest.raises(ValueError, match="seed_000003 is a link to another folder"):
-        run(["--seed", "3", "--count", "2", "--out", str(tmp_path / "out")])
+        cli.run(["generate", "--seed", "3", "--count", "2", "--out", str(tmp_path / "out")])
     assert not list((tmp_path / "elsewhere").iterdir())
 
 
 def test_the_command_line_writes_compact_files(checkpoint, tmp_path):
-    run(
+    cli.run(
         [
+            "generate",
             "--seed",
             "3",
             "--steps",

@@ -8,16 +8,17 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.commands.frame import PosedPerson
-from primdiffusion.commands.merge import MergeFramesRequest, MergeRequest
-from primdiffusion.commands.request import RequestRecord, read_request
+from primdiffusion.commands import merge as commands
 from primdiffusion.commands.session import Session
 from primdiffusion.export.merged_file import upright_grid
+from primdiffusion.formats.answers import MergeAnswer, MergeFramesAnswer
+from primdiffusion.formats.requests import MergeFramesRequest, MergeRequest, PosedPerson
+from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.merge import merge
 from primdiffusion.reshaping import reshaped
-from primdiffusion.serve.server import REQUESTS, Cancelled
+from primdiffusion.serve.server import FUNCTIONS, Cancelled
 from tiny_model import tiny_model
 
 VOXEL = 0.03
@@ -44,19 +45,19 @@ def quiet(*_: object, **__: object) -> None:
     """Hears no report."""
 
 
-def done(request: RequestRecord, report=quiet) -> dict:
-    request.check()
-    return request.run(Session(), report)
+def done(request: MergeRequest | MergeFramesRequest, report=quiet) -> MergeAnswer | MergeFramesAnswer:
+    run = commands.merge if isinstance(request, MergeRequest) else commands.merge_frames
+    return run(request, Session(), report)
 
 
 def test_a_grid_is_the_posed_person_turned_z_up(human, person, tmp_path):
     result = done(MergeRequest(people=[person], out=tmp_path / "grid.npz", voxel=VOXEL))
-    with np.load(result["out"], allow_pickle=False) as grid:
+    with np.load(result.out, allow_pickle=False) as grid:
         density, colour, origin = grid["density"], grid["colour"], grid["origin"]
         assert density.dtype == colour.dtype == np.float16
         assert grid["voxel"] == VOXEL
     expected = merge(place(human, pose(2)), VOXEL)
-    assert list(density.shape) == result["shape"]
+    assert list(density.shape) == result.shape
 
     def centre(values: np.ndarray, start: np.ndarray) -> np.ndarray:
         where = np.stack(np.meshgrid(*map(np.arange, values.shape), indexing="ij"), -1)
@@ -72,7 +73,7 @@ def test_other_betas_merge_the_reshaped_person_whose_boxes_have_grown(human, per
     joints = pose_body(betas, pose(2)).skinning[:, :3].tolist()
     wider = dataclasses.replace(person, joints=joints, betas=betas.tolist())
     result = done(MergeRequest(people=[wider], out=tmp_path / "grid.npz", voxel=VOXEL))
-    with np.load(result["out"], allow_pickle=False) as grid:
+    with np.load(result.out, allow_pickle=False) as grid:
         got = grid["density"].sum(dtype=np.float64)
     grown, ungrown = (
         upright_grid(place(one, pose(2)), VOXEL).density.sum(dtype=np.float64)
@@ -88,8 +89,8 @@ def test_frames_are_the_person_s_single_grids(human, person, tmp_path):
     request = MergeFramesRequest(people=[person, other], out_dir=tmp_path / "new" / "grids", voxel=VOXEL)
     result = done(request, lambda *report: reports.append(report))
     assert [report[:3] for report in reports] == [("merge", 0, 2), ("merge", 1, 2), ("merge", 2, 2)]
-    for file, one in zip(result["files"], (person, other), strict=True):
-        alone = done(MergeRequest(people=[one], out=tmp_path / "one.npz", voxel=VOXEL))["out"]
+    for file, one in zip(result.files, (person, other), strict=True):
+        alone = done(MergeRequest(people=[one], out=tmp_path / "one.npz", voxel=VOXEL)).out
         with np.load(file) as grid, np.load(alone) as expected:
             for name in ("density", "colour", "origin", "voxel"):
                 np.testing.assert_array_equal(grid[name], expected[name])
@@ -118,9 +119,9 @@ def test_a_cancelled_merge_leaves_no_file(person, tmp_path):
 )
 def test_a_wrong_parameter_is_named(record, wrong, name):
     person = {"human": "h", "object": STILL, "joints": [STILL] * 24}
-    with pytest.raises(ValueError, match=name):
-        read_request(record, {"people": [person], **wrong}, "merge")
+    with pytest.raises(FieldError, match=name):
+        read(record, {"people": [person], **wrong})
 
 
 def test_the_child_knows_the_methods():
-    assert {"merge", "merge_frames"} <= set(REQUESTS)
+    assert {"merge", "merge_frames"} <= set(FUNCTIONS)

@@ -7,11 +7,19 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.commands import output
-from primdiffusion.commands.edit import InpaintRequest, InterpolateRequest, Region, TransferRequest, VaryRequest
-from primdiffusion.commands.generate import GenerateRequest
+from primdiffusion.commands.edit import edit
+from primdiffusion.commands.generate import generate
 from primdiffusion.commands.output import PreviewBudget, PreviewFiles, draw_front_and_back, step_previews
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.samplers import SamplerStep
+from primdiffusion.formats.requests import (
+    GenerateRequest,
+    InpaintRequest,
+    InterpolateRequest,
+    TransferRequest,
+    VaryRequest,
+)
+from primdiffusion.formats.schema import FieldError, read
 from tiny_model import save_tiny_checkpoint
 
 FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
@@ -108,9 +116,9 @@ def test_the_last_step_has_no_picture_for_the_result_follows(tmp_path, always):
 def test_generate_shows_what_the_person_will_look_like_and_leaves_no_pictures_behind(checkpoint, tmp_path, always):
     plain, shown = tmp_path / "plain", tmp_path / "shown"
     same = {"seed": 5, "steps": 4, "checkpoint": checkpoint, "size": 32}
-    GenerateRequest(out_dir=plain, **same).run(Session(), lambda *_: None)
+    generate(GenerateRequest(out_dir=plain, **same), Session(), lambda *_: None)
     listener = Listener()
-    GenerateRequest(out_dir=shown, picture_px=24, **same).run(Session(), listener)
+    generate(GenerateRequest(out_dir=shown, picture_px=24, **same), Session(), listener)
     assert [step for step, _ in listener.pictures] == [1, 2, 3]
     assert {(picture.size, picture.mode) for _, picture in listener.pictures} == {((24, 24), "RGBA")}
     assert all(picture.getchannel("A").getextrema() == (0, 255) for _, picture in listener.pictures)
@@ -129,7 +137,7 @@ def test_a_cancelled_job_leaves_no_picture(checkpoint, tmp_path, always):
 
     request = GenerateRequest(seed=5, out_dir=tmp_path / "out", steps=4, checkpoint=checkpoint, picture_px=16)
     with pytest.raises(Stop):
-        request.run(Session(), stop)
+        generate(request, Session(), stop)
     assert not (tmp_path / "out").exists()
 
 
@@ -137,29 +145,27 @@ def test_every_edit_shows_its_guesses(checkpoint, tmp_path, always):
     session, people = Session(), []
     for seed in (1, 2):
         request = GenerateRequest(seed=seed, out_dir=tmp_path / str(seed), steps=2, checkpoint=checkpoint, size=8)
-        request.run(session, lambda *_: None)
+        generate(request, session, lambda *_: None)
         people.append(tmp_path / str(seed) / "person.human.safetensors")
     same = {"person": people[0], "checkpoint": checkpoint, "size": 8, "steps": 4, "picture_px": 16}
     edits = {
         "vary": VaryRequest(out_dir=tmp_path / "v", **same),
         "interpolate": InterpolateRequest(out_dir=tmp_path / "i", other=people[1], **same),
-        "inpaint": InpaintRequest(out_dir=tmp_path / "p", region=Region(("top",)), **same),
-        "transfer": TransferRequest(
-            out_dir=tmp_path / "t", source=people[1], region=Region(("top",)), harmonise=0.5, **same
-        ),
+        "inpaint": InpaintRequest(out_dir=tmp_path / "p", region=["top"], **same),
+        "transfer": TransferRequest(out_dir=tmp_path / "t", source=people[1], region=["top"], harmonise=0.5, **same),
     }
     for method, request in edits.items():
         listener = Listener()
-        request.run(session, listener)
+        edit(request, session, listener)
         assert len(listener.pictures) >= 2, method
         assert sorted(path.name for path in tmp_path.joinpath(request.out_dir).iterdir()) == FILES, method
 
 
 def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp_path):
     from primdiffusion.diffusion.checkpoint import load_checkpoint
-    from primdiffusion.human import generate
+    from primdiffusion.human import generate as generate_human
 
-    human = generate(load_checkpoint(checkpoint, torch.device("cpu")), 3, 2)
+    human = generate_human(load_checkpoint(checkpoint, torch.device("cpu")), 3, 2)
     draw_front_and_back(tmp_path / "both.png", human, 64)
     with Image.open(tmp_path / "both.png") as picture:
         assert picture.size == (64, 64)
@@ -171,7 +177,7 @@ def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp
 
 @pytest.mark.parametrize("px", [-1, 1025])
 def test_sizes_out_of_range_are_rejected(tmp_path, px):
-    with pytest.raises(ValueError, match=f"picture_px is {px}: choose 0, for no previews, to 1024"):
-        GenerateRequest(seed=1, out_dir=tmp_path, picture_px=px).check()
-    with pytest.raises(ValueError, match=f"picture_px is {px}"):
-        VaryRequest(person=tmp_path, out_dir=tmp_path, picture_px=px).check()
+    for record, needed in ((GenerateRequest, {"seed": 1}), (VaryRequest, {"person": tmp_path})):
+        with pytest.raises(FieldError) as error:
+            read(record, {"out_dir": tmp_path, "picture_px": px, **needed})
+        assert error.value.field == "picture_px"

@@ -14,14 +14,14 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
 from primdiffusion.capture.render import render
-from primdiffusion.commands import output
-from primdiffusion.commands.reconstruct import ReconstructRequest
-from primdiffusion.commands.request import read_request
+from primdiffusion.commands import reconstruct as commands
 from primdiffusion.commands.session import Session
 from primdiffusion.encoder import model as encoder_model
 from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
+from primdiffusion.formats.requests import ReconstructRequest
+from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
@@ -189,14 +189,14 @@ def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, t
 def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):
     loaded = []
     load = load_encoder
-    monkeypatch.setattr(output, "write_human", lambda *_: None)
+    monkeypatch.setattr(commands, "write_human", lambda *_: None)
     counted = lambda path, device: loaded.append(path) or load(path, device)  # noqa: E731
     monkeypatch.setattr(encoder_model, "load_encoder", counted)
     other = save_tiny_encoder(tmp_path / "other.safetensors")
     session = Session()
     for path in (checkpoint, checkpoint, other):
         request = ReconstructRequest(capture=dataset / FIRST, out_dir=tmp_path / "out", views=2, checkpoint=path)
-        request.run(session, lambda *report: None)
+        commands.reconstruct(request, session, lambda *report: None)
     assert loaded == [checkpoint, other]
 
 
@@ -207,12 +207,12 @@ def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypa
     folder = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
     request = ReconstructRequest(capture=folder, out_dir=tmp_path / "out", checkpoint=checkpoint, size=32)
     session, reports = Session(), []
-    result = request.run(session, lambda *report: reports.append(report))
+    result = commands.reconstruct(request, session, lambda *report: reports.append(report))
     stages = [("load", 0), ("read", 1), ("encode", 2), ("write", 3), ("write", 4)]
     assert [report[:2] for report in reports] == stages
-    assert result["subject"] == FIRST
-    assert result["views"] == [0, 1, 2, 3]
-    assert "is inside the masks" in result["warnings"][0]
+    assert result.subject == FIRST
+    assert result.views == [0, 1, 2, 3]
+    assert "is inside the masks" in result.warnings[0]
     shutil.rmtree(tmp_path / "out")
     for end in range(len(reports)):
         count = itertools.count()
@@ -222,11 +222,11 @@ def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypa
                 raise Stop
 
         with pytest.raises(Stop):
-            request.run(session, stop)
+            commands.reconstruct(request, session, stop)
         assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize("wrong", [{"frame": -1}, {"views": 0}, {"size": 0}, {"capture": ""}, {"out_dir": ""}])
 def test_impossible_parameters_are_rejected(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        read_request(ReconstructRequest, {"capture": "captures", "out_dir": "out", **wrong}, "reconstruct")
+    with pytest.raises(FieldError, match=next(iter(wrong))):
+        read(ReconstructRequest, {"capture": "captures", "out_dir": "out", **wrong})

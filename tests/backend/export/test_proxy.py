@@ -14,7 +14,6 @@ from primdiffusion.export.proxy import (
     ARRAYS,
     OUTSIDE,
     TEXTURE,
-    ProxySettings,
     _march_inwards,
     mesh_proxy,
     skin_weights,
@@ -23,6 +22,8 @@ from primdiffusion.export.proxy import (
     write_proxy_obj,
 )
 from primdiffusion.export.surface import OuterSurface
+from primdiffusion.formats.requests import ProxySettings
+from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.human import framing, place, pose_body
 from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 from primdiffusion.raster.rasterise import rasterise
@@ -140,5 +141,5 @@ def test_stages_are_reported_and_may_end_the_job():
 
 @pytest.mark.parametrize("wrong", [{"spacing": 0.0}, {"triangles": 10}, {"texture_px": 9000}])
 def test_impossible_settings_are_rejected(wrong):
-    with pytest.raises(ValueError, match="choose"):
-        ProxySettings(**wrong)
+    with pytest.raises(FieldError, match=next(iter(wrong))):
+        read(ProxySettings, wrong)

@@ -12,13 +12,13 @@ import safetensors.torch
 import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
-from primdiffusion.commands.frame import FrameSpec, PosedPerson
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint, read_card
 from primdiffusion.diffusion.codec import ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, place_skinned
 from primdiffusion.human_file import HumanFileError, load_human, save_human
 from primdiffusion.primitives.anchors import build_anchors
@@ -115,7 +115,7 @@ def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_
     camera = framing(primitives, 0.4, 40, 56)
     for view, chart in (("colour", None), ("boxes", human.body_setup.anchors.chart)):
         np.full(40 * 56 * 5, np.nan, np.float32).tofile(tmp_path / "frame")
-        params = FrameSpec(
+        params = DrawRequest(
             frame=tmp_path / "frame", width=40, height=56, view=view, intrinsics=camera.intrinsics.tolist(),
             world_to_camera=camera.world_to_camera.tolist(),
             people=[PosedPerson(tmp_path / "a.human.safetensors", still, [still] * 24)],

@@ -232,7 +232,7 @@ def test_a_cancelled_command_leaves_nothing(line, tmp_path, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("primdiffusion.training.refine.refine", interrupted)
+    monkeypatch.setattr("primdiffusion.commands.reconstruct.refine", interrupted)
     with pytest.raises(SystemExit) as end:
         cli.main(line)
     assert end.value.code == 130
@@ -247,7 +247,7 @@ def test_a_cancelled_command_leaves_nothing(line, tmp_path, monkeypatch):
         (("--start", "missing.human.safetensors"), "no human file missing"),
         (("--start", "missing.glb"), "missing.glb"),
         (("--hold-out-cameras", "4"), "cannot be held out"),
-        (("--size", "0"), "0 pixels"),
+        (("--size", "0"), "size is 0"),
         (("--steps", "0"), "steps"),
         (("--minutes", "-1"), "seconds"),
     ],

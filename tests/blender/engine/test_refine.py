@@ -7,6 +7,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from blender_primdiffusion.formats.answers import DrawAnswer
 
 from blender_primdiffusion.backend.drawing import Drawing
 from blender_primdiffusion.backend.requests import RequestError
@@ -153,7 +154,7 @@ def test_where_drawing_is_fast_moving_pictures_become_finer_and_coarser_again_wh
         bench.refinement.want(wish(step))
         bench.refinement.advance()
         widths.append(bench.asked[-1].params["width"])
-        answer(bench, result={"seconds": seconds})
+        answer(bench, result=DrawAnswer(seconds=seconds))
     assert widths == [-(-SIZE[0] // coarseness) for coarseness in (4, 2, 1, 1, 2, 4)]
 
 

@@ -37,10 +37,10 @@ def person(addon, tmp_path):
 def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Job]:
     target, moment, context = HumanTarget.of(person), Moment.now(person), bpy.context
     return [
-        VaryJob.of(person, 3, {"amount": 0.5, "seed": 3}),
-        RedressJob.of(person, 3, {"region": {"painted": [0.0, 1.0]}, "seed": 3}),
-        TransferJob.of(person, 3, {"other": "/a/b"}),
-        BlendJob.of(person, 3, {"other": "/a/b", "fraction": 0.5}),
+        VaryJob.of(person, {"steps": 3, "amount": 0.5, "seed": 3}),
+        RedressJob.of(person, {"steps": 3, "region": {"painted": [0.0, 1.0]}, "seed": 3}),
+        TransferJob.of(person, {"steps": 3, "other": "/a/b"}),
+        BlendJob.of(person, {"steps": 3, "other": "/a/b", "fraction": 0.5}),
         MergeJob(target, moment, 0.006),
         ExportMeshJob(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
         AddProxyJob(target, 512, 9000),

@@ -31,7 +31,7 @@ def on_their_way(addon, tmp_path, monkeypatch):
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
     monkeypatch.setattr("blender_primdiffusion.jobs.follow.SLICE_S", 0.0)
     bpy.ops.ed.undo_push(message="before")
-    queue.add(addon, GenerateJob(7, 1))
+    queue.add(addon, GenerateJob(7, {"steps": 1}))
     until(lambda: 0.4 < building.fraction < 1.0)
     return addon
 
@@ -61,7 +61,7 @@ def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.jobs.follow.SLICE_S", 0.0)
     written, write_file, ticks = [], volumes.write_file, [0]
     monkeypatch.setattr(volumes, "write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
-    queue.add(addon, GenerateJob(7, 1))
+    queue.add(addon, GenerateJob(7, {"steps": 1}))
     while follow() is not None:
         ticks[0] += 1
     assert len(written) == len(set(written)) == 8
@@ -70,7 +70,7 @@ def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
 
 def test_the_bar_continues_while_volumes_are_written(addon, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.jobs.follow.SLICE_S", 0.0)
-    queue.add(addon, GenerateJob(7, 1))
+    queue.add(addon, GenerateJob(7, {"steps": 1}))
     seen = []
     while follow() is not None:
         if queue.ready:
@@ -131,7 +131,7 @@ def test_files_removed_meanwhile_are_written_again(on_their_way):
 
 
 def test_a_script_that_does_not_wait_for_the_volumes_gets_the_whole_person(addon):
-    queue.add(addon, GenerateJob(7, 1))
+    queue.add(addon, GenerateJob(7, {"steps": 1}))
     until(lambda: queue.ready)
     bpy.ops.primdiffusion.take_result()
     assert follow() is None
@@ -182,7 +182,7 @@ def test_nothing_is_written_while_the_user_holds_something(on_their_way, monkeyp
 
 
 def test_a_damaged_answer_is_reported_and_leaves_no_files(addon, tmp_path):
-    queue.add(addon, GenerateJob(GIVES_GARBAGE, 1))
+    queue.add(addon, GenerateJob(GIVES_GARBAGE, {"steps": 1}))
     drive()
     assert "is damaged" in error_of("generate")
     assert not (tmp_path / "shot_humans").exists()
@@ -190,7 +190,7 @@ def test_a_damaged_answer_is_reported_and_leaves_no_files(addon, tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_reported(addon, tmp_path):
     (tmp_path / "shot_humans").write_text("in the way")
-    queue.add(addon, GenerateJob(7, 1))
+    queue.add(addon, GenerateJob(7, {"steps": 1}))
     drive()
     assert "could not be written" in error_of("generate")
     assert not bpy.data.volumes
@@ -198,7 +198,7 @@ def test_a_folder_that_cannot_be_written_is_reported(addon, tmp_path):
 
 def test_queued_humans_do_not_disturb_each_other(addon):
     for seed in (11, 12, 13):
-        queue.add(addon, GenerateJob(seed, 1))
+        queue.add(addon, GenerateJob(seed, {"steps": 1}))
     drive()
     people = humans(bpy.context.scene)
     assert len({folder_of(person) for person in people}) == 3

@@ -51,7 +51,7 @@ def varied(person, monkeypatch):
 
 
 def vary(person, seed: int = FINE) -> None:
-    queue.add(bpy.context, VaryJob.of(person, 2, {"amount": 0.5, "seed": seed}))
+    queue.add(bpy.context, VaryJob.of(person, {"steps": 2, "amount": 0.5, "seed": seed}))
 
 
 def until_written(seconds: float = 30.0) -> None:
@@ -101,7 +101,7 @@ def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
 def test_only_what_the_edit_changes_is_written(person, monkeypatch):
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     before = set(shown(person).values())
-    queue.add(bpy.context, RedressJob.of(person, 2, {"region": ["top"], "seed": FINE}))
+    queue.add(bpy.context, RedressJob.of(person, {"steps": 2, "region": ["top"], "seed": FINE}))
     until_written()
     assert len(building._writing.result.made) == OF_THE_REGION
     drive()

@@ -27,7 +27,7 @@ from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_OT_generate, P
 
 
 def ask(context, seed: int, steps: int) -> None:
-    queue.add(context, GenerateJob(seed, steps))
+    queue.add(context, GenerateJob(seed, {"steps": steps}))
 
 
 def panel_texts(context) -> list[str]:

@@ -24,7 +24,7 @@ ops = bpy.ops.primdiffusion
 
 def started_and_idle() -> int:
     """The process id of a child that has made a person."""
-    queue.add(bpy.context, GenerateJob(7, 1))
+    queue.add(bpy.context, GenerateJob(7, {"steps": 1}))
     drive()
     return queue.child_pid
 
@@ -55,7 +55,7 @@ def test_release_ends_the_child_reports_the_freed_memory_and_the_next_job_starts
 
 
 def test_memory_is_not_released_while_the_child_is_busy(addon):
-    queue.add(bpy.context, GenerateJob(TAKES_LONG, 50))
+    queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 50}))
     until_running()
     with refused(RuntimeError, "backend"):
         ops.release_memory()
@@ -87,7 +87,7 @@ def test_grids_are_given_back_with_an_idle_child_but_not_under_a_render(addon, m
 
 
 def test_a_busy_child_is_never_idle(addon):
-    queue.add(bpy.context, GenerateJob(TAKES_LONG, 50))
+    queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 50}))
     until_running()
     assert not memory.release_when_idle(time.monotonic() + 10_000)
 

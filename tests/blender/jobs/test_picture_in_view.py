@@ -58,7 +58,7 @@ def redraws(monkeypatch) -> list[bool]:
 @pytest.fixture
 def denoising(addon, redraws):
     """The context of a job whose first picture has come."""
-    queue.add(addon, GenerateJob(TAKES_LONG, 5))
+    queue.add(addon, GenerateJob(TAKES_LONG, {"steps": 5}))
     until_running()
     follow()
     assert shown()
@@ -73,14 +73,14 @@ def test_the_picture_goes_when_the_job_is_cancelled(denoising, redraws):
 
 
 def test_the_picture_goes_when_the_job_fails(addon, redraws):
-    queue.add(addon, GenerateJob(DIES, 3))
+    queue.add(addon, GenerateJob(DIES, {"steps": 3}))
     drive()
     assert error_of("generate")
     assert redraws == [True, False]
 
 
 def test_the_picture_goes_when_the_human_stands(addon, redraws):
-    queue.add(addon, GenerateJob(7, 3))
+    queue.add(addon, GenerateJob(7, {"steps": 3}))
     drive()
     assert redraws == [True, False]
     assert bpy.data.collections["Human"]
@@ -90,7 +90,7 @@ def test_loading_a_file_and_unregistering_remove_the_picture(denoising):
     picture_in_view._texture = "uploaded"
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     assert (picture_in_view._pixels, picture_in_view._texture) == (None, None)
-    queue.add(bpy.context, GenerateJob(TAKES_LONG, 5))
+    queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 5}))
     until_running()
     follow()
     assert shown()

@@ -60,7 +60,7 @@ def test_a_picture_that_is_gone_or_none_is_no_error(tmp_path):
 
 
 def test_the_childs_picture_is_shown_while_it_works_and_then_no_more(addon):
-    queue.add(bpy.context, GenerateJob(TAKES_LONG, 5))
+    queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 5}))
     until_running()
     follow()
     assert so_far.shown.name == "picture.png"

@@ -29,7 +29,7 @@ ops = bpy.ops.primdiffusion
 
 
 def ask(seed: int, steps: int = 1) -> int:
-    return queue.add(bpy.context, GenerateJob(seed, steps)).number
+    return queue.add(bpy.context, GenerateJob(seed, {"steps": steps})).number
 
 
 def seeds() -> list[int]:

@@ -43,7 +43,7 @@ def resting_at_once(monkeypatch):
 
 def test_a_result_waits_until_undo_and_redo_have_rested(addon, monkeypatch):
     steps("before", "one", "two")
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     until_ready()
     monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
     for step in (bpy.ops.ed.undo, bpy.ops.ed.undo, bpy.ops.ed.redo):
@@ -66,7 +66,7 @@ def test_results_between_undo_and_redo_are_steps_of_their_own(addon, resting_at_
         steps(*(f"{count} {name}" for name in ("one", "two", "three")))
         for step in pressed.split():
             getattr(bpy.ops.ed, step)()
-        queue.add(addon, GenerateJob(10 + count, 1))
+        queue.add(addon, GenerateJob(10 + count, {"steps": 1}))
         drive()
         left = names()
         for step, people in (("undo", count - 1), ("redo", count)):
@@ -84,7 +84,7 @@ def test_results_between_undo_and_redo_are_steps_of_their_own(addon, resting_at_
 
 @pytest.mark.parametrize(("job", "shown"), [("RENDER", "the render"), ("OBJECT_BAKE", "the bake")])
 def test_nothing_is_changed_while_blender_reads_the_scene_in_a_thread(addon, monkeypatch, job, shown):
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     until_ready()
     app = SimpleNamespace(is_job_running=lambda kind: kind == job)
     monkeypatch.setattr(windows, "bpy", SimpleNamespace(app=app, context=bpy.context))
@@ -99,7 +99,7 @@ def test_nothing_is_changed_while_blender_reads_the_scene_in_a_thread(addon, mon
 
 
 def test_nothing_is_changed_within_a_modal_operator(addon, monkeypatch):
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     until_ready()
     modals = [
         SimpleNamespace(name="Screencast Keys", bl_options={"REGISTER"}),
@@ -148,7 +148,7 @@ def test_what_a_failure_leaves_is_an_undo_step(addon, resting_at_once, monkeypat
 
     monkeypatch.setattr(GenerateJob, "finish", fail)
     steps("before", "one")
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     drive()
     assert "disk is full" in error_of("generate")
     assert "left behind" in bpy.data.meshes
@@ -163,7 +163,7 @@ def test_a_failure_that_changed_nothing_makes_no_step(addon, resting_at_once, mo
 
     monkeypatch.setattr(GenerateJob, "finish", fail)
     steps("before", "one")
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     drive()
     bpy.ops.ed.undo()
     assert names() == {"before"}
@@ -178,7 +178,7 @@ def test_a_failure_that_left_edit_mode_can_be_undone(addon, resting_at_once, mon
     bpy.ops.ed.undo_push(message="Add Cube")
     bpy.ops.object.mode_set(mode="EDIT")
     bpy.ops.ed.undo_push(message="Edit Mode")
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     drive()
     assert bpy.context.mode == "OBJECT"
     bpy.ops.ed.undo()
@@ -195,7 +195,7 @@ def test_a_job_without_a_step_that_leaves_data_makes_one(addon, resting_at_once,
     monkeypatch.setattr(GenerateJob, "undo", "")
     monkeypatch.setattr(GenerateJob, "finish", finish)
     steps("before")
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     drive()
     bpy.ops.ed.undo()
     assert "baked by an exporter" not in bpy.data.images

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 import pytest
+from blender_primdiffusion.formats.answers import VariationFiles
 from jobs_driven import drive, error_of, shown, until_running
 from support.errors import refused
 from support.fake_child import FAILS, TAKES_LONG
@@ -157,7 +158,7 @@ def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the
 ):
     drawn = []
     monkeypatch.setattr(variations_panel, "_draw_picture", lambda _cell, path, _units: drawn.append(path))
-    queue.add(addon, VariationsJob((31, TAKES_LONG, 33), 3, "ddim"))
+    queue.add(addon, VariationsJob((31, TAKES_LONG, 33), {"steps": 3}))
     until_running()
     while len(queue.request.pictures) < 2:
         queue.tick()
@@ -217,7 +218,7 @@ def test_files_and_pictures_go_when_it_is_cleared_another_file_is_loaded_or_the_
 
 
 def test_a_person_cleared_before_its_turn_is_named(addon, shown_people):
-    queue.add(addon, VariationsJob((1,), 1, "ddim", person=str(sheet.variations[0].person)))
+    queue.add(addon, VariationsJob((1,), {"steps": 1}, person=str(sheet.variations[0].person)))
     ops.variations(clear=True)
     drive()
     assert "the human to vary was cleared" in error_of("variations").lower()
@@ -243,17 +244,16 @@ def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
     mine = tmp_path / "outside" / "mine"
     mine.parent.mkdir()
     mine.write_text("mine")
-    person = {"seed": 7}
-    for name in ("human", "person", "picture"):
-        person[name] = str(tmp_path / name)
-        Path(person[name]).symlink_to(mine)
+    person = VariationFiles(seed=7, **{name: tmp_path / name for name in ("human", "person", "picture")})
+    for link in (person.human, person.person, person.picture):
+        link.symlink_to(mine)
     own = Sheet()
     own.fill([person], "")
     (own.variations[0].folder / "more").symlink_to(mine.parent)
     folder = own.variations[0].folder.parent
     own.clear()
     assert not folder.exists()
-    Path(person["human"]).write_text("")
+    person.human.write_text("")
     with refused(OSError, "person"):
         own.fill([person], "")
     assert mine.read_text() == "mine"

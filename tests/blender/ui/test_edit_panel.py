@@ -47,7 +47,7 @@ def sent(person) -> dict:
 
 
 def start(person, seed: int = FINE, **params) -> None:
-    queue.add(bpy.context, VaryJob.of(person, 2, {"amount": 0.5, "seed": seed, **params}))
+    queue.add(bpy.context, VaryJob.of(person, {"steps": 2, "amount": 0.5, "seed": seed, **params}))
 
 
 def drawn(kind: str) -> str:

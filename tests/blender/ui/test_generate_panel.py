@@ -206,7 +206,7 @@ def test_limits_of_cycles_are_named_in_the_result_where_cycles_is_chosen_alone(a
 
 def test_the_next_step_waits_until_no_job_is_running(addon):
     bpy.ops.primdiffusion.generate(seed=7, steps=1)
-    queue.add(addon, GenerateJob(4, 5))
+    queue.add(addon, GenerateJob(4, {"steps": 5}))
     texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
     assert "primdiffusion.set_up_engine" not in texts
 

@@ -39,7 +39,7 @@ def test_diagnostics_hold_versions_and_the_error_but_no_folder_or_name(addon, tm
 def test_the_panel_jobs_is_shown_only_while_there_are_any(addon):
     shows = jobs_panel.PRIMDIFFUSION_PT_jobs.poll
     assert not shows(addon)
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     assert shows(addon)
     drive()
     assert queue.ended
@@ -52,7 +52,7 @@ def test_the_panel_jobs_is_shown_only_while_there_are_any(addon):
 def test_cancel_says_what_is_not_running(addon):
     with refused(RuntimeError, "Nothing"):
         ops.cancel()
-    queue.add(addon, GenerateJob(11, 1))
+    queue.add(addon, GenerateJob(11, {"steps": 1}))
     for what, sentence in (("CAPTURES", "no captures are being rendered"), ("SET_UP", "[Nn]othing is being set up")):
         with pytest.raises(RuntimeError, match=sentence):
             ops.cancel(what=what)

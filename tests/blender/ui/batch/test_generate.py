@@ -186,7 +186,7 @@ def test_nothing_is_written_through_a_link_in_the_folder(out, tmp_path):
     ("words", "sentence"),
     [
         (["--count", "0"], "invalid whole number from 1 value: '0'"),
-        (["--count", "2", "--seed", str(2**63 - 1)], f"seed {2**63} is outside 0 ... 2^63-1"),
+        (["--count", "2", "--seed", str(2**63 - 1)], f"seed is {2**63}"),
         (["--attributes", "tall"], "'tall' is not name=value"),
         (["--sampler", "euler"], "invalid choice: 'euler'"),
         (["--checkpoint", "/nowhere.safetensors"], "--checkpoint /nowhere.safetensors is no file"),

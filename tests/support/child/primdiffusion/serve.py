@@ -119,8 +119,8 @@ def write_edited(path: Path, params: dict) -> None:
         arrays["betas"] = arrays["betas"] + 1
         for name in ("joints", "vertices", "position"):
             arrays[name] = arrays[name] * 1.1
-    if "weights" in (params.get("region") or ()):
-        with np.load(params["region"]["weights"]) as weights:
+    if "weights" in params:
+        with np.load(params["weights"]) as weights:
             arrays["meta"] = np.array(json.dumps({"painted": weights["weights"].tolist()}))
     np.savez(path, **arrays)
 

@@ -1,0 +1,70 @@
+"""Command lines of declared records (`formats.requests`, `commands.options`): their options, help and checks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Annotated, Any, TypeVar, get_origin
+
+import tyro
+
+from primdiffusion.formats.schema import Option, Range, descriptions, field_types, read, split
+
+Record = TypeVar("Record")
+
+
+def parse(record: type[Record], arguments: Sequence[str], command: str) -> Record:
+    """Read a command line; exits with 2 for a usage error, raises FieldError for values out of range."""
+    given = tyro.cli(_with_options(record), args=arguments, prog=f"primdiffusion {command}")
+    return read(record, vars(given))
+
+
+def _with_options(record: type) -> type:
+    """A subclass whose annotations tyro understands."""
+    about, kinds = descriptions(record), field_types(record)
+    fields = {field.name: field for field in dataclasses.fields(record)}
+    namespace: dict[str, Any] = {
+        "__annotations__": {name: _with_option(kind, about.get(name, "")) for name, kind in kinds.items()},
+        "__doc__": record.__doc__,
+        **{
+            name: dataclasses.field(default_factory=field.default_factory)
+            for name, field in fields.items()
+            if field.default_factory is not dataclasses.MISSING
+        },
+    }
+    return dataclasses.dataclass(frozen=True, kw_only=True)(type(record.__name__, (record,), namespace))
+
+
+def _with_option(kind: Any, about: str) -> Any:
+    plain, marks = split(kind)
+    option = next((mark for mark in marks if isinstance(mark, Option)), Option())
+    if get_origin(plain) is dict:
+        plain = Annotated[plain, _NAMES_AND_VALUES]
+    if option.positional:
+        plain = tyro.conf.Positional[plain]
+    if option.hidden:
+        plain = tyro.conf.Suppress[plain]
+    limits = [f"{str(mark).capitalize()}." for mark in marks if isinstance(mark, Range)]
+    return Annotated[plain, tyro.conf.arg(name=option.name or None, help=" ".join([about, *limits]).strip())]
+
+
+def _names_and_values(words: list[str]) -> dict[str, Any]:
+    """Parse NAME=VALUE arguments. Raises ValueError."""
+    values: dict[str, Any] = {}
+    for word in words:
+        name, _, value = word.partition("=")
+        if not name or not value:
+            raise ValueError(f"{word!r} is not an attribute: write NAME=VALUE, as in outfit=suit or height=1.8")
+        if name in values:
+            raise ValueError(f"the attribute {name!r} is given twice: give it once")
+        values[name] = value
+    return values
+
+
+_NAMES_AND_VALUES = tyro.constructors.PrimitiveConstructorSpec(
+    nargs="*",
+    metavar="NAME=VALUE",
+    instance_from_str=_names_and_values,
+    is_instance=lambda value: isinstance(value, dict),
+    str_from_instance=lambda values: [f"{name}={value}" for name, value in values.items()],
+)

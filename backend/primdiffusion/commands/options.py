@@ -1,0 +1,221 @@
+"""Command lines with more, fewer or other options than a request of JSON-RPC. Needs no torch, for --help."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+from primdiffusion.formats.regular_files import real_path
+from primdiffusion.formats.requests import (
+    LARGEST_SEED,
+    RAY_STEP,
+    VOXEL,
+    Count,
+    GaussiansRequest,
+    GenerateRequest,
+    InpaintRequest,
+    InterpolateRequest,
+    OutDir,
+    Person,
+    Pixels,
+    ProxySettings,
+    RayStep,
+    ReconstructRequest,
+    RenderRequest,
+    Seed,
+    TransferRequest,
+    VaryRequest,
+    View,
+    Voxel,
+)
+from primdiffusion.formats.schema import Ending, FieldError, Length, Option, Range
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GenerateCommand(GenerateRequest):
+    """Generate humans: human.npz for Blender, person.human.safetensors, and previews."""
+
+    out_dir: OutDir
+    """Output folder; with --count above 1, of a folder for each human."""
+    seed: Seed = 0
+    count: Count = 1
+    """Number of humans, with consecutive seeds."""
+    batch: Count = 1
+    """Humans sampled at once: faster, above all on a GPU, and needs more memory. Results differ from those of single
+    humans in the last digits."""
+    compact: bool = False
+    """Store colours and densities of person.human.safetensors in 8 bits: 2 MB instead of 8, without visible loss."""
+
+    def check(self) -> None:
+        """Raise FieldError for seeds beyond the largest."""
+        if self.seed + self.count - 1 > LARGEST_SEED:
+            raise FieldError(("count",), f"is {self.count}: the last seed would be above {LARGEST_SEED}")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PoseOptions:
+    """A pose on the command line."""
+
+    pose: Path | None = None
+    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians); the default is the T pose."""
+    frame: int = 0
+    """Frame of a pose file with several."""
+
+    def check(self) -> None:
+        """Raise FieldError for a frame without a pose file."""
+        if self.frame and self.pose is None:
+            raise FieldError(("frame",), f"is {self.frame} without a pose file: give one with --pose")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderCommand(PoseOptions):
+    """Render a human in a pose."""
+
+    human: Person
+    """A .human.safetensors file."""
+    out: Annotated[Path, Ending((".png",))]
+    """Output PNG."""
+    yaw: float = 0.0
+    """Camera position around the human, degrees: 0 in front, 90 at the human's left."""
+    size: Pixels = RenderRequest.width
+    """Width and height, pixels."""
+    width: Pixels | None = None
+    """Pixels; the default is --size."""
+    height: Pixels | None = None
+    """Pixels; the default is --size."""
+    view: View = "colour"
+    """colour; depth in false colours, bright where near; alpha in grey; boxes: the primitives."""
+    step: RayStep = RAY_STEP
+    """Metres between samples of a ray; finer is slower and more accurate."""
+    background: Literal["black", "white", "transparent"] = "black"
+    """Background behind the human."""
+    depth: Annotated[Path, Ending((".png",))] | None = None
+    """A second PNG: depth in false colours, bright where near."""
+
+    def check(self) -> None:
+        """Raise FieldError for one file with two contents, and as `PoseOptions`."""
+        super().check()
+        if self.depth is not None and real_path(self.depth) == real_path(self.out):
+            raise FieldError(("depth",), f"is {self.depth}, as out: give two different files")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExportCommand(ProxySettings, PoseOptions):
+    """Export a human to other programs; the extension of --out selects the format: .glb, .obj or .ply."""
+
+    human: Person
+    """A .human file (or .human.safetensors)."""
+    out: Annotated[Path, Ending((".glb", ".obj", ".ply"))]
+    """.glb: textured mesh with a skeleton; .obj: the mesh alone, with .mtl and .png; .ply: 3D Gaussians."""
+    gaussians: Count = GaussiansRequest.limit
+    """Largest number of Gaussians; about 130,000 of a human are visible."""
+
+    def check(self) -> None:
+        """Raise FieldError for a pose of a format that stores none, and as `PoseOptions`."""
+        super().check()
+        if self.pose is not None and self.out.suffix.lower() != ".ply":
+            raise FieldError(("pose",), f"cannot be stored in {self.out.name}: omit it, or export Gaussians to a .ply")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MergeCommand(PoseOptions):
+    """Merge humans into one voxel grid; the extension of --out selects the format: .vdb or .npz."""
+
+    humans: Annotated[tuple[Path, ...], Length(1), Option(positional=True)]
+    """.human files (or .human.safetensors)."""
+    out: Annotated[Path, Ending((".vdb", ".npz"))]
+    """.vdb: grids density and Cd (needs Python's module openvdb); .npz: density, colour, origin, voxel. z up."""
+    voxel: Voxel = VOXEL
+    """Voxel size, metres; half the size shows more detail at eight times the memory."""
+    apart: float = 1.0
+    """Distance between neighbours, side by side, metres."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class InfoCommand:
+    """Describe this installation, a checkpoint or a human, as JSON."""
+
+    file: Annotated[Path | None, Option(positional=True)] = None
+    """A .human.safetensors, a checkpoint or an encoder; without it versions, device, memory and the package's cards."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ExportOnnxCommand:
+    """Export the denoiser of a model to ONNX: x [b, C, H, W], t [b] and condition [b, a] to the clean guess x0."""
+
+    checkpoint: Annotated[Path | None, Option(positional=True)] = None
+    """Trained model: a .safetensors file or a folder; the default is the one in the package."""
+    out: Annotated[Path, Ending((".onnx",))] = Path("denoiser.onnx")
+    """Output .onnx."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ViewCommand:
+    """Show a human in a browser, with sliders for the pose."""
+
+    human: Person
+    """A .human.safetensors file."""
+    port: Annotated[int, Range(0, 65_535)] = 8080
+    """Port on this machine; the next free one if it is in use."""
+    size: Pixels = 512
+    """Height of the pictures, pixels; a third of it while the camera moves."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RefineCommand:
+    """Optimise a human to match captures: human.npz for Blender, person.human.safetensors, and previews.
+
+    Captures are those of `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's
+    layout, in several poses and from many sides: with few views the result overfits to them. Some cameras are held out
+    to evaluate the result.
+    """
+
+    capture: Path
+    """Folder of a capture dataset, or of one subject in it."""
+    out: Path
+    """Output folder."""
+    subject: str | None = None
+    """Name of the subject; not needed if there is only one."""
+    start: str = "body"
+    """Initial human: body (the bare body in grey), encoder (reconstructed from the first frame), or a file: a
+    .human.safetensors, or a .glb of primdiffusion people."""
+    checkpoint: Path | None = None
+    """Trained encoder (.safetensors) for --start encoder; the default is the one in the package."""
+    steps: int = 300
+    """Optimiser steps, of two images each."""
+    size: Pixels = 256
+    """Largest side of the images used, and width and height of the previews, pixels."""
+    hold_out_cameras: int = 3
+    """Number of cameras, evenly spaced, held out for evaluation."""
+    minutes: float = 5.0
+    """Time limit of the optimisation."""
+    seed: int = 0
+    """Seed of the order of views; the same seed gives the same human unless time runs out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ServeCommand:
+    """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
+
+    about: bool = False
+    """Print the versions of this program, torch and Python as one line of JSON, and end."""
+
+
+OPTIONS: dict[str, type] = {
+    "generate": GenerateCommand,
+    "vary": VaryRequest,
+    "interpolate": InterpolateRequest,
+    "inpaint": InpaintRequest,
+    "transfer": TransferRequest,
+    "reconstruct": ReconstructRequest,
+    "refine": RefineCommand,
+    "render": RenderCommand,
+    "view": ViewCommand,
+    "export": ExportCommand,
+    "export-onnx": ExportOnnxCommand,
+    "merge": MergeCommand,
+    "serve": ServeCommand,
+    "info": InfoCommand,
+}
+"""Command lines that are read before the command's module, which loads torch, is imported."""

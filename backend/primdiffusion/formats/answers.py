@@ -1,0 +1,258 @@
+"""What the child sends: answers to the requests of `requests`, errors, and notifications. Each is declared here, once.
+
+Fields without a default are those that the extension needs; it reads the answers of other versions too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated
+
+from .schema import Open, Range
+
+Count = Annotated[int, Range(0)]
+Seconds = Annotated[float, Range(0, 2**63)]
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HumanAnswer(Open):
+    """The files of a human."""
+
+    human: Path
+    """human.npz, for Blender."""
+    person: Path
+    """The .human.safetensors file."""
+    seconds: Seconds
+    preview: Path | None = None
+    """The human from the front, PNG."""
+    side: Path | None = None
+    depth: Path | None = None
+    seed: Count | None = None
+    """None where nothing is drawn at random."""
+    steps: Count | None = None
+    seconds_sampling: Seconds | None = None
+    peak_gb: float | None = None
+    """Most memory in use."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReconstructAnswer(HumanAnswer):
+    """A reconstructed human."""
+
+    warnings: list[str]
+    """Sentences."""
+    subject: str | None = None
+    frame: Count | None = None
+    views: list[Count] | None = None
+    """Numbers of the cameras."""
+    seconds_encoding: Seconds | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VariationFiles(Open):
+    """One of several humans."""
+
+    seed: Count
+    human: Path
+    person: Path
+    picture: Path
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VariationsAnswer(Open):
+    """Several humans, in the order of their seeds."""
+
+    people: list[VariationFiles]
+    seconds: Seconds
+    peak_gb: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class AttributesAnswer(Open):
+    """The attributes that a model knows."""
+
+    categories: dict[str, list[str]]
+    """Values by name."""
+    scalars: dict[str, list[float]]
+    """Mean and standard deviation by name."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderAnswer(Open):
+    """Pictures of a human."""
+
+    out: Path | None = None
+    seconds: Seconds | None = None
+    depth: Path | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class DrawAnswer(Open):
+    """A frame is filled."""
+
+    seconds: Seconds | None = None
+    seconds_place: Seconds | None = None
+    """Loading and placing."""
+    seconds_march: Seconds | None = None
+    """The marcher alone."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MergeAnswer(Open):
+    """A grid of merged humans: density float16 [X, Y, Z] (1/m), colour float16 [X, Y, Z, 3] (linear), origin [3] (the
+    centre of the first voxel), voxel; z up."""
+
+    out: Path
+    seconds: Seconds
+    shape: list[Count] | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class MergeFramesAnswer(Open):
+    """A grid for each frame."""
+
+    files: list[Path]
+    seconds: Seconds
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ProxyAnswer(Open):
+    """The textured mesh of a human."""
+
+    proxy: Path
+    """An .npz of the human in the T pose as one closed mesh; vertices [V, 3], faces [F, 3], uv_corner [F, 3, 2],
+    skin_weights [V, 24], joints [24, 3]; y up."""
+    texture: Path
+    """PNG, sRGB."""
+    triangles: Count
+    betas: list[float]
+    """Shape coefficients of the mesh."""
+    seconds: Seconds
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class GaussiansAnswer(Open):
+    """A file of 3D Gaussians."""
+
+    out: Path
+    gaussians: Count
+    """Their number."""
+    seconds: Seconds | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Ready(Open):
+    """Notification: torch is loaded, or `problem` says why it cannot be."""
+
+    ready: bool = False
+    problem: str | None = None
+    device: str | None = None
+    device_name: str | None = None
+    device_memory_gb: float | None = None
+    device_memory_free_gb: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class HelloAnswer(Ready):
+    """About the child; what torch reports is absent until it is loaded."""
+
+    name: str | None = None
+    version: str | None = None
+    protocol: int | None = None
+    pid: int | None = None
+    python: str | None = None
+    executable: str | None = None
+    memory_gb: float | None = None
+    memory_free_gb: float | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CancelAnswer(Open):
+    """Whether the request was running."""
+
+    cancelled: bool = False
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Done(Open):
+    """An answer without values."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Progress(Open):
+    """Notification: a running request has come to a step of a stage."""
+
+    id: int | str | float | None
+    """The request's."""
+    stage: str
+    step: Count
+    total: Count
+    eta_s: Seconds | None = None
+    """Seconds left; None while unknown."""
+    picture: Path | None = None
+    """A new preview, PNG. Read it immediately: it is deleted when newer ones arrive."""
+    index: Count | None = None
+    """The human that the preview shows, of several."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ErrorData(Open):
+    """About an error, for programs."""
+
+    kind: str = ""
+    remedy: str = ""
+    """What to do next; empty where the message says it."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Failure(Open):
+    """The error of a request."""
+
+    code: int
+    message: str
+    data: ErrorData | None = None
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class Message(Open):
+    """A line of the child: a notification, which has a method, or else an answer."""
+
+    id: int | None = None
+    method: str | None = None
+    params: dict | None = None
+    result: dict | None = None
+    error: Failure | None = None
+
+
+ANSWERS: dict[str, type] = {
+    "hello": HelloAnswer,
+    **dict.fromkeys(("generate", "vary", "interpolate", "inpaint", "transfer", "human_npz"), HumanAnswer),
+    "variations": VariationsAnswer,
+    "attributes": AttributesAnswer,
+    "reconstruct": ReconstructAnswer,
+    "render": RenderAnswer,
+    "draw": DrawAnswer,
+    "merge": MergeAnswer,
+    "merge_frames": MergeFramesAnswer,
+    "proxy": ProxyAnswer,
+    "gaussians": GaussiansAnswer,
+    "cancel": CancelAnswer,
+    "shutdown": Done,
+}
+"""Answers by the method of their request."""
+NOTIFICATIONS: dict[str, type] = {"ready": Ready, "progress": Progress, "heartbeat": Done}
+"""Messages that answer no request, by their method."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class CapturesProgress(Open):
+    """Progress of the Blender that renders captures, or a line for the user alone."""
+
+    subject: str = ""
+    done: Count = 0
+    total: Count = 0
+    eta_s: Seconds | None = None
+    news: list[str] = dataclasses.field(default_factory=list)
+    """Lines for the user."""
+    line: str | None = None

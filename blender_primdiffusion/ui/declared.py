@@ -1,0 +1,41 @@
+"""Blender's properties of fields that `formats.requests` declares: their limits, defaults and descriptions."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import bpy
+
+from ..formats.schema import Range, Slider, descriptions, field_types, split
+
+SKIP = {"SKIP_SAVE"}
+PANELS = "Not given: the panel's"
+_LARGEST = 2**31 - 1
+"""Blender's integers are shorter than the backend's."""
+_MAKERS = {int: bpy.props.IntProperty, float: bpy.props.FloatProperty}
+
+
+def declared(record: type, field: str, **changes: Any) -> Any:
+    """A property for an integer or a number of a record, with `changes` to what is declared."""
+    kind, marks = split(field_types(record)[field])
+    settings: dict[str, Any] = {
+        "name": field.replace("_", " ").title(),
+        "description": descriptions(record).get(field, "").rstrip("."),
+    }
+    default = next(each.default for each in dataclasses.fields(record) if each.name == field)
+    if default is not dataclasses.MISSING:
+        settings["default"] = default
+    for mark in marks:
+        if isinstance(mark, Range):
+            settings |= {"min": kind(mark.least), "max": kind(min(mark.most, _LARGEST))}
+            if (mark.least, mark.most) == (0, 1):
+                settings["subtype"] = "FACTOR"
+        elif isinstance(mark, Slider):
+            settings |= {"soft_min": kind(mark.least), "soft_max": kind(mark.most)}
+    return _MAKERS[kind](**settings | changes)
+
+
+def not_given(record: type, field: str, **changes: Any) -> Any:
+    """As `declared`, for an operator that takes the panel's value if a call leaves it out."""
+    return declared(record, field, **{"description": PANELS, "options": SKIP, **changes})
