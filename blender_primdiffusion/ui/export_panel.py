@@ -71,6 +71,22 @@ def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         draw_lines(layout, "Shape or clothes have changed: add it again", "INFO")
 
 
+def draw_as_mesh(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """For the selected human: a button that adds a mesh proxy, with its progress; where there is one, what is shown."""
+    # needs numpy
+    from ..jobs.export import shown
+    from ..scene.proxy import proxy_of
+
+    try:
+        person = selected_person(context)
+    except ValueError:
+        return
+    if proxy_of(person) is None:
+        draw_job(layout, "add_proxy", "primdiffusion.add_proxy", "OUTLINER_OB_MESH", text="As Mesh")
+    else:
+        layout.operator_menu_enum("primdiffusion.show_proxy", "shown", text=_LABELS[shown(person)], icon="HIDE_OFF")
+
+
 def _draw_assets(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Humans and poses for other files."""
     try:

@@ -18,6 +18,7 @@ from ..scene.human import humans
 from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
 from .backend_state import draw_set_up
 from .drawing import BackendPanel, SidebarPanel, draw_job, draw_lines, property_columns
+from .export_panel import draw_as_mesh
 from .gallery import draw_samples
 from .manual import draw_manual_button
 from .render_panel import draw_next_step
@@ -257,6 +258,8 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
             draw_lines(layout, sentence(device_line()), "ERROR")
         if humans(context.scene) and not queue.busy:
             draw_next_step(layout, context.scene)
+        if ready:
+            draw_as_mesh(layout, context)
 
 
 class PRIMDIFFUSION_PT_attributes(SidebarPanel, bpy.types.Panel):

@@ -22,6 +22,7 @@ from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.proxy import proxy_of
 from blender_primdiffusion.scene.surface import primitives_of
 from blender_primdiffusion.ui.export_operators import PRIMDIFFUSION_OT_export
+from blender_primdiffusion.ui.export_panel import draw_as_mesh
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
@@ -136,6 +137,22 @@ def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
     assert (proxy.hide_viewport, proxy.hide_render) == (True, True)
     assert not primitives_of(anna).hide_viewport
     assert not primitives_of(anna).hide_render
+
+
+def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
+    def drawn() -> dict[str, str]:
+        layout = MagicMock()
+        draw_as_mesh(layout, bpy.context)
+        made = (*layout.row().operator.call_args_list, *layout.operator_menu_enum.call_args_list)
+        return {call.args[0]: call.kwargs["text"] for call in made}
+
+    assert drawn() == {"primdiffusion.add_proxy": "As Mesh"}
+    OPERATORS.add_proxy(texture_px=64)
+    assert drawn() == {"primdiffusion.show_proxy": "Show Mesh in Viewport"}
+    OPERATORS.show_proxy(shown="REMOVED")
+    assert drawn() == {"primdiffusion.add_proxy": "As Mesh"}
+    bpy.context.scene.collection.children.unlink(anna)
+    assert drawn() == {}
 
 
 def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):

@@ -182,16 +182,17 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
         ("BLENDER_WORKBENCH", True, "primdiffusion.set_up_engine"),
     ],
 )
-def test_after_success_the_panel_has_one_line_and_the_button_of_the_next_step(addon, engine, camera, button):
+def test_after_success_the_panel_has_one_line_the_button_of_the_next_step_and_as_mesh(addon, engine, camera, button):
     scene, panel = addon.scene, generate_panel.PRIMDIFFUSION_PT_generate
     scene.render.engine = engine
     if camera:
         scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     before = shown(panel, addon)
     bpy.ops.primdiffusion.generate(seed=7, steps=1)
-    line, last = shown(panel, addon)[len(before) :]
+    line, next_step, as_mesh = shown(panel, addon)[len(before) :]
     assert re.fullmatch(r"Generated in [0-9.]+ s\.", line)
-    assert last == button
+    assert next_step == button
+    assert as_mesh == "primdiffusion.add_proxy"
 
 
 def test_limits_of_cycles_are_named_in_the_result_where_cycles_is_chosen_alone(addon, monkeypatch):
