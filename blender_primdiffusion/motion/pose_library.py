@@ -13,6 +13,7 @@ from ..formats.arrays import all_finite
 from ..formats.joints import JOINT_NAMES
 from ..scene.armature import bone_bases, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, matrix_to_quaternion, points_to_backend
+from ..scene.handles import key_handles
 from .adjust import leg_ratio
 from .poses import LIBRARY, grounding
 from .rotation import from_axis_angle, slerp, to_axis_angle
@@ -106,7 +107,7 @@ def apply_pose(
 
 
 def key_pose(armature: bpy.types.Object, frame: float, joints: Collection[str] = JOINT_NAMES) -> None:
-    """Insert keyframes of the current pose. Raises ValueError as `check_posable` does."""
+    """Insert keyframes of the current pose, and of IK handles. Raises ValueError as `check_posable` does."""
     check_posable(armature)
     for name in joints:
         bone = armature.pose.bones[name]
@@ -117,6 +118,7 @@ def key_pose(armature: bpy.types.Object, frame: float, joints: Collection[str] =
         bone.keyframe_insert("rotation_quaternion", frame=frame, group=name)
         if name == JOINT_NAMES[0]:
             bone.keyframe_insert("location", frame=frame, group=name)
+    key_handles(armature, frame)
 
 
 def selected_joints(armature: bpy.types.Object) -> list[str]:

@@ -5,6 +5,8 @@ Panels import this file when Blender starts, so it needs no numpy.
 
 from __future__ import annotations
 
+import math
+
 import bpy
 
 
@@ -31,6 +33,44 @@ def action_curves(armature: bpy.types.Object) -> bpy.types.bpy_prop_collection |
             if bag is not None:
                 return bag.fcurves
     return None
+
+
+def new_action(armature: bpy.types.Object, name: str) -> bpy.types.Action:
+    """Give the armature a new action with an empty layer for its pose."""
+    action = bpy.data.actions.new(name)
+    slot = action.slots.new(id_type="OBJECT", name=armature.name)
+    action.layers.new("Pose").strips.new(type="KEYFRAME").channelbag(slot, ensure=True)
+    animation = armature.animation_data_create()
+    animation.action = action
+    animation.action_slot = slot
+    return action
+
+
+def own_curves(armature: bpy.types.Object) -> bpy.types.bpy_prop_collection:
+    """The curves of an action of the armature's own: a copy where the action is linked or used elsewhere too, new where
+    there is none."""
+    curves = action_curves(armature)
+    if curves is None:
+        new_action(armature, armature.name)
+        return action_curves(armature)
+    animation = armature.animation_data
+    action, slot = animation.action, animation.action_slot
+    if action.library is not None or action.users - action.use_fake_user > 1:
+        animation.action = action.copy()
+        animation.action_slot = animation.action.slots[slot.identifier]
+    return action_curves(armature)
+
+
+def frames_in_use(armature: bpy.types.Object) -> range:
+    """Whole frames from the first to the last key of the pose or strip of the armature; empty where it has none."""
+    animation = armature.animation_data
+    if animation is None:
+        return range(0)
+    curves = [curve for curve in action_curves(armature) or () if curve.data_path.startswith("pose.bones")]
+    times = [point.co[0] for curve in curves for point in (*curve.keyframe_points[:1], *curve.keyframe_points[-1:])]
+    strips = [strip for track in animation.nla_tracks if not track.mute for strip in track.strips if not strip.mute]
+    times += [time for strip in strips for time in (strip.frame_start, strip.frame_end)]
+    return range(math.floor(min(times)), math.ceil(max(times)) + 1) if times else range(0)
 
 
 def last_key(armature: bpy.types.Object) -> float:

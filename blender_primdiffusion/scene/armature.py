@@ -14,8 +14,9 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from .actions import action_curves, last_key
+from .actions import action_curves, last_key, new_action
 from .convention import continuous_quaternions, matrix_to_quaternion, points_to_blender, rotations_to_blender
+from .limbs import place_controls
 
 _POINTS_TO = {"pelvis": "spine1", "spine3": "neck"}
 """The child that a bone points to, where a joint has several."""
@@ -64,7 +65,8 @@ def build_armature(name: str, joints: NDArray) -> bpy.types.Object:
 
 
 def move_rest_joints(data: bpy.types.Armature, joints: NDArray) -> None:
-    """Move an armature's bones to other rest joints [24, 3] (z up, metres); poses and additional bones stay.
+    """Move an armature's bones to other rest joints [24, 3] (z up, metres), and IK handles with them; poses and other
+    additional bones stay.
 
     Bones are moved but not turned towards the new joints: with the same axes, a pose or an animation means the same
     joint rotations as before. Modes, selection and the active object stay too. Raises ValueError when a joint's bone is
@@ -75,14 +77,23 @@ def move_rest_joints(data: bpy.types.Armature, joints: NDArray) -> None:
         raise ValueError(f"the armature {data.name!r} has no bone {missing[0]!r}: its shape cannot be changed")
     if data.is_editmode:
         raise ValueError(f"the armature {data.name!r} is in Edit Mode: leave it (Tab) to change the shape")
+    with editing_bones(data) as bones:
+        for name, joint in zip(JOINT_NAMES, joints, strict=True):
+            bone = bones[name]
+            along, bone.head = bone.tail - bone.head, Vector(joint)
+            bone.tail = bone.head + along
+        place_controls(bones)
+
+
+@contextmanager
+def editing_bones(data: bpy.types.Armature) -> Iterator[bpy.types.ArmatureEditBones]:
+    """The bones of an armature that is not in edit mode, to change them; modes, selection and the active object of the
+    user's scenes stay."""
     mirrored, data.use_mirror_x = data.use_mirror_x, False
     carrier = bpy.data.objects.new("PrimDiffusion Bones", data)
     try:
         with _in_edit_mode(carrier):
-            for name, joint in zip(JOINT_NAMES, joints, strict=True):
-                bone = data.edit_bones[name]
-                along, bone.head = bone.tail - bone.head, Vector(joint)
-                bone.tail = bone.head + along
+            yield data.edit_bones
     finally:
         bpy.data.objects.remove(carrier)
         data.use_mirror_x = mirrored
@@ -163,16 +174,11 @@ def keyframe_poses(
     increase.
     """
     channels = _channels(armature, frames, rotations, translations)
-    action = bpy.data.actions.new(name)
-    slot = action.slots.new(id_type="OBJECT", name=armature.name)
-    strip = action.layers.new("Pose").strips.new(type="KEYFRAME")
-    curves = strip.channelbag(slot, ensure=True).fcurves
+    action = new_action(armature, name)
+    curves = action_curves(armature)
     for (path, index), values in channels.items():
-        _add(curves.new(path, index=index), frames, values)
+        add_keys(curves.new(path, index=index), frames, values)
     _use_quaternions(armature)
-    animation = armature.animation_data_create()
-    animation.action = action
-    animation.action_slot = slot
     return action
 
 
@@ -201,7 +207,7 @@ def append_poses(armature: bpy.types.Object, frames: NDArray, rotations: NDArray
             for key in keys:  # q and -q are the same rotation, but Blender interpolates components
                 channels[key] = -channels[key]
     for key, values in channels.items():
-        _add(existing[key] if key in existing else curves.new(key[0], index=key[1]), frames, values)
+        add_keys(existing[key] if key in existing else curves.new(key[0], index=key[1]), frames, values)
     _use_quaternions(armature)
 
 
@@ -234,7 +240,7 @@ def _use_quaternions(armature: bpy.types.Object) -> None:
         armature.pose.bones[name].rotation_mode = "QUATERNION"
 
 
-def _add(curve: bpy.types.FCurve, times: NDArray, values: NDArray) -> None:
+def add_keys(curve: bpy.types.FCurve, times: NDArray, values: NDArray) -> None:
     """Append linear keys to a curve."""
     points = curve.keyframe_points
     count = len(points)

@@ -76,7 +76,8 @@ def posed_extent(collection: bpy.types.Collection) -> tuple[NDArray[np.float64],
     """Lowest and highest corner [3] in the world of a human's bones as posed, with a margin for flesh."""
     armature = armature_of(collection)
     bpy.context.view_layer.update()
-    ends = [armature.matrix_world @ end for bone in armature.pose.bones for end in (bone.head, bone.tail)]
+    bones = [bone for bone in armature.pose.bones if bone.bone.use_deform]
+    ends = [armature.matrix_world @ end for bone in bones for end in (bone.head, bone.tail)]
     points = np.array(ends, np.float64)
     return points.min(0) - _FLESH_M, points.max(0) + _FLESH_M
 

@@ -1,6 +1,7 @@
 """Export armature and mesh proxy to other programs by Blender's own exporters, in a temporary scene.
 
-That scene holds nothing else, so the user's selection, modes and visibility stay as they are.
+That scene holds nothing else, so the user's selection, modes and visibility stay as they are. Bones that deform nothing
+(IK handles) are left out, and their effect is in the joints.
 """
 
 from __future__ import annotations
@@ -126,6 +127,7 @@ def _write_glb(path: Path, frames: FrameRange) -> None:
             export_rest_position_armature=frames.animated,
             export_current_frame=True,
             export_influence_nb=4,
+            export_def_bones=True,
             export_extras=False,
         )
 
@@ -138,6 +140,7 @@ def _write_fbx(path: Path, frames: FrameRange) -> None:
             use_selection=True,
             object_types={"ARMATURE", "MESH"},
             add_leaf_bones=False,
+            use_armature_deform_only=True,
             mesh_smooth_type="FACE",
             path_mode="COPY",
             embed_textures=True,
@@ -157,6 +160,7 @@ def _write_usd(path: Path, frames: FrameRange) -> None:
         selected_objects_only=True,
         export_animation=frames.animated,
         export_armatures=True,
+        only_deform_bones=True,
         export_textures_mode="NEW",
         export_materials=True,
     )

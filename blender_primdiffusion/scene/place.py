@@ -176,7 +176,7 @@ def _others(scene: bpy.types.Scene, but: bpy.types.Collection | None = None) -> 
 def _extent(armature: bpy.types.Object) -> NDArray[np.float64]:
     """Lowest and highest x, y and z in the world [2, 3] of the bones as posed, with a margin for flesh."""
     to_world = np.array(armature.matrix_world)
-    bones = [(bone.head, bone.tail) for bone in armature.pose.bones]
+    bones = [(bone.head, bone.tail) for bone in armature.pose.bones if bone.bone.use_deform]
     ends = np.array(bones, np.float64).reshape(-1, 3) @ to_world[:3, :3].T + to_world[:3, 3]
     return np.array([ends.min(0) - _FLESH_M, ends.max(0) + _FLESH_M])
 

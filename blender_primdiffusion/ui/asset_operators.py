@@ -8,6 +8,7 @@ import bpy
 
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget
+from ..scene.human import armature_of
 from .on_person import SKIP, OnPerson
 
 _ITEMS = (
@@ -45,8 +46,12 @@ class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
         return next(text for name, _, text in _ITEMS if name == properties.what)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.assets import HumanAssetJob, PoseAssetJob, mark_human  # needs numpy
+        # needs numpy
+        from ..jobs.assets import HumanAssetJob, PoseAssetJob, mark_human
+        from ..scene.handles import joints_from_handles
 
+        if self.what == "POSE":
+            joints_from_handles(context, armature_of(person))
         of_pose = PoseAssetJob.of(person, self.name.strip() or "Pose") if self.what == "POSE" else None
         job = of_pose or HumanAssetJob(HumanTarget.of(person))
         if not self.picture:

@@ -44,9 +44,12 @@ class PRIMDIFFUSION_OT_use_action(OnArmature, bpy.types.Operator):
         )
 
     def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        from ..motion.pose_library import check_posable  # needs numpy
+        # needs numpy
+        from ..motion.pose_library import check_posable
+        from ..scene.handles import check_no_handles
 
         check_posable(armature)
+        check_no_handles(armature)
         if not self.action:
             _clear_motion(armature)
             return {"FINISHED"}

@@ -21,6 +21,7 @@ from ..scene.actions import last_key, push_to_strip
 from ..scene.armature import append_poses, keyframe_poses, rest_rotations
 from ..scene.blend_values import stored_numbers
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
+from ..scene.handles import check_no_handles
 from ..scene.human import BETA_COUNT, BETAS
 from .on_person import FACTS, scene_fps
 
@@ -55,6 +56,7 @@ def place_motion(
 ) -> tuple[float, float]:
     """Set the keys; returns the first and last frame. Raises ValueError before anything is changed."""
     check_posable(armature)
+    check_no_handles(armature)
     rest = rest_joints(armature)
     ratio = stride_ratio(motion, rest) if how.fit_stride else None
     way = dataclasses.replace(how, scale=how.scale * (1.0 if ratio is None else ratio))

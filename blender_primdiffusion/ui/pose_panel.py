@@ -13,6 +13,7 @@ from ..formats.joints import JOINT_NAMES
 from ..motion.own_poses import delete_pose, load_pose, own_poses, picture_of, save_pose
 from ..places import own_folder
 from .drawing import SidebarPanel, property_columns
+from .handle_operators import draw_handles
 from .on_person import OnArmature, may_have_joints, warn_of_rest
 
 if TYPE_CHECKING:
@@ -133,26 +134,34 @@ class _Posing(OnArmature):
             raise ValueError(f"no bone of {armature.name!r} is selected: select some in Pose Mode")
         return chosen
 
-    def pose(
-        self,
-        context: bpy.types.Context,
-        armature: bpy.types.Object,
-        pose: NDArray,
-        translation: NDArray | None,
-        amount: float,
-    ) -> set[str]:
-        """Apply, and key where auto keying is on."""
-        from ..motion.pose_library import apply_pose, key_pose  # needs numpy
+    def pose(self, armature: bpy.types.Object, pose: NDArray, translation: NDArray | None, amount: float) -> list[str]:
+        """Apply a pose; returns the bones that it changed."""
+        from ..motion.pose_library import apply_pose  # needs numpy
 
         joints = self.joints(armature)
         changed = apply_pose(armature, pose, translation, amount, joints)
+        if locked := len(joints) - len(changed):
+            self.report({"WARNING"}, f"{locked} locked bones of {armature.name!r} were not changed")
+        return changed
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        """Keys the pose where auto keying is on."""
+        # needs numpy
+        from ..motion.pose_library import check_posable, key_pose
+        from ..scene.handles import handles_from_joints, joints_from_handles
+
+        check_posable(armature)
+        joints_from_handles(context, armature)
+        changed = self.apply(context, armature)
+        handles_from_joints(context, armature)
         if context.scene.tool_settings.use_keyframe_insert_auto and changed:
             key_pose(armature, context.scene.frame_current, changed)
-        locked = len(joints) - len(changed)
-        if locked:
-            self.report({"WARNING"}, f"{locked} locked bones of {armature.name!r} were not changed")
         warn_of_rest(self, armature)
         return {"FINISHED"}
+
+    def apply(self, context: bpy.types.Context, armature: bpy.types.Object) -> list[str]:
+        """Change the pose; returns the bones changed."""
+        raise NotImplementedError
 
 
 _POSES = (
@@ -208,7 +217,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
                 layout.prop(self, name)
         layout.prop(self, "only_selected")
 
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+    def apply(self, context: bpy.types.Context, armature: bpy.types.Object) -> list[str]:
         # needs numpy
         import numpy as np
 
@@ -216,13 +225,13 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
         from ..motion.rotation import to_axis_angle
 
         if self.what == "REST":
-            return self.pose(context, armature, np.zeros((len(JOINT_NAMES), 3)), np.zeros(3), 1.0)
+            return self.pose(armature, np.zeros((len(JOINT_NAMES), 3)), np.zeros(3), 1.0)
         if self.what == "MIRRORED":
             rotations, translation = current_pose(armature)
-            return self.pose(context, armature, mirrored(to_axis_angle(rotations)), translation * [-1.0, 1.0, 1.0], 1.0)
+            return self.pose(armature, mirrored(to_axis_angle(rotations)), translation * [-1.0, 1.0, 1.0], 1.0)
         return self._apply(context, armature)
 
-    def _apply(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+    def _apply(self, context: bpy.types.Context, armature: bpy.types.Object) -> list[str]:
         """A pose of the library."""
         from ..motion.pose_library import builtin_poses, mirrored, standing  # needs numpy
 
@@ -239,7 +248,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
             translation = None if translation is None else translation * [-1.0, 1.0, 1.0]
         if translation is None and self.ground:
             translation = standing(armature, pose)
-        return self.pose(context, armature, pose, translation, self.amount)
+        return self.pose(armature, pose, translation, self.amount)
 
 
 class PRIMDIFFUSION_OT_key_pose(OnArmature, bpy.types.Operator):
@@ -250,8 +259,12 @@ class PRIMDIFFUSION_OT_key_pose(OnArmature, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        from ..motion.pose_library import key_pose  # needs numpy
+        # needs numpy
+        from ..motion.pose_library import check_posable, key_pose
+        from ..scene.handles import joints_from_handles
 
+        check_posable(armature)
+        joints_from_handles(context, armature)
         key_pose(armature, context.scene.frame_current)
         return {"FINISHED"}
 
@@ -291,10 +304,12 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
         # needs numpy
         from ..motion.pose_library import builtin_poses, current_pose
         from ..motion.rotation import to_axis_angle
+        from ..scene.handles import joints_from_handles
 
         name = self.pose_name.strip()
         if name in builtin_poses():
             raise ValueError(f"{name!r} is a built-in pose: give yours another name")
+        joints_from_handles(context, armature)
         rotations, translation = current_pose(armature)
         path = save_pose(poses_folder(), name, to_axis_angle(rotations), translation)
         try:
@@ -350,6 +365,7 @@ class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
         row.operator("primdiffusion.save_pose", icon="ADD")
         if settings.pose in own_poses(poses_folder()):
             row.operator("primdiffusion.save_pose", text="Delete Pose", icon="TRASH").delete = True
+        draw_handles(layout, context)
 
 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_motion", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_motion)),)

@@ -10,6 +10,7 @@ import synthetic
 
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.export_model import FrameRange, write_model
+from blender_primdiffusion.scene.handles import add_handles
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.proxy import build_proxy, read_proxy, remove_proxy
 
@@ -91,6 +92,27 @@ def test_joints_and_surface_are_where_they_were(moving, store, tmp_path, kind, e
     picture = textures(mesh)[0]
     assert tuple(picture.size) == (16, 16)
     assert picture.pixels[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize(("kind", "ending"), [("GLB", ".glb"), ("FBX", ".fbx"), ("USD", ".usdc")])
+def test_ik_handles_are_not_exported_and_their_effect_is(store, tmp_path, kind, ending):
+    person = exporting.add_person(store)
+    armature = armature_of(person)
+    add_handles(bpy.context, armature)
+    armature.pose.bones["pelvis"].location.y = -0.1
+    for frame, height in ((1, 0.0), (4, 0.3)):
+        armature.pose.bones["left_foot_ik"].location.z = height
+        armature.pose.bones["left_foot_ik"].keyframe_insert("location", frame=frame)
+    proxy = build_proxy(person, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    bpy.context.scene.collection.objects.link(proxy)
+    frames = FrameRange(1, 4)
+    write_model(bpy.context, armature, proxy, tmp_path / f"a{ending}", kind, frames)
+    wanted = at_frames(armature, proxy, frames)
+    assert np.abs(wanted[0][0] - wanted[3][0]).max() > 0.1
+    back, mesh = imported(tmp_path / f"a{ending}", kind)
+    assert sorted(bone.name for bone in back.data.bones) == sorted(synthetic.NAMES)
+    for (joints, _), (joints_back, _) in zip(wanted, at_frames(back, mesh, frames), strict=True):
+        assert np.abs(joints - joints_back).max() < EXACT
 
 
 def test_exporting_leaves_the_scene_as_it_was(moving, store, tmp_path):
