@@ -123,11 +123,10 @@ def key_handles(armature: bpy.types.Object, frame: float) -> None:
 
 def _check_bones(armature: bpy.types.Object) -> None:
     """Raises ValueError where bones cannot be added or removed."""
-    library = armature.data.library
-    if library is not None:
+    if armature.data.library is not None or armature.data.override_library is not None:
         raise ValueError(
-            f"the bones of {armature.name!r} are linked from {library.filepath!r}: change them there, or make them "
-            "local with Object > Relations > Make Local > All"
+            f"the bones of {armature.name!r} are linked from another file: change them there, or make them local with "
+            "Object > Relations > Make Local > All"
         )
     if armature.data.is_editmode:
         raise ValueError(f"the armature {armature.data.name!r} is in Edit Mode: leave it (Tab) first")

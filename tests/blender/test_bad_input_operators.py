@@ -25,6 +25,7 @@ from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import Job, queue
 from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.handles import add_handles
 from blender_primdiffusion.scene.human import armature_of, body_of, humans
 from blender_primdiffusion.ui.drawing import DATA
 
@@ -176,10 +177,15 @@ def tiny_units(person) -> None:
     armature_of(person).scale = (100, 100, 100)
 
 
+def with_ik_handles(person) -> None:
+    add_handles(bpy.context, armature_of(person))
+
+
 SITUATIONS: list[Callable] = [
     empty, nothing_active, armature_in_edit_mode, armature_in_pose_mode, body_in_edit_mode, body_being_painted,
     armature_deleted, armature_data_deleted, volumes_deleted, body_deleted, bones_renamed, mark_damaged, linked,
     overridden, instanced, excluded, hidden, files_missing, never_saved, backend_missing, two_people, tiny_units,
+    with_ik_handles,
 ]  # fmt: skip
 SOURCE: dict[str, Path] = {}
 
