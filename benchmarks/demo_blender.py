@@ -86,6 +86,7 @@ def lbs_error_mm(armature: bpy.types.Object, human_file: Path, rotation: np.ndar
     expected = (blended[:, :3, :3] @ rest[:, :, None])[:, :, 0] + blended[:, :3, 3]
     upright = np.stack([expected[:, 0], -expected[:, 2], expected[:, 1]], -1)  # y up to z up
     world = np.array(armature.matrix_world)
+    upright += import_module(f"{MODULE}.scene.armature").model_origin(armature.data)
     expected_world = upright @ world[:3, :3].T + world[:3, 3]
     graph = bpy.context.evaluated_depsgraph_get()
     volumes = sorted((o for o in armature.children if o.type == "VOLUME"), key=lambda o: o.name)

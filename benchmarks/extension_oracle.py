@@ -13,7 +13,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors
 
-from blender_primdiffusion.scene.armature import rest_rotations
+from blender_primdiffusion.scene.armature import model_origin, rest_rotations
 from blender_primdiffusion.scene.convention import BLENDER_FROM_BACKEND
 
 
@@ -33,7 +33,7 @@ def errors(
         for number in numbers:
             bpy.context.scene.frame_set(number)
             posed = shaped.pose(_pose(armature, bases))
-            world = np.array(armature.matrix_world)
+            world = np.array(armature.matrix_world @ Matrix.Translation(model_origin(armature.data)))
             if mode == "ARMATURE":
                 blended = torch.einsum("kj,jab->kab", weights, posed.skinning)
                 expected = (blended[:, :3, :3] @ rest[:, :, None])[:, :, 0] + blended[:, :3, 3]
@@ -85,6 +85,6 @@ def _instances(armature: bpy.types.Object) -> np.ndarray:
 
 
 def _distance_mm(found: np.ndarray, expected: np.ndarray, world: np.ndarray) -> float:
-    """Largest distance in mm between world points and backend points given in the armature's space."""
+    """Largest distance in mm between world points and backend points given in the body model's space."""
     upright = expected @ BLENDER_FROM_BACKEND.T @ world[:3, :3].T + world[:3, 3]
     return 1e3 * float(np.linalg.norm(found - upright, axis=-1).max())

@@ -19,6 +19,7 @@ import bpy
 import numpy as np
 import psutil
 import torch
+from mathutils import Matrix
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.frame import PosedPerson
 from primdiffusion.commands.merge import MergeRequest
@@ -35,7 +36,7 @@ from record import command_line, report
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import blender_primdiffusion
 from blender_primdiffusion.scene import merged as merging
-from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
+from blender_primdiffusion.scene.armature import keyframe_poses, model_origin, pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import set_attachment, show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
@@ -88,7 +89,7 @@ def surface_error(human, armature, rotations: np.ndarray) -> tuple[float, float]
         graph = bpy.context.evaluated_depsgraph_get()
         found = {i.object.original.name: np.array(i.matrix_world) for i in graph.object_instances if i.is_instance}
         matrices = np.array([found[name] for name in sorted(found)])
-        world = np.array(armature.matrix_world)
+        world = np.array(armature.matrix_world @ Matrix.Translation(model_origin(armature.data)))
         expected = frames.position.double().numpy() @ Z_UP.T @ world[:3, :3].T + world[:3, 3]
         distance = max(distance, 1e3 * float(np.linalg.norm(matrices[:, :3, 3] - expected, axis=-1).max()))
         difference = np.linalg.norm(
@@ -167,7 +168,9 @@ def main() -> None:
     armature.animation_data_clear()
     pose_from_joint_rotations(armature, step_pose())
     joints = pose_body(human.betas, BodyPose(torch.from_numpy(step_pose()).float(), torch.zeros(3))).skinning
-    posed = PosedPerson(folder / "person.human.safetensors", torch.eye(3, 4).tolist(), joints[:, :3].tolist())
+    raised = torch.eye(3, 4)
+    raised[1, 3] = float(model_origin(armature.data)[2])  # merged volumes are in the armature's space
+    posed = PosedPerson(folder / "person.human.safetensors", raised.tolist(), joints[:, :3].tolist())
     session = Session()
     began = time.perf_counter()
     MergeRequest(people=[posed], out=folder / "grid.npz").run(session, lambda *_, **__: None)

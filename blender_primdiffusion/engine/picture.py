@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
+from ..scene.armature import model_origin
 from ..scene.blend_values import stored_numbers
 from ..scene.body_file import body_file
 from ..scene.convention import transforms_to_backend
@@ -28,9 +29,9 @@ class PosedHuman:
 
     file: Path
     object_to_world: NDArray[np.float64]
-    """[3, 4] of the armature object."""
+    """[3, 4]; the object's space is the body model's (see `human.ORIGIN`)."""
     joints: NDArray[np.float64]
-    """Transforms of SMPL's joints from rest to pose, in the armature's space [24, 3, 4]."""
+    """Transforms of SMPL's joints from rest to pose, in the same space [24, 3, 4]."""
     betas: list[float] | None
     """The body's shape; None for the file's."""
     pelvis: NDArray[np.float64]
@@ -169,10 +170,12 @@ def pose_of(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collec
     rest = np.array([bones[name].bone.matrix_local for name in JOINT_NAMES], np.float64)
     if not (np.isfinite(posed).all() and np.isfinite(matrix).all()):
         raise ValueError(f"the armature of {owner.name!r} holds NaN or infinite numbers: check its pose and drivers")
+    origin = np.eye(4)
+    origin[:3, 3] = model_origin(armature.data)
     return PosedHuman(
         person_file(owner),
-        transforms_to_backend(matrix),
-        transforms_to_backend(posed @ np.linalg.inv(rest)),
+        transforms_to_backend(matrix @ origin),
+        transforms_to_backend(np.linalg.inv(origin) @ posed @ np.linalg.inv(rest) @ origin),
         _betas(armature, owner.name),
         (matrix @ posed[0])[:3, 3],
         body_file(owner),

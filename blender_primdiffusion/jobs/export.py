@@ -14,11 +14,11 @@ import numpy as np
 from ..engine.picture import pose_of
 from ..formats.removing import remove_file
 from ..formats.whole_files import written_whole
+from ..motion.pose_library import rest_joints
 from ..motion.skeleton import unchain
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
 from ..scene.body_file import shape_model_of, stored_body_name
-from ..scene.convention import points_to_backend
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import armature_of, person_file
 from ..scene.human_file import (
@@ -200,7 +200,7 @@ def write_human(
 def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: FrameRange) -> HumanMotion:
     numbers = range(frames.first, frames.last + 1)
     joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)
-    pelvis = points_to_backend(np.array(armature_of(person).data.bones["pelvis"].head_local))
+    pelvis = rest_joints(armature_of(person))[0]
     left, _, right = np.linalg.svd(joints[..., :3])
     rotations = left @ right  # the nearest rotations: bones may be scaled
     translations = joints[:, 0, :, :3] @ pelvis + joints[:, 0, :, 3] - pelvis

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite
 from ..formats.joints import JOINT_NAMES
-from ..scene.armature import bone_bases, rest_rotations
+from ..scene.armature import bone_bases, model_origin, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, matrix_to_quaternion, points_to_backend
 from ..scene.handles import key_handles
 from .adjust import leg_ratio
@@ -35,9 +35,11 @@ def mirrored(pose: NDArray) -> NDArray[np.float64]:
 
 
 def rest_joints(armature: bpy.types.Object) -> NDArray[np.float64]:
-    """Heads of SMPL's joints at rest [24, 3], y up, in the armature's units. Raises ValueError as `rest_rotations`."""
+    """SMPL's joints at rest [24, 3] in the body model's space, y up, in the armature's units. Raises ValueError as
+    `rest_rotations`."""
     rest_rotations(armature)
-    return points_to_backend([armature.data.bones[name].head_local for name in JOINT_NAMES])
+    heads = np.array([armature.data.bones[name].head_local for name in JOINT_NAMES], np.float64)
+    return points_to_backend(heads - model_origin(armature.data))
 
 
 def check_posable(armature: bpy.types.Object) -> None:

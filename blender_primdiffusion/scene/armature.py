@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
 from .actions import action_curves, last_key, new_action
+from .blend_values import stored_numbers
 from .convention import continuous_quaternions, matrix_to_quaternion, points_to_blender, rotations_to_blender
+from .human import ORIGIN
 from .limbs import place_controls
 
 _POINTS_TO = {"pelvis": "spine1", "spine3": "neck"}
@@ -119,6 +121,11 @@ def _in_edit_mode(armature: bpy.types.Object) -> Iterator[None]:
                 bpy.ops.object.mode_set(mode="OBJECT")
     finally:
         bpy.data.scenes.remove(scene)
+
+
+def model_origin(data: bpy.types.Armature) -> NDArray[np.float64]:
+    """Where the origin of the body model is in the space of these bones [3], metres, z up: see `human.ORIGIN`."""
+    return np.array(stored_numbers(data, ORIGIN, 3) or (0.0, 0.0, 0.0))
 
 
 def rest_rotations(armature: bpy.types.Object) -> NDArray[np.float64]:

@@ -22,6 +22,7 @@ from .human import (
     BODY_MARK,
     HOME,
     MARK,
+    ORIGIN,
     PERSON,
     available_name,
     folder_of,
@@ -53,10 +54,10 @@ def build_written(
 ) -> bpy.types.Collection:
     """Build a human whose volumes are written: armature, hidden body mesh and a volume for every primitive.
 
-    The human faces -y with the soles on z = 0 at the world's origin: the armature object is lifted; in its space, the
-    backend's axes are turned z up. The files in `keep` are copied to `folder_of(collection)`, and the volumes too where
-    they were written elsewhere because the name was taken since. Raises VolumeWriteError, and then leaves neither data
-    nor files. Makes no undo step.
+    The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
+    space, the backend's axes are turned z up and the body is raised by ORIGIN. The files in `keep` are copied to
+    `folder_of(collection)`, and the volumes too where they were written elsewhere because the name was taken since.
+    Raises VolumeWriteError, and then leaves neither data nor files. Makes no undo step.
     """
     with written.entering(lambda: folder_of(collection)):
         collection = _build(context, written, name, keep)
@@ -77,13 +78,16 @@ def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: S
     with _no_data_left_on_failure():
         collection = bpy.data.collections.new(name[:_NAME_LENGTH])
         label = collection.name
-        armature = build_armature(label, points_to_blender(human.joints))
+        vertices = points_to_blender(human.vertices)
+        origin = floor_below(vertices)
+        armature = build_armature(label, points_to_blender(human.joints) + origin)
+        armature.data[ORIGIN] = origin.tolist()
         armature[BETAS] = human.betas.tolist()
         armature.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
         collection.objects.link(armature)
-        vertices = points_to_blender(human.vertices)
-        armature.location = (0.0, 0.0, -vertices[:, 2].min())
-        body = build_body_mesh(f"{label}_body", armature, vertices, human.faces, human.uv_corner, human.skin_weights)
+        body = build_body_mesh(
+            f"{label}_body", armature, vertices + origin, human.faces, human.uv_corner, human.skin_weights
+        )
         collection.objects.link(body)
         collection.objects.link(build_stand_in(label, armature, body))
         primitives = bpy.data.collections.new(f"{label}_primitives")
@@ -101,7 +105,7 @@ def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: S
                 armature,
                 primitives,
                 list(files.values()),
-                points_to_blender(human.position),
+                points_to_blender(human.position) + origin,
                 frames_to_blender(human.rotation),
                 human.primitive_weights,
                 volume_material(),
@@ -114,6 +118,11 @@ def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: S
                     collection[PERSON] = new_name
             context.scene.collection.children.link(collection)
     return collection
+
+
+def floor_below(vertices: NDArray) -> NDArray[np.float64]:
+    """The displacement [3] that puts the soles of a body at rest, vertices [V, 3], on z = 0: see `human.ORIGIN`."""
+    return np.array([0.0, 0.0, -vertices[:, 2].min()])
 
 
 @contextmanager

@@ -234,6 +234,10 @@ BODY_MARK = "primdiffusion_body"
 """Custom property of a body mesh: the engine leaves it out, shown or hidden."""
 BETAS = "primdiffusion_betas"
 """Custom property of a human's armature: the body's shape, which the engine draws and which may be animated."""
+ORIGIN = "primdiffusion_origin"
+"""Custom property of a human's bones (the armature's data): the origin of the body model in the armature's space [3],
+metres, z up. The armature's own origin is on the floor, at the feet. In humans of earlier versions, which lack the
+property, the two are one."""
 BETA_COUNT = 10
 """Numbers in a shape."""
 LARGEST_BETA = 5.0

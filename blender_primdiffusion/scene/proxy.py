@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
+from .armature import model_origin
 from .blend_values import as_numbers, stored_record
-from .body_file import shape_model_of
-from .build import build_body_mesh
+from .body_file import shape_model_of, stored_body_name
+from .build import build_body_mesh, floor_below
 from .convention import points_to_blender
-from .human import BETA_COUNT, BODY_MARK, armature_of, own_data, person_file_name
+from .human import BETA_COUNT, BODY_MARK, ORIGIN, armature_of, own_data, person_file_name
 from .shape import SAME_BETAS, ShapeModel
 
 PROXY_MARK = "primdiffusion_proxy"
@@ -82,7 +83,7 @@ def build_proxy(
     The texture is packed into the .blend. `betas` [10]: the shape it was made in.
     """
     name = f"{collection.name}_proxy"
-    vertices = points_to_blender(proxy.vertices)
+    vertices = points_to_blender(proxy.vertices) + _model_origin(collection, betas)
     made = build_body_mesh(name, armature_of(collection), vertices, proxy.faces, proxy.uv_corner, proxy.skin_weights)
     del made[BODY_MARK]
     made[PROXY_MARK] = json.dumps(_origin(collection, betas))
@@ -148,10 +149,21 @@ def follow_shape(collection: bpy.types.Collection, proxy: bpy.types.Object | Non
     if np.abs(change).max() <= SAME_BETAS:
         return
     model, mesh = shape_model_of(collection), own_data(proxy, collection)
-    moved = _vertices(mesh) + _basis(_Bound(mesh, shown), model) @ change
+    origin = _model_origin(collection, shown)
+    moved = _vertices(mesh) + _basis(_Bound(mesh, shown, origin), model) @ change
+    moved += _model_origin(collection, betas) - origin
     mesh.vertices.foreach_set("co", moved.astype(np.float32).ravel())
     mesh.update()
     show_betas(proxy, betas)
+
+
+def _model_origin(collection: bpy.types.Collection, betas: NDArray | None) -> NDArray[np.float64]:
+    """The origin of the body model in the armature's space [3] when the human has these betas [10], not those it has
+    now: see `human.ORIGIN`. Raises as `shape_model_of`."""
+    bones = armature_of(collection).data
+    if ORIGIN not in bones or betas is None or stored_body_name(collection) is None:
+        return model_origin(bones)
+    return floor_below(points_to_blender(shape_model_of(collection).surface(betas)))
 
 
 def _origin(collection: bpy.types.Collection, betas: NDArray | None) -> dict[str, object]:
@@ -191,11 +203,11 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
 class _Bound:
     """A mesh as first seen, identified by its faces, so that its nearest body vertices are searched once."""
 
-    def __init__(self, mesh: bpy.types.Mesh, shown: NDArray) -> None:
+    def __init__(self, mesh: bpy.types.Mesh, shown: NDArray, origin: NDArray) -> None:
         corners = np.empty(len(mesh.loops), np.int32)
         mesh.loops.foreach_get("vertex_index", corners)
         self.digest = hashlib.sha256(corners.tobytes()).hexdigest()
-        self.vertices, self.shown = _vertices(mesh), shown
+        self.vertices, self.shown = _vertices(mesh) - origin, shown
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Bound) and self.digest == other.digest

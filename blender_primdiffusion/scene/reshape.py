@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from .armature import move_rest_joints
 from .body_file import shape_model_of
+from .build import floor_below
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
-from .human import BETA_COUNT, BETAS, LARGEST_BETA, armature_of, body_of, own_data, volumes_of
+from .human import BETA_COUNT, BETAS, LARGEST_BETA, ORIGIN, armature_of, body_of, own_data, volumes_of
 from .proxy import follow_shape, proxy_of
 from .shape import Rest, generated_betas
 from .surface import scale_surface
@@ -41,9 +42,8 @@ def check_shapeable(collection: bpy.types.Collection) -> None:
 def reshape(collection: bpy.types.Collection, betas: NDArray) -> str:
     """Give a human another shape [10]; returns what could not follow in a sentence, empty when everything did.
 
-    Bones, body mesh, volumes and mesh proxy move to their new rest places; pose, animation and files stay, and soles
-    that stood on the floor still do. Raises ValueError or FileNotFoundError before anything is touched. Makes no undo
-    step.
+    Bones, body mesh, volumes and mesh proxy move to their new rest places, with the soles where they were; pose,
+    animation and files stay. Raises ValueError or FileNotFoundError before anything is touched. Makes no undo step.
     """
     betas = np.asarray(betas, np.float64)
     if betas.shape != (BETA_COUNT,) or not np.abs(betas).max() <= LARGEST_BETA:
@@ -60,20 +60,28 @@ def apply_rest(collection: bpy.types.Collection, rest: Rest, betas: NDArray, gro
     """Move bones, body mesh and volumes to `rest` (see `reshape`), volumes scaled by `growth` [K, 3]; returns a warning
     as `reshape` does."""
     armature, body = armature_of(collection), body_of(collection)
-    vertices = points_to_blender(rest.vertices)
+    bones = own_data(armature, collection)
+    vertices, on_floor = points_to_blender(rest.vertices), ORIGIN in bones
+    origin = floor_below(vertices) if on_floor else np.zeros(3)
+    vertices += origin
     mesh = None if body is None else own_data(body, collection)
     unchanged = mesh is not None and len(mesh.vertices) == len(vertices) and mesh.shape_keys is None
     lowest = float(_heights(mesh).min()) if unchanged else None
-    move_rest_joints(own_data(armature, collection), points_to_blender(rest.joints))
+    move_rest_joints(bones, points_to_blender(rest.joints) + origin)
+    if on_floor:
+        bones[ORIGIN] = origin.tolist()
+        bones.update_tag()
     armature[BETAS] = betas.tolist()
-    position, quaternion = points_to_blender(rest.position), matrix_to_quaternion(frames_to_blender(rest.rotation))
+    position = points_to_blender(rest.position) + origin
+    quaternion = matrix_to_quaternion(frames_to_blender(rest.rotation))
     for k, objects in volumes_of(collection).items():
         for obj in objects if k < len(growth) else ():  # the number is the file name's
             obj.location, obj.rotation_quaternion, obj.scale = position[k], quaternion[k], growth[k]
     scale_surface(collection, growth)
     armature.update_tag()
     if lowest is not None:
-        _keep_on_floor(armature, lowest, float(vertices[:, 2].min()))
+        if not on_floor:
+            _keep_on_floor(armature, lowest, float(vertices[:, 2].min()))
         mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
         mesh.update()
     return "" if body is None or unchanged else f"the mesh {body.name!r} was changed by hand and keeps its shape"
@@ -94,8 +102,8 @@ def _heights(mesh: bpy.types.Mesh) -> NDArray[np.float32]:
 
 
 def _keep_on_floor(armature: bpy.types.Object, before: float, after: float) -> None:
-    """Lift an upright armature whose lowest rest point, at height `before` in its space, was on z = 0, so that a point
-    at `after` is."""
+    """For humans of earlier versions: lift an upright armature, whose lowest rest point, at height `before` in its
+    space, was on z = 0, so that a point at `after` is."""
     matrix = np.array(armature.matrix_basis)
     upright = np.abs(matrix[2, :2]).max() < 1e-4 * abs(matrix[2, 2])
     if armature.parent is None and upright and abs(matrix[2, 3] + matrix[2, 2] * before) < _FLOOR_TOLERANCE:

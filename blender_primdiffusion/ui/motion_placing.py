@@ -18,7 +18,7 @@ from ..motion.pose_library import check_posable, rest_joints
 from ..motion.rotation import nearest
 from ..motion.skeleton import unchain
 from ..scene.actions import last_key, push_to_strip
-from ..scene.armature import append_poses, keyframe_poses, rest_rotations
+from ..scene.armature import append_poses, keyframe_poses, model_origin, rest_rotations
 from ..scene.blend_values import stored_numbers
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from ..scene.handles import check_no_handles
@@ -128,7 +128,7 @@ def sample_motion(
     bones = np.array(matrices, np.float64)
     world = nearest(bones[..., :3, :3]) @ np.swapaxes(rest, -1, -2)
     world = BLENDER_FROM_BACKEND.T @ world @ BLENDER_FROM_BACKEND
-    places = points_to_backend(bones[:, 0, :3, 3]) - pelvis
+    places = points_to_backend(bones[:, 0, :3, 3] - model_origin(armature.data)) - pelvis
     motion = Motion(unchain(world), places, scene_fps(context.scene), armature.name)
     return motion, np.array(stored_numbers(armature, BETAS, BETA_COUNT) or [0.0] * BETA_COUNT), pelvis
 

@@ -5,12 +5,13 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import synthetic
+from mathutils import Matrix, Vector
 from oracle import evaluated_matrices
 
 from blender_primdiffusion.engine.picture import posed_humans
-from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.armature import move_rest_joints, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of, person_file
+from blender_primdiffusion.scene.human import ORIGIN, armature_of, body_of, person_file
 from blender_primdiffusion.scene.missing import missing_files
 
 COUNT = 6
@@ -24,6 +25,21 @@ def build_posed(source, name="Anna"):
     bpy.context.view_layer.objects.active = armature_of(person)
     bpy.context.view_layer.update()
     return person
+
+
+def make_earlier(person) -> None:
+    """Make a new human as earlier versions did: the armature's origin is the body model's, above the floor."""
+    armature, body = armature_of(person), body_of(person)
+    origin = np.array(armature.data[ORIGIN])
+    heads = [np.array(armature.data.bones[name].head_local) - origin for name in synthetic.NAMES]
+    move_rest_joints(armature.data, np.array(heads))
+    del armature.data[ORIGIN]
+    body.data.transform(Matrix.Translation(-origin))
+    for obj in person.all_objects:
+        if obj.type == "VOLUME":
+            obj.location -= Vector(origin)
+    armature.location += Vector(origin)
+    bpy.context.view_layer.update()
 
 
 def named(name="Anna"):

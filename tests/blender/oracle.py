@@ -27,6 +27,19 @@ def blended_vertices(human: dict, rotations: np.ndarray, translation: np.ndarray
     return np.einsum("ab,vbc,vc->va", Z_UP, transforms, homogeneous)[:, :3]
 
 
+def raised(vertices: np.ndarray) -> np.ndarray:
+    """The armature's space from the body model's [4, 4], z up: rest vertices [V, 3], y up, stand on the armature's
+    origin."""
+    matrix = np.eye(4)
+    matrix[2, 3] = -np.min(np.asarray(vertices)[:, 1])
+    return matrix
+
+
+def world_from_model(armature: bpy.types.Object, vertices: np.ndarray) -> np.ndarray:
+    """The world from the body model's space [4, 4], z up, for an armature on these rest vertices [V, 3], y up."""
+    return np.array(armature.matrix_world) @ raised(vertices)
+
+
 def evaluated_matrices(collection: bpy.types.Collection) -> np.ndarray:
     """World matrices [K, 4, 4] of a person's volumes, in the order of their names."""
     depsgraph = bpy.context.evaluated_depsgraph_get()

@@ -78,12 +78,18 @@ def arrays(count: int = 12, seed: int = 0) -> dict[str, np.ndarray]:
         "face": face,
         "barycentric": barycentric.astype(np.float32),
         "stencil_vertex": np.concatenate([faces[face], others], 1).astype(np.int32),
-        "stencil_du": rng.normal(0, 1, (count, STENCIL)).astype(np.float32),
-        "stencil_dv": rng.normal(0, 1, (count, STENCIL)).astype(np.float32),
+        "stencil_du": _differences(rng, count),
+        "stencil_dv": _differences(rng, count),
     }
     generated = at({**person, **model, "format_version": np.array(2)}, person["betas"] * 0.5)
     del generated["growth"]
     return generated
+
+
+def _differences(rng: np.random.Generator, count: int) -> np.ndarray:
+    """Weights of stencils [count, STENCIL] that sum to zero, as a derivative's do, wherever the body is."""
+    weights = rng.normal(0, 1, (count, STENCIL))
+    return (weights - weights.mean(1, keepdims=True)).astype(np.float32)
 
 
 def write(path: Path, count: int = 12, seed: int = 0, **changes: np.ndarray) -> Path:

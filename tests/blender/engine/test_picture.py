@@ -22,7 +22,9 @@ from engine_stage import (
     render_png,
     set_up_render,
 )
+from human_stage import make_earlier
 from mathutils import Euler, Matrix
+from oracle import raised
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.human import armature_of, remove_human
@@ -50,9 +52,15 @@ def stage(extension, saved_scene, backend, tmp_path):
     )
 
 
+def placed(matrix, folder) -> np.ndarray:
+    """The world from the body model's space [4, 4], for an armature at `matrix` with the rest body of a folder."""
+    with np.load(folder / "human.npz") as archive:
+        return np.array(matrix) @ raised(archive["vertices"])
+
+
 def as_asked(folder, armature, rotations=REST, translation=(0, 0, 0)) -> dict:
-    """A person for the oracle: pose, and the armature's place turned into the backend's axes."""
-    world = Z_UP.T @ np.array(armature.matrix_world) @ Z_UP
+    """A person for the oracle: pose, and the place of the body model's space turned into the backend's axes."""
+    world = Z_UP.T @ placed(armature.matrix_world, folder) @ Z_UP
     return {
         "folder": str(folder),
         "rotations": np.asarray(rotations).tolist(),
@@ -156,6 +164,18 @@ def test_a_posed_scaled_and_rotated_armature_renders_as_posed(stage, backend, se
     assert_same(render_png(stage.out), eight_bit(expected(stage, backend, people, step=step)[0]))
 
 
+def test_a_human_of_an_earlier_version_renders_as_it_did(stage, backend):
+    rotations, translation = strong_pose(1)
+    pose_from_joint_rotations(stage.armature, rotations, translation)
+    bpy.context.view_layer.update()
+    wanted = eight_bit(
+        expected(stage, backend, [as_asked(backend.folders[0], stage.armature, rotations, translation)])[0]
+    )
+    make_earlier(stage.person)
+    assert stage.armature.location.z > 0.5
+    assert_same(render_png(stage.out), wanted)
+
+
 def test_constraints_parents_and_drivers_reach_the_picture(stage, backend):
     target = bpy.data.objects.new("target", None)
     parent = bpy.data.objects.new("parent", None)
@@ -222,7 +242,8 @@ def test_an_instanced_human_renders_at_the_instance(stage, backend):
     instance.location = (0.6, 0.2, 0.0)
     bpy.context.view_layer.update()
     here = as_asked(backend.folders[0], stage.armature)
-    there = {**here, "world": (Z_UP.T @ np.array(instance.matrix_world @ stage.armature.matrix_world) @ Z_UP).tolist()}
+    world = placed(instance.matrix_world @ stage.armature.matrix_world, backend.folders[0])
+    there = {**here, "world": (Z_UP.T @ world @ Z_UP).tolist()}
     assert_same(render_png(stage.out), eight_bit(expected(stage, backend, [here, there])[0]))
 
 

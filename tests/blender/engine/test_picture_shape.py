@@ -10,8 +10,10 @@ import numpy as np
 import pytest
 import synthetic
 from engine_stage import STEP, Z_UP, add_human, camera_by_hand, eight_bit, render_png, set_up_render
+from oracle import world_from_model
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.body_file import shape_model_of
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.shape import betas_of
 
@@ -35,11 +37,12 @@ def test_the_engine_draws_a_reshaped_posed_person_as_the_backend_does(stage):
     armature.primdiffusion_human.betas = [1.5, -2.0, 1.0, 0, 0, 1.0, 0, 0, 0, 0]
     armature.primdiffusion_human.height = 1.82
     bpy.context.view_layer.update()
+    body = shape_model_of(stage.person).surface(betas_of(stage.person))
     asked = {
         "folder": str(stage.folder),
         "rotations": rotations.tolist(),
         "translation": translation.tolist(),
-        "world": (Z_UP.T @ np.array(armature.matrix_world) @ Z_UP).tolist(),
+        "world": (Z_UP.T @ world_from_model(armature, body) @ Z_UP).tolist(),
         "betas": betas_of(stage.person).tolist(),
     }
     combined, _ = stage.oracle.picture([asked], camera_by_hand(stage.camera, SIZE), SIZE)

@@ -11,14 +11,23 @@ import numpy as np
 import pytest
 import synthetic
 from mathutils import Vector
-from oracle import TOLERANCE_M, blended_frames, evaluated_matrices
+from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
 
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.collect import collect_before_saving
+from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning, overlap_warning_in
-from blender_primdiffusion.scene.human import MARK, VolumeWriteError, armature_of, folder_of, humans, remove_human
+from blender_primdiffusion.scene.human import (
+    MARK,
+    VolumeWriteError,
+    armature_of,
+    body_of,
+    folder_of,
+    humans,
+    remove_human,
+)
 from blender_primdiffusion.scene.human_npz import HumanNpzError
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
@@ -47,7 +56,9 @@ def strong_pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
 
 def expected_matrices(collection, arrays, rotations, translation) -> np.ndarray:
     bpy.context.view_layer.update()
-    return np.array(armature_of(collection).matrix_world) @ blended_frames(arrays, rotations, translation)
+    return world_from_model(armature_of(collection), arrays["vertices"]) @ blended_frames(
+        arrays, rotations, translation
+    )
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -83,8 +94,13 @@ def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
 
 def test_soles_stand_on_the_floor_and_the_person_faces_minus_y(person):
     collection, arrays = person
-    assert armature_of(collection).location.z == pytest.approx(-arrays["vertices"][:, 1].min(), abs=1e-6)
-    bones = armature_of(collection).data.bones
+    armature = armature_of(collection)
+    assert armature.matrix_world.translation.length == 0, "the origin is on the floor"
+    feet = [vertex.co for vertex in body_of(collection).data.vertices]
+    assert min(point.z for point in feet) == pytest.approx(0, abs=1e-6)
+    bones = armature.data.bones
+    model = points_to_blender(arrays["joints"]) - [0, 0, points_to_blender(arrays["vertices"])[:, 2].min()]
+    np.testing.assert_allclose([bones[name].head_local for name in synthetic.NAMES], model, atol=1e-6)
     assert bones["left_foot"].head_local.y < bones["left_ankle"].head_local.y
     assert bones["left_hip"].head_local.x > 0
 
@@ -99,7 +115,7 @@ def test_a_volume_covers_its_box_in_the_world(person):
     missing = half * 2 / 7 if bpy.app.version < (5, 0) else 0 * half  # Blender 4.5 forgets the last voxel in bound_box
     local = np.array(list(itertools.product(*[(-e, e - m) for e, m in zip(edge, missing, strict=True)])))
     box = blended_frames(arrays, np.tile(np.eye(3), (24, 1, 1)), np.zeros(3))[7]
-    expected = local @ box[:3, :3].T + box[:3, 3] + np.array(armature_of(collection).location)
+    expected = local @ box[:3, :3].T + box[:3, 3] + raised(arrays["vertices"])[:3, 3]
     np.testing.assert_allclose(sorted(corners.tolist()), sorted(expected.tolist()), atol=1e-5)
 
 

@@ -7,6 +7,7 @@ import exporting
 import numpy as np
 import pytest
 import synthetic_shape
+from human_stage import make_earlier
 from scene_stage import replace
 
 from blender_primdiffusion.jobs.export import AddProxyJob
@@ -14,7 +15,7 @@ from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.human import body_of
-from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
+from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, remove_proxy, shown_betas
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas
 
@@ -38,8 +39,14 @@ def places(obj) -> np.ndarray:
     return np.array([vertex.co for vertex in obj.data.vertices])
 
 
-def surface(betas) -> np.ndarray:
+def model(betas) -> np.ndarray:
+    """The body at rest in the body model's space, z up [V, 3]."""
     return points_to_blender(synthetic_shape.at(synthetic_shape.arrays(), betas)["vertices"])
+
+
+def surface(betas) -> np.ndarray:
+    """The same, standing on the armature's origin."""
+    return model(betas) - [0, 0, model(betas)[:, 2].min()]
 
 
 @pytest.mark.parametrize("change", [TALLER, WIDER, TALLER - WIDER])
@@ -52,6 +59,18 @@ def test_the_proxy_goes_where_the_body_goes(person, change):
     assert np.sqrt((off**2).mean()) < 0.15 * np.sqrt((moved**2).mean()), "neighbours' mean, not the vertex' own way"
     assert np.allclose(shown_betas(proxy), before + change)
     assert not is_outdated(person, proxy, betas_of(person))
+
+
+def test_the_proxy_of_a_human_of_an_earlier_version_follows_about_its_own_origin(person, tmp_path):
+    remove_proxy(proxy_of(person))
+    make_earlier(person)
+    before = betas_of(person)
+    proxy = build_proxy(person, read_proxy(tmp_path / "proxy.npz"), tmp_path / "proxy.png", before)
+    person.objects.link(proxy)
+    np.testing.assert_allclose(places(proxy), model(before), atol=1e-5)
+    reshape(person, before + TALLER)
+    off, moved = places(proxy) - model(before + TALLER), model(before + TALLER) - model(before)
+    assert np.sqrt((off**2).mean()) < 0.15 * np.sqrt((moved**2).mean())
 
 
 def test_an_edit_that_changes_the_body_takes_the_proxy_along(person, tmp_path):

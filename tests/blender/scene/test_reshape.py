@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
-from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices
+from human_stage import make_earlier
+from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
 from scene_stage import replace
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
@@ -17,7 +18,7 @@ from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.duplicate import rename_human
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, humans
+from blender_primdiffusion.scene.human import BETAS, MARK, ORIGIN, armature_of, body_of, humans
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape
 from blender_primdiffusion.scene.surface import build_surface
@@ -41,7 +42,13 @@ def at(betas: np.ndarray) -> dict:
 
 
 def heads(person) -> np.ndarray:
+    """Rest joints [24, 3] in the armature's space."""
     return np.array([armature_of(person).data.bones[name].head_local for name in synthetic.NAMES])
+
+
+def standing(points, body) -> np.ndarray:
+    """Points [N, 3] of the body model, y up, in the space of an armature that has its soles at its origin, z up."""
+    return points_to_blender(points) + raised(body["vertices"])[:3, 3]
 
 
 def lowest(person) -> float:
@@ -52,11 +59,11 @@ def lowest(person) -> float:
 def test_bones_mesh_and_volumes_go_where_the_new_body_has_them(person, saved_scene):
     assert reshape(person, SHAPE) == ""
     wanted = at(SHAPE)
-    np.testing.assert_allclose(heads(person), points_to_blender(wanted["joints"]), atol=TOLERANCE_M)
+    np.testing.assert_allclose(heads(person), standing(wanted["joints"], wanted), atol=TOLERANCE_M)
     surface = np.array([vertex.co for vertex in body_of(person).data.vertices])
-    np.testing.assert_allclose(surface, points_to_blender(wanted["vertices"]), atol=TOLERANCE_M)
+    np.testing.assert_allclose(surface, standing(wanted["vertices"], wanted), atol=TOLERANCE_M)
     saved_scene.view_layer.update()
-    matrices = np.array(armature_of(person).matrix_world) @ blended_frames(
+    matrices = world_from_model(armature_of(person), wanted["vertices"]) @ blended_frames(
         wanted, synthetic.axis_angle(np.zeros((24, 3))), np.zeros(3)
     )
     np.testing.assert_allclose(evaluated_matrices(person), matrices, atol=TOLERANCE_M)
@@ -70,12 +77,13 @@ def test_a_posed_person_is_the_new_body_in_the_same_pose(person, saved_scene):
     reshape(person, SHAPE)
     body_of(person).hide_viewport = False
     saved_scene.view_layer.update()
-    wanted, matrix = at(SHAPE), np.array(armature_of(person).matrix_world)
+    wanted = at(SHAPE)
+    matrix = world_from_model(armature_of(person), wanted["vertices"])
     corners = np.array([[x, y, z, 1] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
     difference = evaluated_matrices(person) - matrix @ blended_frames(wanted, rotations, translation)
     assert np.abs(difference @ corners.T)[:, :3].max() < TOLERANCE_M
     body = body_of(person).evaluated_get(bpy.context.evaluated_depsgraph_get())
-    vertices = np.array([vertex.co for vertex in body.data.vertices])
+    vertices = np.array([vertex.co for vertex in body.data.vertices]) - raised(wanted["vertices"])[:3, 3]
     np.testing.assert_allclose(vertices, blended_vertices(wanted, rotations, translation), atol=TOLERANCE_M)
 
 
@@ -84,7 +92,8 @@ def test_an_animation_turns_the_joints_as_before(person, saved_scene):
     keyframe_poses(armature_of(person), np.array([1, 5]), rotations, np.zeros((2, 3)))
     reshape(person, SHAPE)
     saved_scene.scene.frame_set(5)
-    expected = np.array(armature_of(person).matrix_world) @ blended_frames(at(SHAPE), rotations[1], np.zeros(3))
+    world = world_from_model(armature_of(person), at(SHAPE)["vertices"])
+    expected = world @ blended_frames(at(SHAPE), rotations[1], np.zeros(3))
     np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2e-5)
 
 
@@ -96,8 +105,11 @@ def test_changing_the_shape_and_back_is_no_change(person, saved_scene):
     assert not has_custom_shape(person)
 
 
+@pytest.mark.parametrize("earlier", [False, True], ids=["now", "earlier version"])
 @pytest.mark.parametrize("scale", [1.0, 1.3])
-def test_soles_on_the_floor_stay_there(person, saved_scene, scale):
+def test_soles_on_the_floor_stay_there(person, saved_scene, scale, earlier):
+    if earlier:
+        make_earlier(person)
     armature = armature_of(person)
     armature.location.z *= scale
     armature.scale, armature.rotation_euler.z, armature.location.x = (scale,) * 3, 1.0, 4.0
@@ -106,13 +118,35 @@ def test_soles_on_the_floor_stay_there(person, saved_scene, scale):
     assert lowest(person) == pytest.approx(0, abs=1e-5)
 
 
+@pytest.mark.parametrize("earlier", [False, True], ids=["now", "earlier version"])
 @pytest.mark.parametrize("change", [("location", 2, 0.2), ("rotation_euler", 0, 0.3)])
-def test_who_does_not_stand_on_the_floor_stays_in_place(person, saved_scene, change):
+def test_who_does_not_stand_on_the_floor_stays_in_place(person, saved_scene, change, earlier):
+    if earlier:
+        make_earlier(person)
     armature, (name, axis, value) = armature_of(person), change
     getattr(armature, name)[axis] += value
     height = armature.location.z
     reshape(person, SHAPE)
     assert armature.location.z == height
+
+
+def test_a_human_on_a_table_still_stands_on_it_in_another_shape(person, saved_scene):
+    armature_of(person).location = (1.0, 2.0, 0.75)
+    saved_scene.view_layer.update()
+    reshape(person, SHAPE)
+    assert lowest(person) == pytest.approx(0.75, abs=1e-5)
+
+
+def test_a_human_of_an_earlier_version_is_reshaped_about_its_own_origin(person, saved_scene):
+    make_earlier(person)
+    rotations = synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.6, (24, 3)))
+    pose_from_joint_rotations(armature_of(person), rotations)
+    reshape(person, SHAPE)
+    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    saved_scene.view_layer.update()
+    expected = np.array(armature_of(person).matrix_world) @ blended_frames(at(SHAPE), rotations, np.zeros(3))
+    np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2e-5)
+    assert ORIGIN not in armature_of(person).data
 
 
 def test_undo_and_redo_bring_back_bones_mesh_volumes_and_betas(person):
@@ -204,19 +238,19 @@ def test_an_appended_person_finds_the_file_of_their_body(person, tmp_path):
     bpy.context.scene.collection.children.link(wanted.collections[0])
     (appended,) = humans(bpy.context.scene)
     reshape(appended, SHAPE)
-    np.testing.assert_allclose(heads(appended), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    np.testing.assert_allclose(heads(appended), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
 
 
 def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person):
     body_of(person).shape_key_add(name="Basis")
     assert "'Human_body' was changed by hand" in reshape(person, SHAPE)
-    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    np.testing.assert_allclose(heads(person), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
 
 
 def test_without_body_mesh_the_rest_still_follows(person):
     bpy.data.objects.remove(body_of(person))
     assert reshape(person, SHAPE) == ""
-    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    np.testing.assert_allclose(heads(person), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
 
 
 def edited_file(tmp_path, betas):
@@ -230,7 +264,7 @@ def test_a_custom_shape_survives_an_edit_that_changes_the_shape(person, tmp_path
     done = replace(person, *edited_file(tmp_path, np.ones(10)))
     assert not done.reshaped
     np.testing.assert_allclose(betas_of(person), SHAPE)
-    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    np.testing.assert_allclose(heads(person), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
     assert json.loads(person[MARK])["seed"] == 9
     np.testing.assert_allclose(generated_betas(person), 1)
     reshape(person, generated_betas(person))
@@ -240,7 +274,7 @@ def test_a_custom_shape_survives_an_edit_that_changes_the_shape(person, tmp_path
 def test_a_shape_that_was_not_chosen_follows_the_edit(person, tmp_path):
     assert replace(person, *edited_file(tmp_path, SHAPE)).reshaped
     np.testing.assert_allclose(betas_of(person), SHAPE)
-    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    np.testing.assert_allclose(heads(person), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
     assert not has_custom_shape(person)
 
 
@@ -253,7 +287,7 @@ def test_an_edit_gives_people_of_an_earlier_version_a_shape_to_change(saved_scen
         reshape(old, SHAPE)
     replace(old, *edited_file(tmp_path, generated_betas(old)))
     reshape(old, SHAPE)
-    np.testing.assert_allclose(heads(old), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
+    np.testing.assert_allclose(heads(old), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
 
 
 def shown_on_the_surface() -> dict[str, np.ndarray]:
@@ -278,7 +312,7 @@ def test_volumes_on_the_posed_surface_follow_the_shape_and_outlive_another_name(
     wanted = at(SHAPE)
     for k, name in enumerate(sorted(before)):
         place = wanted["position"][k] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-        place[2] += armature_of(person).location.z
+        place += raised(wanted["vertices"])[:3, 3]
         np.testing.assert_allclose(before[name][:3, 3], place, atol=1e-5)
     assert len(before) == COUNT
     rename_human(person, "Zoe")

@@ -8,6 +8,7 @@ from unittest.mock import MagicMock
 import bpy
 import numpy as np
 import pytest
+import synthetic
 from amass_files import feet, write_amass
 
 from blender_primdiffusion.motion.files import read_motion
@@ -114,6 +115,15 @@ def test_exported_motion_comes_back_the_same(addon, armature, tmp_path):
         np.testing.assert_allclose(arrays["betas"], armature["primdiffusion_betas"])
         assert arrays["poses"].shape == (27, 72)
     assert len(bpy.data.scenes) == 1
+
+
+def test_exported_translations_are_of_smpls_own_body_wherever_the_armature_has_its_origin(addon, armature, tmp_path):
+    armature.location = (1.0, 2.0, 3.0)
+    ops.export_motion(filepath=str(tmp_path / "rest.npz"), first=1, last=1)
+    pelvis = synthetic.joints()[0]
+    upright = np.array([pelvis[0], -pelvis[2], pelvis[1]])
+    with np.load(tmp_path / "rest.npz") as arrays:
+        np.testing.assert_allclose(pelvis + arrays["trans"][0], upright, atol=1e-6)
 
 
 def test_export_counts_constraints_and_rejects_where_it_cannot_write(addon, armature, tmp_path):
