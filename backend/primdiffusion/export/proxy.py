@@ -117,7 +117,7 @@ def skin_weights(
 
     A box may reach into the other leg and must not move it, so closeness to its centre decides.
     """
-    centres = spatial.cKDTree(primitives.position.detach().cpu().numpy())
+    centres = spatial.KDTree(primitives.position.detach().cpu().numpy())
     away, box = centres.query(surface.vertices, min(NEAREST_BOXES, centres.n))
     share = np.exp((away[:, :1] ** 2 - away**2) / FALLOFF**2)
     weights = np.einsum("vb,vbj->vj", share, box_weights.detach().cpu().numpy()[box]).astype(np.float32)
