@@ -130,7 +130,7 @@ def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_wo
     [
         ({"checkpoint": Path("nowhere.safetensors")}, "missing_file", "nowhere.safetensors"),
         ({"sampler": "magic"}, "", "magic"),
-        ({"steps": 0}, "", "0 steps"),
+        ({"steps": 0}, "", "steps is 0"),
     ],
 )
 def test_an_error_of_the_backend_becomes_the_requests_error(start, settings, kind, named):

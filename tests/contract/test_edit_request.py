@@ -73,7 +73,11 @@ def test_a_cancelled_edit_leaves_nothing(backend, people, slow_checkpoint, tmp_p
 
 @pytest.mark.parametrize(
     ("changes", "named"),
-    [({"person": "nobody.human.safetensors"}, "nobody"), ({"amount": 2.0}, "amount is 2"), ({"seed": -1}, "seed -1")],
+    [
+        ({"person": "nobody.human.safetensors"}, "nobody"),
+        ({"amount": 2.0}, "amount is 2"),
+        ({"seed": -1}, "seed is -1"),
+    ],
 )
 def test_what_the_child_rejects_becomes_the_requests_error(backend, people, checkpoint, tmp_path, changes, named):
     wanted = {**PARAMS["vary"], **changes}

@@ -67,7 +67,7 @@ def test_reconstruct_reports_its_stages_and_leaves_whole_files(child, asked):
         ({"frame": 9}, DOMAIN_ERROR, "bad_input", "frames 0 to 1, not 9"),
         ({"capture": "/nowhere"}, DOMAIN_ERROR, "missing_file", "folder of captures /nowhere does not exist"),
         ({"checkpoint": "/nowhere.safetensors"}, DOMAIN_ERROR, "missing_file", "no encoder at /nowhere.safetensors"),
-        ({"views": 0}, INVALID_PARAMS, None, "0 views"),
+        ({"views": 0}, INVALID_PARAMS, None, "views is 0"),
         ({"views": "all"}, INVALID_PARAMS, None, "reconstruct.views"),
     ],
 )

@@ -15,6 +15,7 @@ from fuzz import extension_targets, mutations, served
 from fuzz.mutations import Mutation
 from fuzz.target import Garbage, Target
 from fuzz.verdicts import DRAFT_MUTATIONS, Draft, difference, draft, drafted
+from primdiffusion.formats.answers import Progress
 
 # --- both readers of .human files
 
@@ -129,19 +130,19 @@ def read_answers(path: Path) -> None:
     for event in events:
         if isinstance(event, Notification) and event.method == "progress":
             shown(event.params)
-        if isinstance(event, Response) and "people" in event.result and event.id == 3:
-            for person in event.result["people"]:
-                int(person["seed"])
-                [Path(person[name]).exists() for name in ("human", "person", "picture")]
+        if isinstance(event, Response) and event.id == list(RESULTS).index("variations") + 1:
+            for files in event.result.people:
+                int(files.seed)
+                [path.exists() for path in (files.human, files.person, files.picture)]
     answered = [event.id for event in events if isinstance(event, Response)]
     if len(answered) != len(set(answered)):
         raise Garbage("an answer was taken twice")
 
 
-def shown(progress: dict[str, Any]) -> None:
+def shown(progress: Progress) -> None:
     """As jobs show it."""
-    f"{progress['stage'].capitalize()} {progress['step'] / max(progress['total'], 1):.0%}".encode()
-    Path(progress.get("picture") or "x").exists()
+    f"{progress.stage.capitalize()} {progress.step / progress.total:.0%}".encode()
+    (progress.picture or Path("x")).exists()
 
 
 def line_of(mutation: Mutation) -> Mutation:

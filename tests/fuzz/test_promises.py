@@ -130,7 +130,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "assets `.mhclo`, `.obj`": (
         ("mhclo", "obj"),
-        ("tests/backend/people/test_mhclo.py::test_damaged_mhclo_is_rejected_with_what_is_wrong",),
+        ("tests/backend/people/test_mhclo.py::test_damaged_mhclo_is_rejected",),
     ),
     "lists of licences and captures": (
         ("licences", "captures: list"),

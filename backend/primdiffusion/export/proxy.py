@@ -17,7 +17,7 @@ from torch import Tensor
 from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.requests import ProxySettings
+from primdiffusion.formats.requests import VOXEL, ProxySettings
 from primdiffusion.formats.whole_files import staged, written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
@@ -103,7 +103,7 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
     )
     surface = OuterSurface(*coarse)
     weights = skin_weights(primitives, surface, anchor_skin_weights(anchors, body))
-    colours = grid if settings.spacing <= requests.VOXEL else merge(primitives, points=1)
+    colours = grid if settings.spacing <= VOXEL else merge(primitives, points=1)
     texture = bake_texture(colours, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
     joints = body.shape(human.betas).joints.detach().double().numpy()
     skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), joints)

@@ -158,8 +158,8 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
         ([], "contains several subjects: name one of them (person_000000, person_000001)"),
         (["--subject", "anna"], "there is no subject 'anna'"),
         (["--subject", FIRST, "--frame", "7"], "person_000000 has frames 0 to 1, not 7"),
-        (["--subject", FIRST, "--views", "0"], "0 views were requested"),
-        (["--subject", FIRST, "--size", "0"], "size is 0 pixels"),
+        (["--subject", FIRST, "--views", "0"], "views is 0"),
+        (["--subject", FIRST, "--size", "0"], "size is 0"),
     ],
 )
 def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, capsys, words, sentence):

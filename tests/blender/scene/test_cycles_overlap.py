@@ -22,8 +22,8 @@ from blender_primdiffusion.ui.advanced_panel import details
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
 COUNT = 96
-SMALL = (-4.0, -4.0)
-"""The first two betas, by which all shrinks."""
+SMALL = (-4.0, -4.0, -4.0)
+"""The first betas, by which all shrinks."""
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def person(saved_scene, source):
 
 
 def small(person) -> np.ndarray:
-    return np.concatenate([SMALL, generated_betas(person)[2:]])
+    return np.concatenate([SMALL, generated_betas(person)[len(SMALL) :]])
 
 
 def counted(source, betas) -> int:

@@ -9,7 +9,7 @@ import synthetic
 from scene_stage import render
 from support.errors import refused
 
-from blender_primdiffusion.scene.armature import pose_from_joint_rotations
+from blender_primdiffusion.scene.armature import model_origin, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import posed_extent, setup_cycles_preview
 from blender_primdiffusion.scene.human import armature_of
@@ -41,7 +41,8 @@ def lone_box(saved_scene, tmp_path):
 def test_a_box_has_its_colour_opacity_size_and_place_in_cycles(lone_box, tmp_path):
     camera = setup_cycles_preview(bpy.context.scene, size=96, samples=4)
     camera.data.type, camera.data.ortho_scale = "ORTHO", 0.24
-    centre = np.array([0, 0, 0.3]) + np.array(armature_of(lone_box).location)
+    armature = armature_of(lone_box)
+    centre = np.array([0, 0, 0.3]) + np.array(armature.location + model_origin(armature.data))
     camera.location = (0, -3, centre[2])
     gain = bpy.data.materials[MATERIAL_NAME].node_tree.nodes[GAIN_NODE].outputs[0]
     gain.default_value = 1.0

@@ -10,6 +10,7 @@ import synthetic_shape
 from human_stage import make_earlier
 from scene_stage import replace
 
+from blender_primdiffusion.formats.answers import ProxyAnswer
 from blender_primdiffusion.jobs.export import AddProxyJob
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
@@ -119,7 +120,9 @@ def test_a_human_reshaped_during_the_job_gets_a_proxy_of_its_new_body(person, tm
     before = betas_of(person)
     followed = proxy_of(person)
     reshape(person, before + TALLER)
-    result = {"proxy": str(tmp_path / "proxy.npz"), "texture": str(tmp_path / "proxy.png"), "betas": before.tolist()}
+    result = ProxyAnswer(
+        proxy=tmp_path / "proxy.npz", texture=tmp_path / "proxy.png", triangles=500, betas=before.tolist(), seconds=1.0
+    )
     made = AddProxyJob(HumanTarget.of(person), 64, 500).built(person, result)
     np.testing.assert_allclose(places(made), places(followed), atol=1e-5)
     assert not is_outdated(person, made, betas_of(person))
