@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 from numpy.random import Generator
+from primdiffusion.formats.answers import Progress
 
 from fuzz import extension_targets, mutations, served
 from fuzz.mutations import Mutation
 from fuzz.target import Garbage, Target
 from fuzz.verdicts import DRAFT_MUTATIONS, Draft, difference, draft, drafted
-from primdiffusion.formats.answers import Progress
 
 # --- both readers of .human files
 

@@ -42,7 +42,7 @@ def test_a_box_has_its_colour_opacity_size_and_place_in_cycles(lone_box, tmp_pat
     camera = setup_cycles_preview(bpy.context.scene, size=96, samples=4)
     camera.data.type, camera.data.ortho_scale = "ORTHO", 0.24
     armature = armature_of(lone_box)
-    centre = np.array([0, 0, 0.3]) + np.array(armature.location + model_origin(armature.data))
+    centre = np.array([0, 0, 0.3]) + np.array(armature.location) + model_origin(armature.data)
     camera.location = (0, -3, centre[2])
     gain = bpy.data.materials[MATERIAL_NAME].node_tree.nodes[GAIN_NODE].outputs[0]
     gain.default_value = 1.0

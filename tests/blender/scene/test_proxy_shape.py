@@ -7,10 +7,10 @@ import exporting
 import numpy as np
 import pytest
 import synthetic_shape
+from blender_primdiffusion.formats.answers import ProxyAnswer
 from human_stage import make_earlier
 from scene_stage import replace
 
-from blender_primdiffusion.formats.answers import ProxyAnswer
 from blender_primdiffusion.jobs.export import AddProxyJob
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
