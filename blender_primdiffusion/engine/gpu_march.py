@@ -42,6 +42,7 @@ _SHADERS = {
     "list": gpu_shaders.list_shader,
     "march": gpu_shaders.march_shader,
     "copy": gpu_shaders.copy_shader,
+    "rebind": gpu_shaders.rebind_shader,
 }
 _OPTICAL = 1e-2
 _FAR_PIXEL = 1e6
@@ -191,6 +192,7 @@ class GpuMarcher:
         self._shaders: dict[str, gpu.types.GPUShader] = {}
         self._humans: tuple[GpuPayload, ...] = ()
         self._atlas: gpu.types.GPUTexture | None = None
+        self._pixels = [gpu.types.GPUTexture((1, 1), format="R32F") for _ in range(2)]
 
     def compile(self) -> Iterator[None]:
         """Compile the shaders, one a step; each takes a moment. Raises RuntimeError where one does not compile."""
@@ -214,11 +216,21 @@ class GpuMarcher:
         """
         for _ in self.compile():
             pass
+        self._rebind()
         spacing, strides = _lattice([boxes.density_scale for _, boxes in humans], step)
         size = (ACROSS * VOXELS, max([payload.rows for payload, _ in humans], default=1) * VOXELS)
         atlas_size = (*size, max(len(humans), 1) * VOXELS)
         records = _all_records(humans, view, spacing, strides, atlas_size[1] // VOXELS)
         return GpuMarch(self._shaders, self._common(humans, atlas_size), atlas_size, records, view, spacing, ends)
+
+    def _rebind(self) -> None:
+        """Bind other images than the last ones: Blender 5.2 takes a new texture that has got the number of a freed one
+        for bound, so that nothing would be written to it."""
+        shader = self._shaders["rebind"]
+        shader.bind()
+        for unit, pixel in enumerate(self._pixels):
+            shader.image(f"image_{unit}", pixel)
+        gpu.compute.dispatch(shader, 1, 1, 1)
 
     def _common(self, humans: Sequence[tuple[GpuPayload, Boxes]], size: tuple[int, int, int]) -> gpu.types.GPUTexture:
         """One atlas of all humans, a layer of bricks for each."""

@@ -213,6 +213,14 @@ void main()
 }
 """
 
+_REBIND = """
+void main()
+{
+  imageStore(image_0, ivec2(0), vec4(0.0));
+  imageStore(image_1, ivec2(0), vec4(0.0));
+}
+"""
+
 
 def list_shader() -> gpu.types.GPUShader:
     """Writes each tile's list, one invocation a tile: the finest stride, then the boxes that the tile may see in the
@@ -257,6 +265,14 @@ def copy_shader() -> gpu.types.GPUShader:
     info.image(0, "RGBA16F", "FLOAT_3D", "atlas_image", qualifiers={"WRITE"})
     info.push_constant("INT", "layer")
     return compiled(info, _COPY, (8, 8))
+
+
+def rebind_shader() -> gpu.types.GPUShader:
+    """Writes a pixel of the images at both units; see `GpuMarcher.march`."""
+    info = gpu.types.GPUShaderCreateInfo()
+    for unit in (0, 1):
+        info.image(unit, "R32F", "FLOAT_2D", f"image_{unit}", qualifiers={"WRITE"})
+    return compiled(info, _REBIND, (1, 1))
 
 
 def compiled(info: gpu.types.GPUShaderCreateInfo, source: str, group: tuple[int, int]) -> gpu.types.GPUShader:
