@@ -56,7 +56,7 @@ def other_files(module: str, python: str) -> Steps:
     yield from begin(module, python)
     for link in (False, True):
         with bpy.data.libraries.load(str(source), link=link) as (stored, wanted):
-            wanted.collections = [name for name in stored.collections if name != "Collection"][:1]
+            wanted.collections = [name for name in stored.collections if name == "Human"]
         (collection,) = wanted.collections
         bpy.context.scene.collection.children.link(collection)
     yield from at_rest(module)
@@ -98,6 +98,7 @@ def handles(module: str, python: str) -> Steps:
     yield from with_people(module, python, FIRST_SEED)
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
     armature = armatures()[0]
+    press("view3d.view_selected", "EXEC_DEFAULT")
     press("primdiffusion.add_handles")
     press("object.mode_set", "EXEC_DEFAULT", mode="POSE")
     yield from at_rest(module)
