@@ -26,7 +26,7 @@ _MOVED = tuple(joint for limb in LIMBS for joint in limb.joints)
 _STIFFNESS = 0.9
 """Of elbows and knees against twisting and bending sideways, which Blender's solver would do as readily."""
 _COLOUR = "THEME09"
-_BOX_M = {"handle": 0.05, "pole": 0.03}
+_BOX_M = {"handle": 0.02, "pole": 0.015}
 
 
 def has_handles(armature: bpy.types.Object) -> bool:
