@@ -38,7 +38,7 @@ def merge(request: MergeRequest, session: Session, report: ReportProgress) -> Me
 
 
 def merge_frames(request: MergeFramesRequest, session: Session, report: ReportProgress) -> MergeFramesAnswer:
-    """Write the grids one by one, each atomically, so that another program can load them meanwhile.
+    """Write the grids one by one, each atomically, so that another program can load the finished ones.
 
     Raises as `merge`; grids written before an error stay.
     """

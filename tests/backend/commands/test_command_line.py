@@ -18,7 +18,7 @@ class Settings:
     source: Annotated[Path, Option(positional=True)]
     out_dir: Annotated[Path, Option(name="out")]
     level: Annotated[int, Range(2, 77)] = 7
-    """The level of the thing."""
+    """The level of noise."""
     secret: Annotated[int, Option(hidden=True)] = 3
     attributes: Attributes = dataclasses.field(default_factory=dict)
 
@@ -39,7 +39,7 @@ def test_help_has_the_description_and_the_limits(capsys):
     shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
     assert "usage: primdiffusion settle" in shown
     assert "Settle something." in shown
-    assert "The level of the thing. From 2 to 77. (default: 7)" in shown
+    assert "The level of noise. From 2 to 77. (default: 7)" in shown
     assert "--secret" not in shown
 
 
