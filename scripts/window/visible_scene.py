@@ -6,6 +6,7 @@ from __future__ import annotations
 from importlib import import_module
 
 import bpy
+import numpy as np
 from panels import sidebar, view
 from press import Steps, press, wait
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, queue_of
@@ -26,6 +27,7 @@ def visible_humans(module: str, python: str) -> Steps:
         yield from wait(lambda: not queue_of(module).busy, 600)
         yield from at_rest(module)
         yield f"visible_{name}"
+        check_drawn(module)
         share = yield from visible_share(module, name, armatures()[-1])
         yield {"figures": {f"{name}_human_visible_share": round(share, 3)}}
         yield from at_rest(module)
@@ -104,6 +106,15 @@ def at_rest(module: str) -> Steps:
     yield 1.0
     yield from wait(lambda: overlay.resting, _MOST_S)
     yield 1.0
+
+
+def check_drawn(module: str) -> None:
+    """Raise RuntimeError where the finest picture of a view has no pixel of a human."""
+    overlay = import_module(f"{module}.engine.overlay").overlay
+    far = import_module(f"{module}.engine.view").NO_SURFACE_M
+    for picture in overlay._regions.values():
+        if not (np.array(picture.shown.picture.depth.read(), np.float32) < far).any():
+            raise RuntimeError("a view at rest shows no human")
 
 
 def set_all(holder: object, settings: dict[str, object]) -> None:
