@@ -21,7 +21,7 @@ from primdiffusion.capture.dataset import Views
 from primdiffusion.encoder.unproject import SIDE, TOLERANCE, Unprojected, body_depth, check
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import default_texels
-from primdiffusion.raster.uv_atlas import rasterise_uv
+from primdiffusion.raster.uv_atlas import UvRaster, rasterise_uv
 
 TEXTURE_SIDE = 512
 """Texels per side before resizing to `SIDE`."""
@@ -42,7 +42,8 @@ def unproject_texture(views: Views, vertices: Float[Tensor, "V 3"], body: BodyMo
     """Average the views at 512 x 512 points of the body surface, and resize the texture to 256 x 256; `rgb` is float32.
 
     `views` show one human in one pose (unbatched), `vertices` (metres) are the body in that pose. All views that see a
-    point have the same weight. Texels that no view sees, and those outside of every chart, are black.
+    point have the same weight. Texels outside of every chart have the surface point of the nearest covered texel; those
+    that no view sees are black.
 
     Raises:
         ValueError: as `unproject_texels`.
@@ -50,8 +51,7 @@ def unproject_texture(views: Views, vertices: Float[Tensor, "V 3"], body: BodyMo
     body = default_body() if body is None else body
     check(views, vertices, body)
     face, barycentric = _texture_points(body)
-    points = surface_points(vertices, body.faces, face.clamp_min(0).flatten(), barycentric.flatten(0, 1))
-    points = torch.where((face >= 0).flatten()[:, None], points, torch.nan)
+    points = surface_points(vertices, body.faces, face.flatten(), barycentric.flatten(0, 1))
     rgb, share = sample_both_sides(views, body_depth(views, vertices, body.faces), points)
     picture = torch.cat([rgb.T, share[None]]).unflatten(-1, (TEXTURE_SIDE, TEXTURE_SIDE))
     picture = functional.interpolate(picture[None], size=(SIDE, SIDE), mode="bilinear", align_corners=True)
@@ -61,17 +61,19 @@ def unproject_texture(views: Views, vertices: Float[Tensor, "V 3"], body: BodyMo
 
 @functools.lru_cache(maxsize=4)
 def _texture_points(body: BodyModel) -> tuple[Int[Tensor, "h w"], Float[Tensor, "h w 3"]]:
-    """Face and barycentric coordinates of TEXTURE_SIDE x TEXTURE_SIDE texels; face -1 outside of the charts.
+    """Face and barycentric coordinates of TEXTURE_SIDE x TEXTURE_SIDE texels, none empty.
 
     The default body's layout has a quarter as many; each counts four times.
     """
     if body is default_body():
         each = TEXTURE_SIDE // SIDE
-        face, barycentric = (part.repeat_interleave(each, 0).repeat_interleave(each, 1) for part in default_texels())
-        return face, barycentric
-    if body.uv.numel() == 0:
+        face, barycentric = (part.numpy().repeat(each, 0).repeat(each, 1) for part in default_texels())
+        raster = UvRaster(face, barycentric)
+    elif body.uv.numel() == 0:
         raise ValueError("the body has no UV coordinates: load it with a UV map")
-    raster = rasterise_uv(body.uv[body.uv_faces].double().cpu().numpy(), TEXTURE_SIDE, TEXTURE_SIDE)
+    else:
+        raster = rasterise_uv(body.uv[body.uv_faces].double().cpu().numpy(), TEXTURE_SIDE, TEXTURE_SIDE)
+    raster = raster.filled()
     return torch.from_numpy(raster.face), torch.from_numpy(raster.barycentric).to(body.template.dtype)
 
 
@@ -80,8 +82,7 @@ def sample_both_sides(
 ) -> tuple[Float32[Tensor, "n 3"], Float32[Tensor, "n"]]:
     """Mean colour (0 ... 255) at points over the views that see them, and the fraction of views that do.
 
-    `depth` is the body surface's depth in each view, inf beside it. Colour and depth are bilinear. NaN points are
-    black.
+    `depth` is the body surface's depth in each view, inf beside it. Colour and depth are bilinear.
     """
     rgba = np.ascontiguousarray(views.rgba.cpu().numpy())
     world_to_pixel = (views.camera.intrinsics.double() @ views.camera.world_to_camera.double()).cpu().numpy()
@@ -96,8 +97,6 @@ def _sample(points, rgba, depth, world_to_pixel, tolerance, rgb, share):
     views, height, width = depth.shape
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        if np.isnan(x):
-            continue
         red, green, blue, total = 0.0, 0.0, 0.0, 0
         for view in range(views):
             p = world_to_pixel[view]

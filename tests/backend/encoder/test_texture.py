@@ -102,8 +102,8 @@ def test_the_texture_is_sampled_at_512_and_resized_with_corners_aligned():
     found = unproject_texture(views, body.template, body)
     at = (np.arange(TEXTURE_SIDE) + 0.5) / TEXTURE_SIDE
     u, v = np.meshgrid(at, at)
-    points = np.stack([u / 0.75 - 0.5, v - 0.5, 0 * u], -1).reshape(-1, 3)
-    charted = (u < 0.75).reshape(-1)
+    nearest = np.minimum(u, u[u < 0.75].max())  # of texels beside the chart: the last column that it covers
+    points = np.stack([nearest / 0.75 - 0.5, v - 0.5, 0 * u], -1).reshape(-1, 3)
     depth = []  # of the plane z = 0
     for view in range(2):
         one = views.camera.map(lambda tensor, view=view: tensor[view].double())
@@ -115,12 +115,11 @@ def test_the_texture_is_sampled_at_512_and_resized_with_corners_aligned():
         on_plate = abs(origin[:2] + along[..., None] * rays[..., :2]).max(-1) <= 0.5
         depth.append(np.where(on_plate, along, BESIDE))
     colour, count = brute_force(views, np.stack(depth), points)
-    texture = torch.from_numpy(np.where(charted[:, None], colour, 0).T.reshape(3, TEXTURE_SIDE, TEXTURE_SIDE))
+    texture = torch.from_numpy(colour.T.reshape(3, TEXTURE_SIDE, TEXTURE_SIDE))
     difference = (found.rgb[0].double() - resized(texture)).abs()
     assert found.rgb.shape == (1, 3, SIDE, SIDE)
     assert (difference < 1e-2).double().mean() > 0.999  # depths at the limit may fall on either side
-    assert (count[charted] > 0).mean() > 0.5
-    assert found.rgb[..., int(0.76 * SIDE) :].abs().max() == 0
+    assert (count > 0).mean() > 0.5
 
 
 def test_erosion_is_that_of_scipy_once_by_3_x_3():
