@@ -46,7 +46,7 @@ SOURCES = {
     ),
     "attribute_hits": (
         "Attributes that were asked for",
-        "benchmarks/attribute_hits.py --assets DIR --reference DIR --json docs/results/attribute_hits.json",
+        "benchmarks/attribute_hits.py --people DIR --json docs/results/attribute_hits.json",
     ),
     "faults": ("Faults: hostile files, kills, full disks", "benchmarks/faults.py --json docs/results/faults.json"),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
