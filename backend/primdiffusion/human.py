@@ -174,9 +174,15 @@ def place(
 
     Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
     """
+    return Primitives.place(frames_of(human, pose, body, anchors), human.payload)
+
+
+def frames_of(
+    human: Human, pose: BodyPose | None = None, body: BodyModel | None = None, anchors: Anchors | None = None
+) -> Frames:
+    """Where `place` puts the human's primitives, and how large they are before their delta scales."""
     body, anchors = body_of(human, body, anchors)
-    frames = _frames(human, pose_body(human.betas, pose, body).vertices, body, anchors)
-    return Primitives.place(frames, human.payload)
+    return _frames(human, pose_body(human.betas, pose, body).vertices, body, anchors)
 
 
 def place_skinned(

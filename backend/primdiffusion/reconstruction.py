@@ -1,11 +1,49 @@
-"""Reconstruct a captured subject as a `Human` with the encoder."""
+"""Reconstruct a captured subject as a `Human`: from several views with the encoder, or from one or more with the prior.
+
+`reconstruct_by_prior` finds the person coefficients c of the diffusion model that explain the pictures. Near an
+estimate a picture is linear in c (`cpu_linear`), and the prior is a mixture of Gaussians, so the posterior mean of c
+has a closed form; a few Gauss-Newton steps repeat it. What no picture shows thus has the most probable colours and
+shape given what they show: the back of a jacket belongs to its front. Then the voxels themselves are fitted to the
+pictures (`render.inverse`), which keeps the others close to that human.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from numpy import ndarray
+from torch import Tensor
+
 from primdiffusion import __version__
 from primdiffusion.capture.conditioning import CapturedPerson
+from primdiffusion.diffusion.codec import VOXEL_VALUES, CellCodec, LinearCodec, payload_from_cells
+from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames
-from primdiffusion.human import Human
+from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.human import Human, frames_of, made_by
+from primdiffusion.primitives.primitives import Frames, K, Payload, S
+from primdiffusion.render.cpu_linear import apply_to_codes
+from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, encoding_slope, fit_payload
+
+STEPS = 4
+"""Gauss-Newton steps for person coefficients."""
+OBSERVATIONS = 150.0
+"""Number of independent pixels that a view counts as. What person components cannot draw differs over patches, not over
+pixels; more would fit them to noise, fewer would ignore the view."""
+PIXEL_STD = 0.08
+"""Standard deviation of such a pixel from what the best coefficients draw, in encoded colour."""
+CLAMPED = 0.05
+"""Relative densities farther than this beyond their range count as clamped."""
+COARSE_SIDE, FINE_SIDE = 176, 512
+"""Largest sides of the pictures for coefficients and for voxels, pixels."""
 
 
 def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
@@ -15,12 +53,102 @@ def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
     """
     payload = model.encode(person.views, person.betas)
     provenance = {
-        "reconstructed_from": person.subject,
-        "frame": person.frame,
-        "views": list(person.cameras),
+        **_origin(person),
         "checkpoint": model.card.get("name", "unnamed"),
         "full_density": model.config.full_density,
         "version": __version__,
     }
     betas = betas_of_frames(model.config, person.betas)
     return Human(payload, betas, provenance, model.body_setup).to("cpu").validate()
+
+
+def reconstruct_by_prior(
+    model: DiffusionModel, person: CapturedPerson, on_step: Callable[[int, int], None] | None = None
+) -> Human:
+    """Reconstruct the subject from one or more views, on the CPU; deterministic for a model and views.
+
+    `on_step` is called with the number of completed steps and of all; an exception that it raises cancels.
+
+    Raises ValueError if the model has no person components, or is of another body than the default one.
+    """
+    if not isinstance(model.denoiser, PersonDenoiser) or not isinstance(model.codec, CellCodec):
+        raise ValueError("the model has no person components: give a checkpoint of the default architecture")
+    if model.body_setup is not None:
+        raise ValueError(
+            f"the model belongs to the body {model.body_setup.files.smpl.path}: give one of the default body"
+        )
+    prior, codec = model.denoiser.prior.to("cpu"), model.codec.codec.to("cpu")
+
+    def payload_of(coefficients: Float[Tensor, "r"]) -> Payload:
+        latents = prior.mean + prior.picture(coefficients[None])
+        return payload_from_cells(codec.decode(latents)[0], model.full_density, codec.zone)
+
+    def report(done: int) -> None:
+        if on_step is not None:
+            on_step(done, STEPS + 1)
+
+    coefficients = prior.posterior_mean(torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis)))
+    human = Human(payload_of(coefficients), person.betas, {**_origin(person), **made_by(model)})
+    frames = frames_of(human, person.views.pose)
+    targets = _targets(person, frames, COARSE_SIDE)
+    for step in range(STEPS):
+        coefficients = _gauss_newton(coefficients, prior, codec, payload_of(coefficients), model.full_density, targets)
+        report(step + 1)
+    payload = fit_payload(payload_of(coefficients), _targets(person, frames, FINE_SIDE), model.full_density)
+    report(STEPS + 1)
+    return dataclasses.replace(human, payload=payload).validate()
+
+
+def _gauss_newton(
+    coefficients: Float[Tensor, "r"],
+    prior: PersonPrior,
+    codec: LinearCodec,
+    payload: Payload,
+    full_density: float,
+    targets: Sequence[TargetImage],
+) -> Float[Tensor, "r"]:
+    """The posterior mean of person coefficients, for pictures linearised at `coefficients`, whose payload is given."""
+    cells = codec.decode(prior.mean + prior.picture(coefficients[None]))[0]
+    slope, region = _slopes(cells, codec, full_density), codec.region.numpy()
+    basis = codec.voxel_basis(prior.basis.shape[1] // K).contiguous().numpy()
+    codes = prior.basis.unflatten(1, (-1, K)).permute(2, 1, 0).contiguous().numpy()
+    precision, vector = torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis))
+    for target in targets:
+        view = LinearisedView.of(target, payload, InverseSettings())
+        seen = view.weight.any(1) & (np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0)
+        matrix = apply_to_codes(view.jacobian, slope, basis, region, codes, view.alpha_free)[seen]
+        matrix = torch.from_numpy(matrix).flatten(0, 1)
+        weight = torch.from_numpy(view.weight[seen]).flatten() * (OBSERVATIONS / PIXEL_STD**2)
+        weighted = matrix.mT * weight
+        precision += weighted @ matrix
+        vector += weighted @ (torch.from_numpy(view.residual[seen]).flatten() + matrix @ coefficients)
+    return prior.posterior_mean(precision, vector)
+
+
+def _slopes(cells: Float[Tensor, "k v"], codec: LinearCodec, full_density: float) -> Float32[ndarray, "v 4"]:
+    """d(linear colour, density) / d(encoded colour, relative density) of every voxel; 0 where it stays clamped."""
+    values = cells[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1)
+    linear = decode_srgb(values[:, :3].clamp(0, 1)).numpy()
+    start, width = codec.zone
+    relative = (values[:, 3:] - start) / width
+    density = torch.where((relative > -CLAMPED) & (relative < 1 + CLAMPED), full_density / width, 0.0)
+    return np.concatenate([1 / encoding_slope(linear, 0.0), density.numpy()], axis=1).astype(np.float32)
+
+
+def _targets(person: CapturedPerson, frames: Frames, largest: int) -> list[TargetImage]:
+    """Linear pictures with sides of at most `largest` pixels, averaged over blocks."""
+    targets = []
+    for number, rgba in enumerate(person.views.rgba.cpu()):
+        camera = person.views.camera.to("cpu").map(lambda values, number=number: values[number])
+        picture = torch.cat([decode_srgb(rgba[..., :3].float() / 255), rgba[..., 3:].float() / 255], -1)
+        block = math.ceil(max(camera.width, camera.height) / largest)
+        height, width = camera.height // block, camera.width // block
+        picture = picture[: height * block, : width * block].unflatten(1, (width, block)).unflatten(0, (height, block))
+        intrinsics = torch.cat([camera.intrinsics[:2] / block, camera.intrinsics[2:]])
+        camera = dataclasses.replace(camera, intrinsics=intrinsics, width=width, height=height)
+        targets.append(TargetImage(frames, camera, picture.mean((1, 3)).numpy()))
+    return targets
+
+
+def _origin(person: CapturedPerson) -> dict[str, Any]:
+    return {"reconstructed_from": person.subject, "frame": person.frame, "views": list(person.cameras)}

@@ -12,6 +12,7 @@ import bpy
 
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer, ReconstructAnswer
+from ..formats.requests import ReconstructRequest
 from ..scene.build import build_written, next_folder
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import select_human
@@ -97,15 +98,16 @@ class ReconstructJob(Job):
     """Empty for the only one."""
     frame: int
     views: int
-    checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("encoder"))
+    by: str = ReconstructRequest.by
 
     @property
     def label(self) -> str:
         return f"Human from Captures, {self.subject or Path(self.capture).name}"
 
     def params(self, folder: Path) -> dict[str, Any]:
-        params: dict[str, Any] = {"capture": self.capture, "frame": self.frame, "views": self.views}
-        optional = {"subject": self.subject, "checkpoint": self.checkpoint}
+        params: dict[str, Any] = {"capture": self.capture, "frame": self.frame, "views": self.views, "by": self.by}
+        checkpoint = chosen_checkpoint("encoder" if self.by == "encoder" else "checkpoint")
+        optional = {"subject": self.subject, "checkpoint": checkpoint}
         return {**params, **{k: v for k, v in optional.items() if v}, "out_dir": str(folder)}
 
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:

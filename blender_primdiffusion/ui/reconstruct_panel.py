@@ -12,10 +12,15 @@ from ..formats.requests import ReconstructRequest
 from ..jobs.follow import Reporting, submit
 from ..scene.blend_values import setting_path
 from .captures_panel import DataPanel
-from .declared import declared, not_given
+from .declared import PANELS, SKIP, declared, not_given
 from .drawing import draw_job, property_columns
 
 _CAMERAS_FILE = "cameras.json"
+_BY = (
+    ("encoder", "Encoder", "A network turns several views into a human within seconds"),
+    ("prior", "Prior", "The human is fitted to the views, and what they do not show is guessed: one view is enough"),
+)
+_BY_DESCRIPTION = "How the views become a human"
 
 
 def subjects_in(folder: Path) -> list[str]:
@@ -56,6 +61,7 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
     )
     frame: declared(ReconstructRequest, "frame")
     views: declared(ReconstructRequest, "views")
+    by: bpy.props.EnumProperty(name="By", description=_BY_DESCRIPTION, items=_BY)
 
 
 class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
@@ -70,6 +76,9 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
     subject: bpy.props.StringProperty(name="Subject", description="Empty: the panel's", options={"SKIP_SAVE"})
     frame: not_given(ReconstructRequest, "frame", default=-1, min=-1, description="-1: the panel's")
     views: not_given(ReconstructRequest, "views", default=0, min=0, description="0: the panel's")
+    by: bpy.props.EnumProperty(
+        name="By", description=_BY_DESCRIPTION, items=[("PANEL", "The panel's", PANELS), *_BY], options=SKIP
+    )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
@@ -90,7 +99,8 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
         if not os.path.isdir(folder):
             raise FileNotFoundError(f"there is no folder {folder!r:.200}: choose one of captures")
         frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
-        return submit(self, context, ReconstructJob(folder, subject, frame, views))
+        by = asked.by if self.by == "PANEL" else self.by
+        return submit(self, context, ReconstructJob(folder, subject, frame, views, by))
 
 
 class PRIMDIFFUSION_PT_human_from_captures(DataPanel, bpy.types.Panel):
@@ -103,7 +113,7 @@ class PRIMDIFFUSION_PT_human_from_captures(DataPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout, asked = property_columns(self.layout), context.scene.primdiffusion_reconstruct
         column = layout.column()
-        for name in ("capture", "subject", "frame", "views"):
+        for name in ("capture", "subject", "frame", "views", "by"):
             column.prop(asked, name)
         draw_job(layout, "reconstruct", "primdiffusion.human_from_captures", "OUTLINER_OB_ARMATURE")
 

@@ -31,6 +31,7 @@ from primdiffusion.human import Human
 from primdiffusion.human_file import load_human
 from primdiffusion.machine import best_device, peak_memory_gb
 from primdiffusion.reconstruction import reconstruct as reconstruct_human
+from primdiffusion.reconstruction import reconstruct_by_prior
 from primdiffusion.training.refine import RefineSettings, RefineStep, refine
 from primdiffusion.training.refine_views import bare_body, meshed_person, view_psnr
 
@@ -48,12 +49,18 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
     began = time.perf_counter()
     with staged(request.out_dir) as folder:
         report("load", 0, STAGES, None)
-        model = session.encoder(request.checkpoint)
+        encoder = session.encoder(request.checkpoint) if request.by == "encoder" else None
+        model = session.model(request.checkpoint) if request.by == "prior" else None
         report("read", 1, STAGES, None)
-        person = captured_person(request.capture, request.subject, request.frame, request.views, model.body)
+        body = None if encoder is None else encoder.body
+        person = captured_person(request.capture, request.subject, request.frame, request.views, body)
         report("encode", 2, STAGES, None)
         loaded = time.perf_counter()
-        human = reconstruct_human(model, person)
+        if encoder is not None:
+            human = reconstruct_human(encoder, person)
+        else:
+            assert model is not None
+            human = reconstruct_by_prior(model, person, lambda done, total: report("fit", done, total, None))
         encoded = time.perf_counter()
         report("write", 3, STAGES, None)
         write_human(folder, human, request.size)
@@ -76,7 +83,7 @@ def run(request: ReconstructRequest) -> None:
         answer = reconstruct(request, Session(), report)
     for warning in answer.warnings:
         print(f"primdiffusion: warning: {warning}", file=sys.stderr)
-    seconds = f"{answer.seconds:.1f} s, of which the encoder {answer.seconds_encoding:.1f} s"
+    seconds = f"{answer.seconds:.1f} s, of which the {request.by} {answer.seconds_encoding:.1f} s"
     print(f"{request.out_dir}  {answer.subject}, frame {answer.frame}, {len(answer.views or ())} views, {seconds}")
 
 

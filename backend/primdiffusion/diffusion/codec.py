@@ -90,6 +90,11 @@ class LinearCodec(TensorRecord):
             values[..., members, :] = coefficients[..., members, :] @ basis
         return values / self.weight + self.mean
 
+    def voxel_basis(self, channels: int) -> Float[Tensor, "b 512 4 c"]:
+        """What decoding adds to encoded colour and relative density of each voxel per unit of the leading channels."""
+        basis = self.basis[:, :channels] / (self.weight * SLAB_UNIT)
+        return basis[..., :VOXEL_VALUES].unflatten(-1, (4, S**3)).permute(0, 3, 2, 1)
+
     def mirror(self, latents: Float[Tensor, "*b c 32 32"]) -> Float[Tensor, "*b c 32 32"]:
         """Mirror a person: columns reversed, each cell reversed along W (the layout is symmetric).
 

@@ -112,6 +112,19 @@ class PersonPrior(TensorRecord):
         coefficients = self.denoise_coefficients(y, signal[..., 0, 0], noise[..., 0, 0], condition)
         return self.join(coefficients, self.denoise_rest(rest, signal, noise))
 
+    def posterior_mean(self, precision: Float[Tensor, "r r"], vector: Float[Tensor, "r"]) -> Float[Tensor, "r"]:
+        """E[c] given an observation of likelihood exp(vector^T c - c^T precision c / 2)."""
+        axes, variance, centre = (_double(part) for part in (self.axes, self.variance, self.centre))
+        own = (axes.mT / variance[:, None, :]) @ axes
+        from_centre = centre @ own
+        factor = torch.linalg.cholesky(_double(precision) + own)
+        total = from_centre + _double(vector)
+        mean = torch.cholesky_solve(total.mT, factor).mT
+        spread = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * variance.log().sum(-1)
+        evidence = (mean * total).sum(-1) / 2 - (from_centre * centre).sum(-1) / 2 - spread[:, None]
+        share = (_double(self.log_weight) + evidence).flatten().softmax(0).view_as(evidence)
+        return torch.einsum("gm,gmr->r", share, mean).to(vector)
+
     def marginal_variance(self) -> Float[Tensor, "r"]:
         """Variance of each person coefficient over the whole mixture."""
         weight = self.log_weight.exp()

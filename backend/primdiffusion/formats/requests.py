@@ -31,6 +31,7 @@ SIDED_PARTS = (
 PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
 """Body parts that regions consist of."""
 Making = Literal["fitted", "from_mesh"]
+Reconstruction = Literal["encoder", "prior"]
 """How payloads are made: fitted to renders of the mesh, or with the colours of the nearest surface point."""
 PASSES = ("img", "mask", "depth", "normal", "part")
 """Images of a captured view."""
@@ -223,7 +224,7 @@ class TransferRequest(RegionRequest):
 class ReconstructRequest(Previews):
     """Reconstruct a human from captures: human.npz for Blender, person.human.safetensors, and previews.
 
-    The encoder takes several views of one frame and needs no training per subject. Captures are those of
+    Views are those of one frame; nothing is trained for a subject. Captures are those of
     `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's layout.
     """
 
@@ -235,8 +236,11 @@ class ReconstructRequest(Previews):
     """Captured pose to use; 0 is near the T pose, which shows most of a human."""
     views: Annotated[int, Range(1)] = 8
     """Number of cameras, spread around the human; all if there are fewer."""
+    by: Reconstruction = "encoder"
+    """encoder: a network turns several views into a human within seconds; prior: the human is fitted to the views, and
+    what they do not show is the most probable for the diffusion model, so one view is enough."""
     checkpoint: Path | None = None
-    """Trained encoder (.safetensors); the default is the one in the package."""
+    """Trained encoder, or diffusion model for `by` prior (.safetensors); the default is the one in the package."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -150,6 +150,31 @@ def add_diagonal(
     _add_diagonal(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight, freed, out)
 
 
+def apply_to_codes(
+    jacobian: PictureJacobian,
+    slope: Float32[ndarray, "v 4"],
+    basis: Float32[ndarray, "b 512 4 c"],
+    region: Int64[ndarray, "k"],
+    codes: Float32[ndarray, "k c n"],
+    alpha_free: Float32[ndarray, "r"],
+) -> Float32[ndarray, "r 4 n"]:
+    """J X for n changes X of the voxels that are given by codes: those of box k are slope * basis[region[k]] codes[k].
+
+    As `apply` on each of the n columns, but a small part of its work: segments are multiplied by the basis, not by the
+    columns.
+    """
+    out = np.zeros((jacobian.rays, 4, codes.shape[-1]), np.float32)
+    for k, (first, last) in enumerate(zip(jacobian.box_start[:-1], jacobian.box_start[1:], strict=True)):
+        if first == last:
+            continue
+        part = np.zeros((last - first, 4, basis.shape[-1]), np.float32)
+        own = slope[k * VOXELS : (k + 1) * VOXELS]
+        _add_in_basis(jacobian.start[first : last + 1], jacobian.voxel, jacobian.weight, own, basis[region[k]], part)
+        out[jacobian.ray[first:last]] += part @ codes[k]  # a ray crosses a box once
+    out[:, 3] *= alpha_free[:, None]
+    return out
+
+
 class ColourMatrix(NamedTuple):
     """The colour part of a `PictureJacobian`; exact, because opacity does not depend on colour."""
 
@@ -364,3 +389,18 @@ def _add_colours_transposed(box_start, ray, start, voxel, weight, y, out):
                 w, colours = weight[entry], out[base + np.int64(voxel[entry])]
                 for column in range(columns):
                     colours[column] += w * pixel[column]
+
+
+@kernel
+def _add_in_basis(start, voxel, weight, slope, basis, out):
+    for segment in range(len(start) - 1):
+        for entry in range(start[segment], start[segment + 1]):
+            v = np.int64(voxel[entry])
+            for channel in range(3):
+                a = weight[entry, 0] * slope[v, channel]
+                for c in range(basis.shape[2]):
+                    out[segment, channel, c] += a * basis[v, channel, c]
+            for channel in range(4):
+                a = weight[entry, 1 + channel] * slope[v, 3]
+                for c in range(basis.shape[2]):
+                    out[segment, channel, c] += a * basis[v, 3, c]

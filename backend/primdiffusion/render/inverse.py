@@ -109,7 +109,7 @@ def fit_payload(
     for number in range(settings.steps):
         z = z.clip(0, limit)
         seen = targets if number == settings.steps - 1 else targets[number % 2 :: 2] or targets
-        views = [_View.of(target, _payload(z, start), settings) for target in seen]
+        views = [LinearisedView.of(target, _payload(z, start), settings) for target in seen]
         gradient, diagonal = np.zeros_like(z), np.zeros_like(z)
         for view in views:
             add_transposed(view.jacobian, view.weight * view.residual, view.alpha_free, gradient)
@@ -171,22 +171,26 @@ def fit_colours(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _View:
-    """One target, linearised at the current voxels."""
+class LinearisedView:
+    """A target, linearised at the current voxels: with changes x of voxels, it differs by residual - jacobian x."""
 
     jacobian: PictureJacobian
     residual: Float32[ndarray, "r 4"]
+    """Linear RGB over BACKGROUND, and alpha."""
     weight: Float32[ndarray, "r 4"]
+    """Of squared residuals; the sum with those of a target's pixels is a mean over its figure, of encoded colours."""
     alpha_free: Float32[ndarray, "r"]
+    """1 where alpha follows density, 0 where the ray is opaque."""
 
     @classmethod
-    def of(cls, target: TargetImage, payload: Payload, settings: InverseSettings) -> _View:
+    def of(cls, target: TargetImage, payload: Payload, settings: InverseSettings) -> LinearisedView:
+        """Linearise at a payload on the CPU."""
         rendering, jacobian = linearise(Primitives.place(target.frames, payload), target.camera, BACKGROUND)
         rgb, alpha = rendering.rgb.numpy().reshape(-1, 3), rendering.alpha.numpy().reshape(-1, 1)
         wanted, wanted_alpha = _over_background(target)
         residual = np.concatenate([wanted - (rgb + (1 - alpha) * BACKGROUND), wanted_alpha - alpha], axis=1)
         weight = np.concatenate(
-            [_encoding_slope(wanted, settings.darkest) ** 2, np.full_like(alpha, settings.opacity_weight)], axis=1
+            [encoding_slope(wanted, settings.darkest) ** 2, np.full_like(alpha, settings.opacity_weight)], axis=1
         )
         weight *= target.weight / max(1.0, float(wanted_alpha.sum()))
         return cls(
@@ -194,7 +198,7 @@ class _View:
         )
 
 
-def _curvature(views: Sequence[_View], scale: ndarray) -> Callable[[ndarray], ndarray]:
+def _curvature(views: Sequence[LinearisedView], scale: ndarray) -> Callable[[ndarray], ndarray]:
     """x -> J^T W J x over all views, in the units of `scale`."""
 
     def product(x: ndarray) -> ndarray:
@@ -222,7 +226,7 @@ class _ColourView:
         matrix, alpha = ColourMatrix.of(jacobian), rendering.alpha.numpy().reshape(-1, 1)
         drawn = matrix.apply(z) + (1 - alpha) * BACKGROUND
         wanted = np.concatenate([_over_background(one)[0] for one in targets], axis=1)
-        weight = _encoding_slope(wanted, settings.darkest) ** 2
+        weight = encoding_slope(wanted, settings.darkest) ** 2
         weight *= target.weight / max(1.0, float(target.rgba[..., 3].sum()))
         return cls(matrix, (wanted - drawn).astype(np.float32), weight.astype(np.float32))
 
@@ -294,7 +298,7 @@ def _over_background(target: TargetImage) -> tuple[ndarray, ndarray]:
     return rgba[:, :3] + (1 - rgba[:, 3:]) * BACKGROUND, rgba[:, 3:]
 
 
-def _encoding_slope(linear: ndarray, darkest: float) -> ndarray:
+def encoding_slope(linear: ndarray, darkest: float) -> ndarray:
     """d(sRGB-encoded) / d(linear)."""
     linear = np.maximum(linear, darkest)
     power = 1.055 / 2.4 * np.maximum(linear, 0.0031308) ** (1 / 2.4 - 1)
@@ -303,7 +307,7 @@ def _encoding_slope(linear: ndarray, darkest: float) -> ndarray:
 
 def _linear_unit(colours: ndarray, settings: InverseSettings) -> ndarray:
     """Change of linear colour per unit of encoded colour, at these colours."""
-    return 1 / _encoding_slope(colours.clip(0, 1), settings.darkest)
+    return 1 / encoding_slope(colours.clip(0, 1), settings.darkest)
 
 
 def _mean_diagonal(diagonal: ndarray) -> ndarray:

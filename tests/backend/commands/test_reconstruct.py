@@ -129,6 +129,14 @@ def test_one_view_works_with_a_warning_that_the_rest_is_guessed(dataset, line, t
     assert (tmp_path / "out" / "human.npz").exists()
 
 
+def test_the_prior_fits_the_person_to_a_single_view(dataset, line, tmp_path):
+    line[2] = str(save_tiny_checkpoint(tmp_path / "model.safetensors"))
+    cli.run([*line, "--capture", str(dataset / FIRST), "--views", "1", "--by", "prior"])
+    picture = np.asarray(Image.open(tmp_path / "out" / "front.png")).astype(int)
+    red, green, blue = picture[picture.sum(-1) > 60].mean(0)
+    assert green > 2 * max(red, blue)
+
+
 def test_views_from_behind_alone_work(dataset):
     captures, name = choose_subject(dataset, FIRST)
     behind = [number for number, view in enumerate(captures.subject(name).views) if view.position[2] < 0]

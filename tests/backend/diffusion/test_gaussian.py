@@ -57,6 +57,16 @@ def test_mixture_denoiser_is_bayes_rule(prior, asked):
         assert torch.allclose(guess.flatten(), share @ torch.stack(means), atol=1e-9)
 
 
+def test_posterior_mean_of_white_noise_is_what_the_denoiser_gives(prior):
+    y = torch.randn(5, 4, dtype=F64, generator=torch.Generator().manual_seed(5))
+    signal, noise = (level[..., 0, 0] for level in levels(0.7, 5))
+    wanted = prior.denoise_coefficients(y, signal, noise)
+    ratio = (signal / noise.square())[0, 0]
+    precision = 0.7 * ratio * torch.eye(4, dtype=F64)
+    got = torch.stack([prior.posterior_mean(precision, ratio * one) for one in y])
+    assert torch.allclose(got, wanted, atol=1e-9)
+
+
 def test_samples_have_the_prior_s_moments(prior):
     z = prior.sample(60_000, torch.Generator().manual_seed(0))
     coefficients, rest = prior.split(z)

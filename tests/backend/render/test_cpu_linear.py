@@ -14,6 +14,7 @@ from primdiffusion.render.cpu_linear import (
     add_diagonal,
     add_transposed,
     apply,
+    apply_to_codes,
     linearise,
 )
 from support.errors import refused
@@ -71,6 +72,18 @@ def test_diagonal_is_that_of_the_product(scene):
         unit.ravel()[place] = 1
         column = apply(jacobian, unit, free)
         assert diagonal.ravel()[place] == pytest.approx(float((weight * column**2).sum()), rel=1e-4)
+
+
+def test_changes_given_by_codes_move_the_picture_as_the_voxels_that_they_stand_for(scene):
+    *_, jacobian, free = scene
+    boxes, codes, columns = jacobian.voxels // VOXELS, 5, 3
+    slope, basis = normal(6, jacobian.voxels, 4), normal(7, 2, VOXELS, 4, codes)
+    region, values = np.arange(boxes) % 2, normal(8, boxes, codes, columns)
+    got = apply_to_codes(jacobian, slope, basis, region, values, free)
+    changes = slope[..., None] * np.einsum("kvxc,kcn->kvxn", basis[region], values).reshape(-1, 4, columns)
+    for column in range(columns):
+        expected = apply(jacobian, np.ascontiguousarray(changes[..., column]), free)
+        np.testing.assert_allclose(got[..., column], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
 
 def test_colour_matrix_draws_the_picture(scene):

@@ -33,25 +33,25 @@ def asked_of_the_child(person: bpy.types.Collection) -> dict:
 
 
 def test_the_operator_builds_a_human_from_the_chosen_captures(addon, captures):
-    asked = {"directory": f"{captures}/", "subject": "anna", "frame": 2, "views": 5}
+    asked = {"directory": f"{captures}/", "subject": "anna", "frame": 2, "views": 5, "by": "prior"}
     assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
     (person,) = humans(addon.scene)
     assert sum(obj.type == "VOLUME" for obj in person.all_objects) == 8
     sent = asked_of_the_child(person)
     assert Path(sent.pop("capture")) == captures
     assert Path(sent.pop("out_dir")).name.startswith("reconstruct_")
-    assert sent == {"subject": "anna", "frame": 2, "views": 5}
+    assert sent == {"subject": "anna", "frame": 2, "views": 5, "by": "prior"}
     assert not list(Path(bpy.app.tempdir).glob("reconstruct_*"))
     assert notice_of("reconstruct").startswith("Reconstructed in ")
 
 
 def test_properties_that_are_not_given_are_the_panels(addon, captures):
     panel = addon.scene.primdiffusion_reconstruct
-    panel.capture, panel.subject, panel.frame, panel.views = "//captures", "berta", 3, 4
+    panel.capture, panel.subject, panel.frame, panel.views, panel.by = "//captures", "berta", 3, 4, "prior"
     assert bpy.ops.primdiffusion.human_from_captures() == {"FINISHED"}
     sent = asked_of_the_child(humans(addon.scene)[0])
     assert Path(sent["capture"]) == captures
-    assert (sent["subject"], sent["frame"], sent["views"]) == ("berta", 3, 4)
+    assert (sent["subject"], sent["frame"], sent["views"], sent["by"]) == ("berta", 3, 4, "prior")
 
 
 def test_the_panels_subject_is_not_looked_for_in_another_folder(addon, captures):

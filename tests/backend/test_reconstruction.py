@@ -1,0 +1,69 @@
+"""Reconstruction by the prior, of people of a tiny model whose garments have one colour all over."""
+
+import dataclasses
+import math
+
+import pytest
+import torch
+from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.conditioning import CapturedPerson
+from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import Human, framing, place
+from primdiffusion.reconstruction import reconstruct_by_prior
+from primdiffusion.render.march import march
+from support.errors import refused
+from tiny_model import tiny_model
+
+MODEL = tiny_model()
+PRIOR = MODEL.denoiser.prior
+BETAS = torch.linspace(-0.5, 0.5, 10)
+COLOURS = torch.tensor([30.0, -20.0, 5.0])
+
+
+def human_of(coefficients: torch.Tensor) -> Human:
+    latents = (PRIOR.mean + PRIOR.picture(coefficients[None]))[0]
+    return Human(MODEL.decode(latents).map(torch.Tensor.clone), BETAS, {})
+
+
+def captured(human: Human, pose: BodyPose, yaws: list[float]) -> CapturedPerson:
+    primitives = place(human, pose)
+    cameras = [framing(primitives, yaw, 96, 128) for yaw in yaws]
+    pictures = []
+    for camera in cameras:
+        seen = march(primitives, camera)
+        rgba = torch.cat([encode_srgb(seen.rgb.clamp(0, 1)), seen.alpha[..., None]], -1)
+        pictures.append((255 * rgba).round().to(torch.uint8))
+    views = Views(torch.stack(pictures), stack(cameras), pose)
+    return CapturedPerson("anna", 3, tuple(range(len(yaws))), views, BETAS, ())
+
+
+@pytest.mark.parametrize("yaws", [[0.0], [0.0, math.pi / 2]], ids=["one view", "two views"])
+def test_what_no_view_shows_has_the_most_probable_colours_given_what_they_show(yaws):
+    human, pose = human_of(COLOURS), BodyPose.from_axis_angle(torch.linspace(-0.2, 0.2, 72))
+    found = reconstruct_by_prior(MODEL, captured(human, pose, yaws))
+    wanted, got, mean = (encode_srgb(one.payload.rgb) for one in (human, found, human_of(torch.zeros(3))))
+    assert (mean - wanted).abs().mean() > 0.03
+    assert (got - wanted).abs().mean() < 0.006
+    assert (got - wanted).abs().flatten(1).mean(1).max() < 0.02
+    assert torch.equal(found.betas, BETAS)
+    assert (found.provenance["reconstructed_from"], found.provenance["views"]) == ("anna", list(range(len(yaws))))
+
+
+def test_steps_are_reported_and_an_exception_cancels():
+    person, steps = captured(human_of(COLOURS), BodyPose.rest(), [0.0]), []
+
+    def cancel(done: int, total: int) -> None:
+        steps.append((done, total))
+        if done == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        reconstruct_by_prior(MODEL, person, cancel)
+    assert steps == [(1, 5), (2, 5)]
+
+
+def test_a_model_without_person_components_is_refused():
+    person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
+    with refused(ValueError, "person components"):
+        reconstruct_by_prior(dataclasses.replace(MODEL, denoiser=torch.nn.Identity()), person)
