@@ -39,6 +39,10 @@ SOURCES = {
         "benchmarks/tables.py --models DIR --assets DIR --json docs/results/tables.json "
         "--table docs/results/tables_table.md",
     ),
+    "from_pictures": (
+        "From one view, by the person prior",
+        "benchmarks/from_pictures.py --assets DIR --json docs/results/from_pictures.json",
+    ),
     "encoder_paper_form": (
         "The paper's Table 3 in the paper's own form",
         "benchmarks/encoder_paper_form.py --train DIR --novel DIR --out DIR "

@@ -1,0 +1,166 @@
+"""Measures reconstruction by the person prior from one view: what it shows, what it does not, and whose human it is.
+
+`python benchmarks/from_pictures.py --assets DIR --json F --sheet F.png` makes dressed humans from seeds that no
+training set uses and draws their meshes from 16 sides with the rasteriser, every second human in another pose than T.
+Each is reconstructed from the front view alone, and from every second view. Means over humans, of sRGB-encoded pictures
+over grey, over the figure and 8 pixels around it:
+
+    one_view_psnr, one_view_ssim    the eight views that neither reconstruction was given
+    eight_views_psnr                the same, from eight views
+    encoder_psnr                    the same, by the encoder from the front view: a baseline
+    one_view_seen_psnr              the front view, which was given
+    one_view_seen_gap_db            that from eight views, less that from one
+    identity_rate                   humans whose unseen views are nearer to their own pictures than to anyone else's
+    one_view_seconds_cpu            wall time of a reconstruction from one view
+
+The sheet has a row for each human: the given view, then two others beside the true ones.
+"""
+
+from __future__ import annotations
+
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from PIL import Image
+from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views, default_betas
+from primdiffusion.capture.dataset import Views
+from primdiffusion.capture.people_files import find_people
+from primdiffusion.capture.poses import choose_poses
+from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.capture.render import RenderJob, render
+from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.encoder.model import load_encoder
+from primdiffusion.evaluation.image_metrics import figure_psnr, ssim
+from primdiffusion.formats.camera_rig import Rig
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.human import Human, place
+from primdiffusion.people.assets import open_assets
+from primdiffusion.people.folder import PeopleSet, make_people
+from primdiffusion.people.wardrobe import required_meshes
+from primdiffusion.reconstruction import reconstruct, reconstruct_by_prior
+from primdiffusion.render.march import march
+from record import command_line, report
+from torch import Tensor
+
+SEED = 31_000_000
+"""Seed of the first human; training sets count from 0."""
+CAMERAS, SIZE, POSES = 16, 512, 2
+GREY = decode_srgb(torch.tensor(0.5))
+VIEW = 256
+"""Pixels a side of the sheet's pictures."""
+
+
+class Case(NamedTuple):
+    """A captured human."""
+
+    given: CapturedPerson
+    """From the front."""
+    more: CapturedPerson
+    """From every second side."""
+    unseen: Views
+
+
+def main() -> None:
+    parser = command_line(__doc__)
+    parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
+    parser.add_argument("--checkpoint", type=Path, help="diffusion model; the default one if omitted")
+    parser.add_argument("--people", type=int, default=32)
+    parser.add_argument("--sheet", type=Path, help="PNG of the first eight humans")
+    arguments = parser.parse_args()
+    model, encoder = load_checkpoint(arguments.checkpoint), load_encoder(None, torch.device("cpu"))
+    rows: list[dict[str, float]] = []
+    drawn, true, sheet = [], [], []
+    with tempfile.TemporaryDirectory() as scratch:
+        captures = captured(Path(scratch), arguments.assets, arguments.people)
+        for number, name in enumerate(captures.subjects):
+            case = case_of(captures, name, number % POSES)
+            if not number:  # compiles the marcher
+                reconstruct_by_prior(model, case.given)
+            began = time.perf_counter()
+            one = reconstruct_by_prior(model, case.given)
+            seconds = time.perf_counter() - began
+            many, by_encoder = reconstruct_by_prior(model, case.more), reconstruct(encoder, case.given)
+            pictures, targets = pictures_of(one, case.unseen), over_grey(case.unseen)
+            seen = [psnr_of(human, case.given.views) for human in (one, many)]
+            rows.append({
+                "one_view_psnr": psnr_of(one, case.unseen),
+                "one_view_ssim": float(ssim(pictures, targets).mean()),
+                "eight_views_psnr": psnr_of(many, case.unseen),
+                "encoder_psnr": psnr_of(by_encoder, case.unseen),
+                "one_view_seen_psnr": seen[0],
+                "one_view_seen_gap_db": seen[1] - seen[0],
+                "one_view_seconds_cpu": seconds,
+            })  # fmt: skip
+            print(name, {key: round(value, 2) for key, value in rows[-1].items()}, flush=True)
+            drawn.append(small(pictures))
+            true.append(small(targets))
+            if number < 8:
+                front = over_grey(case.given.views)[0]
+                sheet.append(torch.cat([front, pictures[1], targets[1], pictures[3], targets[3]], 1))
+    figures: dict[str, float | int] = {key: round(float(np.mean([row[key] for row in rows])), 4) for key in rows[0]}
+    distance = torch.cdist(torch.stack(drawn), torch.stack(true))
+    figures["identity_rate"] = float((distance.argmin(1) == torch.arange(len(rows))).float().mean())
+    figures["people"] = len(rows)
+    if arguments.sheet is not None:
+        pixels = (255 * torch.cat(sheet)).round().to(torch.uint8).numpy()
+        Image.fromarray(pixels).resize((5 * VIEW, len(sheet) * VIEW), Image.Resampling.BOX).save(arguments.sheet)
+    report(figures, arguments.json)
+
+
+def captured(folder: Path, assets: Path | None, count: int) -> Captures:
+    """Render dressed humans as a dataset of captures."""
+    list(make_people(open_assets(assets, required_meshes()), PeopleSet(folder / "people", SEED, count), 1))
+    rig = Rig(count=CAMERAS, elevations=(5.0,), width=SIZE, height=SIZE)
+    people = dict(find_people(folder / "people").items())
+    job = RenderJob(people, choose_poses((), POSES, seed=0), folder / "captures", rig, ("img", "mask"))
+    assert all(outcome.status == "done" for outcome in render(job))
+    return open_captures(job.out)
+
+
+def case_of(captures: Captures, name: str, frame: int) -> Case:
+    subject = captures.subject(name)
+    front = max(range(CAMERAS), key=lambda camera: subject.views[camera].position[2])
+    even = [(front + step) % CAMERAS for step in range(0, CAMERAS, 2)]
+    odd = [(front + step) % CAMERAS for step in range(1, CAMERAS, 2)]
+
+    def person(cameras: Sequence[int]) -> CapturedPerson:
+        views = conditioning_views(captures, name, frame, cameras)
+        return CapturedPerson(name, frame, tuple(cameras), views, default_betas(subject), ())
+
+    return Case(person([front]), person(even), conditioning_views(captures, name, frame, odd))
+
+
+def over_grey(views: Views) -> Float[Tensor, "v H W 3"]:
+    """The true pictures, encoded."""
+    alpha = views.mask[..., None] / 255
+    return encode_srgb((decode_srgb(views.image / 255) + (1 - alpha) * GREY).clamp(0, 1))
+
+
+@torch.no_grad()
+def pictures_of(human: Human, views: Views) -> Float[Tensor, "v H W 3"]:
+    """The human in the pose and from the cameras of the views, likewise."""
+    primitives, drawn = place(human, views.pose), []
+    for number in range(len(views.rgba)):
+        seen = march(primitives, views.camera.map(lambda values, number=number: values[number]))
+        drawn.append(encode_srgb((seen.rgb + (1 - seen.alpha[..., None]) * GREY).clamp(0, 1)))
+    return torch.stack(drawn)
+
+
+def psnr_of(human: Human, views: Views) -> float:
+    pairs = zip(pictures_of(human, views), over_grey(views), views.mask > 127, strict=True)
+    return float(torch.stack([figure_psnr(*pair) for pair in pairs]).mean())
+
+
+def small(pictures: Float[Tensor, "v H W 3"]) -> Float[Tensor, "d"]:
+    """Pictures at an eighth of their size, to compare whole humans."""
+    return torch.nn.functional.avg_pool2d(pictures.movedim(-1, 1), 8).flatten()
+
+
+if __name__ == "__main__":
+    main()
