@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import atexit
 import functools
-from typing import TYPE_CHECKING
 
 from ..backend.drawing import IDLE_S, DrawingChild
 from ..places import new_backend, preference
 from .frames import SharedFrames
-
-if TYPE_CHECKING:
-    from .gpu_humans import GpuHumans
-    from .gpu_march import GpuMarcher
+from .gpu_humans import GpuHumans
+from .gpu_march import GpuMarcher
 
 frames = SharedFrames()
 """For all renders and viewports."""
@@ -33,8 +30,6 @@ def drawing_child() -> DrawingChild:
 @functools.cache
 def gpu_marcher() -> GpuMarcher | str:
     """The marcher on the GPU, or why there is none. Asked for while a view is drawn."""
-    from .gpu_march import GpuMarcher  # a render without a window has no GPU
-
     try:
         return GpuMarcher()
     except RuntimeError as error:
@@ -44,8 +39,6 @@ def gpu_marcher() -> GpuMarcher | str:
 @functools.cache
 def gpu_humans() -> GpuHumans:
     """The humans on the GPU."""
-    from .gpu_humans import GpuHumans  # as above
-
     return GpuHumans()
 
 

@@ -1,4 +1,4 @@
-"""Who draws humans in a 3D view. Views and panels ask here; panels import it when Blender starts, without numpy."""
+"""Who draws humans in a 3D view. Views and panels ask here."""
 
 from __future__ import annotations
 

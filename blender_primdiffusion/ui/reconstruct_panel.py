@@ -8,8 +8,10 @@ from pathlib import Path
 
 import bpy
 
+from ..formats.capture_layout import LIST_FILE, read_list
 from ..formats.requests import ReconstructRequest
 from ..jobs.follow import Reporting, submit
+from ..jobs.generate import ReconstructJob
 from ..scene.blend_values import setting_path
 from .captures_panel import DataPanel
 from .declared import declared, not_given
@@ -20,8 +22,6 @@ _CAMERAS_FILE = "cameras.json"
 
 def subjects_in(folder: Path) -> list[str]:
     """Names of the humans in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
-    from ..formats.capture_layout import LIST_FILE, read_list  # needs numpy
-
     try:
         if (folder / _CAMERAS_FILE).is_file():
             return []
@@ -80,8 +80,6 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..jobs.generate import ReconstructJob  # needs numpy
-
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory) or setting_path(asked.capture, "Captures")
         subject = self.subject or ("" if self.directory else asked.subject)  # the panel's belongs to its own folder
