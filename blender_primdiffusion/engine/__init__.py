@@ -7,8 +7,9 @@ from collections.abc import Callable
 import bpy
 
 from ..scene.human import any_humans
-from . import overlay, studio, viewport
+from . import studio, viewport
 from .engine import ENGINE, PRIMDIFFUSION_RenderEngine
+from .gpu import overlay
 from .settings import PRIMDIFFUSION_PG_render
 from .who_draws import view_engine
 

@@ -6,8 +6,7 @@ import bpy
 
 from . import final
 from .viewport import Viewport
-
-ENGINE = "PRIMDIFFUSION"
+from .who_draws import ENGINE
 
 
 class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):

@@ -6,8 +6,7 @@ import enum
 
 import bpy
 
-from .engine import ENGINE
-
+ENGINE = "PRIMDIFFUSION"
 WORKBENCH = "BLENDER_WORKBENCH"
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
 

@@ -126,7 +126,7 @@ class LateVolumes:
 
     def tick(self) -> float | None:
         """The timer: a slice of writing, until all is written. Views that humans are drawn in come first."""
-        from ..engine.overlay import overlay  # needs numpy
+        from ..engine.gpu.overlay import overlay  # needs numpy
 
         if in_the_way() or not overlay.resting:
             return BLOCKED_S

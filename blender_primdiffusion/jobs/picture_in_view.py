@@ -9,9 +9,10 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
-from ..engine import billboard, by_engine
-from ..engine.billboard import corners, figure_of
-from ..engine.overlay import overlay
+from ..engine import by_engine
+from ..engine.gpu import billboard
+from ..engine.gpu.billboard import corners, figure_of
+from ..engine.gpu.overlay import overlay
 from ..scene.place import next_place
 from .pictures import so_far
 from .queue import queue

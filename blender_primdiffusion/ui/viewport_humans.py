@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..engine import shows_humans
-from ..engine.overlay import overlay
+from ..engine.gpu.overlay import overlay
 from ..scene.human import any_humans
 
 _keys: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
