@@ -26,6 +26,7 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import armature_of, body_of, person_file
 from blender_primdiffusion.scene.shape import OPTIONAL_FIELDS
+from blender_primdiffusion.ui import viewport_humans
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
 SIZE = (40, 30)
@@ -308,7 +309,7 @@ def test_a_click_on_an_object_in_front_or_on_nothing_is_blenders(people):
 
 
 def test_clicks_select_extend_and_deselect(people, monkeypatch):
-    monkeypatch.setattr(module, "overlay", people.overlay)
+    monkeypatch.setattr(viewport_humans, "overlay", people.overlay)
     event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
     event["value"] = "CLICK"
 
@@ -335,7 +336,7 @@ def test_clicks_select_extend_and_deselect(people, monkeypatch):
 
 
 def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
-    monkeypatch.setattr(module, "overlay", people.overlay)
+    monkeypatch.setattr(viewport_humans, "overlay", people.overlay)
     click, held, begun = PRIMDIFFUSION_OT_click_human, SimpleNamespace(extend=False), []
     around = clickable(people)
     around.selected_objects, around.window_manager = [], SimpleNamespace(modal_handler_add=begun.append)
