@@ -20,6 +20,7 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.body.model import BodyPose
+from primdiffusion.device import best_device
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.inpaint import harmonise, inpaint
@@ -31,7 +32,6 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, Sampling
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, generate, place
-from primdiffusion.machine import best_device
 from primdiffusion.render.image import over
 from primdiffusion.render.march import march
 from record import command_line, report

@@ -24,10 +24,10 @@ from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.commands.reconstruct import split_cameras
+from primdiffusion.device import best_device
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place
-from primdiffusion.machine import best_device
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes

@@ -48,7 +48,7 @@ def in_blender(folder: Path) -> None:
 
     sys.path.insert(0, str(ROOT))
     from blender_primdiffusion.engine.boxes import Boxes
-    from blender_primdiffusion.engine.gpu_march import GpuMarcher, GpuPayload
+    from blender_primdiffusion.engine.gpu.march import GpuMarcher, GpuPayload
     from blender_primdiffusion.engine.view import PinholeView
 
     gpu.init()

@@ -6,28 +6,36 @@ bpy and numpy only; the generator runs in a child process with a Python of its o
 from __future__ import annotations
 
 import atexit
+import importlib.util
+from types import ModuleType
 
-_registered = False
+_registered: list[ModuleType] = []
+"""Packages that are registered, in order."""
 
 
 def register() -> None:
-    """Called by Blender when the extension is enabled.
+    """Called by Blender when the extension is enabled. Without numpy only a panel is registered: what to install.
 
     Raises RuntimeError, before anything is registered, if the other build (the extension or its viewer) is enabled.
     """
-    global _registered
-    # here, so that the backend's client can be imported without bpy
-    import bpy
+    import bpy  # here, so that the backend's client can be imported without bpy
 
-    if (other := _registered_by()) is not None:
+    if (other := _registered_by(bpy.types)) is not None:
         raise RuntimeError(
             f"{other} is enabled and has the same operators: disable it in Preferences > Add-ons, then enable this one"
         )
-    from . import engine, ui  # likewise
+    bpy.utils.expose_bundled_modules()
+    if importlib.util.find_spec("numpy") is None:
+        from . import without_numpy
 
-    engine.register()
-    ui.register()
-    _registered = True
+        packages = [without_numpy]
+    else:
+        from . import engine, ui  # which import numpy
+
+        packages = [engine, ui]
+    for package in packages:
+        package.register()
+        _registered.append(package)
     if not bpy.app.binary_path:
         atexit.register(unregister)
 
@@ -39,25 +47,16 @@ def unregister() -> None:
     Newer ones call it too, after `atexit`; a second call does nothing. In the application `atexit` would be too late:
     Blender's data are freed before.
     """
-    global _registered
-    if not _registered:
-        return
-    _registered = False
-    from . import engine, ui  # as in `register`
-
     atexit.unregister(unregister)
+    while _registered:
+        _registered.pop().unregister()
 
-    ui.unregister()
-    engine.unregister()
 
-
-def _registered_by() -> str | None:
-    """The module of another extension that has registered our classes."""
-    import bpy
-
-    for name in dir(bpy.types):
+def _registered_by(types: ModuleType) -> str | None:
+    """The module of another extension that has registered our classes; `types` is bpy.types."""
+    for name in dir(types):
         if name.startswith("PRIMDIFFUSION_"):
-            parts = getattr(bpy.types, name).__module__.split(".")
+            parts = getattr(types, name).__module__.split(".")
             other = ".".join(parts[:3] if parts[0] == "bl_ext" else parts[:1])
             if other != __package__:
                 return other

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import importlib.util
 import os
 import shutil
 from collections.abc import Generator
@@ -60,24 +58,6 @@ def body_data(name: str) -> Path:
         if path.is_file():
             return path
     raise FileNotFoundError(f"the extension lacks {name} of the default body: install its zip again")
-
-
-_PACKAGES = {"numpy": "python3-numpy", "openvdb": "python3-openvdb"}
-"""Python packages that Blender brings, and their names in Debian, whose Blender does not bring them."""
-
-
-@functools.cache
-def missing_packages() -> str:
-    """Which Python packages this Blender lacks and how to install them, as a sentence; empty where it has all."""
-    bpy.utils.expose_bundled_modules()
-    missing = [name for name in _PACKAGES if importlib.util.find_spec(name) is None]
-    if not missing:
-        return ""
-    debian = " ".join(_PACKAGES[name] for name in missing)
-    return (
-        f"the Python of this Blender lacks {' and '.join(missing)}, without which humans cannot be shown: install them "
-        f"(on Debian and Ubuntu: sudo apt install {debian}), then start Blender again"
-    )
 
 
 def own_folder() -> Path:

@@ -55,6 +55,12 @@ COMMANDS = {
 """The function of each command, imported when it is used, because several take a second to import; and its summary.
 
 It gets the record of `OPTIONS`, or the arguments of a command that is not there."""
+SUBCOMMANDS = {
+    "payloads encode": "commands.people:run_encode",
+    "payloads pack": "commands.people:run_pack",
+    "payloads verify": "commands.people:run_verify",
+}
+"""Functions of commands with two names, which the help of the first lists."""
 
 
 def help_text() -> str:
@@ -83,11 +89,14 @@ def run(arguments: Sequence[str]) -> None:
         print(f"primdiffusion: there is no command {name!r}: choose from {', '.join(COMMANDS)}", file=sys.stderr)
         sys.exit(USAGE)
     given: Any = arguments[1:]
+    if given and f"{name} {given[0]}" in SUBCOMMANDS:
+        name, given = f"{name} {given[0]}", given[1:]
     if name in OPTIONS:
         from primdiffusion.commands.command_line import parse  # `primdiffusion --help` does not need tyro
 
         given = parse(OPTIONS[name], given, name)
-    module, _, function = COMMANDS[name][0].partition(":")
+    where = SUBCOMMANDS[name] if name in SUBCOMMANDS else COMMANDS[name][0]
+    module, _, function = where.partition(":")
     getattr(importlib.import_module(f"primdiffusion.{module}"), function)(given)
 
 

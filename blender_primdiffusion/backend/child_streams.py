@@ -10,11 +10,16 @@ ends; what the pipe does not take at once is written at the next tick.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import errno
 import os
+import select
 import sys
 import tempfile
 from typing import IO
+
+if sys.platform == "win32":
+    import msvcrt
 
 READ_BYTES = 1 << 18
 """Of a child's output, taken in at once."""
@@ -137,8 +142,6 @@ def stdin_has_ended() -> bool:
     """
     if os.name == "nt":
         return _windows_pipe_is_broken(0)
-    import select  # of no use on Windows
-
     while select.select([0], [], [], 0)[0]:
         if not os.read(0, 4096):
             return True
@@ -146,13 +149,9 @@ def stdin_has_ended() -> bool:
 
 
 def _stop_waiting_on(descriptor: int) -> None:
-    if sys.platform != "win32":
+    if sys.platform != "win32":  # Windows: os.set_blocking handles pipes from Python 3.12 on
         os.set_blocking(descriptor, False)
         return
-    # only on Windows, where os.set_blocking handles pipes from Python 3.12 on
-    import ctypes
-    import msvcrt
-
     no_wait = ctypes.c_ulong(1)  # PIPE_NOWAIT
     handle = ctypes.c_void_p(msvcrt.get_osfhandle(descriptor))
     ctypes.windll.kernel32.SetNamedPipeHandleState(handle, ctypes.byref(no_wait), None, None)
@@ -161,10 +160,6 @@ def _stop_waiting_on(descriptor: int) -> None:
 def _windows_pipe_is_broken(descriptor: int) -> bool:
     if sys.platform != "win32":
         raise AssertionError("for Windows alone")
-    # only on Windows
-    import ctypes
-    import msvcrt
-
     kernel = ctypes.WinDLL("kernel32", use_last_error=True)
     handle = ctypes.c_void_p(msvcrt.get_osfhandle(descriptor))
     there = kernel.PeekNamedPipe(handle, None, 0, None, None, None)

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..formats.json_files import parse_json
 from ..formats.regular_files import TooLargeError, open_regular
+from ..formats.tensor_layout import check_limits, read_layout
 
 _LARGEST_FILE = 16 << 30
 """Bytes, as in the backend's `tensor_file`."""
@@ -29,8 +30,6 @@ def read_vocabulary(path: Path) -> Vocabulary:
 
     Raises OSError for a file that cannot be read and ValueError for one that is no checkpoint.
     """
-    from ..formats.tensor_layout import check_limits, read_layout  # needs numpy
-
     try:
         with open_regular(path, _LARGEST_FILE) as file:
             layout = read_layout(file)

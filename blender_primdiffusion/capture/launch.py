@@ -10,6 +10,8 @@ import sys
 from pathlib import Path
 from typing import NoReturn
 
+import bpy
+
 _NAME = "primdiffusion_extension"
 
 
@@ -26,8 +28,6 @@ def run_command() -> int:
 
 def leave(code: int) -> NoReturn:
     """End the process without Blender's own end: 4.5 as a module hangs there while a thread waits for stdin."""
-    import bpy  # this script finds the package before
-
     sys.stdout.flush()
     sys.stderr.flush()
     shutil.rmtree(bpy.app.tempdir, ignore_errors=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 
 import bpy
 
 from ..scene.human import any_humans
+from . import studio, viewport
 from .engine import ENGINE, PRIMDIFFUSION_RenderEngine
+from .gpu import overlay
 from .settings import PRIMDIFFUSION_PG_render
 from .who_draws import view_engine
 
@@ -40,9 +41,9 @@ def unregister() -> None:
     for name, handler in _handlers():
         if handler in getattr(bpy.app.handlers, name):
             getattr(bpy.app.handlers, name).remove(handler)
-    for module, ending in (("overlay", "stop"), ("viewport", "stop"), ("studio", "close")):
-        if (drawn := sys.modules.get(f"{__package__}.{module}")) is not None:  # imported by the first picture
-            getattr(drawn, ending)()
+    overlay.stop()
+    viewport.stop()
+    studio.close()
     _reset_scenes()
     del bpy.types.Scene.primdiffusion_render
     for cls in reversed(CLASSES):
@@ -61,15 +62,10 @@ def by_engine(context: bpy.types.Context) -> bool:
 
 def _draw_humans() -> None:
     context = bpy.context
-    rendered = sys.modules.get(f"{__package__}.viewport")  # imported by the first picture
     if shows_humans(context):
-        from .overlay import overlay  # numpy, which Blender starts without
-
-        overlay.draw(context)
-    elif rendered is not None and _shows_overlays(context) and (picture := rendered.picture_above_overlays(context)):
-        from .overlay import draw_above_overlays  # as above
-
-        draw_above_overlays(context, picture)
+        overlay.overlay.draw(context)
+    elif _shows_overlays(context) and (picture := viewport.picture_above_overlays(context)):
+        overlay.draw_above_overlays(context, picture)
 
 
 def _shows_overlays(context: bpy.types.Context) -> bool:
@@ -78,9 +74,8 @@ def _shows_overlays(context: bpy.types.Context) -> bool:
 
 
 def _draw_error() -> None:
-    module = sys.modules.get(f"{__package__}.overlay")
-    if module is not None and shows_humans(bpy.context):
-        module.draw_error(bpy.context)
+    if shows_humans(bpy.context):
+        overlay.draw_error(bpy.context)
 
 
 def _handlers() -> list[tuple[str, Callable[..., None]]]:
@@ -90,19 +85,16 @@ def _handlers() -> list[tuple[str, Callable[..., None]]]:
 
 @bpy.app.handlers.persistent
 def _scene_changed(*_given: object) -> None:
-    if (module := sys.modules.get(f"{__package__}.overlay")) is not None:
-        module.overlay.scene_changed()
+    overlay.overlay.scene_changed()
 
 
 @bpy.app.handlers.persistent
 def _depsgraph_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) -> None:
-    if (module := sys.modules.get(f"{__package__}.overlay")) is not None:
-        module.overlay.scene_changed(update.id for update in depsgraph.updates)
+    overlay.overlay.scene_changed(update.id for update in depsgraph.updates)
 
 
 def _check_child() -> float:
-    if (studio := sys.modules.get(f"{__package__}.studio")) is not None:  # imported by the first picture
-        studio.advance()
+    studio.advance()
     return CHECK_S
 
 

@@ -52,5 +52,15 @@ def wanted_region(render: bpy.types.RenderSettings, size: tuple[int, int]) -> li
     return [low[0], low[1], high[0] - low[0], high[1] - low[1]]
 
 
+def camera_frame(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> tuple[NDArray, NDArray]:
+    """Lowest and highest corner [2] of the camera's picture, pixels of the region."""
+    region, camera = context.region, context.space_data.camera
+    corners = np.array(camera.data.view_frame(scene=depsgraph.scene), np.float64)
+    homogeneous = np.concatenate([corners, np.ones((4, 1))], 1)
+    clip = homogeneous @ np.array(context.region_data.window_matrix, np.float64).T
+    pixels = (clip[:, :2] / clip[:, 3:] + 1) / 2 * [region.width, region.height]
+    return pixels.min(0), pixels.max(0)
+
+
 def _corner(render: bpy.types.RenderSettings, which: str) -> tuple[float, float]:
     return getattr(render, f"border_{which}_x"), getattr(render, f"border_{which}_y")

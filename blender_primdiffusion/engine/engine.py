@@ -1,18 +1,12 @@
-"""The render engine as Blender calls it.
-
-Blender registers the engine at each start, without numpy; the modules that draw are imported by the first picture.
-"""
+"""The render engine as Blender calls it."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import bpy
 
-if TYPE_CHECKING:
-    from .viewport import Viewport
-
-ENGINE = "PRIMDIFFUSION"
+from . import final
+from .viewport import Viewport
+from .who_draws import ENGINE
 
 
 class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
@@ -37,8 +31,6 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
 
     def render(self, depsgraph: bpy.types.Depsgraph) -> None:
         """One view layer of one frame, in a thread of Blender's, in its main one under -b. Errors end the render."""
-        from . import final  # see the module's docstring
-
         try:
             final.render_layer(self, depsgraph)
         except (final.RenderFailed, ValueError, OSError) as error:
@@ -49,13 +41,13 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
 
     def view_update(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Called when the scene has changed."""
-        self._viewport = self._viewport or _new_viewport()
+        self._viewport = self._viewport or Viewport()
         self._viewport.update(context, depsgraph)
 
     def view_draw(self, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """Draw the newest picture, without waiting for one."""
         if self._viewport is None:
-            self._viewport = _new_viewport()
+            self._viewport = Viewport()
             self._viewport.update(context, depsgraph)
         self._viewport.draw(self, context, depsgraph)
 
@@ -63,9 +55,3 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
         message = f"PrimDiffusion: {message}"
         self.update_stats("", message)
         self.report({"ERROR"}, message)  # ends animations too; after error_set they would continue
-
-
-def _new_viewport() -> Viewport:
-    from .viewport import Viewport  # see the module's docstring
-
-    return Viewport()

@@ -1,18 +1,12 @@
-"""What all pictures share: the marcher on the GPU; the child that draws, and the shared memory it draws into."""
+"""What pictures by the child share: the child that draws, and the shared memory it draws into."""
 
 from __future__ import annotations
 
 import atexit
-import functools
-from typing import TYPE_CHECKING
 
 from ..backend.drawing import IDLE_S, DrawingChild
 from ..places import new_backend, preference
 from .frames import SharedFrames
-
-if TYPE_CHECKING:
-    from .gpu_humans import GpuHumans
-    from .gpu_march import GpuMarcher
 
 frames = SharedFrames()
 """For all renders and viewports."""
@@ -28,25 +22,6 @@ def drawing_child() -> DrawingChild:
         child = _children.setdefault(python, DrawingChild(new_backend(python), IDLE_S))
         _close([other for other in list(_children) if other != python])
     return child
-
-
-@functools.cache
-def gpu_marcher() -> GpuMarcher | str:
-    """The marcher on the GPU, or why there is none. Asked for while a view is drawn."""
-    from .gpu_march import GpuMarcher  # a render without a window has no GPU
-
-    try:
-        return GpuMarcher()
-    except RuntimeError as error:
-        return str(error)
-
-
-@functools.cache
-def gpu_humans() -> GpuHumans:
-    """The humans on the GPU."""
-    from .gpu_humans import GpuHumans  # as above
-
-    return GpuHumans()
 
 
 def advance() -> None:

@@ -13,10 +13,12 @@ import numpy as np
 from gpu_extras.presets import draw_texture_2d
 
 from . import studio
-from .composite import PictureTextures
-from .gpu_picture import GpuPicture, GpuScene, GpuSolids
-from .gpu_refine import GpuRefinement, MarchRequest
-from .gpu_start import gpu_start
+from .camera import camera_frame
+from .gpu.composite import PictureTextures
+from .gpu.humans import gpu_humans
+from .gpu.picture import GpuPicture, GpuScene, GpuSolids
+from .gpu.refine import GpuRefinement, MarchRequest
+from .gpu.start import gpu_start
 from .picture import SceneContent, scene_content
 from .refine import Refinement, ShownPicture, ViewRequest
 from .solids import SceneSolids, changed_by, scene_solids, stored
@@ -138,8 +140,8 @@ class Viewport:
         if self._gpu_scene is None or self._gpu_scene[0] != key:
             if self._solids is not None and self._gpu_solids is None:
                 self._gpu_solids = GpuSolids(self._solids)
-            humans = [studio.gpu_humans().placed(human) for human in picture.people]
-            studio.gpu_humans().keep_only(picture.people)
+            humans = [gpu_humans().placed(human) for human in picture.people]
+            gpu_humans().keep_only(picture.people)
             self._gpu_scene = key, GpuScene(humans, self._gpu_solids, picture.background, picture.step)
         return self._gpu_scene[1]
 
@@ -229,16 +231,6 @@ def _border(
     if right <= left or top <= bottom:
         return None
     return left, bottom, right - left, top - bottom
-
-
-def camera_frame(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest corner [2] of the camera's picture, pixels of the region."""
-    region, camera = context.region, context.space_data.camera
-    corners = np.array(camera.data.view_frame(scene=depsgraph.scene), np.float64)
-    homogeneous = np.concatenate([corners, np.ones((4, 1))], 1)
-    clip = homogeneous @ np.array(context.region_data.window_matrix, np.float64).T
-    pixels = (clip[:, :2] / clip[:, 3:] + 1) / 2 * [region.width, region.height]
-    return pixels.min(0), pixels.max(0)
 
 
 def picture_above_overlays(context: bpy.types.Context) -> PictureTextures | None:

@@ -1,4 +1,4 @@
-"""Who draws humans in a 3D view. Views and panels ask here; panels import it when Blender starts, without numpy."""
+"""Who draws humans in a 3D view. Views and panels ask here."""
 
 from __future__ import annotations
 
@@ -6,8 +6,7 @@ import enum
 
 import bpy
 
-from .engine import ENGINE
-
+ENGINE = "PRIMDIFFUSION"
 WORKBENCH = "BLENDER_WORKBENCH"
 EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
 

@@ -12,7 +12,7 @@ import time
 import bpy
 from bpy.app.handlers import persistent
 
-from ..places import missing_packages
+from ..scene.copies import any_copies, separate_copies
 from ..scene.human import any_humans
 from .late_volumes import keep_writing
 from .windows import in_the_way, window_of
@@ -29,10 +29,8 @@ _held = False
 
 def separate() -> list[str]:
     """Make humans of all copies, as one undo step; returns their names."""
-    if not any_humans() or missing_packages():
+    if not any_humans():
         return []
-    from ..scene.copies import any_copies, separate_copies  # needs numpy
-
     names = separate_copies() if any_copies() else []
     if names:
         bpy.ops.ed.undo_push(message="Duplicate Human")
@@ -58,10 +56,8 @@ def look(*_: object) -> None:
         _undone, _update_follows = time.monotonic(), False
     elif _held and time.monotonic() - _undone > UNDONE_S:
         _held = False
-    if bpy.app.background or _held or not any_humans() or bpy.app.timers.is_registered(tick) or missing_packages():
+    if bpy.app.background or _held or not any_humans() or bpy.app.timers.is_registered(tick):
         return
-    from ..scene.copies import any_copies  # needs numpy
-
     if any_copies():
         bpy.app.timers.register(tick, first_interval=SOON_S)
 

@@ -9,14 +9,15 @@ from __future__ import annotations
 import time
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 
 from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import in_words, sentence
 from ..formats.answers import HumanAnswer
-from ..places import backend_is_named, missing_packages
+from ..places import backend_is_named
+from ..scene.human_npz import Destination, VolumeWriter, WrittenHuman
 from .late_volumes import keep_writing
 from .memory import release_when_idle
 from .picture_in_view import follow_picture
@@ -24,10 +25,6 @@ from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
 from .remedies import error_before_the_scene
 from .windows import in_the_way, redraw, window_of
-
-if TYPE_CHECKING:
-    from ..scene.human_npz import Destination, VolumeWriter, WrittenHuman
-    from .queue import Entry, Job
 
 SLICE_S = 0.05
 """Of reading the human or writing volumes between two redraws."""
@@ -67,8 +64,6 @@ class Building:
         self._entry = entry
         place = _place(entry.job) if isinstance(result, HumanAnswer) else None
         if place is not None:
-            from ..scene.human_npz import VolumeWriter  # needs numpy
-
             self._human = result.human
             self._writing = VolumeWriter(self._human, place)
 
@@ -182,10 +177,6 @@ class Reporting:
             return self.act(context)
         except (ValueError, OSError) as error:
             self.report({"ERROR"}, in_words(error))
-        except ModuleNotFoundError:
-            if not (lacking := missing_packages()):
-                raise
-            self.report({"ERROR"}, sentence(lacking))
         return {"CANCELLED"}
 
     def act(self, context: bpy.types.Context) -> set[str]:
@@ -196,13 +187,10 @@ class Reporting:
 def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -> set[str]:
     """Queue `job` for the scene of `context`; with a window a timer follows it, in background mode this waits.
 
-    A job whose result could not be shown is rejected, and one that needs a backend where there is none.
+    A job that needs a backend is rejected where there is none.
     """
     if type(job).result_here is Job.result_here and not backend_is_named():
         operator.report({"ERROR"}, sentence(NOT_INSTALLED))
-        return {"CANCELLED"}
-    if job.undo and (lacking := missing_packages()):
-        operator.report({"ERROR"}, sentence(lacking))
         return {"CANCELLED"}
     if not bpy.app.background:
         queue.add(context, job)

@@ -12,7 +12,7 @@ from bpy.app.handlers import persistent
 
 from ..backend.requests import sentence
 from ..engine.engine import ENGINE
-from ..places import EXTENSION, missing_packages
+from ..places import EXTENSION
 from ..scene.human import any_humans
 from .windows import in_the_way, redraw
 
@@ -126,7 +126,7 @@ class LateVolumes:
 
     def tick(self) -> float | None:
         """The timer: a slice of writing, until all is written. Views that humans are drawn in come first."""
-        from ..engine.overlay import overlay  # needs numpy
+        from ..engine.gpu.overlay import overlay  # needs numpy
 
         if in_the_way() or not overlay.resting:
             return BLOCKED_S
@@ -168,7 +168,7 @@ def keep_writing() -> None:
 
 
 def _bring_here() -> None:
-    if any_humans() and not missing_packages():
+    if any_humans():
         late_volumes.bring_here()
 
 
@@ -205,7 +205,7 @@ def write_after_loading(*_: object) -> None:
 def write_after_importing(*_: object) -> None:
     """Handler of blend_import_post: humans were appended or linked."""
     _bring_here()
-    if any_humans() and not missing_packages():
+    if any_humans():
         late_volumes.look_for_newer()
     keep_writing()
 

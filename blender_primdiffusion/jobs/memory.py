@@ -7,7 +7,9 @@ import subprocess
 
 import bpy
 
+from ..engine import studio
 from ..places import EXTENSION
+from ..scene.volumes import free_unused_grids
 from .queue import queue
 
 
@@ -60,8 +62,6 @@ def release_when_idle(now: float) -> bool:
     if queue.release() is None:
         return False
     if not bpy.app.is_job_running("RENDER"):
-        from ..scene.volumes import free_unused_grids  # needs numpy
-
         free_unused_grids()
     return True
 
@@ -71,10 +71,6 @@ def release() -> str:
 
     Raises RuntimeError while one of them is busy.
     """
-    # needs numpy
-    from ..engine import studio
-    from ..scene.volumes import free_unused_grids
-
     if queue.busy:
         raise RuntimeError("the backend is busy: wait for it, or cancel the job first")
     if bpy.app.is_job_running("RENDER"):

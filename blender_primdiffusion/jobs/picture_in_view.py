@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
+import gpu
+import numpy as np
+from numpy.typing import NDArray
 
 from ..engine import by_engine
+from ..engine.gpu import billboard
+from ..engine.gpu.billboard import corners, figure_of
+from ..engine.gpu.overlay import overlay
+from ..scene.place import next_place
 from .pictures import so_far
 from .queue import queue
+from .views import eye
 from .windows import redraw_views
-
-if TYPE_CHECKING:
-    import gpu
-    import numpy as np
-    from numpy.typing import NDArray
 
 
 class PictureInView:
@@ -54,13 +56,6 @@ class PictureInView:
 
     def corners(self, context: bpy.types.Context) -> NDArray[np.float64]:
         """The picture's corners [4, 3] in this 3D view; follows the 3D cursor."""
-        # these need numpy
-        import numpy as np
-
-        from ..engine.billboard import corners, figure_of
-        from ..scene.place import next_place
-        from .views import eye
-
         cursor = tuple(context.scene.cursor.location)
         if cursor != self._cursor:
             self._cursor, self._place = cursor, next_place(context, eye())
@@ -74,12 +69,7 @@ class PictureInView:
         """
         if not self.drawn_in(context):
             return
-        # these need numpy
-        from ..engine import billboard
-        from ..engine.overlay import overlay
-
         overlay.prepare()
-
         self._texture = self._texture or billboard.texture_of(self._pixels)
         billboard.draw(self._texture, self.corners(context))
 

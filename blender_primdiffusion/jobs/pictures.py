@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy.utils.previews
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
+import numpy as np
+from numpy.typing import NDArray
 
 _NAME = "so far"
 
@@ -51,8 +48,6 @@ class SoFar:
 
     def pixels(self) -> NDArray[np.float32]:
         """RGBA [h, w, 4] of the picture that is shown, bottom row first; sRGB-encoded after it was premultiplied."""
-        import numpy as np  # which Blender starts without
-
         preview = self._collection[_NAME]
         width, height = preview.image_size
         values = np.empty(width * height * 4, np.float32)

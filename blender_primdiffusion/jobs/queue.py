@@ -10,7 +10,7 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 import bpy
 
@@ -21,11 +21,9 @@ from ..formats.regular_files import is_local_path
 from ..formats.removing import remove_folder
 from ..places import new_backend, preference
 from ..scene.attachment import volumes_may_wait
+from ..scene.build import next_folder
+from ..scene.human_npz import Destination
 from .remedies import defect_in_the_scene, error_in_the_scene
-
-if TYPE_CHECKING:
-    from ..scene.human_npz import Destination
-
 
 PREVIEW_PX = 16
 """Of the child's previews, which most jobs do not use."""
@@ -78,10 +76,6 @@ class Job(abc.ABC):
         Evaluated when the result has arrived. ValueError and OSError are ignored: `finish` raises them again."""
         if not self.new_person:
             return None
-        # needs numpy
-        from ..scene.build import next_folder
-        from ..scene.human_npz import Destination
-
         return Destination(next_folder(self.new_person), later=volumes_may_wait())
 
 

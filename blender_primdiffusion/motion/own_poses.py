@@ -1,7 +1,4 @@
-"""The user's own poses: a folder with a JSON file and a picture for each, which can be copied to other computers.
-
-Panels import this file when Blender starts, so numpy is imported by the functions that need it.
-"""
+"""The user's own poses: a folder with a JSON file and a picture for each, which can be copied to other computers."""
 
 from __future__ import annotations
 
@@ -9,15 +6,13 @@ import contextlib
 import json
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ..formats.json_files import read_json
 from ..formats.removing import remove_file
 from ..formats.whole_files import write_atomically
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 SUFFIX = ".pose.json"
 PICTURE_SUFFIX = ".pose.png"
@@ -52,8 +47,6 @@ def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> P
     `files.read_motion` reads the file too (`pose`, `transl`). Raises PoseFileError for a name that is empty, taken or
     no valid file name, and where the folder cannot be written to.
     """
-    import numpy as np  # see the module's docstring
-
     name = name.strip()
     if not name or len(name) > _LONGEST_NAME or re.search(r'[\\/:*?"<>|\x00-\x1f]', name) or name.startswith("."):
         raise PoseFileError(
@@ -73,8 +66,6 @@ def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> P
 
 def load_pose(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The pose [24, 3] and the translation [3] in a file. Raises PoseFileError where there is none."""
-    import numpy as np  # see the module's docstring
-
     try:
         content = read_json(path)
         pose = np.asarray(content["pose"], np.float64)

@@ -1,7 +1,4 @@
-"""An armature's action: its curves, its end, looping, and pushing it down to an NLA strip.
-
-Panels import this file when Blender starts, so it needs no numpy.
-"""
+"""An armature's action: its curves, its end, looping, and pushing it down to an NLA strip."""
 
 from __future__ import annotations
 

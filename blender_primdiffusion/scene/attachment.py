@@ -6,6 +6,8 @@ import bpy
 
 from .blend_values import stored_choice, stored_flag
 from .human import check_editable
+from .merged import merged_of
+from .surface import build_surface, carrier_of, primitives_of
 
 ATTACHMENT = "primdiffusion_attachment"
 """Custom property of a human's collection: one of MODES; ARMATURE where it is missing."""
@@ -31,8 +33,6 @@ def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
     by `merged.show_merged` in one pose. Raises ValueError or FileNotFoundError before anything changes. Makes no undo
     step.
     """
-    from .surface import build_surface  # needs numpy
-
     if mode not in MODES:
         raise ValueError(f"there is no attachment {mode!r}: choose from {', '.join(MODES)}")
     parts = _parts(collection)
@@ -48,10 +48,6 @@ def set_attachment(collection: bpy.types.Collection, mode: str) -> None:
 
 def _parts(collection: bpy.types.Collection) -> dict[str, bpy.types.Collection | bpy.types.Object | None]:
     """What each mode shows. Raises ValueError for humans that cannot be edited or whose volumes have no collection."""
-    # numpy, which Blender starts without: panels import this file to show the mode
-    from .merged import merged_of
-    from .surface import carrier_of, primitives_of
-
     check_editable(collection)
     return {"ARMATURE": primitives_of(collection), "SURFACE": carrier_of(collection), "MERGED": merged_of(collection)}
 

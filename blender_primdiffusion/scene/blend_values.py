@@ -2,7 +2,7 @@
 
 Anyone can write anything into a .blend. A value of another type, form or size than the extension stores counts as
 missing, so that neither drawing nor saving raises, and no name or path leads out of its folder. Nothing else in the
-extension reads these values (`tests/blender/scene/test_blend_values.py`). Needs no numpy: panels import this file.
+extension reads these values (`tests/blender/scene/test_blend_values.py`).
 """
 
 from __future__ import annotations

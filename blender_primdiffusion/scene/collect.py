@@ -42,7 +42,8 @@ from .human import (
     unwritten_in,
     volume_path,
 )
-from .volumes import format_of, readable_format, reload_volume
+from .vdb import readable_format
+from .volumes import format_of, reload_volume
 
 _OURS = (PRIMITIVE_VDB, PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
 

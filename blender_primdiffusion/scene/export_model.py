@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import addon_utils
 import bpy
 
 from ..formats.joints import JOINT_NAMES
@@ -172,8 +173,6 @@ _EXPORTERS: dict[str, Callable[[Path, FrameRange], None]] = {"GLB": _write_glb, 
 @contextmanager
 def _enabled(module: str, label: str) -> Iterator[None]:
     """Enable Blender's own add-on `module` for the block where the user has disabled it."""
-    import addon_utils  # of Blender's scripts, which the bpy module adds to the path when it starts
-
     _, loaded = addon_utils.check(module)
     if not loaded and addon_utils.enable(module, default_set=False) is None:
         raise ValueError(f"Blender's {label} add-on {module!r} cannot be enabled: choose another format")

@@ -1,7 +1,4 @@
-"""A human in the scene: a marked collection that holds an armature, a body mesh and volumes; and its files.
-
-Panels import this file when Blender starts, so it needs no numpy.
-"""
+"""A human in the scene: a marked collection that holds an armature, a body mesh and volumes; and its files."""
 
 from __future__ import annotations
 

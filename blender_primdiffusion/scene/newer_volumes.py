@@ -18,7 +18,8 @@ from .attachment import in_viewport
 from .body_file import body_file, read_body_file
 from .human import MARK, MissingPersonFile, is_own, person_file, volume_path, volumes_of
 from .human_file import read_payload
-from .volumes import bake, format_of, is_readable, readable_format, write_error, write_one
+from .vdb import readable_format
+from .volumes import bake, format_of, is_readable, write_error, write_one
 
 _WRITTEN_AS = (5, 0, 0)
 """The version of Blender by which grids are placed: formats that older ones cannot read came later."""

@@ -13,7 +13,6 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 
 import bpy
 import numpy as np
@@ -23,6 +22,7 @@ from ..formats.regular_files import exists_in_its_folder, open_regular
 from ..formats.removing import OutsideFolderError, check_inside, remove_folder
 from ..formats.whole_files import publish, remove_abandoned, temporary_folder, temporary_name
 from .human import UNWRITTEN_NPZ, VolumeWriteError, folders_of, is_there, link_error, unwritten_in, volume_path
+from .vdb import grid_bytes, openvdb, readable_format
 
 VOXELS = 8
 """Voxels along a side of a primitive."""
@@ -235,15 +235,6 @@ def write_vdb(
     vdb.write(str(path), grids=[fog, cd])
 
 
-@functools.cache
-def openvdb() -> ModuleType:
-    """Blender's own module."""
-    bpy.utils.expose_bundled_modules()
-    import openvdb  # importable only after the line above
-
-    return openvdb
-
-
 _HEADER = struct.Struct("<8sI")
 _MAGIC = b" BDV\0\0\0\0"
 
@@ -256,11 +247,6 @@ def format_of(path: Path) -> int | None:
     except (OSError, ValueError, struct.error):
         return None
     return version if magic == _MAGIC else None
-
-
-def readable_format() -> int:
-    """The newest format version that this Blender's OpenVDB reads; 5.2 writes 225, and 5.0 reads up to 224."""
-    return openvdb().FILE_FORMAT_VERSION
 
 
 def is_readable(path: Path) -> bool:
@@ -331,14 +317,10 @@ def person_memory(collection: bpy.types.Collection) -> Memory:
 
 @functools.lru_cache(maxsize=64)
 def _memory_of(paths: Sequence[Path]) -> Memory:
-    vdb = openvdb()
     files = grids = 0
     for path in paths:
         if not exists_in_its_folder(path):
             continue
         files += path.stat().st_size
-        try:
-            grids += sum(grid.metadata.get("file_mem_bytes", 0) for grid in vdb.readAllGridMetadata(str(path)))
-        except (OSError, RuntimeError):
-            continue  # a damaged file takes no memory
+        grids += grid_bytes(path)
     return Memory(files, grids)

@@ -3,8 +3,6 @@
 A module's classes named PRIMDIFFUSION_* are registered in the order in which they are defined, then SUB_PANELS, its
 PROPERTIES (owner, name, property) and HANDLERS (list of bpy.app.handlers, function). `register` and `unregister` do
 the rest.
-
-Blender imports these modules when it starts, without numpy. What needs numpy is imported in functions.
 """
 
 from __future__ import annotations

@@ -6,12 +6,16 @@ import bpy
 
 from ..backend.requests import sentence
 from ..formats.requests import DENSITY_GAIN, VOXEL
+from ..jobs.merge import Moment
 from ..jobs.target import selected_person
 from ..places import backend_is_named
 from ..scene.attachment import MODES, attachment_of, in_viewport
 from ..scene.blend_values import as_shown
+from ..scene.cycles import current_overlap, overlap_warning_in
 from ..scene.human import humans, provenance_of
 from ..scene.material import density_gain, set_density_gain
+from ..scene.merged import merged_of, merged_state
+from ..scene.volumes import person_memory
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend
 from .render_operators import ATTACHMENT_ITEMS
@@ -110,8 +114,6 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
 
 def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Collection) -> None:
     """How volumes follow the body."""
-    from ..scene.merged import merged_of  # needs numpy
-
     now = attachment_of(person)
     row = layout.row(align=True)
     for mode, label, _ in ATTACHMENT_ITEMS:
@@ -123,8 +125,6 @@ def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, pe
 
 def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Collection) -> None:
     """One volume for Cycles."""
-    from ..scene.merged import merged_of  # needs numpy
-
     layout.prop(context.scene.primdiffusion_merging, "voxel")
     draw_job(layout, "merge", "primdiffusion.merge", "VOLUME_DATA", text="Merge Pose")
     frames = draw_job(layout, "merge_frames", "primdiffusion.merge", "RENDER_ANIMATION", text="Merge Frame Range")
@@ -137,8 +137,6 @@ def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: 
 
 def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Collection) -> None:
     """What brings Cycles near the exact picture."""
-    from ..scene.cycles import overlap_warning_in  # numpy, which Blender starts without
-
     if density_gain(person) is None:
         draw_lines(layout, "The human's material has no node Density Gain", "INFO")
     else:
@@ -157,10 +155,6 @@ def _draw_memory(layout: bpy.types.UILayout, _context: bpy.types.Context, person
 
 def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or human than the armature as it is now."""
-    # needs numpy
-    from ..jobs.merge import Moment
-    from ..scene.merged import merged_of, merged_state
-
     try:
         return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)
     except (ValueError, OSError):  # other panels report broken bones and files
@@ -175,10 +169,6 @@ _MOST_LINES = 60
 
 def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     """Names and values: how the human was made, what its files and volumes take."""
-    # needs numpy
-    from ..scene.cycles import current_overlap
-    from ..scene.volumes import person_memory
-
     provenance = provenance_of(person)
     attributes, edits = provenance.get("attributes"), provenance.get("edits")
     shown = {name: provenance[name] for name in _SHOWN if provenance.get(name) not in (None, "")}

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import bpy
 
+from ..jobs.assets import HumanAssetJob, PoseAssetJob, mark_human, write_pose_library
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget
+from ..scene.handles import joints_from_handles
 from ..scene.human import armature_of
 from .declared import SKIP
 from .on_person import OnPerson
@@ -47,10 +49,6 @@ class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
         return next(text for name, _, text in _ITEMS if name == properties.what)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        # needs numpy
-        from ..jobs.assets import HumanAssetJob, PoseAssetJob, mark_human
-        from ..scene.handles import joints_from_handles
-
         if self.what == "POSE":
             joints_from_handles(context, armature_of(person))
         of_pose = PoseAssetJob.of(person, self.name.strip() or "Pose") if self.what == "POSE" else None
@@ -74,8 +72,6 @@ class PRIMDIFFUSION_OT_make_pose_assets(Reporting, bpy.types.Operator):
     )
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..jobs.assets import write_pose_library  # needs numpy
-
         folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
         path, count = write_pose_library(context, folder)
         self.report({"INFO"}, f"{count} poses are in {path}, and in the Asset Browser")

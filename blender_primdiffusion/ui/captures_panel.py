@@ -5,21 +5,26 @@ from __future__ import annotations
 import contextlib
 import shlex
 import time
-from typing import TYPE_CHECKING
 
 import bpy
+import numpy as np
 from mathutils import Vector
+from numpy.typing import NDArray
 
+from ..capture.blender_camera import aim
+from ..capture.command import describe, estimate, scans_in
+from ..capture.job import run
+from ..capture.options import ASK_FROM, parse, settings_of
+from ..capture.report import Report, report_path
+from ..formats.camera_rig import bounding_sphere
+from ..formats.capture_repair import repair, verify
 from ..jobs.follow import Reporting, redraw
 from ..places import shows_captures
 from ..scene.blend_values import setting_path
+from ..scene.convention import points_to_backend
 from .captures_session import Busy, captures
 from .captures_settings import words_of
 from .drawing import DATA, SidebarPanel, draw_lines, draw_section, property_columns
-
-if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
 
 RIG = "Capture Rig"
 _TICK_S = 0.1
@@ -42,10 +47,6 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask before a long run; errors are reported by `execute`."""
-        # needs numpy
-        from ..capture.command import estimate, scans_in
-        from ..capture.options import ASK_FROM, parse, settings_of
-
         try:
             options = parse(self._words(context))
             views, message = estimate(settings_of(options), len(scans_in(options.people, options.only)))
@@ -63,8 +64,6 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         """With a window another Blender renders and a timer follows it; in background mode this one renders."""
-        from ..capture.options import parse, settings_of  # needs numpy
-
         try:
             if captures.busy:
                 raise Busy("captures are being rendered; wait for them or press Cancel")
@@ -80,12 +79,6 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         return {"FINISHED"}
 
     def _render_here(self, context: bpy.types.Context, words: list[str]) -> set[str]:
-        # needs numpy
-        from ..capture.command import describe, scans_in
-        from ..capture.job import run
-        from ..capture.options import parse, settings_of
-        from ..capture.report import Report, report_path
-
         options = parse(words)
         settings, report, printed = settings_of(options), Report(), 0.0
         captures.close()  # the file of cameras is read
@@ -118,10 +111,6 @@ class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> set[str]:
         """With a window another Blender verifies; in background mode this one, failing on damage."""
-        # needs numpy
-        from ..capture.options import parse
-        from ..formats.capture_repair import repair, verify
-
         out = bpy.path.abspath(self.out) or setting_path(context.scene.primdiffusion_captures.out, "Captures")
         if not out:
             raise ValueError("choose the folder of captures first")
@@ -150,8 +139,6 @@ class PRIMDIFFUSION_OT_preview_rig(Reporting, bpy.types.Operator):
     bl_options = {"UNDO"}
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..capture.blender_camera import aim  # needs numpy
-
         collection = context.scene.collection.children.get(RIG)
         if collection is not None:
             remove_rig(collection)
@@ -184,12 +171,6 @@ def follow() -> float | None:
 
 def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], float]:
     """Bounding sphere of the active object and its children, else of a human at the origin."""
-    import numpy as np  # needs numpy
-
-    # needs numpy
-    from ..formats.camera_rig import bounding_sphere
-    from ..scene.convention import points_to_backend
-
     active = context.active_object
     objects = [active, *active.children_recursive] if active is not None and active.type != "CAMERA" else []
     depsgraph = context.evaluated_depsgraph_get()

@@ -15,6 +15,8 @@ import bpy
 
 from ..backend.child_streams import Output
 from ..backend.child_variables import BLENDER, COMPUTING, passed_on
+from ..capture import launch
+from ..capture.options import MARK
 from ..console import CANCELLED, DONE
 from ..formats.answers import CapturesProgress
 from ..formats.json_files import parse_message
@@ -123,8 +125,6 @@ class CaptureSession:
             self._take(line.decode("utf-8", "replace"))
 
     def _take(self, line: str) -> None:
-        from ..capture.options import MARK  # needs numpy
-
         if not line.startswith(MARK):
             return  # printed by Blender
         try:
@@ -173,8 +173,6 @@ class CaptureSession:
 
 def child_command() -> list[str]:
     """The command that starts a Blender for captures, without its options."""
-    from ..capture import launch  # needs numpy
-
     script = str(Path(launch.__file__).resolve())
     if bpy.app.binary_path:
         return [bpy.app.binary_path, "-b", "--factory-startup", "--python", script, "--"]

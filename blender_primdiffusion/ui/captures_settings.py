@@ -5,15 +5,13 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 
+from ..capture.blender_camera import CameraError, view_of
+from ..formats.camera_rig import Rig
 from ..formats.requests import LAYOUTS, PASSES
 from ..scene.blend_values import setting_path
-
-if TYPE_CHECKING:
-    from ..formats.camera_rig import Rig
 
 _PASS_NAMES = {
     "img": ("Colour", "What the camera sees, over black"),
@@ -153,8 +151,6 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
 
     def rig(self) -> Rig:
         """The rig asked for. Raises ValueError where it is the scene's cameras, or impossible."""
-        from ..formats.camera_rig import Rig  # needs numpy
-
         if self.arrangement == "custom":
             raise ValueError("the scene's own cameras need no preview: choose another arrangement")
         return Rig(
@@ -205,8 +201,6 @@ def _rig_words(rig: Rig) -> list[str]:
 
 
 def _custom_words(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
-    from ..capture.blender_camera import CameraError, view_of  # needs numpy
-
     depsgraph, render = context.evaluated_depsgraph_get(), context.scene.render
     aspect = (render.pixel_aspect_x, render.pixel_aspect_y)
     objects = asked.cameras.all_objects if asked.cameras is not None else context.selected_objects

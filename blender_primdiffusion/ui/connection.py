@@ -6,7 +6,7 @@ import bpy
 
 from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, own_python_has_backend
 from ..backend.requests import sentence
-from ..places import EXTENSION, installed_backend, missing_packages, preference
+from ..places import EXTENSION, installed_backend, preference
 from .drawing import draw_lines
 from .preferences import NOTHING_TO_CANCEL, WIDTH, CommonPreferences, forget_failures
 
@@ -16,8 +16,6 @@ _SIDEBAR = 30
 
 def found() -> tuple[bool, str]:
     """Whether there is a backend to try, without trying it; and which, or what to do, for panels."""
-    if lacking := missing_packages():
-        return False, sentence(lacking)
     own = own_python_has_backend()
     try:
         named = next(candidates(preference("backend_python"), None, installed_backend(), own_python=own), None)
@@ -32,8 +30,7 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
     if not usable:
         box = layout.box()
         draw_lines(box, line, "ERROR", width)
-        if not missing_packages():
-            box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
+        box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
     return usable
 
 

@@ -15,9 +15,11 @@ from ..formats.requests import (
     TransferRequest,
     VaryRequest,
 )
+from ..jobs import edit
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import selected_person
 from ..places import backend_is_named
+from ..scene.edit import end_painting, painted_weights, start_painting
 from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
 from .declared import PANELS, SKIP, declared, not_given
@@ -101,8 +103,6 @@ class PRIMDIFFUSION_OT_paint_region(Reporting, bpy.types.Operator):
         return properties.rna_type.properties["finish"].description if properties.finish else str(cls.__doc__)
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..scene.edit import end_painting, start_painting  # needs numpy
-
         settings = context.scene.primdiffusion_edit
         if self.finish:
             if not painting(context):
@@ -133,8 +133,6 @@ class _Edit(OnPerson):
     steps: not_given(VaryRequest, "steps")
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs import edit  # needs numpy
-
         params = {"steps": self.chosen("steps", context.scene.primdiffusion), **self.params(context, person)}
         return submit(self, context, getattr(edit, self.job).of(person, params))
 
@@ -159,8 +157,6 @@ class _Region:
         self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
     ) -> list[str] | dict[str, list[float]]:
         """Names of parts, or painted weights [V]."""
-        from ..scene.edit import painted_weights  # needs numpy
-
         given = self.properties.is_property_set
         if given("vertex_group") or (not given("parts") and settings.region == "PAINTED"):
             body = body_of(person)

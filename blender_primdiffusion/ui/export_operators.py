@@ -5,20 +5,32 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 
 from ..formats.requests import GaussiansRequest, MergeFramesRequest, ProxyRequest
+from ..jobs.export import (
+    AddProxyJob,
+    ExportGaussiansJob,
+    ExportMeshJob,
+    ExportVdbSequenceJob,
+    ImportHumanJob,
+    posed_frames,
+    posed_now,
+    scene_frames,
+    show,
+    write_human,
+)
 from ..jobs.follow import Reporting, submit
+from ..jobs.queue import Job
 from ..jobs.target import HumanTarget
+from ..scene.export_model import check_ready
 from ..scene.human import armature_of
+from ..scene.human_file import motion_in, read_tensors
+from ..scene.proxy import proxy_of, remove_proxy
 from .declared import PANELS, SKIP, declared, not_given
 from .drawing import property_columns
 from .on_person import OnPerson
-
-if TYPE_CHECKING:
-    from ..jobs.queue import Job
 
 _SCENES = "Not given: the scene's"
 
@@ -205,8 +217,6 @@ class PRIMDIFFUSION_OT_export(_Export, bpy.types.Operator):
         return self.format if given else by_ending or self.chosen(context, "format")
 
     def _write_human(self, context: bpy.types.Context, person: bpy.types.Collection, path: Path) -> set[str]:
-        from ..jobs.export import scene_frames, write_human  # needs numpy
-
         frames = scene_frames(context.scene, True) if self.chosen(context, "motion") else None
         write_human(context, person, path, frames, compact=self.chosen(context, "compact"))
         self.report({"INFO"}, f"Exported {person.name} to {path.name}")
@@ -214,17 +224,6 @@ class PRIMDIFFUSION_OT_export(_Export, bpy.types.Operator):
 
     def _job(self, context: bpy.types.Context, person: bpy.types.Collection, kind: str, path: Path) -> Job:
         """What writes a mesh, Gaussians or volumes. Raises ValueError."""
-        # needs numpy
-        from ..jobs.export import (
-            ExportGaussiansJob,
-            ExportMeshJob,
-            ExportVdbSequenceJob,
-            posed_frames,
-            posed_now,
-            scene_frames,
-        )
-        from ..scene.export_model import check_ready
-
         target = HumanTarget.of(person)
         if kind == "PLY":
             return ExportGaussiansJob(target, path, posed_now(context, person), self.chosen(context, "gaussians"))
@@ -256,10 +255,6 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
     triangles: not_given(ProxyRequest, "triangles")
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        # needs numpy
-        from ..jobs.export import AddProxyJob
-        from ..scene.export_model import check_ready
-
         target = HumanTarget.of(person)
         check_ready(armature_of(person))
         px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
@@ -276,10 +271,6 @@ class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
     shown: bpy.props.EnumProperty(name="Show", description="How the human is shown", items=SHOWN)
 
     def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        # needs numpy
-        from ..jobs.export import show
-        from ..scene.proxy import proxy_of, remove_proxy
-
         removed = self.shown == "REMOVED"
         show(person, "VOLUMES" if removed else self.shown)
         if removed:
@@ -312,10 +303,6 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        # needs numpy
-        from ..jobs.export import ImportHumanJob
-        from ..scene.human_file import motion_in, read_tensors
-
         path = Path(bpy.path.abspath(self.filepath))
         if not self.filepath or not path.is_file():
             raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")

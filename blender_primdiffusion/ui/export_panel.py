@@ -5,9 +5,12 @@ from __future__ import annotations
 import bpy
 
 from ..backend.requests import sentence
+from ..jobs.export import shown
 from ..jobs.target import selected_person
 from ..places import INSTALLS_BACKEND, backend_is_named
 from ..scene.human import humans
+from ..scene.proxy import is_outdated, proxy_of
+from ..scene.shape import betas_of
 from . import gallery
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .export_operators import OPTIONS
@@ -54,11 +57,6 @@ def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         person = selected_person(context)
     except ValueError:
         return
-    # needs numpy
-    from ..jobs.export import shown
-    from ..scene.proxy import is_outdated, proxy_of
-    from ..scene.shape import betas_of
-
     try:
         proxy = proxy_of(person)
         outdated = proxy is not None and is_outdated(person, proxy, betas_of(person))
@@ -73,10 +71,6 @@ def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
 
 def draw_as_mesh(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """For the selected human: a button that adds a mesh proxy, with its progress; where there is one, what is shown."""
-    # needs numpy
-    from ..jobs.export import shown
-    from ..scene.proxy import proxy_of
-
     try:
         person = selected_person(context)
     except ValueError:

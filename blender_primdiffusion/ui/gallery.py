@@ -7,6 +7,7 @@ from pathlib import Path
 
 import bpy
 
+from ..jobs.export import ImportHumanJob
 from ..jobs.follow import Reporting, submit
 
 FOLDER = Path(__file__).resolve().parents[1] / "gallery"
@@ -33,8 +34,6 @@ class PRIMDIFFUSION_OT_add_from_gallery(Reporting, bpy.types.Operator):
     )
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..jobs.export import ImportHumanJob  # needs numpy
-
         if not self.human:
             raise ValueError("this build of the extension has no gallery: choose Import Human File")
         return submit(self, context, ImportHumanJob(str(FOLDER / self.human)))

@@ -12,6 +12,7 @@ from bl_ui.utils import PresetPanel
 from ..backend.requests import sentence
 from ..formats.requests import SAMPLERS, GenerateRequest
 from ..jobs.follow import Reporting, submit
+from ..jobs.generate import GenerateJob
 from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
@@ -175,8 +176,6 @@ class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
     )
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..jobs.generate import GenerateJob  # needs numpy
-
         settings = context.scene.primdiffusion
         from_panel = self.seed < 0
         # a seed given by a script means one human, whatever the panel's count

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ..motion.pose_library import check_posable
+from ..scene.handles import add_handles, bake_handles, has_handles
 from .on_person import OnArmature, target_armature, warn_of_rest
 
 
@@ -15,10 +17,6 @@ class PRIMDIFFUSION_OT_add_handles(OnArmature, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.pose_library import check_posable
-        from ..scene.handles import add_handles
-
         check_posable(armature)
         add_handles(context, armature)
         warn_of_rest(self, armature)
@@ -33,10 +31,6 @@ class PRIMDIFFUSION_OT_bake_handles(OnArmature, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.pose_library import check_posable
-        from ..scene.handles import bake_handles
-
         check_posable(armature)
         bake_handles(context, armature)
         return {"FINISHED"}
@@ -44,8 +38,6 @@ class PRIMDIFFUSION_OT_bake_handles(OnArmature, bpy.types.Operator):
 
 def draw_handles(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """The button that adds handles, or the one that bakes them."""
-    from ..scene.handles import has_handles  # needs numpy
-
     try:
         armature = target_armature(context)
     except ValueError:

@@ -8,11 +8,18 @@ import bpy
 
 from ..backend.requests import in_words, sentence
 from ..formats.removing import OutsideFolderError, remove_file
+from ..jobs.edit import RegenerateJob, RestoreJob, made_from_seed
 from ..jobs.follow import Reporting, submit
 from ..jobs.late_volumes import late_volumes
 from ..jobs.missing_files import look, state
 from ..jobs.target import HumanTarget, selected_person
+from ..scene.collect import collect_files, ignored_values, unused
+from ..scene.duplicate import duplicate_human
+from ..scene.edit import leave_mode, select_human
 from ..scene.human import armature_of, check_editable, humans, humans_folder, person_file, remove_human
+from ..scene.missing import copy_back, find_files, find_person, missing_files, repair
+from ..scene.place import stand_beside_others
+from ..scene.volumes import free_unused_grids
 from .drawing import SidebarPanel, draw_job, draw_lines
 from .on_person import OnPerson
 
@@ -47,10 +54,6 @@ class PRIMDIFFUSION_OT_find_missing_volumes(bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def execute(self, context: bpy.types.Context) -> set[str]:
-        # needs numpy
-        from ..scene.collect import ignored_values
-        from ..scene.missing import copy_back, find_files, missing_files, repair
-
         for fault in ignored_values():
             self.report({"WARNING"}, sentence(fault))
         directory = Path(bpy.path.abspath(self.directory)) if self.directory else None
@@ -77,10 +80,6 @@ class PRIMDIFFUSION_OT_find_missing_volumes(bpy.types.Operator):
 
     def _restore(self, context: bpy.types.Context, directory: Path | None) -> tuple[int, list[str]]:
         """Queue jobs for humans whose files were not found; returns how many, and sentences on humans that are lost."""
-        # needs numpy
-        from ..jobs.edit import RestoreJob
-        from ..scene.missing import find_person, missing_files
-
         jobs, left = [], []
         for one in missing_files():
             source = find_person(one, directory)
@@ -111,8 +110,6 @@ class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
     bl_label = "Generate Again"
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..jobs.edit import RegenerateJob, made_from_seed  # needs numpy
-
         try:
             there = person_file(person)
         except FileNotFoundError:
@@ -128,8 +125,6 @@ class PRIMDIFFUSION_OT_collect_files(Reporting, bpy.types.Operator):
     bl_options = {"UNDO"}
 
     def act(self, _context: bpy.types.Context) -> set[str]:
-        from ..scene.collect import collect_files, ignored_values  # needs numpy
-
         done = collect_files()
         for fault in ignored_values():
             self.report({"WARNING"}, sentence(fault))
@@ -155,8 +150,6 @@ files that share the folder, may need them"""
         return context.window_manager.invoke_confirm(self, event)
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
-        from ..scene.collect import unused  # needs numpy
-
         removed = size = 0
         for path in unused(humans_folder()):
             try:
@@ -201,8 +194,6 @@ class PRIMDIFFUSION_OT_select_human(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Frames in the viewport that the button was pressed in, else in the first one."""
-        from ..scene.edit import select_human  # needs numpy
-
         place = _viewport(context) if self.frame else None
         if self.frame and place is None:
             raise ValueError("no 3D viewport is open: open one")
@@ -221,11 +212,6 @@ class PRIMDIFFUSION_OT_duplicate_human(OnPerson, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        # needs numpy
-        from ..scene.duplicate import duplicate_human
-        from ..scene.edit import leave_mode, select_human
-        from ..scene.place import stand_beside_others
-
         check_editable(person)
         leave_mode(context)
         twin = duplicate_human(person)
@@ -252,10 +238,6 @@ class PRIMDIFFUSION_OT_delete_human(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         """Linked humans belong to another file: the Outliner unlinks them."""
-        # needs numpy
-        from ..scene.edit import leave_mode
-        from ..scene.volumes import free_unused_grids
-
         if person.library is not None:
             raise ValueError(f"the human {person.name!r} is linked: remove it in the Outliner with Unlink")
         leave_mode(context)

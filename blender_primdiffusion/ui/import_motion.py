@@ -5,19 +5,22 @@ from __future__ import annotations
 import dataclasses
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
+import numpy as np
 from bpy_extras.io_utils import ImportHelper
+from bpy_extras.view3d_utils import location_3d_to_region_2d
+from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..formats.joints import JOINT_NAMES
+from ..motion.bvh import BvhError, bone_names, parse_bvh
+from ..motion.files import MotionFileError, read_motion
+from ..motion.rigs import UnknownBonesError, map_bones
 from ..scene.human import armature_of, humans
 from .drawing import draw_lines, property_columns
+from .motion_placing import Placement, extend_range, facts, place_motion
 from .on_person import OnArmature, WhereTo, target_armature
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _MARGIN = 0.12
 """Margin around the joints' rectangle that still counts as the human, as a share of its height."""
@@ -25,10 +28,6 @@ _MARGIN = 0.12
 
 def person_under(context: bpy.types.Context, event: bpy.types.Event) -> str:
     """Name of the human under the mouse in the 3D view, by its joints (rays do not hit volumes); empty for none."""
-    # needs numpy
-    import numpy as np
-    from bpy_extras.view3d_utils import location_3d_to_region_2d
-
     region, view = context.region, context.region_data
     if region is None or view is None:
         return ""
@@ -46,8 +45,6 @@ def person_under(context: bpy.types.Context, event: bpy.types.Event) -> str:
 
 def nearest_to(mouse: tuple[float, float], seen: dict[str, NDArray]) -> str:
     """The name whose joints on screen [n, 2], in pixels, surround the mouse; the closest of several."""
-    import numpy as np  # needs numpy
-
     best, name = np.inf, ""
     for person, spots in seen.items():
         if len(spots) == 0:
@@ -94,12 +91,6 @@ def look_at(filepath: str, up: str = "") -> FileFacts:
 
 @functools.lru_cache(maxsize=8)
 def _look_at(path: str, up: str, _changed: int, _size: int) -> FileFacts:
-    # needs numpy
-    from ..motion.bvh import BvhError, bone_names, parse_bvh
-    from ..motion.files import MotionFileError, read_motion
-    from ..motion.rigs import UnknownBonesError, map_bones
-    from .motion_placing import facts
-
     bones: tuple[str, ...] = ()
     try:
         if path.lower().endswith(".bvh"):
@@ -199,10 +190,6 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         return ImportHelper.invoke(self, context, event)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.files import read_motion
-        from .motion_placing import Placement, extend_range, place_motion
-
         if not self.filepath:
             raise ValueError("no file was chosen: choose an .npz, .npy, .json or .bvh file")
         chosen = None

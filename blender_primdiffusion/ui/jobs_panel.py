@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import getpass
 import os
 import platform
+import tomllib
 from collections.abc import Iterator
 
 import bpy
@@ -61,8 +63,6 @@ def _lines() -> Iterator[str]:
 def _version() -> str:
     manifest = os.path.join(os.path.dirname(os.path.dirname(__file__)), "blender_manifest.toml")
     try:
-        import tomllib  # for reports alone
-
         with open(manifest, "rb") as file:
             return tomllib.load(file)["version"]
     except (OSError, ValueError, KeyError):
@@ -75,9 +75,6 @@ def _window() -> str:
 
 def _names() -> set[str]:
     """Names of the user, the home folder and the machine."""
-    # for reports alone
-    import getpass
-
     home = os.path.basename(os.path.expanduser("~"))
     names = {home, os.environ.get("USER", ""), os.environ.get("USERNAME", ""), platform.node()}
     with contextlib.suppress(OSError, KeyError, ImportError):  # no such user on this system (containers)

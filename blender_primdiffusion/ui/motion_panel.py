@@ -6,13 +6,20 @@ import dataclasses
 import itertools
 
 import bpy
+import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
+from ..motion.built_in_motions import built_in_motion
+from ..motion.files import write_amass
+from ..motion.pose_library import check_posable
 from ..scene.actions import action_curves
+from ..scene.armature import pose_from_joint_rotations
 from ..scene.blend_values import as_shown, stored_record
+from ..scene.handles import check_no_handles
 from .drawing import SidebarPanel, draw_lines, property_columns
 from .export_operators import destination
+from .motion_placing import Placement, extend_range, place_motion, sample_motion
 from .on_person import FACTS, OnArmature, WhereTo, may_have_joints, scene_fps, target_armature
 
 _MOST_FACTS = 20
@@ -44,10 +51,6 @@ class PRIMDIFFUSION_OT_use_action(OnArmature, bpy.types.Operator):
         )
 
     def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.pose_library import check_posable
-        from ..scene.handles import check_no_handles
-
         check_posable(armature)
         check_no_handles(armature)
         if not self.action:
@@ -67,10 +70,6 @@ class PRIMDIFFUSION_OT_use_action(OnArmature, bpy.types.Operator):
 
 def _clear_motion(armature: bpy.types.Object) -> None:
     """Remove action and strips, and pose the armature as at rest. Raises ValueError where there are none."""
-    import numpy as np  # needs numpy
-
-    from ..scene.armature import pose_from_joint_rotations  # needs numpy
-
     animation = armature.animation_data
     if animation is None or (animation.action is None and not animation.nla_tracks):
         raise ValueError(f"{armature.name!r} has no motion to clear")
@@ -103,10 +102,6 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
     speed: bpy.props.FloatProperty(name="Speed", description="2 is twice as fast", default=1.0, min=0.1, max=10.0)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.built_in_motions import built_in_motion
-        from .motion_placing import Placement, extend_range, place_motion
-
         rate = scene_fps(context.scene)
         made = dataclasses.replace(built_in_motion(self.motion, self.rounds, rate / self.speed), fps=rate)
         how = Placement(start=self.start, timing="SOURCE", root=self.root, ground=False, into=self.into)
@@ -130,10 +125,6 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
     last: bpy.props.IntProperty(name="To", description="Last frame", default=0)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.files import write_amass
-        from .motion_placing import sample_motion
-
         scene = context.scene
         first, last = (self.first, self.last) if self.first or self.last else (scene.frame_start, scene.frame_end)
         if last < first:

@@ -4,20 +4,34 @@ from __future__ import annotations
 
 import zlib
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
+import numpy as np
 from bpy.utils import previews
+from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
+from ..formats.picture_files import write_png
+from ..jobs.assets import clay_figure
 from ..motion.own_poses import delete_pose, load_pose, own_poses, picture_of, save_pose
+from ..motion.pose_library import (
+    apply_pose,
+    builtin_poses,
+    check_posable,
+    current_pose,
+    key_pose,
+    mirrored,
+    selected_joints,
+    standing,
+)
+from ..motion.poses import LIBRARY
+from ..motion.rotation import to_axis_angle
+from ..motion.skeleton import joint_positions
 from ..places import own_folder
+from ..scene.handles import handles_from_joints, joints_from_handles
 from .drawing import SidebarPanel, property_columns
 from .handle_operators import draw_handles
 from .on_person import OnArmature, may_have_joints, warn_of_rest
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _PICTURES = Path(__file__).parents[1] / "motion" / "data" / "thumbnails"
 _collections: list = []
@@ -33,8 +47,6 @@ def poses_folder() -> Path:
 
 def pose_items(_self, _context: bpy.types.Context) -> list[tuple[str, str, str, int, int]]:
     """Built-in poses first, then the user's own."""
-    from ..motion.poses import LIBRARY  # needs numpy
-
     own = own_poses(poses_folder())
     wanted = [*LIBRARY, *(name for name in own if name not in LIBRARY)]
     if [item[0] for item in _items] != wanted:
@@ -51,13 +63,6 @@ def pose_items(_self, _context: bpy.types.Context) -> list[tuple[str, str, str, 
 
 def draw_picture(pose: Path, rotations: NDArray) -> None:
     """Draw the picture of a saved pose, joint rotations [24, 3, 3], beside its file. Raises OSError."""
-    import numpy as np  # needs numpy
-
-    # needs numpy
-    from ..formats.picture_files import write_png
-    from ..jobs.assets import clay_figure
-    from ..motion.skeleton import joint_positions
-
     picture = clay_figure(joint_positions(np.asarray(rotations)))[::-1]  # PNG files begin with the top row
     write_png(picture_of(pose), np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8))
 
@@ -125,8 +130,6 @@ class _Posing(OnArmature):
 
     def joints(self, armature: bpy.types.Object) -> list[str]:
         """Which to change. Raises ValueError where none is selected."""
-        from ..motion.pose_library import selected_joints  # needs numpy
-
         if not self.only_selected:
             return list(JOINT_NAMES)
         chosen = selected_joints(armature)
@@ -136,8 +139,6 @@ class _Posing(OnArmature):
 
     def pose(self, armature: bpy.types.Object, pose: NDArray, translation: NDArray | None, amount: float) -> list[str]:
         """Apply a pose; returns the bones that it changed."""
-        from ..motion.pose_library import apply_pose  # needs numpy
-
         joints = self.joints(armature)
         changed = apply_pose(armature, pose, translation, amount, joints)
         if locked := len(joints) - len(changed):
@@ -146,10 +147,6 @@ class _Posing(OnArmature):
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         """Keys the pose where auto keying is on."""
-        # needs numpy
-        from ..motion.pose_library import check_posable, key_pose
-        from ..scene.handles import handles_from_joints, joints_from_handles
-
         check_posable(armature)
         joints_from_handles(context, armature)
         changed = self.apply(context, armature)
@@ -218,12 +215,6 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
         layout.prop(self, "only_selected")
 
     def apply(self, context: bpy.types.Context, armature: bpy.types.Object) -> list[str]:
-        # needs numpy
-        import numpy as np
-
-        from ..motion.pose_library import current_pose, mirrored
-        from ..motion.rotation import to_axis_angle
-
         if self.what == "REST":
             return self.pose(armature, np.zeros((len(JOINT_NAMES), 3)), np.zeros(3), 1.0)
         if self.what == "MIRRORED":
@@ -233,8 +224,6 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
 
     def _apply(self, context: bpy.types.Context, armature: bpy.types.Object) -> list[str]:
         """A pose of the library."""
-        from ..motion.pose_library import builtin_poses, mirrored, standing  # needs numpy
-
         name = self.pose_name or context.scene.primdiffusion_motion.pose
         own = own_poses(poses_folder())
         if name in builtin_poses():
@@ -259,10 +248,6 @@ class PRIMDIFFUSION_OT_key_pose(OnArmature, bpy.types.Operator):
     bl_options = {"REGISTER", "UNDO"}
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.pose_library import check_posable, key_pose
-        from ..scene.handles import joints_from_handles
-
         check_posable(armature)
         joints_from_handles(context, armature)
         key_pose(armature, context.scene.frame_current)
@@ -301,11 +286,6 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
         return self._delete(context.scene.primdiffusion_motion) if self.delete else super().act(context)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        # needs numpy
-        from ..motion.pose_library import builtin_poses, current_pose
-        from ..motion.rotation import to_axis_angle
-        from ..scene.handles import joints_from_handles
-
         name = self.pose_name.strip()
         if name in builtin_poses():
             raise ValueError(f"{name!r} is a built-in pose: give yours another name")

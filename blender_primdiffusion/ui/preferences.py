@@ -1,17 +1,14 @@
-"""Preferences that every build has, and the message about missing Python packages."""
+"""Preferences that every build has."""
 
 from __future__ import annotations
 
-import sys
-
 import bpy
 
-from ..backend.requests import sentence
 from ..jobs.follow import redraw
 from ..jobs.late_volumes import keep_writing
 from ..jobs.queue import queue
-from ..places import EXTENSION, missing_packages
-from .drawing import DATA, draw_lines
+from ..places import EXTENSION
+from .drawing import DATA
 
 WIDTH = 90
 """Characters in a line of the preferences window at its default size."""
@@ -84,29 +81,3 @@ class CommonPreferences:
         layout.use_property_decorate = False
         for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "volumes", "captures"):
             layout.prop(self, name)
-
-
-def register() -> None:
-    """Say which Python packages are missing: on the console, and to a user who has just enabled the extension."""
-    if lacking := missing_packages():
-        print(f"PrimDiffusion: {lacking}", file=sys.stderr, flush=True)
-        if not bpy.app.background:
-            bpy.app.timers.register(_pop_up, first_interval=0.1)
-
-
-def _pop_up() -> None:
-    """A message over the preferences, if they are shown; elsewhere the sidebar has it."""
-    for window in bpy.context.window_manager.windows:
-        if any(area.type == "PREFERENCES" for area in window.screen.areas):
-            with bpy.context.temp_override(window=window):
-                window_manager = bpy.context.window_manager
-                window_manager.popup_menu(
-                    lambda menu, _: draw_lines(menu.layout, sentence(missing_packages()), "NONE", WIDTH),
-                    title="PrimDiffusion",
-                )
-
-
-def unregister() -> None:
-    """No message after the extension was disabled."""
-    if bpy.app.timers.is_registered(_pop_up):
-        bpy.app.timers.unregister(_pop_up)

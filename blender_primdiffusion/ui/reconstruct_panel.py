@@ -8,8 +8,10 @@ from pathlib import Path
 
 import bpy
 
+from ..formats.capture_layout import LIST_FILE, read_list
 from ..formats.requests import ReconstructRequest
 from ..jobs.follow import Reporting, submit
+from ..jobs.generate import ReconstructJob
 from ..scene.blend_values import setting_path
 from .captures_panel import DataPanel
 from .declared import PANELS, SKIP, declared, not_given
@@ -25,8 +27,6 @@ _BY_DESCRIPTION = "How the views become a human"
 
 def subjects_in(folder: Path) -> list[str]:
     """Names of the humans in a dataset of captures; none where the folder is one subject's own, or cannot be read."""
-    from ..formats.capture_layout import LIST_FILE, read_list  # needs numpy
-
     try:
         if (folder / _CAMERAS_FILE).is_file():
             return []
@@ -89,8 +89,6 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
         return {"RUNNING_MODAL"}
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..jobs.generate import ReconstructJob  # needs numpy
-
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory) or setting_path(asked.capture, "Captures")
         subject = self.subject or ("" if self.directory else asked.subject)  # the panel's belongs to its own folder

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import bpy
 
 from ..formats.requests import VOXEL
+from ..jobs.export import show, shown
 from ..jobs.follow import submit
+from ..jobs.merge import MergeFramesJob, MergeJob, Moment
 from ..jobs.target import HumanTarget
 from ..scene.attachment import (
     attachment_before_merge,
@@ -16,12 +16,13 @@ from ..scene.attachment import (
     set_attachment,
     show_in_viewport,
 )
+from ..scene.collect import collect_unwritten
 from ..scene.human import armature_of, humans
+from ..scene.merged import merged_of, remove_merged
+from ..scene.proxy import proxy_of
+from ..scene.unwritten import write_all_unwritten
 from .declared import SKIP
 from .on_person import OnPerson
-
-if TYPE_CHECKING:
-    from ..jobs.merge import Moment
 
 ATTACHMENT_ITEMS = (
     ("ARMATURE", "Armature", "Each volume is an object that follows the bones; fast, and the default"),
@@ -61,12 +62,6 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
     everyone: bpy.props.BoolProperty(name="All Humans", description="Do it for all humans of the scene", options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        # needs numpy
-        from ..jobs.export import show, shown
-        from ..scene.collect import collect_unwritten
-        from ..scene.proxy import proxy_of
-        from ..scene.unwritten import write_all_unwritten
-
         visible = not in_viewport(person)
         if visible:
             collect_unwritten()
@@ -120,8 +115,6 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
             _unmerge(person)
             bpy.ops.ed.undo_push(message="Unmerge")
             return {"FINISHED"}
-        from ..jobs.merge import MergeFramesJob, MergeJob  # needs numpy
-
         given, target = self.properties.is_property_set, HumanTarget.of(person)
         voxel = self.voxel if given("voxel") else context.scene.primdiffusion_merging.voxel
         if self.what == "POSE":
@@ -138,8 +131,6 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
 
 def _unmerge(person: bpy.types.Collection) -> None:
     """Raises ValueError where there is no merged volume."""
-    from ..scene.merged import merged_of, remove_merged  # needs numpy
-
     if merged_of(person) is None:
         raise ValueError(f"{person.name!r} has no merged volume")
     if attachment_of(person) == "MERGED":
@@ -148,8 +139,6 @@ def _unmerge(person: bpy.types.Collection) -> None:
 
 
 def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
-    from ..jobs.merge import Moment  # needs numpy
-
     return Moment.now(person, armature_of(person).evaluated_get(graph))
 
 

@@ -14,6 +14,7 @@ from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting
 from ..places import backend_is_named
 from ..scene.attachment import in_viewport
+from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera, posed_extent
 from ..scene.human import human_of, humans
 from .drawing import SidebarPanel, draw_lines, property_columns
 
@@ -125,8 +126,6 @@ class PRIMDIFFUSION_OT_set_up_engine(Reporting, bpy.types.Operator):
         if self.engine == ENGINE and not backend_is_named():
             raise ValueError(NOT_INSTALLED)  # views would show humans, and F12 would fail
         if self.engine == "CYCLES":
-            from ..scene.cycles import fit_cycles_to_volumes  # needs numpy
-
             if not hasattr(scene, "cycles"):
                 raise ValueError("Cycles is disabled: enable the add-on Cycles Render Engine in the preferences")
             bounces = scene.cycles.max_bounces
@@ -145,8 +144,6 @@ class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
     bl_options = {"UNDO"}
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..scene.cycles import frame_box, humans_extent, new_camera, posed_extent  # needs numpy
-
         scene = context.scene
         person = human_of(context.view_layer.objects.active, scene)
         extent = humans_extent(scene) if person is None else posed_extent(person)

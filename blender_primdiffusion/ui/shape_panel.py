@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import random
-from typing import TYPE_CHECKING
 
 import bpy
+import numpy as np
+from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..jobs.target import selected_person
+from ..scene.body_file import shape_model_of
 from ..scene.human import BETA_COUNT, BETAS, armature_of, humans
+from ..scene.reshape import check_shapeable, reshape
+from ..scene.shape import betas_of, betas_of_measures, generated_betas, slider_names
 from .declared import SKIP
 from .drawing import draw_lines, property_columns
 from .on_person import HumanPanel, OnPerson, other_human
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 _FARTHEST = 3.0
 _SHAPES = (
@@ -73,8 +74,6 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
             layout.prop(self, name)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        from ..scene.reshape import reshape  # needs numpy
-
         warning = reshape(person, self._betas(context, person))
         if warning:
             self.report({"WARNING"}, warning)
@@ -82,11 +81,6 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
 
     def _betas(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
         """The new shape [10]. Raises ValueError."""
-        import numpy as np  # needs numpy
-
-        from ..scene.body_file import shape_model_of  # needs numpy
-        from ..scene.shape import betas_of, betas_of_measures, generated_betas  # needs numpy
-
         if self.to == "GENERATED":
             return generated_betas(person)
         if self.to == "OTHER":
@@ -100,9 +94,6 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         return betas_of_measures(shape_model_of(person), betas, height, weight)
 
     def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
-        from ..scene.body_file import shape_model_of  # needs numpy
-        from ..scene.shape import betas_of  # needs numpy
-
         other = other_human(context, person, self.other)
         if len(shape_model_of(other).template) != len(shape_model_of(person).template):
             raise ValueError(
@@ -122,11 +113,6 @@ class PRIMDIFFUSION_PT_shape(HumanPanel, bpy.types.Panel):
     manual_page, manual_section = "editing", "shape"
 
     def draw(self, context: bpy.types.Context) -> None:
-        # needs numpy
-        from ..scene.body_file import shape_model_of
-        from ..scene.reshape import check_shapeable
-        from ..scene.shape import slider_names
-
         layout = property_columns(self.layout)
         person = selected_person(context)
         try:

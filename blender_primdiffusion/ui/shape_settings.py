@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import bpy
+import numpy as np
 
 from ..scene.actions import action_curves, end_repeat, loops, repeat
+from ..scene.body_file import shape_model_of
+from ..scene.duplicate import rename_human
 from ..scene.human import BETA_COUNT, LARGEST_BETA, MARK
-
-if TYPE_CHECKING:
-    from ..scene.shape import BodyMeasures
+from ..scene.reshape import reshape
+from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, measure
 
 _NOT_ANIMATED: set[str] = set()
 """Options: an animation would move the rest bones in each frame; the custom property can be animated instead."""
@@ -27,9 +28,6 @@ def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
 
 def measures_of(armature: bpy.types.Object) -> BodyMeasures:
     """Height and weight as set by the sliders. Raises ValueError or FileNotFoundError where they are unknown."""
-    from ..scene.body_file import shape_model_of  # needs numpy
-    from ..scene.shape import betas_of, measure  # needs numpy
-
     person = person_of(armature)
     return measure(shape_model_of(person), betas_of(person))
 
@@ -42,14 +40,10 @@ def _name(self: PRIMDIFFUSION_PG_human) -> str:
 
 
 def _rename(self: PRIMDIFFUSION_PG_human, name: str) -> None:
-    from ..scene.duplicate import rename_human  # needs numpy
-
     _printed(lambda: rename_human(person_of(self.id_data), name))
 
 
 def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
-    from ..scene.shape import betas_of  # needs numpy
-
     try:
         return betas_of(person_of(self.id_data)).tolist()
     except ValueError:
@@ -57,16 +51,10 @@ def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
 
 
 def _set_betas(self: PRIMDIFFUSION_PG_human, betas: Sequence[float]) -> None:
-    import numpy as np  # needs numpy
-
-    from ..scene.reshape import reshape  # needs numpy
-
     _printed(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
 
 
 def _measure(self: PRIMDIFFUSION_PG_human) -> BodyMeasures:
-    from ..scene.shape import BodyMeasures  # needs numpy
-
     try:
         return measures_of(self.id_data)
     except (OSError, ValueError):
@@ -94,11 +82,6 @@ def set_measures(person: bpy.types.Collection, height: float | None = None, weig
 
     Raises ValueError where no body has these, and as `reshape`.
     """
-    # needs numpy
-    from ..scene.body_file import shape_model_of
-    from ..scene.reshape import reshape
-    from ..scene.shape import betas_of, betas_of_measures
-
     return reshape(person, betas_of_measures(shape_model_of(person), betas_of(person), height, weight))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import bpy
 from bpy.app.handlers import persistent
@@ -16,12 +16,12 @@ from ..jobs.late_volumes import keep_writing
 from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
+from ..scene.build import build_human
+from ..scene.cycles import overlap_warning_in
+from ..scene.place import stand_at_cursor
 from .declared import SKIP, declared, not_given
 from .drawing import BackendPanel, draw_job, property_columns, row_unless
 from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed, random_seed
-
-if TYPE_CHECKING:
-    from ..jobs.variations import VariationsJob
 
 COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in (4, 8, 12, 16)]
 
@@ -159,8 +159,6 @@ class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
         return _BUILD_ALL if properties.build_all else str(cls.__doc__)
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        from ..scene.cycles import overlap_warning_in  # numpy, which Blender starts without
-
         wanted = list(sheet.variations) if self.build_all else _targets(self.index)
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
@@ -225,10 +223,6 @@ def _only(wanted: list[Variation], what_to_do: str) -> Variation:
 
 def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Collection], str]:
     """The humans built, and what went wrong with the next one in a sentence; empty for nothing."""
-    # needs numpy
-    from ..scene.build import build_human
-    from ..scene.place import stand_at_cursor
-
     built: list[bpy.types.Collection] = []
     context.window_manager.progress_begin(0, len(wanted))
     try:

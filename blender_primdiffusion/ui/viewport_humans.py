@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..engine import shows_humans
+from ..engine.gpu.overlay import overlay
 from ..scene.human import any_humans
 
 _keys: list[tuple[bpy.types.KeyMap, bpy.types.KeyMapItem]] = []
@@ -27,8 +28,6 @@ class PRIMDIFFUSION_OT_click_human(bpy.types.Operator):
         """Leave the click to Blender where no human is, or another object in front; a press may begin a drag."""
         if context.mode != "OBJECT" or context.region_data is None or not shows_humans(context):
             return {"PASS_THROUGH"}
-        from ..engine.overlay import overlay  # needs numpy
-
         obj = overlay.object_at(context, event.mouse_region_x, event.mouse_region_y)
         if obj is None or obj.hide_select:
             return {"PASS_THROUGH"}

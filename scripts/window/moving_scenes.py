@@ -47,7 +47,7 @@ def turning(module: str, python: str) -> Steps:
     wide_view()
     space = view()[1].spaces.active
     space.shading.type, around = "SOLID", space.region_3d
-    overlay = import_module(f"{module}.engine.overlay")
+    overlay = import_module(f"{module}.engine.gpu.overlay")
     (person,) = [layer for layer in bpy.context.view_layer.layer_collection.children if layer.name == "Human"]
     yield from wait(lambda: overlay.overlay.resting and bool(overlay.overlay._regions), 120)
     measured = {True: [], False: []}
@@ -103,7 +103,7 @@ def playing(module: str, python: str) -> Steps:
         yield 0.5
     wide_view()
     view()[1].spaces.active.shading.type = "SOLID"
-    overlay = import_module(f"{module}.engine.overlay").overlay
+    overlay = import_module(f"{module}.engine.gpu.overlay").overlay
     people = [one for one in bpy.context.view_layer.layer_collection.children if one.name.startswith("Human")]
     yield from wait(lambda: overlay.resting and bool(overlay._regions), 120)
     measured: dict[bool, list[float]] = {True: [], False: []}

@@ -44,7 +44,7 @@ def tick() -> float | None:
         found["open_to_visible_seconds"] = round(moments["seen"] - moments["read"], 3)
         write()
         moments["written"] = now
-    overlay = import_module(f"{MODULE}.engine.overlay").overlay
+    overlay = import_module(f"{MODULE}.engine.gpu.overlay").overlay
     rested = overlay.resting or now - moments["read"] > LONGEST_S
     if rested and "opened_refined_seconds" not in found:
         found["opened_refined_seconds"] = round(now - moments["read"], 3)
@@ -59,7 +59,7 @@ def watch() -> None:
 
     def drawn() -> None:
         draw()
-        overlay = sys.modules.get(f"{MODULE}.engine.overlay")
+        overlay = sys.modules.get(f"{MODULE}.engine.gpu.overlay")
         if overlay is not None and any(one.shown is not None for one in overlay.overlay._regions.values()):
             gpu.state.active_framebuffer_get().read_color(0, 0, 1, 1, 4, 0, "UBYTE")  # what was drawn is finished
             moments.setdefault("seen", time.monotonic())

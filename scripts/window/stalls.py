@@ -18,8 +18,8 @@ _OURS = (
     ("jobs.follow", "", "enter"),
     ("jobs.late_volumes", "LateVolumes", "work"),
     ("jobs.picture_in_view", "PictureInView", "draw"),
-    ("engine.overlay", "Overlay", "advance"),
-    ("engine.overlay", "Overlay", "draw"),
+    ("engine.gpu.overlay", "Overlay", "advance"),
+    ("engine.gpu.overlay", "Overlay", "draw"),
 )
 """Module, class and function of what the extension does in the main loop and in draw handlers while a human enters."""
 _ours_s = dict.fromkeys((f"{owner or module}.{function}" for module, owner, function in _OURS), 0.0)

@@ -181,7 +181,7 @@ def stalls(module: str, python: str) -> Steps:
 
 def entering(module: str, seed: int, prefix: str) -> Steps:
     """Generate a person and measure from the child's answer until a view shows them and their volumes are written."""
-    queue, overlay = queue_of(module), import_module(f"{module}.engine.overlay").overlay
+    queue, overlay = queue_of(module), import_module(f"{module}.engine.gpu.overlay").overlay
     writing = import_module(f"{module}.jobs.late_volumes")._tick
     humans = len(armatures()) + 1
 
@@ -221,7 +221,7 @@ def redraw(module: str, python: str) -> Steps:
     yield from with_people(module, python, FIRST_SEED)
     wide_view()
     view()[1].spaces.active.shading.type = "SOLID"
-    overlay = import_module(f"{module}.engine.overlay")
+    overlay = import_module(f"{module}.engine.gpu.overlay")
     (person,) = [layer for layer in bpy.context.view_layer.layer_collection.children if layer.name == "Human"]
     settings = bpy.context.scene.primdiffusion_render
     states = {"empty": (True, False), "armature": (False, False), "person": (False, True)}

@@ -102,7 +102,7 @@ def layers() -> list[bpy.types.LayerCollection]:
 
 def at_rest(module: str) -> Steps:
     """Until the views show their finest pictures."""
-    overlay = import_module(f"{module}.engine.overlay").overlay
+    overlay = import_module(f"{module}.engine.gpu.overlay").overlay
     yield 1.0
     yield from wait(lambda: overlay.resting, _MOST_S)
     yield 1.0
@@ -110,7 +110,7 @@ def at_rest(module: str) -> Steps:
 
 def check_drawn(module: str) -> None:
     """Raise RuntimeError where the finest picture of a view has no pixel of a human."""
-    overlay = import_module(f"{module}.engine.overlay").overlay
+    overlay = import_module(f"{module}.engine.gpu.overlay").overlay
     far = import_module(f"{module}.engine.view").NO_SURFACE_M
     for picture in overlay._regions.values():
         if not (np.array(picture.shown.picture.depth.read(), np.float32) < far).any():

@@ -8,13 +8,8 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion import cli
-from primdiffusion.machine import (
-    best_device,
-    choose_device,
-    device_info,
-    memory,
-    share_processors,
-)
+from primdiffusion.device import best_device, device_info
+from primdiffusion.machine import choose_device, memory, share_processors
 from tiny_model import tiny_model
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
 from torch.overrides import TorchFunctionMode

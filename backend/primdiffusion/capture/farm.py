@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from primdiffusion.failures import optional_package
 from primdiffusion.formats.json_files import parse_json
 
 LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
@@ -113,10 +114,7 @@ def render_one(command: list[str], subject: str, attempts: int) -> FarmResult:
 
 
 def _started(farm: Farm) -> Any:
-    try:
-        import ray  # pyright: ignore[reportMissingImports]  # an extra
-    except ImportError as e:
-        raise FarmError("Ray is not installed: pip install 'primdiffusion[farm]'") from e
+    ray = optional_package("ray", "farm")
     local: dict[str, Any] = {} if farm.address else {"num_cpus": max(1, round(farm.workers * farm.processors_each))}
     if not farm.address and farm.gpus_each:
         local["num_gpus"] = max(1, round(farm.workers * farm.gpus_each))

@@ -13,11 +13,16 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.dataset import open_pack, pack
+from primdiffusion.capture.farm import Farm, FarmError, FarmResult, render_on
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import MotionFileError, choose_poses, read_motion, read_motions
+from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
+from primdiffusion.capture.sheet import draw_sheet
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
+from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.requests import PASSES
 
 DESCRIPTION = "Multi-view captures, to train on."
@@ -131,9 +136,6 @@ class VerifyCaptures:
 
     def run(self) -> None:
         """Print a line for each finding; raises ValueError if there is any."""
-        # used by this subcommand alone
-        from primdiffusion.formats.capture_repair import repair, subject_folders, verify
-
         findings = verify(self.root, checksums=not self.quick)
         for path, what in findings.items():
             print(f"{path}: {what}")
@@ -156,10 +158,6 @@ class InfoOfCaptures:
 
     def run(self) -> None:
         """Print one JSON object."""
-        # used by this subcommand alone
-        from primdiffusion.capture.dataset import open_pack
-        from primdiffusion.capture.reader import open_captures
-
         captures = open_captures(self.root)
         first = captures.subject(captures.subjects[0])
         view = first.views[0]
@@ -185,10 +183,6 @@ class PackCaptures:
 
     def run(self) -> None:
         """Pack, and print a line for each subject."""
-        # used by this subcommand alone
-        from primdiffusion.capture.dataset import pack
-        from primdiffusion.capture.reader import open_captures
-
         captures = open_captures(self.root)
         for packing in tqdm(pack(captures), total=len(captures.subjects), unit="human", disable=None):
             print(
@@ -213,10 +207,6 @@ class SheetOfCaptures:
 
     def run(self) -> None:
         """Draw; print the path and the largest reprojection error of the joints, pixels."""
-        # used by this subcommand alone
-        from primdiffusion.capture.reader import open_captures
-        from primdiffusion.capture.sheet import draw_sheet
-
         captures = open_captures(self.root)
         error = draw_sheet(captures, self.out, self.rows, self.columns, self.size)
         print(f"{self.out}  joints drawn, largest error {error:.4f} px")
@@ -244,8 +234,6 @@ class FarmCaptures:
 
     def run(self) -> None:
         """Render, and print a line for each human. Raises FarmError if the cluster cannot start or a human fails."""
-        # used by this subcommand alone
-        from primdiffusion.capture.farm import Farm, FarmError, FarmResult, render_on
 
         def show(outcome: FarmResult, done: int, total: int) -> None:
             print(f"{done}/{total}  {outcome.subject}  {outcome.error or f'{outcome.seconds:.0f} s'}", flush=True)

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from primdiffusion import __version__
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.commands.evaluate_tables import Generated, TableOptions, measure
+from primdiffusion.device import best_device
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation import generation, reconstruction
@@ -32,7 +33,6 @@ from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate
 from primdiffusion.formats.requests import Sampling
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import generate, place
-from primdiffusion.machine import best_device
 from primdiffusion.people.assets import open_assets
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person

@@ -16,6 +16,7 @@ from tqdm import tqdm
 from primdiffusion import __version__
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.poses import choose_poses, read_motion
+from primdiffusion.device import best_device
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.onnx_networks import (
@@ -54,7 +55,6 @@ from primdiffusion.evaluation.tables import (
     table,
 )
 from primdiffusion.human import Human, framing, generate, place
-from primdiffusion.machine import best_device
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person

@@ -15,7 +15,7 @@ import torch
 from primdiffusion.commands.options import MergeCommand
 from primdiffusion.commands.progress import Pace, ReportProgress
 from primdiffusion.commands.session import Session
-from primdiffusion.export.merged_file import check_openvdb, upright_grid, write_grid_npz, write_grid_vdb
+from primdiffusion.export.merged_file import load_openvdb, upright_grid, write_grid_npz, write_grid_vdb
 from primdiffusion.formats.answers import MergeAnswer, MergeFramesAnswer
 from primdiffusion.formats.requests import MergeFramesRequest, MergeRequest, PosedPerson
 from primdiffusion.formats.whole_files import written_whole
@@ -75,7 +75,7 @@ def run(command: MergeCommand) -> None:
         raise FileNotFoundError(f"there is no folder {command.out.parent}: create it, or choose another")
     as_vdb = command.out.suffix.lower() == ".vdb"
     if as_vdb:
-        check_openvdb()
+        load_openvdb()
     pose = None if command.pose is None else read_pose(command.pose, command.frame)
     people = []
     for number, path in enumerate(command.humans):

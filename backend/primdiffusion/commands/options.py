@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -16,6 +17,7 @@ from primdiffusion.formats.requests import (
     GenerateRequest,
     InpaintRequest,
     InterpolateRequest,
+    Making,
     OutDir,
     Person,
     Pixels,
@@ -202,6 +204,96 @@ class ServeCommand:
     """Print the versions of this program, torch and Python as one line of JSON, and end."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PeopleCommand:
+    """Make dressed, rigged humans as glTF files, from which captures are rendered."""
+
+    out: Path
+    """Folder to write person_NNNNNN/person.glb and manifest.json into; complete ones are skipped."""
+    assets: Path | None = None
+    """MakeHuman asset folder (CC0); the default is the environment variable PRIMDIFFUSION_ASSETS."""
+    count: Count = 100
+    """Number of humans."""
+    seed: Seed = 0
+    """Seed of the first human; the others have the following seeds."""
+    workers: Count = os.cpu_count() or 1
+    """Processes; each needs a core and about 1 GB."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PayloadsCommand:
+    """Make dressed humans as primitives: the training set of the diffusion model.
+
+    `payloads encode` makes them from captures instead; `payloads pack` stores either in few files, whose checksums
+    `payloads verify` compares (each with its own --help).
+    """
+
+    out: Path
+    """Folder to write person_NNNNNN.npz into; complete ones are skipped."""
+    assets: Path | None = None
+    """MakeHuman asset folder (CC0); the default is the environment variable PRIMDIFFUSION_ASSETS."""
+    count: Count = 100
+    """Number of humans."""
+    variants: Count = 4
+    """Colourings of each human."""
+    seed: Seed = 0
+    """Seed of the first human; the others have the following seeds."""
+    making: Making = "fitted"
+    """fitted: the primitives are fitted to renders of the mesh, about 30 s per human and core; from_mesh: each voxel
+    takes the colour of the nearest surface point, 2 s, blurred."""
+    workers: Count = os.cpu_count() or 1
+    """Processes; each needs a core and about 1.5 GB."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class EncodePayloadsCommand:
+    """Encode captures as training payloads with the trained encoder.
+
+    Captures are those of `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's
+    layout. Running the command again resumes it.
+    """
+
+    captures: Path
+    """Folder of a capture dataset."""
+    out: Path
+    """Output folder of NAME.npz."""
+    encoder: Path | None = None
+    """Trained encoder (.safetensors); the default is the one in the package."""
+    people: Path | None = None
+    """Folder of `primdiffusion people` that was captured, for attributes such as outfit, hair and height."""
+    views: Count = 8
+    """Images to encode, spread around the subject; all if there are fewer."""
+    looks: Count = 1
+    """Frames of each subject to encode, evenly spaced; the first, near the T pose, has the least occlusion."""
+    refine_steps: Annotated[int, Range(0)] = 0
+    """Refinement steps on all images of the subject, which restore detail that the encoder blurs, such as 300; 0 for
+    none."""
+    refine_size: Pixels = 256
+    """Largest side of the images used in refinement, pixels."""
+    seed: Seed = 0
+    """Seed of the order of images in refinement."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PackPayloadsCommand:
+    """Pack payloads into a few files with checksums that training maps into memory: large, but quick to read."""
+
+    folder: Annotated[Path, Option(positional=True)]
+    """Folder of payloads, one file each."""
+    out: Path
+    """Output folder of shards and their index, for `primdiffusion train --data`."""
+    people_each: Count = 32
+    """Payloads in a shard; one with four colour variants takes 8 MiB."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class VerifyPayloadsCommand:
+    """Verify the checksums of packed payloads."""
+
+    folder: Annotated[Path, Option(positional=True)]
+    """Folder of shards."""
+
+
 OPTIONS: dict[str, type] = {
     "generate": GenerateCommand,
     "vary": VaryRequest,
@@ -217,5 +309,10 @@ OPTIONS: dict[str, type] = {
     "merge": MergeCommand,
     "serve": ServeCommand,
     "info": InfoCommand,
+    "people": PeopleCommand,
+    "payloads": PayloadsCommand,
+    "payloads encode": EncodePayloadsCommand,
+    "payloads pack": PackPayloadsCommand,
+    "payloads verify": VerifyPayloadsCommand,
 }
 """Command lines that are read before the command's module, which loads torch, is imported."""

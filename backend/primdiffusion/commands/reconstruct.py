@@ -23,13 +23,14 @@ from primdiffusion.commands.options import RefineCommand
 from primdiffusion.commands.output import FILES, write_human
 from primdiffusion.commands.progress import ReportProgress, progress_bar
 from primdiffusion.commands.session import Session
+from primdiffusion.device import best_device
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.answers import ReconstructAnswer
 from primdiffusion.formats.requests import ReconstructRequest
 from primdiffusion.formats.whole_files import staged
 from primdiffusion.human import Human
 from primdiffusion.human_file import load_human
-from primdiffusion.machine import best_device, peak_memory_gb
+from primdiffusion.machine import peak_memory_gb
 from primdiffusion.reconstruction import reconstruct as reconstruct_human
 from primdiffusion.reconstruction import reconstruct_by_prior
 from primdiffusion.training.refine import RefineSettings, RefineStep, refine

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
+from primdiffusion.device import best_device, device_info
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.machine import best_device, device_info
-
-if TYPE_CHECKING:
-    from primdiffusion.encoder.model import EncoderModel
+from primdiffusion.encoder.model import EncoderModel, load_encoder
 
 T = TypeVar("T")
 
@@ -40,8 +38,6 @@ class Session:
 
     def encoder(self, checkpoint: Path | None) -> EncoderModel:
         """Load an encoder (None: the default); the last one stays loaded."""
-        from primdiffusion.encoder.model import load_encoder  # children that only generate start sooner
-
         if self._encoder is None or self._encoder[0] != checkpoint:
             self._encoder = None
             self._encoder = (checkpoint, load_encoder(checkpoint, self.device))

@@ -16,13 +16,13 @@ from scipy.spatial.transform import Rotation
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.options import ViewCommand
+from primdiffusion.device import best_device
 from primdiffusion.failures import optional_package
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import VERTICAL_FOV, Human, framing, place
 from primdiffusion.human_file import load_human
-from primdiffusion.machine import best_device
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import march
 

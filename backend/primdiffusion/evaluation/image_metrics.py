@@ -21,6 +21,7 @@ from primdiffusion.evaluation.pretrained_networks import (
     fill,
     read_weights,
 )
+from primdiffusion.failures import optional_package
 
 WINDOW = 11
 """Width of SSIM's Gaussian window, pixels."""
@@ -69,17 +70,16 @@ def ssim(image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) ->
 
     Gaussian windows of 11 x 11 pixels, sigma 1.5, biased variances; windows that cross the border are left out, as in
     Wang et al.'s program and scikit-image. Raises ValueError if shapes differ or a side has fewer than 11 pixels, and
-    ImportError without the extra `training`.
+    MissingPackageError without the extra `training`.
     """
-    from torchmetrics.functional.image import structural_similarity_index_measure  # in the extra `training`
-
+    metrics = optional_package("torchmetrics.functional.image", "training")
     _check_pair(image, target)
     height, width = image.shape[-3:-1]
     if min(height, width) < WINDOW:
         raise ValueError(f"images have {width} x {height} pixels: SSIM needs at least {WINDOW} x {WINDOW}")
     one, other = (picture.reshape(-1, height, width, 3).movedim(-1, 1) for picture in (image, target))
     # Its own mean takes windows across the border too, in mirrored images.
-    _, windows = structural_similarity_index_measure(
+    _, windows = metrics.structural_similarity_index_measure(
         one, other, data_range=1.0, reduction="none", return_full_image=True
     )
     inside = slice(WINDOW // 2, -(WINDOW // 2))

@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from primdiffusion.evaluation.shots import SIDE, Shot
+from primdiffusion.failures import optional_package
 
 Normalisation = Literal["imagenet", "half"]
 """Mean and standard deviation of a network's inputs: of ImageNet (RTMPose, ViTPose, MiDaS, Depth Anything), or 0.5 and
@@ -56,17 +57,12 @@ class OnnxNetwork:
 def open_onnx(path: Path, size: tuple[int, int]) -> OnnxNetwork:
     """Open a network whose input is [1, 3, h, w]; `size` is h, w where the file leaves them open.
 
-    Deterministic: one thread, on the CPU. Raises FileNotFoundError, ImportError without onnxruntime, and ValueError for
-    another file.
+    Deterministic: one thread, on the CPU. Raises FileNotFoundError, MissingPackageError without onnxruntime, and
+    ValueError for another file.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no ONNX file at {path}: check the path")
-    try:
-        import onnxruntime  # in the extra `evaluation`
-    except ImportError as error:
-        raise ImportError(
-            f"{path} needs onnxruntime, which is not installed: pip install 'primdiffusion[evaluation]'"
-        ) from error
+    onnxruntime = optional_package("onnxruntime", "evaluation")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.log_severity_level = 4

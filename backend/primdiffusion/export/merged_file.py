@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import torch
@@ -45,22 +46,21 @@ def write_grid_npz(path: Path, grid: Merged) -> None:
     write_deflated(path, arrays)
 
 
-def check_openvdb() -> None:
-    """Raise NoOpenVDB if the module `openvdb` is missing."""
+def load_openvdb() -> ModuleType:
+    """Return the module `openvdb`, an optional dependency. Raises NoOpenVDB if it is missing."""
     try:
-        import openvdb  # noqa: F401  optional dependency
+        import openvdb
     except ImportError as error:
         raise NoOpenVDB(
             "writing .vdb needs the module openvdb: install it (Debian and Ubuntu: python3-openvdb; Blender bundles "
             "its own), or write an .npz"
         ) from error
+    return openvdb
 
 
 def write_grid_vdb(path: Path, grid: Merged) -> None:
     """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) as half floats. Raises NoOpenVDB, OSError."""
-    check_openvdb()
-    import openvdb  # optional dependency
-
+    openvdb = load_openvdb()
     index_to_world = np.diag([grid.voxel] * 3 + [1.0])  # row vectors
     index_to_world[3, :3] = grid.origin
     transform = openvdb.createLinearTransform(index_to_world.tolist())

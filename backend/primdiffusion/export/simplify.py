@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import igl
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray as Array
@@ -30,8 +31,6 @@ def simplified(
     """Simplify a closed mesh to at most `triangles` triangles by quadric edge collapse (libigl)."""
     if len(faces) <= triangles:
         return vertices, faces
-    import igl  # slow to load
-
     coarse, corners, *_ = igl.qslim(vertices, faces, triangles)
     return np.asarray(coarse), np.asarray(corners)
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
+import igl
 import numpy as np
+import trimesh
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray as Array
 from scipy import ndimage
@@ -41,8 +43,6 @@ def outside_surface(grid: Merged, on_wait: Callable[[], None] = lambda: None) ->
 
     `on_wait` is called regularly; exceptions it raises cancel. Raises NoSurface.
     """
-    import igl  # large, and used only here
-
     density = np.pad(grid.density, _MARGIN)
     solid = filled(density > LEVEL, grid.voxel)
     if not solid.any():
@@ -87,8 +87,6 @@ def _cubes_across(solid: Array) -> tuple[Int64[Array, "n"], Int64[Array, "c 8"]]
 
 def _large_pieces(vertices: Array, faces: Array) -> OuterSurface:
     """Drop pieces smaller than SMALLEST_PIECE, and cavities, whose volume is negative."""
-    import trimesh  # used only here
-
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     piece = trimesh.graph.connected_component_labels(mesh.edges, len(vertices))[faces[:, 0]]
     volume = np.bincount(piece, np.linalg.det(mesh.triangles) / 6)

@@ -196,19 +196,18 @@ class Server:
     def _warm_up(self) -> Session | RpcError:
         """Import torch and what needs it; an import error becomes the error of every later request."""
         try:
-            # after `hello` can be answered
-            from primdiffusion.commands import frame_drawer, output  # noqa: F401  loaded before the first request
-            from primdiffusion.commands.session import Session
+            # after `hello` can be answered; the other two are loaded before the first request
+            from primdiffusion.commands import frame_drawer, output, session  # noqa: F401
 
-            session = Session()
+            started = session.Session()
         except Exception as e:
             error = _as_rpc_error(e)
             self._state = Ready(problem=str(error))
             self._notify("ready", self._state)
             return error
-        self._state = Ready(ready=True, **session.device_info())
+        self._state = Ready(ready=True, **started.device_info())
         self._notify("ready", self._state)
-        return session
+        return started
 
     def _run_request(self, session: Session | RpcError, running: Running) -> None:
         def report(stage: str, step: int, total: int, eta_s: float | None, /, **more: Any) -> None:

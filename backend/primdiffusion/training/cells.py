@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from primdiffusion import tensor_file
+from primdiffusion.device import has_fast_bfloat16
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
@@ -20,7 +21,6 @@ from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.whole_files import write_atomically
-from primdiffusion.machine import has_fast_bfloat16
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors

@@ -12,10 +12,10 @@ import tyro
 from accelerate import Accelerator, PartialState
 
 from primdiffusion import __version__
+from primdiffusion.device import device_info
 from primdiffusion.diffusion.checkpoint import file_hash, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.machine import device_info
 from primdiffusion.training.cells import CellTrainee, load_base, prepare
 from primdiffusion.training.config import TrainingConfig
 from primdiffusion.training.latents import split_people

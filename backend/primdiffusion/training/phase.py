@@ -18,13 +18,13 @@ from PIL import Image
 from torch import Tensor, nn
 from tqdm.contrib.logging import logging_redirect_tqdm
 
+from primdiffusion.device import has_fast_bfloat16
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.failures import out_of_memory
 from primdiffusion.formats import requests
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, generate_batch, place
-from primdiffusion.machine import has_fast_bfloat16
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.muon import MuonAdamW

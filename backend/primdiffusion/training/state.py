@@ -15,8 +15,8 @@ from accelerate.utils import InitProcessGroupKwargs
 from torch import Tensor, nn
 
 from primdiffusion import tensor_file
+from primdiffusion.device import best_device
 from primdiffusion.formats.whole_files import write_atomically
-from primdiffusion.machine import best_device
 from primdiffusion.training.muon import BETAS
 
 PATIENCE = datetime.timedelta(hours=3)

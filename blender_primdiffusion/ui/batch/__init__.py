@@ -7,8 +7,9 @@ from collections.abc import Sequence
 
 import bpy
 
+from ...capture import command as capture
 from ...console import DONE, UNUSABLE
-from ...places import missing_packages
+from . import generate, render
 
 COMMAND = "primdiffusion"
 _HELP = """\
@@ -17,30 +18,19 @@ blender -c primdiffusion render PEOPLE --out PICTURES                  pictures 
 blender -c primdiffusion capture --people SCANS --out CAPTURES         captures from all sides, to train on
 Each has more options: see --help.
 Exit codes: 0 all done, 1 some failed, 2 usage error, 3 no Python runs the backend, 130 stopped by Ctrl-C."""
+_MAINS = {"generate": generate.main, "render": render.main, "capture": capture.main}
 _handles: list[object] = []
 """Of the command, while it is registered."""
 
 
 def execute(argv: Sequence[str]) -> int:
     """Run a command; returns its exit code."""
-    command, words = argv[:1], list(argv[1:])
-    try:
-        if command == ["generate"]:
-            from .generate import main  # each command loads its own modules
-        elif command == ["render"]:
-            from .render import main  # needs numpy
-        elif command == ["capture"]:
-            from ...capture.command import main  # needs numpy
-    except ModuleNotFoundError:
-        if not (lacking := missing_packages()):
-            raise
-        print(f"{command[0]}: {lacking}", file=sys.stderr, flush=True)
-        return UNUSABLE
-    if command not in (["generate"], ["render"], ["capture"]):
-        asked = command in (["--help"], ["-h"])
-        print(_HELP, file=sys.stdout if asked else sys.stderr, flush=True)
-        return DONE if asked else UNUSABLE
-    return main(words)
+    command = argv[0] if argv else ""
+    if command in _MAINS:
+        return _MAINS[command](list(argv[1:]))
+    asked = len(argv) == 1 and command in ("--help", "-h")
+    print(_HELP, file=sys.stdout if asked else sys.stderr, flush=True)
+    return DONE if asked else UNUSABLE
 
 
 def register() -> None:

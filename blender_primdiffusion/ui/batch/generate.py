@@ -11,7 +11,6 @@ import argparse
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from ...backend.requests import Backend, ChildRequest
 from ...capture.report import Report
@@ -19,14 +18,11 @@ from ...console import Stop, duration
 from ...formats.regular_files import real_path
 from ...formats.removing import check_unlinked
 from ...jobs.queue import chosen_checkpoint
-from ...places import missing_packages
 from ...scene.human import NPZ_FILE, PERSON_FILE
 from ..attributes import Attributes, parsed
+from .people import Movement, movement_of, person_blend
 from .running import Clock, NoBackend, Say, Stopped, ask, backend_of, begun, publish, reason, run, staging
 from .words import DECLARED, motion_name, parse_generate
-
-if TYPE_CHECKING:
-    from .people import Movement
 
 SETTINGS = "settings.json"
 """The settings of a folder's humans."""
@@ -35,17 +31,13 @@ _PRINT_S = 2.0
 
 
 def main(argv: Sequence[str]) -> int:
-    """The command with its words; returns the exit code. Without --blend, Blender needs no further Python packages."""
+    """The command with its words; returns the exit code."""
     return run("generate", argv, parse_generate, _generate)
 
 
 def _generate(options: argparse.Namespace, say: Say, stop: Stop) -> Report:
     attributes, movement = parsed(", ".join(options.attributes)), None
     if options.blend is not None:
-        if lacking := missing_packages():
-            raise ValueError(f"--blend: {lacking}; or leave out --blend")
-        from .people import movement_of  # needs numpy
-
         movement = movement_of(options)
     params = _params(options, attributes)
     report, clock = Report(), Clock(options.count)
@@ -105,8 +97,6 @@ class _Person:
                 ask(backend, "generate", {**self._params, "out_dir": str(made)}, self._stop, self._print_progress)
                 publish(made, self._folder, last=PERSON_FILE)
         if self._blend is not None:
-            from .people import person_blend  # needs numpy
-
             npz, person = self._folder / NPZ_FILE, self._folder / PERSON_FILE
             with staging(self._folder) as made:
                 person_blend(npz, person, made / self._blend, self.name, self._movement)

@@ -16,7 +16,7 @@ from ...backend.packages import Lock, Machine, chosen_compute, locks_for, read_l
 from ...backend.requests import sentence
 from ...backend.setup import state_of
 from ...formats.regular_files import is_local_path
-from ...places import EXTENSION, missing_packages, preference, set_up_folder
+from ...places import EXTENSION, preference, set_up_folder
 
 LOCKS = Path(__file__).resolve().parents[2] / "requirements"
 _LINE_BYTES_PER_S = 50e6 / 8
@@ -29,7 +29,7 @@ _SELF_TEST_S = 30.0
 class Known:
     """Which Python would run the backend."""
 
-    state: Literal["named", "own Python", "ready", "outdated", "broken", "absent", "lacking"]
+    state: Literal["named", "own Python", "ready", "outdated", "broken", "absent"]
     usable: bool
     line: str
     """For the panels."""
@@ -40,9 +40,7 @@ class Known:
 
 
 def known() -> Known:
-    """Which Python would run the backend, in the order in which it is searched; whether Blender can show humans."""
-    if lacking := missing_packages():
-        return Known("lacking", False, sentence(lacking))
+    """Which Python would run the backend, in the order in which it is searched."""
     if named := preference("backend_python"):
         if not is_local_path(named):
             return Known("named", False, sentence(NOT_ABSOLUTE.format("a Python", named[:200])))

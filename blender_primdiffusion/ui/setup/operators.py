@@ -13,6 +13,7 @@ from ...backend import environment, setup
 from ...backend.packages import read_lock
 from ...backend.requests import sentence
 from ...backend.setup import Steps
+from ...engine import studio
 from ...jobs.queue import queue
 from ...places import CACHE_VARIABLE, backend_module_path, cache_folder, preference, set_up_folder
 from ..preferences import NOTHING_TO_CANCEL
@@ -164,8 +165,6 @@ def _begin(operator: bpy.types.Operator, make: Callable[[], Steps], *, replaces:
 
 def _release_environment() -> None:
     """End the children that run on the environment: their files could not be replaced. Raises ValueError."""
-    from ...engine import studio  # needs numpy
-
     if queue.busy:
         raise ValueError("The backend is at work; wait until it is done, or press Cancel")
     queue.close()
@@ -270,7 +269,7 @@ class PRIMDIFFUSION_OT_test_backend(bpy.types.Operator):
     def execute(self, context: bpy.types.Context) -> set[str]:
         now = known.known()
         if not now.usable:
-            remedy = "" if now.state in {"lacking", "named"} else ": press Set Up Backend first, or name a Python"
+            remedy = "" if now.state == "named" else ": press Set Up Backend first, or name a Python"
             self.report({"ERROR"}, f"{now.line}{remedy}")
             return {"CANCELLED"}
         return _begin(self, testing, replaces=False)

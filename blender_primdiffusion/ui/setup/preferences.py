@@ -29,8 +29,6 @@ def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
         return True
     box = layout.box()
     draw_lines(box, now.line, "ERROR", width)
-    if now.state == "lacking":
-        return False
     if now.state == "named" or not draw_cost(box, width):
         props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
         props.module = EXTENSION
@@ -112,8 +110,6 @@ class PRIMDIFFUSION_AP_preferences(CommonPreferences, bpy.types.AddonPreferences
             return
         now, folder = known(), set_up_folder()
         draw_lines(box, now.line, _icon(now), WIDTH)
-        if now.state == "lacking":
-            return
         if now.usable and now.works is None:
             draw_lines(box, "Not tested yet: press Test", "BLANK1", WIDTH)
         if folder.environment.is_dir():

@@ -12,7 +12,7 @@ from engine_stage import PYTHON, Oracle
 from gpu_stage import placed
 
 import blender_primdiffusion
-from blender_primdiffusion.engine.gpu_march import GpuMarcher, GpuPayload
+from blender_primdiffusion.engine.gpu.march import GpuMarcher, GpuPayload
 
 
 @pytest.fixture(scope="module")

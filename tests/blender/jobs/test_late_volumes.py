@@ -10,7 +10,7 @@ import pytest
 from late_volumes_stage import COUNT, advance, check_complete, generated, on_disk, paths_of
 
 import blender_primdiffusion
-from blender_primdiffusion.engine.overlay import overlay
+from blender_primdiffusion.engine.gpu.overlay import overlay
 from blender_primdiffusion.jobs import late_volumes as module
 from blender_primdiffusion.jobs import windows
 from blender_primdiffusion.jobs.late_volumes import late_volumes

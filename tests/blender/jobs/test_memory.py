@@ -79,7 +79,7 @@ def test_an_idle_child_is_ended_after_the_minutes_of_the_preferences(addon, monk
 def test_grids_are_given_back_with_an_idle_child_but_not_under_a_render(addon, monkeypatch, renders):
     started_and_idle()
     freed = []
-    monkeypatch.setattr("blender_primdiffusion.scene.volumes.free_unused_grids", lambda: freed.append(1))
+    monkeypatch.setattr(memory, "free_unused_grids", lambda: freed.append(1))
     monkeypatch.setattr(memory, "idle_minutes", lambda: 10.0)
     monkeypatch.setattr(memory, "bpy", SimpleNamespace(app=SimpleNamespace(is_job_running=lambda _: renders)))
     assert memory.release_when_idle(queue.idle_since + 601)

@@ -12,8 +12,8 @@ from jobs_driven import drive, error_of, until_running
 from support.fake_child import DIES, TAKES_LONG
 
 import blender_primdiffusion
-from blender_primdiffusion.engine import billboard
-from blender_primdiffusion.engine.overlay import overlay
+from blender_primdiffusion.engine.gpu import billboard
+from blender_primdiffusion.engine.gpu.overlay import overlay
 from blender_primdiffusion.jobs import picture_in_view as module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob

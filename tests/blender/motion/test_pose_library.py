@@ -176,7 +176,7 @@ def test_a_pose_whose_picture_cannot_be_written_or_is_missing_is_in_the_library_
     def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("blender_primdiffusion.formats.picture_files.write_png", full)
+    monkeypatch.setattr("blender_primdiffusion.ui.pose_panel.write_png", full)
     assert ops.save_pose(pose_name="mine") == {"FINISHED"}
     assert "The pose 'mine' has no picture: [Errno 28] No space left" in capfd.readouterr().out
     assert "mine" in [item[0] for item in pose_panel.pose_items(None, addon)]

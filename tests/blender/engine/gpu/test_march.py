@@ -10,8 +10,8 @@ import pytest
 from engine_stage import STEP
 from gpu_stage import boxes_of, pinhole, placed, read
 
-from blender_primdiffusion.engine import gpu_march
-from blender_primdiffusion.engine.gpu_march import Boxes, GpuPayload
+from blender_primdiffusion.engine.gpu import march as gpu_march
+from blender_primdiffusion.engine.gpu.march import Boxes, GpuPayload
 from blender_primdiffusion.engine.view import NO_SURFACE_M, PARALLEL_M, view_from_matrices
 from blender_primdiffusion.scene.convention import BLENDER_FROM_BACKEND
 

@@ -10,15 +10,15 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.human import BODY_MARK
-from ..scene.human_file import file_version
-from ..scene.proxy import PROXY_MARK
-from . import studio
-from .boxes import Boxes, EarlierVersionError
-from .gpu_march import GpuPayload
-from .picture import PosedHuman, human_armatures, pose_of
-from .solids import visible_instances
-from .who_draws import Drawer, who_draws
+from ...scene.human import BODY_MARK
+from ...scene.human_file import file_version
+from ...scene.proxy import PROXY_MARK
+from ..boxes import Boxes, EarlierVersionError
+from ..picture import PosedHuman, human_armatures, pose_of
+from ..solids import visible_instances
+from ..who_draws import Drawer, who_draws
+from .humans import gpu_humans
+from .march import GpuPayload
 
 READING_S = 0.1
 """Time for reading the files of new humans in one go."""
@@ -110,8 +110,8 @@ class SceneReader:
             try:
                 if isinstance(pose, Exception):
                     raise pose
-                key, known = _key(pose), studio.gpu_humans().holds(pose)
-                placed = self._placed.get(key) or studio.gpu_humans().placed(pose)
+                key, known = _key(pose), gpu_humans().holds(pose)
+                placed = self._placed.get(key) or gpu_humans().placed(pose)
             except (ValueError, OSError) as error:
                 if "volume" not in shown:  # Blender's fog shows where the human is
                     errors.append(_EARLIER.format(owner.name) if isinstance(error, EarlierVersionError) else str(error))
@@ -120,7 +120,7 @@ class SceneReader:
             if not known and number < len(candidates) and time.monotonic() > end:
                 complete = False
                 break
-        studio.gpu_humans().keep_only(human.pose for human in humans.values())
+        gpu_humans().keep_only(human.pose for human in humans.values())
         self._placed = {key: human.placed for key, human in humans.items()}
         return SceneReading(humans, np.concatenate(bones), complete, errors[-1])
 

@@ -14,11 +14,11 @@ import synthetic_shape
 from engine_stage import cube
 from mathutils import Matrix
 
-from blender_primdiffusion.engine import overlay as module
-from blender_primdiffusion.engine import scene_reading, studio
 from blender_primdiffusion.engine.boxes import Boxes, boxes_of
-from blender_primdiffusion.engine.gpu_start import GpuStart
-from blender_primdiffusion.engine.overlay import Overlay
+from blender_primdiffusion.engine.gpu import overlay as module
+from blender_primdiffusion.engine.gpu import scene_reading
+from blender_primdiffusion.engine.gpu.overlay import Overlay
+from blender_primdiffusion.engine.gpu.start import GpuStart
 from blender_primdiffusion.engine.view import NO_SURFACE_M
 from blender_primdiffusion.scene.attachment import show_in_viewport
 from blender_primdiffusion.scene.body_file import BODY_FILE, body_file, saved_body_file, shape_model_of
@@ -26,6 +26,7 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import armature_of, body_of, person_file
 from blender_primdiffusion.scene.shape import OPTIONAL_FIELDS
+from blender_primdiffusion.ui import viewport_humans
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
 SIZE = (40, 30)
@@ -55,7 +56,7 @@ class Uploads:
 def people(addon, tmp_path, monkeypatch):
     """Two humans whose volumes viewports hide, and the scene's overlay."""
     uploads = Uploads()
-    monkeypatch.setattr(studio, "gpu_humans", lambda: uploads)
+    monkeypatch.setattr(scene_reading, "gpu_humans", lambda: uploads)
     source = synthetic_shape.write(tmp_path / "human.npz", 12)
     found = []
     for name, x in (("Anna", 0.0), ("Bert", 1.0)):
@@ -156,7 +157,7 @@ def test_the_view_says_how_to_see_a_human_of_an_earlier_version(people, monkeypa
     def placed(pose):
         return None, boxes_of(pose)
 
-    monkeypatch.setattr(studio.gpu_humans(), "placed", placed)
+    monkeypatch.setattr(scene_reading.gpu_humans(), "placed", placed)
     early = dataclasses.replace(shape_model_of(people.anna), **dict.fromkeys(OPTIONAL_FIELDS))
     with saved_body_file(early, body_file(people.anna).parent) as name:
         people.anna[BODY_FILE] = name
@@ -308,7 +309,7 @@ def test_a_click_on_an_object_in_front_or_on_nothing_is_blenders(people):
 
 
 def test_clicks_select_extend_and_deselect(people, monkeypatch):
-    monkeypatch.setattr(module, "overlay", people.overlay)
+    monkeypatch.setattr(viewport_humans, "overlay", people.overlay)
     event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
     event["value"] = "CLICK"
 
@@ -335,7 +336,7 @@ def test_clicks_select_extend_and_deselect(people, monkeypatch):
 
 
 def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
-    monkeypatch.setattr(module, "overlay", people.overlay)
+    monkeypatch.setattr(viewport_humans, "overlay", people.overlay)
     click, held, begun = PRIMDIFFUSION_OT_click_human, SimpleNamespace(extend=False), []
     around = clickable(people)
     around.selected_objects, around.window_manager = [], SimpleNamespace(modal_handler_add=begun.append)

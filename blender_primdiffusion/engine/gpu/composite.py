@@ -10,8 +10,8 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-from .gpu_march import GpuMarch
-from .gpu_relief import ReliefPicture
+from .march import GpuMarch
+from .relief import ReliefPicture
 
 NO_PLANES: NDArray[np.float32] = np.zeros((1, 4), np.float32)
 _NOTHING = "1e9"

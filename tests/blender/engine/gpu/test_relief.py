@@ -8,8 +8,8 @@ import pytest
 from engine_stage import STEP
 from gpu_stage import boxes_of, pinhole, placed, read
 
-from blender_primdiffusion.engine.gpu_march import GpuPayload
-from blender_primdiffusion.engine.gpu_relief import ReliefPicture
+from blender_primdiffusion.engine.gpu.march import GpuPayload
+from blender_primdiffusion.engine.gpu.relief import ReliefPicture
 from blender_primdiffusion.engine.view import NO_SURFACE_M
 
 

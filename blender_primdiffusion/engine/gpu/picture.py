@@ -14,12 +14,12 @@ import gpu
 import numpy as np
 from mathutils import Matrix
 
-from .boxes import Boxes
-from .gpu_march import GpuMarch, GpuMarcher, GpuPayload
-from .gpu_relief import ReliefPicture
-from .gpu_shaders import TILE, compiled, shader_of
-from .solids import SceneSolids
-from .view import NO_SURFACE_M, PinholeView, opengl_projection
+from ..boxes import Boxes
+from ..solids import SceneSolids
+from ..view import NO_SURFACE_M, PinholeView, opengl_projection
+from .march import GpuMarch, GpuMarcher, GpuPayload
+from .relief import ReliefPicture
+from .shaders import TILE, compiled, shader_of
 
 _VERTEX = """
 void main()

@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .refine import FLUENT_S, REST_S
-from .view import PinholeView
+from ..refine import FLUENT_S, REST_S
+from ..view import PinholeView
 
 SLICE_S = 0.1
 SKETCH = 4

@@ -9,7 +9,7 @@ import gpu
 import numpy as np
 import pytest
 
-from blender_primdiffusion.engine.composite import ViewLook, draw_picture, keep_bones
+from blender_primdiffusion.engine.gpu.composite import ViewLook, draw_picture, keep_bones
 from blender_primdiffusion.engine.view import NO_SURFACE_M
 
 SIZE = (32, 16)

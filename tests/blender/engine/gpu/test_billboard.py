@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from mathutils import Matrix
 
-from blender_primdiffusion.engine import billboard
-from blender_primdiffusion.engine.billboard import HEIGHT_M, corners, figure_of
+from blender_primdiffusion.engine.gpu import billboard
+from blender_primdiffusion.engine.gpu.billboard import HEIGHT_M, corners, figure_of
 
 PLACE = np.array([2.0, 3.0, 0.5])
 

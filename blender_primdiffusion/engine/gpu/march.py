@@ -17,6 +17,7 @@ common one near the boxes. Records and lists are textures: Python gets storage b
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 
 import bpy
@@ -24,12 +25,12 @@ import gpu
 import numpy as np
 from numpy.typing import NDArray
 
-from . import gpu_shaders
-from .boxes import Boxes
-from .gpu_relief import GpuRelief
-from .gpu_shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
-from .relief import relief_of
-from .view import PinholeView
+from ..boxes import Boxes
+from ..relief import relief_of
+from ..view import PinholeView
+from . import shaders
+from .relief import GpuRelief
+from .shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
 
 STRIDES = [1, 2, 4]
 SAMPLES_PER_VOXEL = 2.0
@@ -39,10 +40,10 @@ MOST_DOUBLINGS = 16
 MOST_ENTRIES = 2**22
 """Of all tiles' lists; with more, boxes are listed for larger tiles."""
 _SHADERS = {
-    "list": gpu_shaders.list_shader,
-    "march": gpu_shaders.march_shader,
-    "copy": gpu_shaders.copy_shader,
-    "rebind": gpu_shaders.rebind_shader,
+    "list": shaders.list_shader,
+    "march": shaders.march_shader,
+    "copy": shaders.copy_shader,
+    "rebind": shaders.rebind_shader,
 }
 _OPTICAL = 1e-2
 _FAR_PIXEL = 1e6
@@ -402,3 +403,12 @@ def _texture(values: NDArray, format_: str) -> gpu.types.GPUTexture:
     return gpu.types.GPUTexture(
         tuple(reversed(values.shape[:-1])), format=format_, data=gpu.types.Buffer("FLOAT", flat.size, flat)
     )
+
+
+@functools.cache
+def gpu_marcher() -> GpuMarcher | str:
+    """The marcher on the GPU, or why there is none. Asked for while a view is drawn."""
+    try:
+        return GpuMarcher()
+    except RuntimeError as error:
+        return str(error)

@@ -9,8 +9,8 @@ import pytest
 from engine_stage import STEP
 from gpu_stage import boxes_of, pinhole, placed, read
 
-from blender_primdiffusion.engine.gpu_picture import GpuPicture, GpuScene, GpuSolids
-from blender_primdiffusion.engine.gpu_refine import SAMPLES, jittered
+from blender_primdiffusion.engine.gpu.picture import GpuPicture, GpuScene, GpuSolids
+from blender_primdiffusion.engine.gpu.refine import SAMPLES, jittered
 from blender_primdiffusion.engine.solids import SceneSolids
 from blender_primdiffusion.engine.view import view_from_matrices
 from blender_primdiffusion.scene.convention import BLENDER_FROM_BACKEND

@@ -16,16 +16,16 @@ import numpy as np
 from mathutils import Matrix, Vector
 from numpy.typing import NDArray
 
-from ..scene.convention import points_to_backend
-from .boxes import Boxes, seen_part
+from ...scene.convention import points_to_backend
+from ..boxes import Boxes, seen_part
+from ..camera import camera_frame
+from ..view import NO_SURFACE_M, PinholeView, view_from_matrices
 from .composite import NO_PLANES, Part, PictureTextures, ViewLook, draw_picture, keep_bones
-from .gpu_march import GpuMarch, GpuMarcher
-from .gpu_refine import REVEAL_S, GpuRefinement, MarchRequest
-from .gpu_relief import ReliefPicture
-from .gpu_start import gpu_start
+from .march import GpuMarch, GpuMarcher
+from .refine import REVEAL_S, GpuRefinement, MarchRequest
+from .relief import ReliefPicture
 from .scene_reading import SceneReader, SceneReading, ViewContent, concerns_humans
-from .view import NO_SURFACE_M, PinholeView, view_from_matrices
-from .viewport import camera_frame
+from .start import gpu_start
 
 TICK_S = 0.02
 START_S = 0.3

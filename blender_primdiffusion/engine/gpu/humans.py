@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterable
 
-from ..scene.human_file import FileVersion, file_version, read_payload
-from .boxes import Boxes, boxes_of
-from .gpu_march import GpuPayload
-from .picture import PosedHuman
+from ...scene.human_file import FileVersion, file_version, read_payload
+from ..boxes import Boxes, boxes_of
+from ..picture import PosedHuman
+from .march import GpuPayload
 
 PAYLOADS_KEPT = 4
 """Of humans that are no longer drawn; 4 MB each."""
@@ -41,3 +42,9 @@ class GpuHumans:
         others = [version for version in self._payloads if version.path not in files]
         for version in others[:-PAYLOADS_KEPT]:
             del self._payloads[version]
+
+
+@functools.cache
+def gpu_humans() -> GpuHumans:
+    """The humans on the GPU."""
+    return GpuHumans()

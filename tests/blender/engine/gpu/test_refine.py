@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from blender_primdiffusion.engine.gpu_refine import (
+from blender_primdiffusion.engine.gpu.refine import (
     REVEAL_S,
     SAMPLES,
     SKETCH,

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from . import studio
-from .boxes import Boxes
-from .gpu_march import GpuMarcher, GpuPayload
-from .view import PinholeView
+from ..boxes import Boxes
+from ..view import PinholeView
+from .march import GpuMarcher, GpuPayload
 
 
 class GpuStart:
@@ -49,7 +48,7 @@ class GpuStart:
         self.fault, self._steps, self._marcher = fault, None, None
 
     def _compiling(self) -> Iterator[None]:
-        marcher = studio.gpu_marcher()
+        marcher = gpu_marcher()
         if isinstance(marcher, str):
             raise RuntimeError(marcher)
         yield from marcher.compile()

@@ -1,5 +1,5 @@
 """The marcher's compute shaders (docs/design/marcher.md), in the GLSL that Blender translates for OpenGL, Vulkan and
-Metal. `gpu_march` documents the box records that they read."""
+Metal. `march` documents the box records that they read."""
 
 from __future__ import annotations
 
@@ -142,7 +142,7 @@ void main()
       vec4 high = record(box, 6);
       vec4 centre = record(box, 7);
 
-      /* The ray in the box is p + (n - n0) q, see `gpu_march`. */
+      /* The ray in the box is p + (n - n0) q, see `march`. */
       float du = (float(pixel.x) - centre.x) + centre.y;
       float dv = (float(pixel.y) - centre.z) + centre.w;
       float more = du * (down.w + du * metric.x) + dv * (middle.w + dv * metric.y);

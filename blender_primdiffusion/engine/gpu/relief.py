@@ -11,10 +11,10 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from .boxes import Boxes
-from .gpu_shaders import BOXES_A_ROW, shader_of
-from .relief import VISIBLE, Relief
-from .view import NO_SURFACE_M, PinholeView, opengl_projection
+from ..boxes import Boxes
+from ..relief import VISIBLE, Relief
+from ..view import NO_SURFACE_M, PinholeView, opengl_projection
+from .shaders import BOXES_A_ROW, shader_of
 
 _ROWS = 3
 """Texels of a box: the rows of its transform to the camera's coordinates."""
