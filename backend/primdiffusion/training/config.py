@@ -6,7 +6,7 @@ import dataclasses
 import json
 import math
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
@@ -102,14 +102,16 @@ class PhaseConfig:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """How a run of stage 2 is stopped, measured and saved; the same for each of its networks."""
+    """Where a run is, and how it is stopped, measured and saved: the same for every task."""
 
+    data: Path
+    """Training set."""
+    run: Path
+    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
     minutes: float | None = None
-    """Time limit, after which the run can be resumed."""
+    """Time limit, after which the run can be resumed; 0 writes the model of the last saved state."""
     seed: int = 0
     """Seed of all random numbers."""
-    holdout: float = 0.05
-    """Fraction of geometries, with all their colour variants, held out for evaluation."""
     save_every: float = 60.0
     """Seconds between checkpoints; 0 saves after every step."""
     threads: int | None = None
@@ -117,7 +119,7 @@ class RunSettings:
     log_every: int = 50
     """Steps between lines of metrics.jsonl, which are running means."""
     pictures_every: int = 1000
-    """Steps between images of samples from the averaged weights."""
+    """Steps between images made with the averaged weights."""
     tracker: Tracker | None = None
     """Where metrics go besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
 
@@ -129,17 +131,16 @@ class RunSettings:
         for name in ("minutes", "save_every"):
             value = getattr(self, name)
             _check(name, value, value is None or value >= 0, "0 or more")
-        _check("holdout", self.holdout, 0 < self.holdout < 1, "between 0 and 1")
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainingConfig(RunSettings):
     """Train a diffusion model; the same command line resumes (docs/design/diffusion_training.md)."""
 
     data: Path
     """Training set of `primdiffusion payloads`: a folder of files, or of shards from `payloads pack`."""
-    run: Path
-    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
+    holdout: float = 0.05
+    """Fraction of geometries, with all their colour variants, held out for evaluation."""
     more_data: Path | None = None
     """More humans, of `payloads --making from_mesh`: cheap, so they can be many, but blurred. The default preset learns
     from them what noise does not hide: the closed form, and its networks at levels above t = 300."""
@@ -186,6 +187,7 @@ class TrainingConfig(RunSettings):
             if getattr(self, name) is None:
                 object.__setattr__(self, name, value)
         super().__post_init__()
+        _check("holdout", self.holdout, 0 < self.holdout < 1, "between 0 and 1")
         if self.preset == "paper" and self.slab.weighting == "whitened":
             raise ValueError("slab.weighting is whitened, for which slabs have no closed form: choose plain or min_snr")
         if self.preset == "paper" and self.slab.optimiser == "muon":
@@ -232,16 +234,7 @@ _ADDED = {"unet.attention_context": "input", "slab.optimiser": "adamw"}
 """Settings of the paper preset that earlier runs do not name, and what they were."""
 
 
-class RunConfig(Protocol):
-    """Settings of a run of either stage: a dataclass with its folder and its data."""
-
-    @property
-    def run(self) -> Path: ...
-    @property
-    def data(self) -> Path: ...
-
-
-def check_resumable(saved: str, config: RunConfig) -> None:
+def check_resumable(saved: str, config: RunSettings) -> None:
     """Raise ValueError, naming the settings in which a saved run differs from `config`, except those allowed to."""
     try:
         before = _comparable(parse_json(saved))

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from primdiffusion.encoder.config import PRESETS
-from primdiffusion.training.config import Tracker
+from primdiffusion.training.config import RunSettings
 
 Preset = Literal[
     "default",
@@ -27,10 +27,7 @@ AT_LEAST_ONE = (
     "views",
     "targets",
     "size",
-    "threads",
-    "log_every",
     "evaluate_every",
-    "pictures_every",
 )
 
 
@@ -61,14 +58,12 @@ class LossConfig:
             raise ValueError("neither loss.rgb nor loss.perceptual has a weight: nothing would teach colours")
 
 
-@dataclasses.dataclass(frozen=True)
-class FitConfig:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitConfig(RunSettings):
     """A run of `primdiffusion fit`."""
 
     data: Path
     """Captures to train on; packed ones load much faster."""
-    run: Path
-    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
     held: Path | None = None
     """Captures of held-out subjects for evaluation."""
     encoder: Preset = "default"
@@ -105,14 +100,8 @@ class FitConfig:
     mixed_precision: Literal["no", "bf16"] = "no"
     """Precision of the network; the marcher runs in float32."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)
-    seed: int = 0
-    """Seed of all random numbers."""
-    minutes: float | None = None
-    """Time limit, after which the run can be resumed."""
     workers: int = 0
     """Data loading processes; 0 loads in the main process."""
-    threads: int | None = None
-    """CPU threads; the default is torch's."""
     save_every: float = 120.0
     """Seconds between checkpoints; 0 saves after every step."""
     log_every: int = 25
@@ -121,19 +110,18 @@ class FitConfig:
     """Steps between evaluations on a few subjects of `data` and `held`."""
     pictures_every: int = 500
     """Steps between images."""
-    tracker: Tracker | None = None
-    """Where metrics go besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
 
     def __post_init__(self) -> None:
         """Raise ValueError for values out of range."""
+        super().__post_init__()
         for name in AT_LEAST_ONE:
-            if getattr(self, name) is not None and getattr(self, name) < 1:
+            if getattr(self, name) < 1:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be 1 or more")
         for name in ("learning_rate", "place_rate", "step", "gradient_clip"):
             if not 0 < getattr(self, name) < math.inf:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be above 0")
-        for name in ("weight_decay", "hold_scale", "workers", "save_every", "minutes"):
-            if not (getattr(self, name) or 0) >= 0:
+        for name in ("weight_decay", "hold_scale", "workers"):
+            if not getattr(self, name) >= 0:
                 raise ValueError(f"{name} is {getattr(self, name)}: it must be 0 or more")
         if not 0 <= self.ema < 1:
             raise ValueError(f"ema is {self.ema}: it must be 0 or more, and below 1")
