@@ -155,7 +155,7 @@ def test_settings_that_cannot_be_are_named(captures, tmp_path, change):
 def test_losses_without_colour_are_rejected():
     with refused(ValueError, "colours"):
         LossConfig(rgb=0.0)
-    with refused(ValueError, "loss.volume"):
+    with refused(ValueError, "volume"):
         LossConfig(volume=-1.0)
 
 
