@@ -243,9 +243,9 @@ class FarmCaptures:
     """Attempts for a human whose worker or renderer is killed."""
 
     def run(self) -> None:
-        """Render, and print a line for each human. Raises FarmError if the cluster cannot start or a human fails."""
+        """Render, and print a line for each human. Raises ValueError if the cluster cannot start or a human fails."""
         # used by this subcommand alone
-        from primdiffusion.capture.farm import Farm, FarmError, FarmResult, render_on
+        from primdiffusion.capture.farm import Farm, FarmResult, render_on
 
         def show(outcome: FarmResult, done: int, total: int) -> None:
             print(f"{done}/{total}  {outcome.subject}  {outcome.error or f'{outcome.seconds:.0f} s'}", flush=True)
@@ -254,7 +254,7 @@ class FarmCaptures:
         outcomes = render_on(farm, self.command, show)
         failed = [outcome.subject for outcome in outcomes if outcome.exit_code]
         if failed:
-            raise FarmError(f"{len(failed)} of {len(outcomes)} humans are not finished: {', '.join(failed[:5])}")
+            raise ValueError(f"{len(failed)} of {len(outcomes)} humans are not finished: {', '.join(failed[:5])}")
 
 
 Command = (

@@ -16,10 +16,6 @@ Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Blender's axes from the backend's; applied before voxelising, because a grid cannot be rotated without resampling."""
 
 
-class NoOpenVDB(ValueError):
-    """This Python cannot write VDB files."""
-
-
 def upright_grid(primitives: Primitives, voxel: float = VOXEL) -> Merged:
     """Merge `primitives` (y up, unbatched) into one z-up grid. Raises as `merge`."""
     return merge(
@@ -46,18 +42,18 @@ def write_grid_npz(path: Path, grid: Merged) -> None:
 
 
 def check_openvdb() -> None:
-    """Raise NoOpenVDB if the module `openvdb` is missing."""
+    """Raise ValueError if the module `openvdb` is missing."""
     try:
         import openvdb  # noqa: F401  optional dependency
     except ImportError as error:
-        raise NoOpenVDB(
+        raise ValueError(
             "writing .vdb needs the module openvdb: install it (Debian and Ubuntu: python3-openvdb; Blender bundles "
             "its own), or write an .npz"
         ) from error
 
 
 def write_grid_vdb(path: Path, grid: Merged) -> None:
-    """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) as half floats. Raises NoOpenVDB, OSError."""
+    """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) in float16. Raises ValueError, OSError."""
     check_openvdb()
     import openvdb  # optional dependency
 

@@ -97,9 +97,8 @@ def looks_of(
     """Return the payloads of a subject, on the CPU, and the betas of the body that carries the boxes.
 
     Raises:
-        FileNotFoundError, ConditioningError, CaptureFileError, ArrayFileError, BodyFileError: captures are missing,
-            damaged or of another body.
-        ValueError: the pictures lead to numbers that are not finite.
+        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: captures are missing or damaged.
+        ValueError: they are of another body; the pictures lead to numbers that are not finite.
     """
     subject = captures.subject(name)
     given = body_betas(subject, model.body)

@@ -56,7 +56,7 @@ def train(config: TrainingConfig) -> DiffusionModel:
 
     Raises:
         ValueError: invalid settings, or settings or people other than those the run in this folder began with; people
-            of different full densities; a loss or gradient that is not finite (NotFiniteError); out of memory; a
+            of different full densities; a loss or gradient that is not finite; out of memory; a
             damaged file (ShardError among them).
         FileNotFoundError: there are fewer than two people.
         MissingPackageError: the tracker's package is not installed.

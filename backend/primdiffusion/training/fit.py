@@ -59,7 +59,7 @@ def fit(config: FitConfig) -> EncoderModel:
 
     Raises:
         ValueError: settings that cannot be, or others than those with which the run in this folder began; captures
-            without a frame, or of another body; objective or gradient that are not finite (NotFiniteError); too little
+            without a frame, or of another body; objective or gradient that are not finite; too little
             memory (says which batch to try).
         FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError, WeightsFileError: files are missing or
             damaged.

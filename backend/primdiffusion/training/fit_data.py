@@ -83,7 +83,7 @@ def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
     """Return the betas of all subjects on the default body.
 
     Raises:
-        ConditioningError: a subject was captured on another body model.
+        ValueError: a subject was captured on another body model.
         FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a camera has no images, a file is damaged.
     """
     return torch.stack([default_betas(captures.subject(name)) for name in captures.subjects])

@@ -33,7 +33,7 @@ from primdiffusion.failures import out_of_memory
 from primdiffusion.formats.json_files import parse_message
 from primdiffusion.training.config import RunSettings
 from primdiffusion.training.run_folder import PICTURES, Metrics, open_metrics, state_path
-from primdiffusion.training.state import NotFiniteError, PhaseSettings, TrainingState, adamw, agreed
+from primdiffusion.training.state import PhaseSettings, TrainingState, adamw, agreed
 
 log = logging.getLogger(__name__)
 
@@ -135,7 +135,7 @@ def train(task: Task, config: RunSettings, accelerator: Accelerator) -> dict[str
     end a run between two steps.
 
     Raises:
-        ValueError: loss, gradient or weights are not finite (NotFiniteError); out of memory; a saved state is damaged
+        ValueError: loss, gradient or weights are not finite; out of memory; a saved state is damaged
             or of another network.
         OSError: the disk is full; the last saved state remains.
     """
@@ -182,7 +182,7 @@ def begin_phase(task: Task, phase: str, accelerator: Accelerator) -> TrainingSta
 def take_step(task: Task, phase: str, seed: int, state: TrainingState) -> StepMetrics:
     """Take one optimiser step; its random numbers depend only on seed, phase, step and process.
 
-    Raises ValueError: the loss or its gradient is not finite (NotFiniteError); out of memory.
+    Raises ValueError: the loss or its gradient is not finite; out of memory.
     """
     device = state.accelerator.device
     seed = step_seed(seed, phase, state.step, state.accelerator.process_index)
@@ -194,7 +194,7 @@ def take_step(task: Task, phase: str, seed: int, state: TrainingState) -> StepMe
         values = {name: float(term.detach()) for name, term in terms.items()}
         if bad := [name for name, value in values.items() if not math.isfinite(value)]:
             which = f"of {phase!r}" if phase else f"({', '.join(bad)})"
-            raise NotFiniteError(
+            raise ValueError(
                 f"the loss {which} at step {state.step} is not finite: lower {_option(phase, 'learning-rate')} in a "
                 "new run folder"
             )

@@ -49,7 +49,7 @@ PROJECT = "primdiffusion"
 def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accelerate.Accelerator]:
     """Hold the folder of a run, by the first of its processes, and yield the accelerator of this process.
 
-    Raises MissingPackageError for the tracker's package; FolderInUseError, OSError.
+    Raises MissingPackageError for the tracker's package; ValueError, OSError.
     """
     if config.threads:
         torch.set_num_threads(config.threads)

@@ -42,10 +42,6 @@ class PhaseSettings(Protocol):
     def evaluate_every(self) -> int: ...
 
 
-class NotFiniteError(FloatingPointError, ValueError):
-    """Training diverged; the message names the step and the remedy."""
-
-
 class TrainingState:
     """A network with optimiser, weight average and number of steps; saved and loaded as one file.
 
@@ -73,7 +69,7 @@ class TrainingState:
     def update(self, loss: Tensor) -> float:
         """Take one optimiser step and update the average; returns the gradient's norm before clipping.
 
-        Raises NotFiniteError if the gradient is not finite.
+        Raises ValueError if the gradient is not finite.
         """
         rate = self.settings.learning_rate * learning_rate_factor(self.step, self.settings.steps)
         for group in self.optimiser.param_groups:
@@ -82,7 +78,7 @@ class TrainingState:
         self.accelerator.backward(loss)
         norm = self.accelerator.clip_grad_norm_(self.prepared.parameters(), self.settings.gradient_clip)
         if norm is None or not norm < math.inf:
-            raise NotFiniteError(
+            raise ValueError(
                 f"the gradient at step {self.step} is not finite: lower the learning rate in a new run folder"
             )
         self.optimiser.step()
@@ -96,14 +92,14 @@ class TrainingState:
     def save(self, path: Path) -> None:
         """Write everything to one safetensors file, atomically.
 
-        Raises NotFiniteError, leaving the file as it was, if a weight is not finite; OSError.
+        Raises ValueError, leaving the file as it was, if a weight is not finite; OSError.
         """
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
         if bad := _not_finite(tensors):
-            raise NotFiniteError(
+            raise ValueError(
                 f"{bad} is not finite after step {self.step}: lower the learning rate in a new run folder; {path} "
                 "was not overwritten"
             )
