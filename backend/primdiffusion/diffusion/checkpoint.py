@@ -27,7 +27,7 @@ from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import JsonError, parse_json
-from primdiffusion.formats.regular_files import TooLargeError, open_regular
+from primdiffusion.formats.regular_files import FileError, TooLargeError, open_regular
 from primdiffusion.formats.schema import FieldError, Open, Range, read
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
@@ -77,10 +77,6 @@ class ModelConfig(Open):
         return read(UNetConfig, {"attention_context": "input", **self.config})
 
 
-class CheckpointError(ValueError):
-    """A checkpoint that cannot be used; the message names the file and the remedy."""
-
-
 def default_checkpoint() -> Path:
     """Path of the weights that ship with the package."""
     return Path(str(resources.files("primdiffusion.weights") / "default.safetensors"))
@@ -119,16 +115,17 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
 def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], ModelConfig, dict[str, Any]]:
     """Return tensors in float32, configuration and card (with the file's SHA-256) of a checkpoint of any kind.
 
-    Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
+    Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
     format or version, or holds values that are not finite.
     """
     tensors, metadata, digest = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
         architecture, card = parse_json(metadata["architecture"]), parse_json(metadata["card"])
         if "detail" in architecture:
-            raise CheckpointError(
-                f"{path} has a detail decoder, which this version no longer reads: train a new checkpoint, or use the "
-                "default one"
+            raise FileError(
+                path,
+                "has a detail decoder, which this version no longer reads",
+                "train a new checkpoint, or use the default one",
             )
         return tensors, read(ModelConfig, architecture), {**card, "sha256": digest}
 
@@ -146,14 +143,12 @@ def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor],
 
 @contextlib.contextmanager
 def mismatches_named(path: Path, *also: type[Exception]) -> Iterator[None]:
-    """Raise CheckpointError for errors (and `also`) caused by tensors that contradict the file's own architecture."""
+    """Raise FileError for errors (and `also`) caused by tensors that contradict the file's own architecture."""
     try:
         yield
     except (KeyError, TypeError, JsonError, FieldError, RuntimeError, *also) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
-        raise CheckpointError(
-            f"{path} does not match its own description ({reason}): download or train it again"
-        ) from error
+        raise FileError(path, f"does not match its own description ({reason})", "download or train it again") from error
 
 
 def file_hash(path: Path) -> str:
@@ -177,7 +172,7 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
 def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:
     """Load a model in float32 (without a path: the default checkpoint), trained here or imported (`released`).
 
-    Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
+    Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
     format or version, does not match its own architecture or holds values that are not finite. An imported one raises
     BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
     """
@@ -316,14 +311,13 @@ def _check_there(path: Path) -> None:
 
 def _check_format(path: Path, metadata: Mapping[str, str], formats: Sequence[str]) -> None:
     if metadata.get("format") not in formats:
-        raise CheckpointError(
-            f"{path} is a safetensors file of format {metadata.get('format')!r:.40}, not "
-            f"{formats[0]!r}: choose another file"
+        raise FileError(
+            path, f"has the format {metadata.get('format')!r:.40}, not {formats[0]!r}", "choose another file"
         )
     if metadata.get("format_version") != _READABLE[metadata["format"]]:
         version, readable = metadata.get("format_version"), _READABLE[metadata["format"]]
-        raise CheckpointError(
-            f"{path} has format version {version!s:.20}, this program reads {readable}: use the matching release"
+        raise FileError(
+            path, f"has format version {version!s:.20}, this program reads {readable}", "use the matching release"
         )
 
 
@@ -334,16 +328,16 @@ def _damage_named(path: Path) -> Iterator[None]:
     except TooLargeError:
         raise
     except (ValueError, OSError) as error:
-        raise CheckpointError(
-            f"{path} is damaged or no safetensors file ({error!s:.160}): download or train it again"
+        raise FileError(
+            path, f"is damaged or no safetensors file ({error!s:.160})", "download or train it again"
         ) from error
 
 
 def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Raise CheckpointError for NaN or infinite values."""
+    """Raise FileError for NaN or infinite values."""
     for key, value in tensors.items():
         if not torch.isfinite(value).all():
-            raise CheckpointError(f"{path}: weights {key!r} hold NaN or infinite values: download or train them again")
+            raise FileError(path, f"has NaN or infinite values in {key!r}", "download or train it again")
 
 
 def _fields(prefix: str, record: TensorRecord) -> dict[str, Tensor]:

@@ -57,7 +57,7 @@ def train(config: TrainingConfig) -> DiffusionModel:
     Raises:
         ValueError: invalid settings, or settings or people other than those the run in this folder began with; people
             of different full densities; a loss or gradient that is not finite; out of memory; a
-            damaged file (ShardError among them).
+            damaged file (FileError among them).
         FileNotFoundError: there are fewer than two people.
         MissingPackageError: the tracker's package is not installed.
         OSError: the disk is full; the last saved state remains.

@@ -61,7 +61,7 @@ def fit(config: FitConfig) -> EncoderModel:
         ValueError: settings that cannot be, or others than those with which the run in this folder began; captures
             without a frame, or of another body; objective or gradient that are not finite; too little
             memory (says which batch to try).
-        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError, WeightsFileError: files are missing or
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: files are missing or
             damaged.
         OSError: there is no room; the last whole state remains.
     """
@@ -161,7 +161,7 @@ class EncoderTask(Task):
     def save(self, state: TrainingState) -> None:
         """Write the encoder, atomically. A kill before the state is written leaves one newer than the state.
 
-        Raises CheckpointError, leaving the file as it was, if a weight is not finite; OSError.
+        Raises FileError, leaving the file as it was, if a weight is not finite; OSError.
         """
         save_encoder(self.config.run / MODEL, self.model(state))
 

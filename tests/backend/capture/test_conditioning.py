@@ -17,11 +17,12 @@ from primdiffusion.capture.conditioning import (
     default_betas,
     spread_cameras,
 )
-from primdiffusion.capture.reader import CaptureFileError, Subject, open_captures
+from primdiffusion.capture.reader import Subject, open_captures
 from primdiffusion.capture.render import render
 from primdiffusion.capture.smpl_parameters import SmplParameters
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.capture_layout import picture_path, write_smpl
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from support.errors import refused
 
@@ -122,7 +123,7 @@ def test_a_missing_picture_is_named(folder):
 def test_a_mask_of_another_size_is_named(folder):
     path = picture_path(folder / FIRST, "mask", 1, 0)
     Image.new("L", (16, 32), 255).save(path)
-    with refused(CaptureFileError, str(path)):
+    with refused(FileError, str(path)):
         captured_person(folder, FIRST)
 
 
