@@ -17,17 +17,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from accelerate.utils import set_seed
 from primdiffusion.capture.reader import Captures, open_captures
-from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder, save_encoder
-from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary
-from primdiffusion.training.fit import model_of, steps
+from primdiffusion.training.fit import EncoderTask
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.fit_data import fit_dataset
-from primdiffusion.training.fit_run import FitState
-from primdiffusion.training.state import accelerator_of
+from primdiffusion.training.loop import begin_phase, take_step
+from primdiffusion.training.state import TrainingState, accelerator_of
 from record import command_line, report
 
 FORMS = {
@@ -94,32 +90,34 @@ def train(arguments: argparse.Namespace, preset: str, captures: Captures, path: 
     tried = list(timed_steps(settings(arguments, preset, TRIED), captures))
     seconds = 60 * arguments.minutes
     planned = max(TRIED, round(seconds / statistics.median([one.seconds for one in tried[2:]])))
-    config, state, total = settings(arguments, preset, planned), tried[-1].state, 0.0
-    for taken in timed_steps(config, captures):
-        state, total = taken.state, total + taken.seconds
-        if state.step % 50 == 0:
-            print(preset, state.step, "of", planned, f"{total:.0f} s, loss {taken.loss:.4f}", flush=True)
+    taken, total = tried[-1], 0.0
+    for taken in timed_steps(settings(arguments, preset, planned), captures):
+        total += taken.seconds
+        if taken.state.step % 50 == 0:
+            print(preset, taken.state.step, "of", planned, f"{total:.0f} s, loss {taken.loss:.4f}", flush=True)
         if total > seconds:
             break
-    state.seconds = total
-    save_encoder(path, model_of(config, state, captures))
+    taken.state.seconds = total
+    save_encoder(path, taken.task.model(taken.state))
 
 
 class Taken(NamedTuple):
     """A step of training."""
 
-    state: FitState
+    task: EncoderTask
+    state: TrainingState
     seconds: float
     loss: float
 
 
 def timed_steps(config: FitConfig, captures: Captures) -> Iterator[Taken]:
     """The steps of `primdiffusion fit`, and the processor's seconds of each."""
-    set_seed(config.seed)
-    state = FitState(Encoder(PRESETS[config.encoder]), config, accelerator_of())
+    task = EncoderTask(config, captures, accelerator_of())
+    state = begin_phase(task, "", task.accelerator)
     began = time.process_time()
-    for progress in steps(config, state, fit_dataset(captures, config)):
-        yield Taken(state, time.process_time() - began, sum(progress.terms.values()))
+    while state.step < config.steps:
+        progress = take_step(task, "", config.seed, state)
+        yield Taken(task, state, time.process_time() - began, sum(progress.terms.values()))
         began = time.process_time()
 
 

@@ -36,13 +36,14 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.payloads import rest_frames
-from primdiffusion.training.cells import CellTrainee, prepare
+from primdiffusion.training.cells import CellTask, prepare
 from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, split_people, vocabulary_of
+from primdiffusion.training.loop import step_seed
 from primdiffusion.training.losses import PersonObjective, RestObjective
 from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.shards import open_people
-from primdiffusion.training.state import TrainingState
+from primdiffusion.training.state import TrainingState, accelerator_of
 from primdiffusion.training.stored_people import find_people, read_outline, read_person
 from safetensors.torch import load_file, save
 from torch import Tensor
@@ -111,7 +112,7 @@ def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export:
     if not plan.is_file():
         plan.write_text(json.dumps(planned_steps(denoiser, name, run, seconds)))
     config = dataclasses.replace(run.phases[name], steps=json.loads(plan.read_text()))
-    state = TrainingState(network, config, run.seed + 1)
+    state = TrainingState(network, config, accelerator_of())
     if stored.is_file():
         state.load(stored)
     objective = run.objectives(name, config)
@@ -126,7 +127,7 @@ def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export:
 
     while state.seconds < seconds:
         began = time.process_time()
-        loss = objective.loss(state.generator)
+        loss = objective.loss(numbers(run.seed + 1, name, state.step))
         state.update(loss)
         mean += (float(loss.detach()) - mean) / min(state.step, 200)
         state.seconds += time.process_time() - began
@@ -138,18 +139,25 @@ def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export:
     denoiser.network_dtype = torch.float32
 
 
+def numbers(seed: int, name: str, step: int) -> torch.Generator:
+    """The random numbers of a step: a run that goes on draws those that it would have drawn."""
+    seed = step_seed(seed, name, step, 0)
+    torch.manual_seed(seed)
+    return torch.Generator().manual_seed(seed)
+
+
 def planned_steps(denoiser: PersonDenoiser, name: str, run: Run, seconds: float) -> int:
     """How many steps fit into the time, by a few of a network that is thrown away: the rate falls over as many."""
     config = dataclasses.replace(run.phases[name], steps=1000)
     network = getattr(denoiser, name)
     weights = {key: value.clone() for key, value in network.state_dict().items()}
-    state = TrainingState(network, config, 0)
+    state = TrainingState(network, config, accelerator_of())
     objective = run.objectives(name, config)
     denoiser.network_dtype = torch.bfloat16 if config.bfloat16 else torch.float32
     times = []
     for _ in range(TRIED):
         began = time.process_time()
-        state.update(objective.loss(state.generator))
+        state.update(objective.loss(numbers(run.seed, name, state.step)))
         times.append(time.process_time() - began)
     network.load_state_dict(weights)
     return max(1, round(seconds / statistics.median(times[2:])))
@@ -218,35 +226,21 @@ def train_model(config: TrainingConfig, kind: str, out: Path, minutes: float, th
     """Trains both networks of a model; the prepared parts are those of `config.run`."""
     people = open_people(config.data)
     prepared = prepare(config, people, *split_people(range(len(people.names)), config.holdout, config.seed))
-    trainee = CellTrainee(config, prepared, torch.device("cpu"))
-    denoiser = trainee.denoiser
+    task = CellTask(config, prepared, torch.device("cpu"))
+    denoiser = task.denoiser
 
     def objective(name: str, phase: PhaseConfig) -> Objective:
         if name == "local" and kind == "latents":
             return DecoderObjective(denoiser, prepared.train, prepared.codec, phase)
-        return _OfTrainee(trainee, name)
+        return task.objective(name)
 
     def save(about: dict[str, object]) -> None:
         named = {"name": f"{kind}, of a comparison on equal time", "baseline": kind}
         card = {**named, "full_density": prepared.full_density, **about}
-        save_checkpoint(
-            out / "model.safetensors", dataclasses.replace(trainee.model(), card=card), str(config.schedule)
-        )
+        save_checkpoint(out / "model.safetensors", dataclasses.replace(task.model(), card=card), str(config.schedule))
 
-    run = Run(objective, trainee.phases, out, config.seed)
+    run = Run(objective, task.phases, out, config.seed)
     train_both(denoiser, run, prepared.train, minutes, threads, save)
-
-
-@dataclasses.dataclass
-class _OfTrainee:
-    """The objective with which `primdiffusion train` trains a network."""
-
-    trainee: CellTrainee
-    name: str
-
-    def loss(self, generator: torch.Generator) -> Tensor:
-        """Loss of a random batch."""
-        return self.trainee.loss(self.name, generator)
 
 
 def voxels() -> None:

@@ -30,7 +30,7 @@ from primdiffusion.formats import compact_human
 from primdiffusion.formats.arrays import write_stored
 from primdiffusion.formats.human_metadata import check_provenance, provenance_of, version_fault
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.regular_files import TooLargeError
+from primdiffusion.formats.regular_files import FileError, TooLargeError
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, body_of
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
@@ -54,11 +54,7 @@ _KNOWN = (*SHAPES, *_EXTENTS)
 """Whatever else a file holds, such as a motion, is not read."""
 
 
-class HumanFileError(ValueError):
-    """A file without a human that this version can read."""
-
-
-class NoPersonError(HumanFileError):
+class NoPersonError(FileError):
     """A safetensors file without a human."""
 
 
@@ -96,7 +92,7 @@ def format_version(human: Human) -> int:
 def load_human(path: str | Path) -> Human:
     """Read and validate a `.human.safetensors` file.
 
-    Raises FileNotFoundError, and HumanFileError (a ValueError) for a file that is damaged, newer or of another kind.
+    Raises FileNotFoundError, and FileError (a ValueError) for a file that is damaged, newer or of another kind.
     """
     path = Path(path)
     if not path.is_file():
@@ -107,7 +103,7 @@ def load_human(path: str | Path) -> Human:
     except TooLargeError:
         raise
     except (ValueError, OSError) as e:
-        raise HumanFileError(f"{path} is damaged or no safetensors file ({e!s:.160}): generate the human again") from e
+        raise FileError(path, f"is damaged or no safetensors file ({e!s:.160})", "generate the human again") from e
     _check_format(path, metadata)
     tensors = _expanded(path, tensors, metadata)
     _check_shapes(path, tensors)
@@ -118,17 +114,17 @@ def load_human(path: str | Path) -> Human:
         human = Human(payload, tensors["betas"], provenance_of(metadata), body_setup).validate()
         _check_values(human)
     except BodySetupError as e:
-        raise HumanFileError(f"{path}: {e}") from e
+        raise FileError(path, "needs its body", str(e)) from e
     except ValueError as e:
-        raise HumanFileError(f"{path} does not contain a valid human: {e}") from e
+        raise FileError(path, "does not contain a valid human", str(e)) from e
     return human
 
 
 def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
     if metadata.get("format") != FORMAT:
-        raise NoPersonError(f"{path} is a safetensors file without a human: choose a .human.safetensors file")
+        raise NoPersonError(path, "is a safetensors file without a human", "choose a .human.safetensors file")
     if fault := version_fault(metadata):
-        raise HumanFileError(f"{path} {fault}")
+        raise FileError(path, fault)
 
 
 def _body_setup(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, torch.Tensor]) -> BodySetup:
@@ -144,7 +140,7 @@ def _expanded(path: Path, tensors: dict[str, torch.Tensor], metadata: Mapping[st
         stored = {name: tensors[name].numpy() for name in ("rgb", "density") if name in tensors}
         expanded = compact_human.expand(stored, metadata[compact_human.METADATA])
     except (ValueError, KeyError, TypeError) as e:  # numpy has no bfloat16
-        raise HumanFileError(f"{path} does not contain a valid human ({e!s:.100}): generate it again") from e
+        raise FileError(path, f"does not contain a valid human ({e!s:.100})", "generate it again") from e
     return {**tensors, **{name: torch.from_numpy(values) for name, values in expanded.items()}}
 
 
@@ -153,15 +149,15 @@ def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
         if name not in tensors:
             if name in _EXTENTS:
                 continue
-            raise HumanFileError(f"{path} does not contain a valid human ({name} is missing): generate it again")
+            raise FileError(path, f"does not contain a valid human ({name} is missing)", "generate it again")
         if tuple(tensors[name].shape) != shape or tensors[name].dtype not in _FLOATS:
             given = f"{tensors[name].dtype} {tuple(tensors[name].shape)}"
-            raise HumanFileError(
-                f"{path} does not contain a valid human ({name} is {given}, not {shape}): generate it again"
+            raise FileError(
+                path, f"does not contain a valid human ({name} is {given}, not {shape})", "generate it again"
             )
         if name in _EXTENTS and float(tensors[name].abs().max()) > compact_human.LARGEST_VALUE:
-            raise HumanFileError(
-                f"{path} does not contain a valid human ({name} holds impossible values): generate it again"
+            raise FileError(
+                path, f"does not contain a valid human ({name} holds impossible values)", "generate it again"
             )
 
 

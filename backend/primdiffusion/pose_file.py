@@ -23,17 +23,13 @@ LARGEST_NUMBER = 1e6
 """Radians and metres in a pose: larger angles have no digits left after the point in float32."""
 
 
-class InvalidPoseError(ValueError):
-    """A file without a valid pose."""
-
-
 def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
     """Read the pose of a .json or .npz file, or one `frame` of several (AMASS: `poses` [F, 156], `trans`).
 
     JSON: a list of 72 numbers or 24 rows of 3, or an object with such a "pose" and a "translation" in metres.
     SMPL-H and SMPL-X give 22 joints (`body_theta`).
 
-    Raises FileNotFoundError and InvalidPoseError.
+    Raises FileNotFoundError and ValueError.
     """
     path = Path(path)
     if not path.is_file():
@@ -45,14 +41,14 @@ def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
             content = read_arrays(path, optional=(*POSE_KEYS, *TRANSLATION_KEYS))
     except (ValueError, OSError) as e:
         reason = str(e).removeprefix(f"{path}")[:120].strip(" :")
-        raise InvalidPoseError(
+        raise ValueError(
             f"{path} is neither JSON nor an npz of plain arrays ({reason}): convert it to one of these"
         ) from e
     return pose_from_numbers(content, str(path), frame)
 
 
 def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
-    """Parse a list, or a mapping with "pose" and "translation"; errors call it `name`. Raises InvalidPoseError."""
+    """Parse a list, or a mapping with "pose" and "translation"; errors call it `name`. Raises ValueError."""
     pose, translation = content, [0.0, 0.0, 0.0]
     if isinstance(content, dict):
         pose = _first(content, POSE_KEYS, None)
@@ -66,13 +62,11 @@ def pose_from_numbers(content: Any, name: str, frame: int = 0) -> BodyPose:
         if len(move) < 3:
             raise ValueError(f"{len(move)} numbers instead of 3")
     except (TypeError, ValueError, IndexError, OverflowError) as e:
-        raise InvalidPoseError(
-            f"{name} holds no pose: it needs {3 * J} axis-angle numbers ({J} joints x 3, radians)"
-        ) from e
+        raise ValueError(f"{name} holds no pose: it needs {3 * J} axis-angle numbers ({J} joints x 3, radians)") from e
     if not (np.isfinite(theta).all() and np.isfinite(move).all()):
-        raise InvalidPoseError(f"{name} holds NaN or infinite numbers: export the pose again")
+        raise ValueError(f"{name} holds NaN or infinite numbers: export the pose again")
     if max(np.abs(theta).max(initial=0), np.abs(move).max(initial=0)) > LARGEST_NUMBER:
-        raise InvalidPoseError(f"{name} holds numbers above {LARGEST_NUMBER:g}, which are no angles or metres")
+        raise ValueError(f"{name} holds numbers above {LARGEST_NUMBER:g}, which are no angles or metres")
     return BodyPose.from_axis_angle(torch.from_numpy(theta), torch.from_numpy(move))
 
 

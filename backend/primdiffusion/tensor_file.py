@@ -39,14 +39,10 @@ _ROOM, _SMALL = 2, 100_000
 Network = TypeVar("Network", bound=nn.Module)
 
 
-class TensorFileError(ValueError):
-    """A file that is damaged or no safetensors file. The message is a reason without the file's name."""
-
-
 def read(path: Path, limit: int = LARGEST_FILE) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return the tensors and the metadata of a file of at most `limit` bytes.
 
-    Raises TensorFileError, also for numbers that are not finite or above LARGEST_NUMBER; TooLargeError,
+    Raises ValueError, also for numbers that are not finite or above LARGEST_NUMBER; TooLargeError,
     FileNotFoundError and other OSErrors.
     """
     file = opened(path, limit)
@@ -73,11 +69,11 @@ class TensorFile:
     """
 
     def __init__(self, file: io.BufferedReader | io.BytesIO) -> None:
-        """Check and keep the content of an open file, which may be closed. Raises TensorFileError, OSError."""
+        """Check and keep the content of an open file, which may be closed. Raises ValueError, OSError."""
         self._layout = _layout(file)
         self._bytes = private_content(file)
         if len(self._bytes) < self._layout.size:
-            raise TensorFileError("it was cut short while it was read")
+            raise ValueError("it was cut short while it was read")
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -104,12 +100,12 @@ class TensorFile:
     def finite_tensors(self, names: Container[str] | None = None) -> dict[str, Tensor]:
         """All tensors, or those of `names`.
 
-        Raises TensorFileError for numbers that are not finite or above LARGEST_NUMBER.
+        Raises ValueError for numbers that are not finite or above LARGEST_NUMBER.
         """
         tensors = {name: self.tensor(name) for name in self._layout.tensors if names is None or name in names}
         for name, values in tensors.items():
             if not ((values >= -LARGEST_NUMBER) & (values <= LARGEST_NUMBER)).all():
-                raise TensorFileError(f"{name!r:.60} holds NaN or infinite values, or numbers above {LARGEST_NUMBER:g}")
+                raise ValueError(f"{name!r:.60} holds NaN or infinite values, or numbers above {LARGEST_NUMBER:g}")
         return tensors
 
     def sha256(self) -> str:
@@ -122,7 +118,7 @@ def _layout(file: io.BufferedReader | io.BytesIO) -> TensorLayout:
         layout = read_layout(file)
         check_limits(layout)
     except TensorLayoutError as error:
-        raise TensorFileError(str(error)) from error
+        raise ValueError(str(error)) from error
     return layout
 
 

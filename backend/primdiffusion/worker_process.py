@@ -87,10 +87,6 @@ def _answer(answering: Connection, function: Callable[..., Any], arguments: tupl
 THREAD_COUNTS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 
 
-class WorkerKilledError(ValueError):
-    """A worker process was killed."""
-
-
 def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: int) -> Iterator[None]:
     """Call `work(*job)` for every job, in this process or in `workers` others; yield after each finished job.
 
@@ -98,7 +94,7 @@ def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: 
     which only this process receives.
 
     Raises:
-        WorkerKilledError: a process was killed, usually out of memory.
+        ValueError: a process was killed, usually out of memory.
         Exception: whatever `work` raises.
     """
     if workers == 1:
@@ -117,7 +113,7 @@ def each(work: Callable[..., object], jobs: Iterable[tuple[Any, ...]], workers: 
                     future.result()
                     yield
         except BrokenProcessPool as error:
-            raise WorkerKilledError(
+            raise ValueError(
                 f"one of {workers} worker processes was killed, perhaps out of memory: run the command again with "
                 "fewer --workers; finished files are skipped"
             ) from error

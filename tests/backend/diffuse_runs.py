@@ -10,7 +10,7 @@ import pytest
 from accelerate.state import AcceleratorState
 from diffusion_people import SMALL
 from primdiffusion.diffusion.unet import UNetConfig
-from primdiffusion.training import losses, phase, slabs
+from primdiffusion.training import diffusion_task, losses, slabs
 from primdiffusion.training.config import CodecConfig, PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.run_folder import METRICS
@@ -23,11 +23,11 @@ DEFAULT_FILES = {".lock", "config.json", "run.json", "metrics.jsonl", "pictures"
 
 def make_small(patch: pytest.MonkeyPatch) -> None:
     """Pictures of one person, of few pixels and steps, slabs judged at one level; accelerate forgets earlier runs."""
-    patch.setattr(phase, "WIDTH", 24)
-    patch.setattr(phase, "HEIGHT", 40)
-    patch.setattr(phase, "STEP", 0.03)
+    patch.setattr(diffusion_task, "WIDTH", 24)
+    patch.setattr(diffusion_task, "HEIGHT", 40)
+    patch.setattr(diffusion_task, "STEP", 0.03)
     patch.setattr(slabs, "x0_errors", functools.partial(losses.x0_errors, levels=(500,)))
-    patch.setattr(phase, "write_samples", functools.partial(phase.write_samples, seeds=(0,), steps=1))
+    patch.setattr(diffusion_task, "write_samples", functools.partial(diffusion_task.write_samples, seeds=(0,), steps=1))
     AcceleratorState._reset_state(reset_partial_state=True)
 
 

@@ -1,10 +1,13 @@
 """Runs of stage 1 that take seconds: boxes for people, few pixels, an encoder of few channels."""
 
+import contextlib
 import dataclasses
 import functools
+import itertools
 import json
 import os
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -16,13 +19,15 @@ from primdiffusion.cli import main
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.failures import describe
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.training import fit_run
+from primdiffusion.training import fit as fit_module
+from primdiffusion.training.fit import MODEL
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.fit_run import MODEL, STATE
+from primdiffusion.training.loop import Interrupt
 from primdiffusion.training.run_folder import METRICS
 from safetensors.torch import load_file
 from tiny_encoder import TINY
 
+STATE = "state.safetensors"
 FEW = {"steps": 6, "batch": 1, "views": 2, "targets": 1, "size": 16, "step": 0.02, "hold_scale": 2, "log_every": 1}
 WHOLE = {".lock", "config.json", "run.json", METRICS, MODEL, STATE, "pictures"}
 """What lies in the folder of a run that was not torn."""
@@ -31,15 +36,20 @@ WHOLE = {".lock", "config.json", "run.json", METRICS, MODEL, STATE, "pictures"}
 def make_small(patch: pytest.MonkeyPatch) -> None:
     """The default encoder becomes a tiny one, and what is measured small."""
     patch.setitem(PRESETS, "default", dataclasses.replace(TINY, appearance="texels"))
-    patch.setattr(fit_run, "SIZE", 24)
-    patch.setattr(fit_run, "measure", functools.partial(fit_run.measure, people=1))
-    patch.setattr(fit_run, "write_pictures", functools.partial(fit_run.write_pictures, people=2))
+    patch.setattr(fit_module, "SIZE", 24)
+    patch.setattr(fit_module, "measure", functools.partial(fit_module.measure, people=1))
+    patch.setattr(fit_module, "write_pictures", functools.partial(fit_module.write_pictures, people=2))
     forget_processes()
 
 
 def forget_processes() -> None:
     """accelerate keeps the precision of a process' first run."""
     AcceleratorState._reset_state(reset_partial_state=True)
+
+
+def stop_after(steps: int) -> contextlib.AbstractContextManager:
+    """Interrupt runs after so many steps."""
+    return mock.patch.object(Interrupt, "due", side_effect=(asked >= steps for asked in itertools.count()))
 
 
 def settings(data: Path, run: Path, **changes) -> FitConfig:

@@ -10,9 +10,10 @@ import torch
 from primdiffusion import tensor_file
 from primdiffusion.body.model import default_body
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, generate, place
-from primdiffusion.human_file import HumanFileError, export_for_blender, load_human, save_human
+from primdiffusion.human_file import export_for_blender, load_human, save_human
 from primdiffusion.primitives.primitives import K
 from primdiffusion.render.march import march
 from support.errors import refused
@@ -159,7 +160,7 @@ def damage(path, human, how):
 def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how, message):
     path = tmp_path / "bad.human.safetensors"
     damage(path, human, how)
-    with refused(HumanFileError, "bad.human.safetensors") as error:
+    with refused(FileError, "bad.human.safetensors") as error:
         load_human(path)
     assert message in str(error.value)
     assert len(str(error.value)) - len(str(path)) < 280
@@ -174,14 +175,14 @@ def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, 
     path = tmp_path / "other.human.safetensors"
     save_human(path, human)
     safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "format_version": version})
-    with pytest.raises(HumanFileError, match=message):
+    with pytest.raises(FileError, match=message):
         load_human(path)
 
 
 def test_a_newer_file_is_rejected_for_its_version_even_where_its_tensors_are_others(human, tmp_path):
     path = tmp_path / "newer.human.safetensors"
     safetensors.torch.save_file({"latents": torch.zeros(3)}, path, {**META, "format_version": "4"})
-    with refused(HumanFileError):
+    with refused(FileError):
         load_human(path)
 
 
@@ -214,7 +215,7 @@ def test_a_provenance_of_the_wrong_kind_is_rejected_by_its_entry(human, tmp_path
     path = tmp_path / "odd.human.safetensors"
     save_human(path, human)
     safetensors.torch.save_file(safetensors.torch.load_file(path), path, {**META, "provenance": provenance})
-    with refused(HumanFileError, "odd.human.safetensors") as error:
+    with refused(FileError, "odd.human.safetensors") as error:
         load_human(path)
     assert message in str(error.value)
     assert len(str(error.value)) < 300 + len(str(tmp_path))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.pose_file import InvalidPoseError, pose_from_numbers, read_pose
+from primdiffusion.pose_file import pose_from_numbers, read_pose
 from support.errors import refused
 
 THETA = np.linspace(-1, 1, 72).astype(np.float32)
@@ -47,7 +47,7 @@ def test_an_npz_that_would_run_code_is_rejected(tmp_path):
 
     path = tmp_path / "trap.npz"
     np.savez(path, poses=np.array([Trap()], dtype=object))
-    with refused(InvalidPoseError, "trap.npz"):
+    with refused(ValueError, "trap.npz"):
         read_pose(path)
     assert not (tmp_path / "trapped").exists()
 
@@ -56,19 +56,19 @@ def test_an_npz_that_would_run_code_is_rejected(tmp_path):
     "content", [[1, 2, 3], {"theta": None}, {"pose": "up"}, {}, [[0, 0, 0]] * 23, [math.nan] * 72, None, {"pose": []}]
 )
 def test_numbers_that_are_no_pose_are_rejected_by_name(content):
-    with refused(InvalidPoseError):
+    with refused(ValueError, "my pose"):
         pose_from_numbers(content, "my pose")
 
 
 def test_a_frame_beyond_the_end_and_a_missing_file_are_errors(tmp_path):
     path = tmp_path / "one.npz"
     np.savez(path, poses=np.zeros((2, 72)))
-    with pytest.raises(InvalidPoseError):
+    with refused(ValueError, "one.npz"):
         read_pose(path, frame=2)
     with refused(FileNotFoundError, "none"):
         read_pose(tmp_path / "none.json")
     (tmp_path / "text.json").write_text("{")
-    with pytest.raises(InvalidPoseError):
+    with refused(ValueError, "text.json"):
         read_pose(tmp_path / "text.json")
 
 
@@ -76,6 +76,6 @@ def test_a_frame_beyond_the_end_and_a_missing_file_are_errors(tmp_path):
 def test_numbers_that_become_no_rotation_are_rejected(tmp_path, number):
     path = tmp_path / "pose.json"
     path.write_text(f"[{','.join([number] * 72)}]")
-    with refused(InvalidPoseError, "pose.json") as caught:
+    with refused(ValueError, "pose.json") as caught:
         read_pose(path)
     assert len(str(caught.value)) < 300

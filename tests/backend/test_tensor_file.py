@@ -11,16 +11,7 @@ import safetensors.torch
 import torch
 from primdiffusion.formats.regular_files import TooLargeError
 from primdiffusion.formats.tensor_layout import LARGEST_HEADER
-from primdiffusion.tensor_file import (
-    LARGEST_FILE,
-    RoomFor,
-    TensorFileError,
-    load_network,
-    opened,
-    read,
-    read_metadata,
-    save,
-)
+from primdiffusion.tensor_file import LARGEST_FILE, RoomFor, load_network, opened, read, read_metadata, save
 from safetensors import safe_open
 from support.errors import refused
 from torch import nn
@@ -101,7 +92,7 @@ def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
     with pytest.raises(PermissionError):
         read(path)
     if os.path.exists("/proc/self/pagemap"):
-        with pytest.raises(TensorFileError):
+        with refused(ValueError, "shorter than"):
             read(pathlib.Path("/proc/self/pagemap"))
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from primdiffusion.worker_process import THREAD_COUNTS, ProcessDied, WorkerKilledError, each, run_in_process
+from primdiffusion.worker_process import THREAD_COUNTS, ProcessDied, each, run_in_process
 from support.errors import refused
 
 
@@ -60,7 +60,7 @@ def test_the_first_error_of_a_worker_is_raised(tmp_path):
 
 
 def test_a_killed_worker_is_an_error_that_says_what_to_do():
-    with refused(WorkerKilledError, "--workers"):
+    with refused(ValueError, "--workers"):
         list(each(signal.raise_signal, [(signal.SIGKILL,)], workers=2))
 
 

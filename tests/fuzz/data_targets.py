@@ -223,9 +223,9 @@ def read_shots(path: Path) -> None:
 
 def state_of(network: torch.nn.Module):
     from primdiffusion.training.config import PhaseConfig
-    from primdiffusion.training.state import TrainingState
+    from primdiffusion.training.state import TrainingState, accelerator_of
 
-    return TrainingState(network, PhaseConfig(steps=2, batch=1), 0)
+    return TrainingState(network, PhaseConfig(steps=2, batch=1), accelerator_of())
 
 
 def make_state(folder: Path) -> Path:

@@ -129,7 +129,7 @@ def begin_run(path: Path) -> None:
     from primdiffusion.training.config import TrainingConfig
     from primdiffusion.training.run_folder import begin
 
-    begin(TrainingConfig(path.parent, path.parent), ["a", "b"], {}, {"step": 0, "processes": 1}, lambda _: True)
+    begin(TrainingConfig(data=path.parent, run=path.parent), ["a", "b"], {}, ["person"], 1)
 
 
 def make_prepared(folder: Path) -> Path:

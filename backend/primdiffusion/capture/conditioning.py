@@ -40,10 +40,6 @@ _EACH = 20
 _NAMED = 3
 
 
-class ConditioningError(ValueError):
-    """Captures that the encoder cannot use."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class CapturedPerson:
     """The encoder's input for a subject."""
@@ -69,8 +65,8 @@ def captured_person(
 
     Raises:
         FileNotFoundError: the folder or a file of the subject does not exist.
-        ConditioningError: the subject is missing or ambiguous, the frame is missing, or another body model was used.
-        CaptureFolderError, CaptureFileError, ArrayFileError, BodyFileError: a file is damaged or has another size.
+        ValueError: the subject is missing or ambiguous, the frame is missing, or another body model was used.
+        CaptureFolderError, FileError, ArrayFileError, BodyFileError: a file is damaged or has another size.
     """
     captures, name = choose_subject(path, subject)
     person = captures.subject(name)
@@ -94,8 +90,8 @@ def choose_subject(path: str | Path, subject: str | None = None) -> tuple[Captur
 
     Raises:
         FileNotFoundError: the folder does not exist or contains no subjects.
-        ConditioningError: there is no such subject, or several and `subject` is None.
-        CaptureFolderError, CaptureFileError: the dataset's own files are damaged.
+        ValueError: there is no such subject, or several and `subject` is None.
+        CaptureFolderError, FileError: the dataset's own files are damaged.
     """
     path = Path(path).absolute()
     if (path / CAMERAS_FILE).is_file():
@@ -112,8 +108,8 @@ def choose_subject(path: str | Path, subject: str | None = None) -> tuple[Captur
     others = f" and {len(names) - len(shown)} more" if len(names) > len(shown) else ""
     available = f"{', '.join(shown)}{others}"
     if subject is None:
-        raise ConditioningError(f"{path} contains several subjects: name one of them ({available})")
-    raise ConditioningError(f"there is no subject {subject!r} in {path}: choose from {available}")
+        raise ValueError(f"{path} contains several subjects: name one of them ({available})")
+    raise ValueError(f"there is no subject {subject!r} in {path}: choose from {available}")
 
 
 def conditioning_views(
@@ -130,15 +126,15 @@ def conditioning_views(
     Raises:
         KeyError: there is no subject of this name.
         FileNotFoundError: a file of the subject is missing.
-        ConditioningError: there is no such frame or camera, or no mask shows the subject.
-        CaptureFileError, ArrayFileError, BodyFileError: a file is damaged, or a mask and its image differ in size.
+        ValueError: there is no such frame or camera, or no mask shows the subject.
+        FileError, ArrayFileError, BodyFileError: a file is damaged, or a mask and its image differ in size.
     """
     person = captures.subject(subject)
     _check_frame(person, frame)
     numbers = range(len(person.views)) if cameras is None else cameras
     if not numbers or not all(0 <= number < len(person.views) for number in numbers):
         last = len(person.views) - 1
-        raise ConditioningError(f"{subject} has cameras 0 to {last}, not {list(numbers)}: choose at least one of them")
+        raise ValueError(f"{subject} has cameras 0 to {last}, not {list(numbers)}: choose at least one of them")
     side = min(largest_side, max(max(person.views[n].width, person.views[n].height) for n in numbers))
     pictures, seen = [], []
     for number in numbers:
@@ -147,7 +143,7 @@ def conditioning_views(
         seen.append(as_camera(windowed_view(view, full_window(view), side)))
     views = Views(torch.from_numpy(np.stack(pictures)), stack(seen), person.smpl.pose(frame))
     if not views.mask.any():
-        raise ConditioningError(f"no mask of {subject} in frame {frame} shows a human: choose another frame or views")
+        raise ValueError(f"no mask of {subject} in frame {frame} shows a human: choose another frame or views")
     return views
 
 
@@ -155,10 +151,10 @@ def spread_cameras(subject: Subject, frame: int, count: int, body: BodyModel | N
     """Indices of `count` cameras around a subject, sorted; all if there are fewer.
 
     The first faces the subject most directly; each next is the farthest in angle from those chosen.
-    Raises ConditioningError if `count` is less than 1.
+    Raises ValueError if `count` is less than 1.
     """
     if count < 1:
-        raise ConditioningError(f"{count} views were requested: the encoder needs 1 or more")
+        raise ValueError(f"{count} views were requested: the encoder needs 1 or more")
     if count >= len(subject.views):
         return tuple(range(len(subject.views)))
     pose = subject.smpl.pose(frame)
@@ -183,7 +179,7 @@ def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
     """Betas of the subject on a body, padded with zeros to the number of its shape components.
 
     Raises:
-        ConditioningError: there are too many, they are out of range, or stored joints are not the body's.
+        ValueError: there are too many, they are out of range, or stored joints are not the body's.
         ArrayFileError: joints.npz is damaged.
     """
     betas, components = torch.from_numpy(subject.smpl.betas), body.shape_basis.shape[-1]
@@ -194,13 +190,13 @@ def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
     if body is not default_body():
         name, remedy = "encoder's body", "use captures that are fitted to the SMPL file that the encoder refers to"
     if len(betas) > components or not (betas.abs() <= LARGEST_BETA).all():
-        raise ConditioningError(
+        raise ValueError(
             f"{subject.folder} has {len(betas)} betas of up to {float(betas.abs().max()):.3g}; there may be at most "
             f"{components} of the {name}, within {LARGEST_BETA:g}: {remedy}"
         )
     distance = float(np.linalg.norm(joints_of(subject, body) - body_joints(subject, body), axis=-1).max())
     if not distance <= SAME_BODY_M:
-        raise ConditioningError(
+        raise ValueError(
             f"the joints of {subject.folder} are up to {100 * distance:.0f} cm from the {name}'s, so its betas "
             f"belong to another body model; {remedy}"
         )
@@ -209,13 +205,13 @@ def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
 
 def _check_frame(subject: Subject, frame: int) -> None:
     if not 0 <= frame < subject.frames:
-        raise ConditioningError(f"{subject.name} has frames 0 to {subject.frames - 1}, not {frame}: choose one of them")
+        raise ValueError(f"{subject.name} has frames 0 to {subject.frames - 1}, not {frame}: choose one of them")
 
 
 def _covered_share(subject: Subject, frame: int, cameras: Sequence[int], views: Views, body: BodyModel) -> float:
     """Fraction of the body's projected points that are inside the masks.
 
-    Raises ConditioningError if it is 0.
+    Raises ValueError if it is 0.
     """
     posed = body.shape(torch.from_numpy(subject.smpl.betas)).pose(subject.smpl.pose(frame))
     points, size = posed.vertices[::_EACH].double().numpy(), views.rgba.shape[-2]
@@ -226,7 +222,7 @@ def _covered_share(subject: Subject, frame: int, cameras: Sequence[int], views: 
     ]
     covered = np.concatenate(inside)
     if not covered.any():
-        raise ConditioningError(
+        raise ValueError(
             f"the body of {subject.name} projects outside its masks: its poses, betas and cameras.json do not belong "
             "together; take them from one source"
         )

@@ -27,21 +27,12 @@ from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
 
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture.reader import (
-    CaptureFileError,
-    Captures,
-    Subject,
-    Window,
-    as_camera,
-    full_window,
-    resample,
-    windowed_view,
-)
+from primdiffusion.capture.reader import Captures, Subject, Window, as_camera, full_window, resample, windowed_view
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import map_npy
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import LARGEST_BYTES, read_json
-from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.regular_files import FileError, read_regular
 from primdiffusion.formats.removing import check_inside
 from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.camera import Camera
@@ -64,7 +55,7 @@ def pack(captures: Captures) -> Iterator[Packing]:
     """Pack all subjects that have no current pack; yields each when its array is complete.
 
     Raises:
-        FileNotFoundError, CaptureFileError: an image is missing or damaged, or cameras differ in size.
+        FileNotFoundError, FileError: an image is missing or damaged, or cameras differ in size.
         OSError: a file cannot be written.
     """
     for name in captures.subjects:
@@ -79,8 +70,8 @@ def pack_subject(subject: Subject) -> None:
     """Write one subject's array. Raises as `pack` does."""
     sizes = {(view.height, view.width) for view in subject.views}
     if len(sizes) != 1:
-        raise CaptureFileError(
-            f"{subject.folder} has images of several sizes, which cannot be packed: render it with one size"
+        raise FileError(
+            subject.folder, "has images of several sizes, which cannot be packed", "render it with one size"
         )
     check_inside(pack_path(subject), subject.folder.parent)
     stamp = source_stamp(subject)
@@ -236,7 +227,7 @@ class CaptureDataset(SampleSet[TrainingSample]):
         """The sample at a position.
 
         Raises:
-            FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         """
         epoch, index = position
         if self._order[0] != epoch:
@@ -315,7 +306,7 @@ def batches(
 
     Raises:
         ValueError: the batch size is not positive.
-        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
     """
     if size < 1:
         raise ValueError(f"the batch size is {size}: give 1 or more")

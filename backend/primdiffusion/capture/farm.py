@@ -25,10 +25,6 @@ _LINES_OF_ERROR = 5
 _SET_PARENT_DEATH_SIGNAL = 1
 
 
-class FarmError(ValueError):
-    """The farm cannot start: no Ray, no cluster, or a command that lists no subjects."""
-
-
 @dataclasses.dataclass(frozen=True)
 class FarmResult:
     """The result of rendering one subject."""
@@ -56,14 +52,16 @@ class Farm:
 
 
 def subjects_of(command: Sequence[str]) -> list[str]:
-    """List the subjects that a renderer's command would render. Raises FarmError if there are none."""
+    """List the subjects that a renderer's command would render. Raises ValueError if there are none."""
     try:
         ran = subprocess.run([*command, *LIST], capture_output=True, text=True, check=False)
     except OSError as e:
-        raise FarmError(f"the renderer {command[0]!r} cannot be started ({e!s:.160}): give its path") from e
+        raise ValueError(f"the renderer {command[0]!r} cannot be started ({e!s:.160}): give its path") from e
     listed = [parse_json(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
     if ran.returncode or not listed:
-        raise FarmError(f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it printed nothing'}")
+        raise ValueError(
+            f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it printed nothing'}"
+        )
     return [line["line"] for line in listed]
 
 
@@ -74,7 +72,7 @@ def render_on(
 ) -> list[FarmResult]:
     """Render every subject of `command` and return the results; `report` gets each, the number done, and the total.
 
-    The command may run on any machine of the cluster, so its paths must be valid on all. Raises FarmError.
+    The command may run on any machine of the cluster, so its paths must be valid on all. Raises ValueError.
     """
     subjects = subjects_of(command)
     ray = _started(farm)
@@ -121,7 +119,7 @@ def _started(farm: Farm) -> Any:
     try:
         ray.init(address=farm.address or "local", include_dashboard=None if farm.address else False, **local)
     except (ConnectionError, RuntimeError, ValueError, OSError) as e:
-        raise FarmError(
+        raise ValueError(
             f"no Ray cluster at {farm.address or 'this machine'} ({e!s:.160}): start one with `ray start`"
         ) from e
     return ray

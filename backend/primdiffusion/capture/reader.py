@@ -23,7 +23,7 @@ from primdiffusion.formats.arrays import all_finite
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.formats.regular_files import open_regular
+from primdiffusion.formats.regular_files import FileError, open_regular
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.pictures import LARGEST_FILE, decoded, decoded_bytes, opened_picture, strips
 from primdiffusion.geometry.records import TensorRecord
@@ -100,10 +100,6 @@ VIEW_OF_FILES = 2
 """Times of what the largest of its files may take alone (`decoded_bytes`) that all passes of a view may take."""
 
 
-class CaptureFileError(ValueError):
-    """A damaged or unexpected capture file; the message names it."""
-
-
 @dataclasses.dataclass(frozen=True)
 class CapturedView(TensorRecord):
     """One image of a subject with its camera, pose and passes."""
@@ -154,7 +150,7 @@ class Subject:
 
         Raises:
             FileNotFoundError: a file is missing.
-            CaptureFileError: one is damaged, its size is not the camera's, or all are too large for their files.
+            FileError: one is damaged, its size is not the camera's, or all are too large for their files.
         """
         view = self.views[camera]
         paths = {kind: capture_layout.picture_path(self.folder, kind, camera, frame) for kind in kinds}
@@ -172,10 +168,9 @@ class Subject:
         largest = max((file.seek(0, os.SEEK_END) for file in files.values()), default=0)
         claimed = view.width * view.height * sum(_BYTES_OF_A_PIXEL.get(kind, 4) for kind in files)
         if claimed > VIEW_OF_FILES * decoded_bytes(largest):
-            raise CaptureFileError(
-                f"{self.folder} has {len(files)} images of {view.width} x {view.height} pixels of one view, in files "
-                f"of at most {largest} bytes: render the subject again, smaller"
-            )
+            claim = f"{len(files)} images of {view.width} x {view.height} pixels of one view"
+            given = f"files of at most {largest} bytes"
+            raise FileError(self.folder, f"has {claim}, in {given}", "render the subject again, smaller")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -199,7 +194,7 @@ class Captures:
 
         Raises:
             KeyError: there is no subject of this name.
-            FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         """
         if name not in self.subjects:
             raise KeyError(f"{self.root} has no subject {name!r}")
@@ -213,7 +208,7 @@ class Captures:
 
         Raises:
             KeyError, IndexError: there is no such subject, frame or camera.
-            FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         """
         person = self.subject(subject)
         if not (0 <= frame < person.frames and 0 <= camera < len(person.views)):
@@ -241,7 +236,7 @@ def open_captures(root: str | Path) -> Captures:
     Raises:
         FileNotFoundError: the folder does not exist or contains no subjects.
         CaptureFolderError: its dataset.json is damaged or of another version.
-        CaptureFileError: the list contains an invalid name.
+        FileError: the list contains an invalid name.
     """
     root = Path(root)
     if not root.is_dir():
@@ -257,7 +252,7 @@ def open_captures(root: str | Path) -> Captures:
     else:
         names = sorted(path.parent.name for path in root.glob(f"*/{CAMERAS_FILE}"))
     if wrong := next((name for name in names if not SUBJECT_NAME.fullmatch(name)), None):
-        raise CaptureFileError(f"{listed} contains {wrong!r:.80}: subjects are named by letters, digits and . _ -")
+        raise FileError(listed, f"contains {wrong!r:.80}", "subjects are named by letters, digits and . _ -")
     if not names:
         raise FileNotFoundError(f"there are no finished captures in {root}: render some, or check the path")
     return Captures(root, tuple(names), about)
@@ -276,7 +271,7 @@ def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
 
     Raises:
         FileNotFoundError: the file is missing.
-        CaptureFileError: it is damaged or has another size.
+        FileError: it is damaged or has another size.
     """
     with _opened(path) as file:
         return _read(file, path, kind, width, height)
@@ -296,7 +291,7 @@ def _read(file: BinaryIO, path: Path, kind: str, width: int, height: int) -> np.
             return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
         if size == (width, height):
             return decoded(picture, "RGB" if kind in ("img", "normal") else "L")
-    raise CaptureFileError(f"{path} has {size[0]} x {size[1]} pixels, its camera {width} x {height}: render it again")
+    raise FileError(path, f"has {size[0]} x {size[1]} pixels, its camera {width} x {height}", "render it again")
 
 
 @contextlib.contextmanager
@@ -307,7 +302,7 @@ def _named(path: Path) -> Iterator[None]:
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
-        raise CaptureFileError(f"{path} is not a complete image ({e!s:.160}): render it again") from e
+        raise FileError(path, f"is not a complete image ({e!s:.160})", "render it again") from e
 
 
 def _read_views(folder: Path) -> list[View]:
@@ -318,7 +313,7 @@ def _read_views(folder: Path) -> list[View]:
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
-        raise CaptureFileError(f"{path} cannot be read ({e!s:.160}): render the subject again") from e
+        raise FileError(path, f"cannot be read ({e!s:.160})", "render the subject again") from e
     views = []
     try:
         for camera in range(len(named)):
@@ -332,11 +327,11 @@ def _read_views(folder: Path) -> list[View]:
     except FileNotFoundError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
-        if isinstance(e, CaptureFileError):
+        if isinstance(e, FileError):
             raise
-        raise CaptureFileError(f"{path} is not a list of cameras ({e!s:.160}): render the subject again") from e
+        raise FileError(path, f"is not a list of cameras ({e!s:.160})", "render the subject again") from e
     if not views:
-        raise CaptureFileError(f"{path} contains no camera: render the subject again")
+        raise FileError(path, "contains no camera", "render the subject again")
     return views
 
 
@@ -349,7 +344,7 @@ def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
                 with opened_picture(path, bytes_each=1) as picture:
                     return picture.size
             except (OSError, ValueError) as e:
-                raise CaptureFileError(f"{path} is not a complete image ({e!s:.160}): render it again") from e
+                raise FileError(path, f"is not a complete image ({e!s:.160})", "render it again") from e
     raise FileNotFoundError(f"{folder} has no images of camera {camera}: render the subject again")
 
 

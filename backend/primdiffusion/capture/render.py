@@ -54,8 +54,7 @@ def set_up_capture(person: SkinnedPerson, poses: BodyPose, rig: Rig | Sequence[V
     """Pose the subject in all `poses` [F] and place the cameras: a rig that shows every pose whole, or given views.
 
     Raises:
-        UnusableMesh: the mesh cannot be drawn.
-        ValueError: the poses are not finite.
+        ValueError: the mesh cannot be drawn; the poses are not finite.
     """
     figure = figure_from_mesh(person.mesh)
     with _one_thread():

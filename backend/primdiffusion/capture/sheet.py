@@ -25,7 +25,7 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
 
     Raises:
         ValueError: a size is not positive.
-        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
     """
     if min(rows, columns, size) < 1:
         raise ValueError(f"rows, columns and size are {rows}, {columns} and {size}: give 1 or more")

@@ -14,7 +14,7 @@ from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.dataset import open_pack, pack
-from primdiffusion.capture.farm import Farm, FarmError, FarmResult, render_on
+from primdiffusion.capture.farm import Farm, FarmResult, render_on
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import MotionFileError, choose_poses, read_motion, read_motions
 from primdiffusion.capture.reader import open_captures
@@ -233,7 +233,7 @@ class FarmCaptures:
     """Attempts for a human whose worker or renderer is killed."""
 
     def run(self) -> None:
-        """Render, and print a line for each human. Raises FarmError if the cluster cannot start or a human fails."""
+        """Render, and print a line for each human. Raises ValueError if the cluster cannot start or a human fails."""
 
         def show(outcome: FarmResult, done: int, total: int) -> None:
             print(f"{done}/{total}  {outcome.subject}  {outcome.error or f'{outcome.seconds:.0f} s'}", flush=True)
@@ -242,7 +242,7 @@ class FarmCaptures:
         outcomes = render_on(farm, self.command, show)
         failed = [outcome.subject for outcome in outcomes if outcome.exit_code]
         if failed:
-            raise FarmError(f"{len(failed)} of {len(outcomes)} humans are not finished: {', '.join(failed[:5])}")
+            raise ValueError(f"{len(failed)} of {len(outcomes)} humans are not finished: {', '.join(failed[:5])}")
 
 
 Command = (

@@ -9,7 +9,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import torch
 from jaxtyping import Float
@@ -22,13 +22,13 @@ from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.consistency import check_codec, check_parts
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
 from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import JsonError, parse_json
-from primdiffusion.formats.regular_files import TooLargeError, open_regular
+from primdiffusion.formats.regular_files import FileError, TooLargeError, open_regular
+from primdiffusion.formats.schema import FieldError, Open, Range, read
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
@@ -48,8 +48,33 @@ SYMMETRIC = 1e-4
 """Largest difference between an entry of a person component and its mirror image; entries are up to 1."""
 
 
-class CheckpointError(ValueError):
-    """A checkpoint that cannot be used; the message names the file and the remedy."""
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ModelConfig(Open):
+    """What a checkpoint says of its model, under "architecture" in its metadata."""
+
+    kind: Literal["person", "slab", "released"]
+    """Which denoiser it holds: a PersonDenoiser, a SlabUNet, or the authors' U-Net on a body of the user."""
+    schedule: Literal["linear", "sqrt_linear", "fine_linear"]
+    """Noise schedule."""
+    chain: Literal["trailing", "dense", "early", "released"] = "trailing"
+    """Timesteps of samplers."""
+    full_density: Annotated[float, Range(1e-30, LARGEST_NUMBER)]
+    """Density of a stored value of 1, 1/m."""
+    config: dict
+    """Sizes of the denoiser's networks: a DenoiserConfig or a UNetConfig."""
+    vocabulary: dict = dataclasses.field(default_factory=lambda: AttributeVocabulary({}, {}).to_json())
+    """Attributes that the model can be conditioned on (`AttributeVocabulary.to_json`)."""
+    body: str = ""
+    """The user's body of a released model, as JSON (`BodyFiles.to_json`)."""
+
+    def denoiser(self) -> DenoiserConfig:
+        """Return the sizes of a PersonDenoiser; files older than `end_kernel` have one of 3. Raises FieldError."""
+        local = self.config.get("local")
+        return read(DenoiserConfig, {**self.config, "local": local and {"end_kernel": 3, **local}})
+
+    def unet(self) -> UNetConfig:
+        """Return the sizes of a U-Net; files older than `attention_context` have "input". Raises FieldError."""
+        return read(UNetConfig, {"attention_context": "input", **self.config})
 
 
 def default_checkpoint() -> Path:
@@ -87,18 +112,22 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     write_atomically(path, tensor_file.save(contents, metadata=metadata))
 
 
-def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], dict[str, Any], dict[str, Any]]:
-    """Return tensors in float32, architecture and card (with the file's SHA-256) of a checkpoint of any kind.
+def read_checkpoint(path: Path) -> tuple[dict[str, Tensor], ModelConfig, dict[str, Any]]:
+    """Return tensors in float32, configuration and card (with the file's SHA-256) of a checkpoint of any kind.
 
-    Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
+    Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
     format or version, or holds values that are not finite.
     """
     tensors, metadata, digest = read_tensors(path, (FORMAT,))
     with mismatches_named(path):
         architecture, card = parse_json(metadata["architecture"]), parse_json(metadata["card"])
-        if not 0 < architecture["full_density"] <= LARGEST_NUMBER:
-            raise RuntimeError(f"a full density of {architecture['full_density']!r:.20}")
-        return tensors, architecture, {**card, "sha256": digest}
+        if "detail" in architecture:
+            raise FileError(
+                path,
+                "has a detail decoder, which this version no longer reads",
+                "train a new checkpoint, or use the default one",
+            )
+        return tensors, read(ModelConfig, architecture), {**card, "sha256": digest}
 
 
 def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor], dict[str, str], str]:
@@ -114,14 +143,12 @@ def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor],
 
 @contextlib.contextmanager
 def mismatches_named(path: Path, *also: type[Exception]) -> Iterator[None]:
-    """Raise CheckpointError for errors (and `also`) caused by tensors that contradict the file's own architecture."""
+    """Raise FileError for errors (and `also`) caused by tensors that contradict the file's own architecture."""
     try:
         yield
-    except (KeyError, TypeError, JsonError, RuntimeError, *also) as error:
+    except (KeyError, TypeError, JsonError, FieldError, RuntimeError, *also) as error:
         reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
-        raise CheckpointError(
-            f"{path} does not match its own description ({reason}): download or train it again"
-        ) from error
+        raise FileError(path, f"does not match its own description ({reason})", "download or train it again") from error
 
 
 def file_hash(path: Path) -> str:
@@ -145,31 +172,25 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
 def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:
     """Load a model in float32 (without a path: the default checkpoint), trained here or imported (`released`).
 
-    Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
+    Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
     format or version, does not match its own architecture or holds values that are not finite. An imported one raises
     BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
     """
     path = default_checkpoint() if path is None else Path(path)
-    tensors, architecture, card = read_checkpoint(path)
-    with mismatches_named(path):
-        if "detail" in architecture:
-            raise CheckpointError(
-                f"{path} has a detail decoder, which this version no longer reads: train a new checkpoint, or use the "
-                "default one"
-            )
-        if architecture["kind"] == RELEASED:
-            return _released_model(tensors, architecture, card, path.parent).to(device)
+    tensors, config, card = read_checkpoint(path)
+    if config.kind == RELEASED:
+        with mismatches_named(path):
+            return _released_model(tensors, config, card, path.parent).to(device)
     with mismatches_named(path, ValueError, AttributeError):
-        return _model(tensors, architecture, card).to(device)
+        return _model(tensors, config, card).to(device)
 
 
-def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any]) -> DiffusionModel:
-    schedule = SCHEDULES[architecture["schedule"]]()
-    config = architecture["config"]
+def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str, Any]) -> DiffusionModel:
+    schedule = SCHEDULES[config.schedule]()
     weights = under(tensors, "denoiser.")
-    vocabulary = AttributeVocabulary.from_json(architecture["vocabulary"])
-    if architecture["kind"] == "slab":
-        denoiser: torch.nn.Module = tensor_file.load_network(lambda: SlabUNet(_unet_config(config)), weights)
+    vocabulary = AttributeVocabulary.from_json(config.vocabulary)
+    if config.kind == "slab":
+        denoiser: torch.nn.Module = tensor_file.load_network(lambda: SlabUNet(config.unet()), weights)
         codec, shapes = WholeSlab(), STANDARD_SHAPES
     else:
         codec = CellCodec(_linear_codec(under(tensors, "codec.")))
@@ -178,10 +199,10 @@ def _model(tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card:
         prior = PersonPrior(**under(weights, "prior_"))
         shapes = ShapePrior(**under(tensors, "shapes."))
         check_parts(codec.codec, prior, shapes, vocabulary)
-        denoiser = tensor_file.load_network(lambda: PersonDenoiser(denoiser_config(config), prior, schedule), weights)
+        denoiser = tensor_file.load_network(lambda: PersonDenoiser(config.denoiser(), prior, schedule), weights)
     denoiser.eval().requires_grad_(False)
-    chain = CHAINS[architecture.get("chain", "trailing")]
-    density = float(architecture["full_density"])
+    chain = CHAINS[config.chain]
+    density = float(config.full_density)
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
 
 
@@ -219,15 +240,15 @@ def _linear_codec(tensors: Mapping[str, Tensor]) -> LinearCodec:
 
 
 def _released_model(
-    tensors: Mapping[str, Tensor], architecture: Mapping[str, Any], card: Mapping[str, Any], folder: Path
+    tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str, Any], folder: Path
 ) -> DiffusionModel:
     """Build an imported model; `folder` is that of its file."""
     weights = under(tensors, "denoiser.")
     with tensor_file.RoomFor(weights), torch.device("meta"):
-        network = SlabUNet(_unet_config(architecture["config"]))
+        network = SlabUNet(config.unet())
     network.load_state_dict(weights, assign=True)
     network.eval().requires_grad_(False)
-    body_setup = stored_body_setup(tensors, architecture["body"], folder)
+    body_setup = stored_body_setup(tensors, config.body, folder)
     if tensors["stand.betas"].shape != (BETAS,):
         raise RuntimeError(f"betas have shape {tuple(tensors['stand.betas'].shape)}, not ({BETAS},)")
     fixed_betas = (
@@ -238,12 +259,12 @@ def _released_model(
     )
     return DiffusionModel(
         denoiser=network,
-        schedule=SCHEDULES[architecture["schedule"]](),
+        schedule=SCHEDULES[config.schedule](),
         codec=ReleasedSlab(),
         shapes=ShapePrior(*fixed_betas),
-        full_density=float(architecture["full_density"]),
+        full_density=float(config.full_density),
         card=card,
-        chain=CHAINS[architecture["chain"]],
+        chain=CHAINS[config.chain],
         body_setup=body_setup,
     )
 
@@ -272,23 +293,6 @@ def stored_body_setup(tensors: Mapping[str, Tensor], body: str, folder: Path) ->
     return body_setup
 
 
-def _unet_config(tree: Mapping[str, Any]) -> UNetConfig:
-    """Parse a U-Net's configuration; files older than `attention_context` have "input"."""
-    levels = {key: tuple(tree[key]) for key in ("multipliers", "attention_levels")}
-    return UNetConfig(**{"attention_context": "input", **tree, **levels})
-
-
-def denoiser_config(tree: Mapping[str, Any]) -> DenoiserConfig:
-    """Parse a denoiser's configuration; files older than `end_kernel` have one of 3."""
-    person, local = tree["person"], tree["local"]
-    return DenoiserConfig(
-        person=None if person is None else PersonNetworkConfig(**person),
-        local=None
-        if local is None
-        else LocalUNetConfig(**{"end_kernel": 3, **local, "widths": tuple(local["widths"])}),
-    )
-
-
 def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
     """Return the metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
     _check_there(path)
@@ -307,14 +311,13 @@ def _check_there(path: Path) -> None:
 
 def _check_format(path: Path, metadata: Mapping[str, str], formats: Sequence[str]) -> None:
     if metadata.get("format") not in formats:
-        raise CheckpointError(
-            f"{path} is a safetensors file of format {metadata.get('format')!r:.40}, not "
-            f"{formats[0]!r}: choose another file"
+        raise FileError(
+            path, f"has the format {metadata.get('format')!r:.40}, not {formats[0]!r}", "choose another file"
         )
     if metadata.get("format_version") != _READABLE[metadata["format"]]:
         version, readable = metadata.get("format_version"), _READABLE[metadata["format"]]
-        raise CheckpointError(
-            f"{path} has format version {version!s:.20}, this program reads {readable}: use the matching release"
+        raise FileError(
+            path, f"has format version {version!s:.20}, this program reads {readable}", "use the matching release"
         )
 
 
@@ -325,16 +328,16 @@ def _damage_named(path: Path) -> Iterator[None]:
     except TooLargeError:
         raise
     except (ValueError, OSError) as error:
-        raise CheckpointError(
-            f"{path} is damaged or no safetensors file ({error!s:.160}): download or train it again"
+        raise FileError(
+            path, f"is damaged or no safetensors file ({error!s:.160})", "download or train it again"
         ) from error
 
 
 def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Raise CheckpointError for NaN or infinite values."""
+    """Raise FileError for NaN or infinite values."""
     for key, value in tensors.items():
         if not torch.isfinite(value).all():
-            raise CheckpointError(f"{path}: weights {key!r} hold NaN or infinite values: download or train them again")
+            raise FileError(path, f"has NaN or infinite values in {key!r}", "download or train it again")
 
 
 def _fields(prefix: str, record: TensorRecord) -> dict[str, Tensor]:

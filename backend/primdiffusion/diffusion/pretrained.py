@@ -10,19 +10,12 @@ from typing import Any
 
 import torch
 
-from primdiffusion.diffusion.checkpoint import (
-    FORMAT,
-    CheckpointError,
-    load_checkpoint,
-    read_card,
-    read_metadata,
-    save_checkpoint,
-)
+from primdiffusion.diffusion.checkpoint import FORMAT, load_checkpoint, read_card, read_metadata, save_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.schedule import schedule_name
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.regular_files import FileError, read_regular
 from primdiffusion.formats.whole_files import staged
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
@@ -33,7 +26,7 @@ _LICENCE = re.compile(r"[A-Za-z0-9.+-]+", re.ASCII)
 def load_pretrained(path: Path | str, device: torch.device | str = "cpu") -> DiffusionModel:
     """Load a model from a checkpoint, a folder of `save_pretrained`, or a repository in a local hub cache.
 
-    Downloads nothing. Errors as in `load_checkpoint`; FileNotFoundError also without such a folder, CheckpointError for
+    Downloads nothing. Errors as in `load_checkpoint`; FileNotFoundError also without such a folder, FileError for
     a folder without a model or with several snapshots and no main branch.
     """
     path = Path(path)
@@ -83,11 +76,12 @@ def _weights_in(folder: Path) -> Path:
     found = [path for path in found if path.is_file()]
     if len(found) > 1:
         names = ", ".join(path.parent.name for path in found)
-        raise CheckpointError(f"{folder} holds several snapshots ({names}): give the folder of one of them")
+        raise FileError(folder, f"holds several snapshots ({names})", "give the folder of one of them")
     if not found:
-        raise CheckpointError(
-            f"{folder} holds no {WEIGHTS}, nor a hub snapshot with one: give the folder that save_pretrained or "
-            "hf download wrote"
+        raise FileError(
+            folder,
+            f"holds no {WEIGHTS}, nor a hub snapshot with one",
+            "give a folder of save_pretrained or hf download",
         )
     return found[0]
 

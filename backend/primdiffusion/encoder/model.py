@@ -127,7 +127,7 @@ def default_encoder() -> Path:
 def save_encoder(path: Path, model: EncoderModel, dtype: torch.dtype = torch.float16) -> None:
     """Write an encoder, whole or not at all; of its body only path and checksum of the files, and the anchors.
 
-    Raises CheckpointError for weights that are not finite, OSError.
+    Raises FileError for weights that are not finite, OSError.
     """
     tensors = {
         name: value.detach().cpu().to(dtype).contiguous().clone() for name, value in model.encoder.state_dict().items()
@@ -150,7 +150,7 @@ def save_encoder(path: Path, model: EncoderModel, dtype: torch.dtype = torch.flo
 def load_encoder(path: Path | str | None = None, device: torch.device | str = "cpu") -> EncoderModel:
     """Load an encoder in float32 (without a path: the one in the package).
 
-    Raises FileNotFoundError for a missing file and CheckpointError (a ValueError) for one that is truncated, of another
+    Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
     format or version, does not match its own configuration or holds values that are not finite. An imported one raises
     BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
     """

@@ -17,11 +17,11 @@ from primdiffusion.evaluation.pretrained_networks import (
     VGG16,
     Architecture,
     PictureFeatures,
-    WeightsFileError,
     fill,
     read_weights,
 )
 from primdiffusion.failures import optional_package
+from primdiffusion.formats.regular_files import FileError
 
 WINDOW = 11
 """Width of SSIM's Gaussian window, pixels."""
@@ -211,7 +211,7 @@ def load_lpips(paths: Sequence[Path | str]) -> Lpips:
 
     Raises:
         FileNotFoundError: a file is missing.
-        WeightsFileError: a file is damaged, weights are missing, or the files are of two architectures.
+        FileError: a file is damaged, weights are missing, or the files are of two architectures.
     """
     source = " and ".join(str(path) for path in paths)
     weights: dict[str, Tensor] = {}
@@ -220,7 +220,7 @@ def load_lpips(paths: Sequence[Path | str]) -> Lpips:
     what = "torchvision's VGG16 or AlexNet and LPIPS' linear weights of the same network"
     first = weights.get("network.features.0.weight")
     if first is None:
-        raise WeightsFileError(f"no backbone weights in {source or 'no file'}: give {what}")
+        raise FileError(source or "an empty list", "has no backbone weights", f"give {what}")
     lpips = Lpips(ALEXNET if tuple(first.shape[-2:]) == (11, 11) else VGG16)
     fill(lpips, weights, what, source)
     return lpips

@@ -1,7 +1,7 @@
 """A small network of joints, depth and attributes of a human in a picture, trained on renders of MakeHuman meshes.
 
 It needs no weights of others: `weights/pose_depth.safetensors` ships with the package. Trained by
-scripts/train_pose_depth_network (`pose_depth_training`); its card states its errors on renders of held-out meshes.
+scripts/train_pose_depth_network.py; its card states its errors on renders of held-out meshes.
 """
 
 from __future__ import annotations

@@ -17,11 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion import tensor_file, torch_file
-from primdiffusion.formats.regular_files import TooLargeError
-
-
-class WeightsFileError(ValueError):
-    """A weights file that is damaged or of another network."""
+from primdiffusion.formats.regular_files import FileError, TooLargeError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -116,7 +112,7 @@ def read_weights(path: Path | str) -> dict[str, Tensor]:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        WeightsFileError: the file is truncated or not a dictionary of named tensors.
+        FileError: the file is truncated or not a dictionary of named tensors.
     """
     path = Path(path)
     if not path.is_file():
@@ -128,14 +124,15 @@ def read_weights(path: Path | str) -> dict[str, Tensor]:
     except TooLargeError:
         raise
     except torch_file.PICKLE_ERRORS as e:
-        raise WeightsFileError(
-            f"{path} is truncated or not a plain weights file ({_reason(e)}): download it again, or save "
-            "the network's state_dict()"
+        raise FileError(
+            path,
+            f"is truncated or not a plain weights file ({_reason(e)})",
+            "download it again, or save the network's state_dict()",
         ) from e
     if not isinstance(content, Mapping) or not all(
         isinstance(value, Tensor) and torch_file.is_plain(value) for value in content.values()
     ):
-        raise WeightsFileError(f"{path} is not a dictionary of named tensors: save the network's state_dict()")
+        raise FileError(path, "is not a dictionary of named tensors", "save the network's state_dict()")
     return dict(content)
 
 
@@ -147,19 +144,18 @@ def _reason(error: Exception) -> str:
 def fill(network: nn.Module, weights: Mapping[str, Tensor], what: str, source: str) -> None:
     """Load the weights that `network` has; extra ones, such as a classifier's, are ignored.
 
-    `what` and `source` name the network and the file in messages. Raises WeightsFileError if a name is missing, a shape
+    `what` and `source` name the network and the file in messages. Raises FileError if a name is missing, a shape
     differs or a value is not finite.
     """
     for name, own in network.state_dict().items():
         if name not in weights:
-            raise WeightsFileError(f"{source} has no {name!r}: give weights of {what}")
+            raise FileError(source, f"has no {name!r}", f"give weights of {what}")
         given = weights[name]
         if given.shape != own.shape:
-            raise WeightsFileError(
-                f"{name!r} in {source} has shape {tuple(given.shape)}, not {tuple(own.shape)}: give weights of {what}"
-            )
+            shapes = f"{tuple(given.shape)}, not {tuple(own.shape)}"
+            raise FileError(source, f"has {name!r} of shape {shapes}", f"give weights of {what}")
         if not torch.isfinite(given).all():
-            raise WeightsFileError(f"{name!r} in {source} has NaN or infinite values: download it again")
+            raise FileError(source, f"has NaN or infinite values in {name!r}", "download it again")
     network.load_state_dict({name: weights[name] for name in network.state_dict()})
 
 
@@ -304,7 +300,7 @@ class Inception(nn.Module):
 
 
 def load_inception(path: Path | str, resize: Resize = "torch-fidelity") -> Inception:
-    """Load the encoder from a weights file. Raises FileNotFoundError and WeightsFileError."""
+    """Load the encoder from a weights file. Raises FileNotFoundError and FileError."""
     network = Inception(resize)
     # Older files lack num_batches_tracked, which evaluation mode does not use.
     own = {name: value for name, value in network.state_dict().items() if name.endswith("num_batches_tracked")}
@@ -366,7 +362,7 @@ def load_clip_vision(path: Path | str, resize: Resize = "antialiased") -> ClipVi
     """Load the encoder from a weights file with OpenAI's names, with or without the text encoder.
 
     OpenAI's own file is a TorchScript program and is not run: save its state_dict() as .safetensors. Raises
-    FileNotFoundError and WeightsFileError.
+    FileNotFoundError and FileError.
     """
     given = read_weights(path)
     beside_text = {name[7:]: value for name, value in given.items() if name.startswith("visual.")}

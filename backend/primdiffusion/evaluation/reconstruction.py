@@ -132,8 +132,8 @@ def evaluate(
 
     Raises:
         KeyError: unknown subject.
-        FileNotFoundError, ConditioningError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or
-            damaged, a frame or camera does not exist, or a subject has another body model.
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+        ValueError: a frame or camera does not exist, or a subject has another body model.
     """
     settings = settings or EvaluationSettings()
     for name in settings.subjects or captures.subjects:

@@ -17,10 +17,6 @@ Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Blender's axes from the backend's; applied before voxelising, because a grid cannot be rotated without resampling."""
 
 
-class NoOpenVDB(ValueError):
-    """This Python cannot write VDB files."""
-
-
 def upright_grid(primitives: Primitives, voxel: float = VOXEL) -> Merged:
     """Merge `primitives` (y up, unbatched) into one z-up grid. Raises as `merge`."""
     return merge(
@@ -47,11 +43,11 @@ def write_grid_npz(path: Path, grid: Merged) -> None:
 
 
 def load_openvdb() -> ModuleType:
-    """Return the module `openvdb`, an optional dependency. Raises NoOpenVDB if it is missing."""
+    """Return the module `openvdb`, an optional dependency. Raises ValueError if it is missing."""
     try:
         import openvdb
     except ImportError as error:
-        raise NoOpenVDB(
+        raise ValueError(
             "writing .vdb needs the module openvdb: install it (Debian and Ubuntu: python3-openvdb; Blender bundles "
             "its own), or write an .npz"
         ) from error
@@ -59,7 +55,7 @@ def load_openvdb() -> ModuleType:
 
 
 def write_grid_vdb(path: Path, grid: Merged) -> None:
-    """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) as half floats. Raises NoOpenVDB, OSError."""
+    """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) in float16. Raises ValueError, OSError."""
     openvdb = load_openvdb()
     index_to_world = np.diag([grid.voxel] * 3 + [1.0])  # row vectors
     index_to_world[3, :3] = grid.origin

@@ -21,10 +21,6 @@ def simplified_and_unwrapped(
     return (*coarse, unwrapped(*coarse, texture_px))
 
 
-class NoUnwrapping(ValueError):
-    """xatlas is not available for this Python."""
-
-
 def simplified(
     vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], triangles: int
 ) -> tuple[Float64[Array, "w 3"], Int64[Array, "g 3"]]:
@@ -36,11 +32,11 @@ def simplified(
 
 
 def unwrapped(vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], texture_px: int) -> Float64[Array, "f 3 2"]:
-    """Compute texture coordinates of every corner in non-overlapping charts (xatlas). Raises NoUnwrapping."""
+    """Compute texture coordinates of every corner in non-overlapping charts (xatlas). Raises ValueError."""
     try:
         import xatlas  # optional dependency
     except ModuleNotFoundError as error:  # it has no package for Python 3.14 or Linux on ARM
-        raise NoUnwrapping(
+        raise ValueError(
             "textured meshes need xatlas, which has no package for this Python and machine: use Python 3.11 or 3.13 "
             "on x86-64 or Apple Silicon, or export Gaussians or VDB"
         ) from error

@@ -19,6 +19,15 @@ COPIED_BYTES = 256 * 2**20
 """Files up to this size are copied into memory before they are checked and used; larger ones are mapped."""
 
 
+class FileError(ValueError):
+    """A file or folder that cannot be used: which one, what is wrong with it, and what to do."""
+
+    def __init__(self, path: Path | str, reason: str = "", remedy: str = ""):
+        """`reason` is a predicate ("is damaged"). A message alone stands for a path: processes send errors as text."""
+        self.path, self.reason, self.remedy = path, reason, remedy
+        super().__init__(f"{path} {reason}: {remedy}" if remedy else f"{path} {reason}".strip())
+
+
 class TooLargeError(ValueError):
     """A file is larger than its kind may be; the message names it."""
 

@@ -170,6 +170,12 @@ def read(record: type[Record], values: Mapping[str, Any], *path: str | int) -> R
     return made
 
 
+def check(record: Any) -> None:
+    """Raise FieldError for a field of a record that was not `read`, whose value its annotation does not allow."""
+    for name, kind in field_types(type(record)).items():
+        _value(kind, getattr(record, name), (name,))
+
+
 def written(value: Any) -> Any:
     """The JSON of a record or of a field's value."""
     if dataclasses.is_dataclass(value):

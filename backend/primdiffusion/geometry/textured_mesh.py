@@ -14,10 +14,6 @@ from trimesh.geometry import mean_vertex_normals
 from trimesh.triangles import cross
 
 
-class UnusableMesh(ValueError):
-    """A textured mesh that is empty, not finite, or has faces with invalid indices."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class TexturedPart:
     """A mesh with one texture, such as a body or a garment. Arrays may be shared: never write to them."""

@@ -30,10 +30,6 @@ SUBFOLDERS = ("clothes", "hair", "eyebrows", "eyelashes", "eyes", "skins")
 SOURCE = "https://github.com/makehumancommunity/makehuman-assets"
 
 
-class DamagedPictureError(ValueError):
-    """An image that cannot be decoded."""
-
-
 class AssetsMissingError(FileNotFoundError):
     """No asset folder, or files missing from it."""
 
@@ -57,7 +53,7 @@ class Assets:
 
         Raises:
             AssetsMissingError: the folder has no such image.
-            DamagedPictureError: it cannot be decoded.
+            PictureError: it cannot be decoded.
         """
         path = _picture_path(self.root, name)
         if path is None:
@@ -139,7 +135,7 @@ def _decoded(path: Path, size: int) -> UInt8[np.ndarray, "H W 4"]:
         with opened_picture(path) as picture:
             array = decoded(picture, "RGBA") if picture.width <= size else _shrunk(picture, size)
     except (OSError, PictureError) as error:
-        raise DamagedPictureError(f"{path} cannot be decoded ({error!s:.160}): fetch it again") from error
+        raise PictureError(f"{path} cannot be decoded ({error!s:.160}): fetch it again") from error
     array.setflags(write=False)
     return array
 

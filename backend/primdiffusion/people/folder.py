@@ -43,10 +43,6 @@ JOINT_GRID = 2.0**20
 PERSON = re.compile(r"person_\d{6,}")
 
 
-class OtherPeopleError(ValueError):
-    """The folder contains another set of samples."""
-
-
 @dataclasses.dataclass(frozen=True)
 class PeopleSet:
     """The samples of a folder: seeds seed ... seed + count - 1."""
@@ -83,9 +79,8 @@ def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int
     A sample takes about one second on one core. Files are deterministic for a seed, whatever the number of workers.
 
     Raises:
-        OtherPeopleError: the folder contains other samples.
+        ValueError: the folder contains other samples; a worker process was killed.
         AssetsMissingError, ProxyFileError: asset files are missing or damaged.
-        WorkerKilledError: a worker process was killed.
         OSError: a file cannot be written.
     """
     if workers < 1:
@@ -164,12 +159,12 @@ def _identity(person: Person, seed: int) -> dict[str, Any]:
 
 
 def _check_folder(people: PeopleSet) -> None:
-    """Raise OtherPeopleError if the folder has another first seed or samples outside the range."""
+    """Raise ValueError if the folder has another first seed or samples outside the range."""
     remedy = "choose another folder, or give the same --seed and at least the same --count"
     requested = f"{people.count} from seed {people.seed} were requested"
     manifest = _read_json(people.root / MANIFEST)
     if manifest is not None and manifest.get("seed") != people.seed:
-        raise OtherPeopleError(
+        raise ValueError(
             f"{people.root} contains {manifest.get('count')} samples from seed {manifest.get('seed')}, "
             f"but {requested}: {remedy}"
         )
@@ -177,7 +172,7 @@ def _check_folder(people: PeopleSet) -> None:
     found = [path.name for path in people.root.glob("person_*") if PERSON.fullmatch(path.name)]
     unexpected = sorted(set(found) - expected)
     if unexpected:
-        raise OtherPeopleError(
+        raise ValueError(
             f"{people.root} contains {unexpected[0]} ({len(unexpected)} out of range), but {requested}: {remedy}"
         )
 

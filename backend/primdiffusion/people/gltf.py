@@ -29,10 +29,6 @@ NORMAL_STEPS = 4096
 JPEG_QUALITY = 92
 
 
-class UnwritableMesh(ValueError):
-    """A mesh that cannot be written as glTF."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Skeleton:
     """Joints of a rest pose, with axes parallel to the world's."""
@@ -82,7 +78,7 @@ def glb(mesh: TexturedMesh, skeleton: Skeleton, extras: Mapping[str, Any]) -> by
         extras: JSON values for `extras` of the asset and of the scene (Blender shows the scene's).
 
     Raises:
-        UnwritableMesh: no part has a face, or a value is NaN or infinite.
+        ValueError: no part has a face, or a value is NaN or infinite.
     """
     parts = [part for part in mesh.parts if len(part.faces)]
     _check(parts, skeleton)
@@ -116,7 +112,7 @@ def glb(mesh: TexturedMesh, skeleton: Skeleton, extras: Mapping[str, Any]) -> by
 
 def _check(parts: list[TexturedPart], skeleton: Skeleton) -> None:
     if not parts:
-        raise UnwritableMesh("the mesh has no faces: give at least one")
+        raise ValueError("the mesh has no faces: give at least one")
     arrays = {"the joints' positions": skeleton.positions}
     for part in parts:
         arrays |= {
@@ -125,7 +121,7 @@ def _check(parts: list[TexturedPart], skeleton: Skeleton) -> None:
     for what, array in arrays.items():
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array)).sum())
-            raise UnwritableMesh(f"{bad} values of {what} are NaN or infinite: check the betas")
+            raise ValueError(f"{bad} values of {what} are NaN or infinite: check the betas")
 
 
 def _joint_nodes(skeleton: Skeleton) -> list[dict[str, Any]]:

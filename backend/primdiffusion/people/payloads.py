@@ -64,9 +64,8 @@ def make_payloads(
     receives the number of finished samples and the total.
 
     Raises:
-        ValueError: a count is not positive.
+        ValueError: a count is not positive; a worker process was killed.
         AssetsMissingError, ProxyFileError: asset files are missing or damaged.
-        WorkerKilledError: a worker process was killed.
     """
     for name, value in (("count", count), ("variants", variants), ("workers", workers)):
         if value < 1:
@@ -173,7 +172,7 @@ def fitted_payloads(
     Takes about 30 s on one core; further colourings add little, as they share marches and matrices.
 
     Raises:
-        UnusableMesh, ValueError: as `surface_field`; no colourings are given.
+        ValueError: as `surface_field`; no colourings are given.
     """
     if not colourings:
         raise ValueError("no mesh to fit to: give at least one colouring")

@@ -245,7 +245,7 @@ def from_mesh(mesh: TexturedMesh, frames: Frames) -> Payload:
     """The payload with which primitives in `frames` look like `mesh`: `surface_field`, then `colour`.
 
     Raises:
-        UnusableMesh, ValueError: as `surface_field`.
+        ValueError: as `surface_field`.
     """
     return colour(surface_field(mesh, frames), mesh)
 
@@ -258,8 +258,7 @@ def surface_field(mesh: TexturedMesh, frames: Frames) -> SurfaceField:
     RAMP. Meshes need not be closed: hair and skirts may be single sheets.
 
     Raises:
-        UnusableMesh: the mesh is empty or not finite.
-        ValueError: the frames are batched or not finite.
+        ValueError: the mesh is empty or not finite; the frames are batched or not finite.
     """
     soup = flatten(mesh)
     centres = voxel_centres(frames)

@@ -81,7 +81,7 @@ def figure_from_mesh(mesh: TexturedMesh) -> Figure:
     """Prepare a mesh for `render_view`.
 
     Raises:
-        UnusableMesh: as `flatten`.
+        ValueError: as `flatten`.
     """
     soup = flatten(mesh)
     first = 0

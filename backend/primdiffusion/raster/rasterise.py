@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, Int32
 
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.raster.textures import ALPHA_TEST, LINEAR_OF_BYTE, Textures, gather_textures
 from primdiffusion.raster.z_buffer import AlphaTest, barycentrics, project, z_buffer
 
@@ -89,8 +89,7 @@ def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: 
     Deterministic. Not differentiable.
 
     Raises:
-        UnusableMesh: see `flatten`.
-        ValueError: `supersample` is less than 1.
+        ValueError: see `flatten`; `supersample` is less than 1.
     """
     return rasterise_colourings([mesh], view, supersample)[0]
 
@@ -101,8 +100,7 @@ def rasterise_colourings(
     """As `rasterise`, for meshes that differ only in the colours of their textures; triangles are drawn once.
 
     Raises:
-        UnusableMesh: see `flatten`.
-        ValueError: `supersample` is less than 1.
+        ValueError: see `flatten`; `supersample` is less than 1.
     """
     if supersample < 1:
         raise ValueError(f"supersample is {supersample}: give 1 or more")
@@ -219,11 +217,11 @@ def flatten(mesh: TexturedMesh) -> TriangleSoup:
     """Concatenate the parts of a mesh.
 
     Raises:
-        UnusableMesh: the mesh has no faces, values that are not finite, faces with invalid indices, or empty textures.
+        ValueError: the mesh has no faces, values that are not finite, faces with invalid indices, or empty textures.
     """
     parts = [part for part in mesh.parts if len(part.faces)]
     if not parts:
-        raise UnusableMesh(f"the mesh has no triangles in its {len(mesh.parts)} parts: give at least one")
+        raise ValueError(f"the mesh has no triangles in its {len(mesh.parts)} parts: give at least one")
     for part in parts:
         _check(part)
     first = np.cumsum([0] + [len(part.vertices) for part in mesh.parts])
@@ -240,13 +238,13 @@ def _check(part: TexturedPart) -> None:
     """Check for values that compiled loops would read out of bounds or drop."""
     for name, values in (("vertices", part.vertices), ("corner_uv", part.corner_uv)):
         if not np.isfinite(values).all():
-            raise UnusableMesh(
+            raise ValueError(
                 f"part {part.name!r} has {int((~np.isfinite(values)).sum())} NaN or infinite values in {name}: "
                 "repair or remove the part"
             )
     low, high = int(part.faces.min()), int(part.faces.max())
     if low < 0 or high >= len(part.vertices):
-        raise UnusableMesh(
+        raise ValueError(
             f"part {part.name!r} has faces with vertices {low} to {high}, but only {len(part.vertices)} vertices: "
             "repair the faces"
         )

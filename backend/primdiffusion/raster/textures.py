@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Int32, Int64, UInt8
 
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
-from primdiffusion.geometry.textured_mesh import TexturedMesh, UnusableMesh
+from primdiffusion.geometry.textured_mesh import TexturedMesh
 
 ALPHA_TEST = 128
 """Texels with a smaller alpha (of 255) are holes."""
@@ -64,7 +64,7 @@ class TexturePyramid:
 
 
 def gather_textures(mesh: TexturedMesh) -> Textures:
-    """The textures of a mesh, one after the other. Raises UnusableMesh if one is empty."""
+    """The textures of a mesh, one after the other. Raises ValueError if one is empty."""
     _check_textures(mesh)
     textures, which = _distinct(mesh)
     flat = [np.ascontiguousarray(texture).reshape(-1, 4) for texture in textures]
@@ -79,7 +79,7 @@ def gather_textures(mesh: TexturedMesh) -> Textures:
 def texture_pyramid(mesh: TexturedMesh) -> TexturePyramid:
     """Each part's texture and its halvings, averaged in linear colour weighted by alpha so that holes tint nothing.
 
-    Raises UnusableMesh if a texture is empty.
+    Raises ValueError if a texture is empty.
     """
     _check_textures(mesh)
     textures, which = _distinct(mesh)
@@ -135,7 +135,7 @@ def mip_levels(texture: UInt8[np.ndarray, "H W 4"], count: int) -> list[Float32[
 def _check_textures(mesh: TexturedMesh) -> None:
     for part in mesh.parts:
         if part.texture.size == 0:
-            raise UnusableMesh(
+            raise ValueError(
                 f"Part {part.name!r} has an empty texture of shape {part.texture.shape}; "
                 "a plain colour is a 1 x 1 texture."
             )

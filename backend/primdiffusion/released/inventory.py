@@ -20,7 +20,7 @@ from primdiffusion.primitives.primitives import S
 from primdiffusion.primitives.slab import CHANNELS_PER_LAYER
 from primdiffusion.released import stage_one
 from primdiffusion.released.imported import SCHEDULE
-from primdiffusion.released.reading import Account, ReleasedFileError, TensorEntry
+from primdiffusion.released.reading import Account, TensorEntry
 
 RELATIVE, ABSOLUTE = 1e-4, 1e-6
 """Tolerances for buffers computed in float32. The linear schedule differs by tens of per cent."""
@@ -53,16 +53,14 @@ def buffers() -> dict[str, Tensor]:
 
 
 def check_buffers(found: Mapping[str, Tensor]) -> list[TensorEntry]:
-    """Validate the buffers. Raises ReleasedFileError, naming one that is missing or has a wrong shape or value."""
+    """Validate the buffers. Raises ValueError, naming one that is missing or has a wrong shape or value."""
     entries = []
     for name, expected in buffers().items():
         if name not in found:
-            raise ReleasedFileError(
-                f"{name!r}, a buffer of the noise schedule, is missing: download the checkpoint again"
-            )
+            raise ValueError(f"{name!r}, a buffer of the noise schedule, is missing: download the checkpoint again")
         given = found[name]
         if given.shape != expected.shape:
-            raise ReleasedFileError(
+            raise ValueError(
                 f"{name!r} has shape {tuple(given.shape)}, not {tuple(expected.shape)}: the checkpoint was trained "
                 "with another schedule"
             )
@@ -72,7 +70,7 @@ def check_buffers(found: Mapping[str, Tensor]) -> list[TensorEntry]:
             expected = torch.cat([expected[1:2], expected[1:]])
         if not torch.allclose(given, expected, rtol=RELATIVE, atol=ABSOLUTE):
             step = int((given - expected).abs().nan_to_num(torch.inf).argmax())
-            raise ReleasedFileError(
+            raise ValueError(
                 f"{name!r} is {given[step]:.6g} at step {step}, not {expected[step]:.6g} as in the released schedule "
                 f"({SCHEDULE}, beta from 1e-4 to 2e-2): the checkpoint was trained with another schedule"
             )
@@ -84,7 +82,7 @@ def infer_unet_config(weights: Mapping[str, Tensor]) -> UNetConfig:
     """Infer the U-Net of these tensors (names without the prefix); the number of heads is the released 8.
 
     Attention levels are those with a transformer after their residual blocks: none in the released checkpoints, despite
-    their configuration (SPEC 1.3). Raises ReleasedFileError if the names do not form a U-Net.
+    their configuration (SPEC 1.3). Raises ValueError if the names do not form a U-Net.
     """
     first = _shape(weights, "input_blocks.0.0.weight")
     width, multipliers, blocks, attention = first[0], [], [0], set()
@@ -101,7 +99,7 @@ def infer_unet_config(weights: Mapping[str, Tensor]) -> UNetConfig:
             blocks[-1] += 1
         number += 1
     if len(multipliers) != len(blocks) or len(set(blocks)) != 1:
-        raise ReleasedFileError(
+        raise ValueError(
             f"the levels of {PREFIX}input_blocks have {blocks} residual blocks, which must be equal: download the "
             "checkpoint again"
         )
@@ -111,31 +109,31 @@ def infer_unet_config(weights: Mapping[str, Tensor]) -> UNetConfig:
 def account_denoiser(weights: Mapping[str, Tensor]) -> tuple[UNetConfig, list[TensorEntry]]:
     """Infer the U-Net's configuration and validate its tensors (names without the prefix).
 
-    Raises ReleasedFileError, naming a tensor that is missing, unknown, of a wrong shape, or not finite floating point.
+    Raises ValueError, naming a tensor that is missing, unknown, of a wrong shape, or not finite floating point.
     """
     config = max((PAPER, PAPER_WITH_ATTENTION), key=lambda known: _match_fraction(known, weights))
     if _match_fraction(config, weights) < 0.5:
         config = infer_unet_config(weights)
     if config.slab_channels != SLAB_CHANNELS:
-        raise ReleasedFileError(
+        raise ValueError(
             f"'{PREFIX}input_blocks.0.0.weight' takes {config.slab_channels} channels, but slabs of {S} layers have "
             f"{SLAB_CHANNELS}: this is not a checkpoint of 1024 primitives"
         )
     expected = _shapes(config)
     for name in expected:
         if name not in weights:
-            raise ReleasedFileError(f"'{PREFIX}{name}' {expected[name]} is missing: download the checkpoint again")
+            raise ValueError(f"'{PREFIX}{name}' {expected[name]} is missing: download the checkpoint again")
     entries = []
     for name, value in weights.items():
         key, shape = f"{PREFIX}{name}", tuple(value.shape)
         if name not in expected:
-            raise ReleasedFileError(f"unknown tensor {key!r} {shape} in the denoiser: {_OTHER}")
+            raise ValueError(f"unknown tensor {key!r} {shape} in the denoiser: {_OTHER}")
         if shape != expected[name]:
-            raise ReleasedFileError(f"{key!r} has shape {shape}, not {expected[name]}: {_OTHER}")
+            raise ValueError(f"{key!r} has shape {shape}, not {expected[name]}: {_OTHER}")
         entries.append(TensorEntry(key, "diffusion", shape, "imported", "as denoiser.*"))
     for name, value in weights.items():
         if not value.is_floating_point() or not torch.isfinite(value).all():
-            raise ReleasedFileError(
+            raise ValueError(
                 f"'{PREFIX}{name}' has NaN or infinite values or is not floating point: download the checkpoint again"
             )
     return config, entries
@@ -154,7 +152,7 @@ def _shapes(config: UNetConfig) -> dict[str, tuple[int, ...]]:
         with torch.device("meta"):
             return {name: tuple(value.shape) for name, value in SlabUNet(config).state_dict().items()}
     except (ValueError, RuntimeError) as error:  # from torch, for widths not divisible by groups or heads
-        raise ReleasedFileError(f"{PREFIX}input_blocks is not a valid U-Net ({config}: {error}): {_OTHER}") from error
+        raise ValueError(f"{PREFIX}input_blocks is not a valid U-Net ({config}: {error}): {_OTHER}") from error
 
 
 _OTHER = "the checkpoint is of another version of the released code, or damaged"
@@ -162,9 +160,9 @@ _OTHER = "the checkpoint is of another version of the released code, or damaged"
 
 def _shape(weights: Mapping[str, Tensor], name: str) -> tuple[int, ...]:
     if name not in weights:
-        raise ReleasedFileError(f"'{PREFIX}{name}' is missing: {_OTHER}")
+        raise ValueError(f"'{PREFIX}{name}' is missing: {_OTHER}")
     if weights[name].ndim != 4 or 0 in weights[name].shape:
-        raise ReleasedFileError(f"'{PREFIX}{name}' has shape {tuple(weights[name].shape)}, not [o, i, 3, 3]: {_OTHER}")
+        raise ValueError(f"'{PREFIX}{name}' has shape {tuple(weights[name].shape)}, not [o, i, 3, 3]: {_OTHER}")
     return tuple(weights[name].shape)
 
 
@@ -180,13 +178,13 @@ class Inventory:
 def take_inventory(weights: Mapping[str, Tensor]) -> Inventory:
     """Validate each tensor of a checkpoint of both stages (475 in the released one), or of stage 1 alone (165).
 
-    Raises ReleasedFileError, naming the first tensor that is unknown, missing or invalid.
+    Raises ValueError, naming the first tensor that is unknown, missing or invalid.
     """
     prefixes = (stage_one.PREFIX, PREFIX)
     if not any(key.startswith(prefixes) for key in weights):
         if not any(key.partition(".")[0] in stage_one.TENSORS for key in weights):
             names = ", ".join(map(repr, list(weights)[:4])) or "none"
-            raise ReleasedFileError(
+            raise ValueError(
                 f"none of the {len(weights)} tensors belongs to a released checkpoint (first: {names}): give the "
                 "authors' primdiffusion.pt"
             )
@@ -196,7 +194,7 @@ def take_inventory(weights: Mapping[str, Tensor]) -> Inventory:
     known = buffers()
     for key, value in weights.items():
         if key not in known and not key.startswith(prefixes):
-            raise ReleasedFileError(f"unknown tensor {key!r} {tuple(value.shape)}: give the authors' primdiffusion.pt")
+            raise ValueError(f"unknown tensor {key!r} {tuple(value.shape)}: give the authors' primdiffusion.pt")
     entries = check_buffers({key: weights[key] for key in known if key in weights})
     entries += stage_one.account_stage_one(under(weights, stage_one.PREFIX))
     unet, imported = account_denoiser(under(weights, PREFIX))

@@ -70,28 +70,24 @@ class Account:
         )
 
 
-class ReleasedFileError(ValueError):
-    """A file that is not a checkpoint of the released code."""
-
-
 def read_weights(path: Path) -> dict[str, Tensor]:
     """Read the tensors of a released checkpoint in file order, memory-mapped if possible, so optimisers are not loaded.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        ReleasedFileError: the file would execute code, is truncated, or is not a dictionary of named tensors.
+        ValueError: the file would execute code, is truncated, or is not a dictionary of named tensors.
     """
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}: give the path of the authors' primdiffusion.pt")
     content = _load(path)
     state = content.get(STATE, content) if isinstance(content, Mapping) else content
     if not isinstance(state, Mapping):
-        raise ReleasedFileError(
+        raise ValueError(
             f"{path} contains a {type(state).__name__} instead of {STATE!r}: give the authors' primdiffusion.pt"
         )
     for key, value in state.items():
         if not isinstance(key, str) or not isinstance(value, Tensor) or not torch_file.is_plain(value):
-            raise ReleasedFileError(
+            raise ValueError(
                 f"{key!r} in {path} is a {type(value).__name__}, not a dense tensor: give the authors' "
                 f"primdiffusion.pt, with top-level keys {STATE!r} and 'optimizer'"
             )
@@ -106,11 +102,11 @@ def _load(path: Path) -> object:
     except torch_file.PICKLE_ERRORS as error:
         asked = re.search(r"GLOBAL:? (\S+)|global (\S+)", str(error))
         if asked:
-            raise ReleasedFileError(
+            raise ValueError(
                 f"{path} would execute {asked[1] or asked[2]} when loaded, which weights never need; nothing was "
                 "executed: download the file again from its publisher"
             ) from error
-        raise ReleasedFileError(
+        raise ValueError(
             f"{path} is truncated or not a torch file ({_first_sentence(error)}): download it again"
         ) from error
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.released.reading import ReleasedFileError, TensorEntry
+from primdiffusion.released.reading import TensorEntry
 
 PREFIX = "bodydecoder."
 TENSORS = {
@@ -142,7 +142,7 @@ def _shapes() -> dict[str, tuple[int, ...]]:
 def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> list[TensorEntry]:
     """Validate the tensors (names without `prefix`, which error messages include).
 
-    Groups that are not used may be of any shape, incomplete or missing. Raises ReleasedFileError, naming a tensor that
+    Groups that are not used may be of any shape, incomplete or missing. Raises ValueError, naming a tensor that
     is unknown, of a wrong shape or not finite floating point, an incomplete group, or layers that cannot be told apart.
     """
     groups = _grouped(tensors, prefix)
@@ -153,7 +153,7 @@ def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> li
             _matched(group, found)
         if len(found) != TENSORS[group]:
             names = ", ".join(found) or "none"
-            raise ReleasedFileError(
+            raise ValueError(
                 f"'{prefix}{group}' has {len(found)} tensors, not {TENSORS[group]}: {names}; download the checkpoint "
                 "again"
             )
@@ -161,7 +161,7 @@ def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> li
     for group, found in groups.items():
         for key, value in found.items():
             if group not in NOT_USED and not (value.is_floating_point() and torch.isfinite(value).all()):
-                raise ReleasedFileError(
+                raise ValueError(
                     f"{key!r} has NaN or infinite values or is not floating point: download the checkpoint again"
                 )
     return [
@@ -179,14 +179,14 @@ def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> li
 def encoder_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Parameters (float32) of the encoder "released" by name, from tensors that `account_stage_one` has validated.
 
-    Raises ReleasedFileError for a convolution whose weights are all zero, which has no direction.
+    Raises ValueError for a convolution whose weights are all zero, which has no direction.
     """
     groups, shapes, found = _grouped(tensors, ""), _shapes(), {}
     for group in LAYERS:
         for name, keys in _matched(group, groups[group]).items():
             weight, gain, bias = (tensors[key].float() for key in keys)
             if not weight.any():
-                raise ReleasedFileError(f"{keys.weight!r} is all zero: download the checkpoint again")
+                raise ValueError(f"{keys.weight!r} is all zero: download the checkpoint again")
             norm = f"{name}.convolution.parametrizations.weight"
             found[f"{norm}.original0"] = gain.reshape(shapes[f"{norm}.original0"])
             found[f"{norm}.original1"] = weight.contiguous()
@@ -203,7 +203,7 @@ def _grouped(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, dict[str, 
     for name, value in tensors.items():
         group = name.partition(".")[0]
         if group not in groups:
-            raise ReleasedFileError(
+            raise ValueError(
                 f"unknown tensor '{prefix}{name}' {tuple(value.shape)}: give the authors' primdiffusion.pt"
             )
         groups[group][f"{prefix}{name}"] = value
@@ -223,13 +223,13 @@ def _matched(group: str, found: Mapping[str, Tensor]) -> dict[str, Convolution]:
         fitting = [layer for layer in left if shapes == (layer.weight, layer.bias)]
         if not fitting:
             rest = "; ".join(f"{_written(layer.weight)} with {_written(layer.bias)}" for layer in left) or "none"
-            raise ReleasedFileError(
+            raise ValueError(
                 f"{keys.weight!r} {shapes[0]} with {keys.bias!r} {shapes[1]} matches no layer of {group}; unmatched "
                 f"layers: {rest}"
             )
         before = by_shapes.setdefault(shapes, module)
         if before != module and _NUMBER.sub("", before) != _NUMBER.sub("", module):
-            raise ReleasedFileError(
+            raise ValueError(
                 f"{before!r} and {module!r} have the same shapes and no numbers that tell which comes first: the "
                 "checkpoint is of another version of the released code"
             )
@@ -255,10 +255,10 @@ def _convolution(module: str, found: Mapping[str, Tensor]) -> Convolution:
     gains = [key for key in found if key not in weights + biases]
     if not len(weights) == len(biases) == len(gains) == 1:
         given = ", ".join(f"{key!r} {tuple(value.shape)}" for key, value in found.items())
-        raise ReleasedFileError(f"{module!r} is not a convolution with weight, gain and bias: it has {given}")
+        raise ValueError(f"{module!r} is not a convolution with weight, gain and bias: it has {given}")
     channels = found[biases[0]].shape[0]
     if found[gains[0]].numel() != channels:
-        raise ReleasedFileError(
+        raise ValueError(
             f"{gains[0]!r} has shape {tuple(found[gains[0]].shape)}, not one value per channel of {biases[0]!r} "
             f"{tuple(found[biases[0]].shape)}"
         )
@@ -273,11 +273,9 @@ def _check_attention(found: Mapping[str, Tensor], prefix: str) -> None:
             key = f"{prefix}transformer.{part}"
             if key not in found:
                 unknown = ", ".join(sorted(found.keys() - _attention_keys(prefix))) or "none"
-                raise ReleasedFileError(
-                    f"{key!r} is missing; the transformer has unknown tensors instead: {unknown:.120}"
-                )
+                raise ValueError(f"{key!r} is missing; the transformer has unknown tensors instead: {unknown:.120}")
             if [side for side in found[key].shape if side != 1] != expected:
-                raise ReleasedFileError(
+                raise ValueError(
                     f"{key!r} has shape {tuple(found[key].shape)}, not {tuple(expected)}: the checkpoint is of another "
                     "version of the released code, or damaged"
                 )

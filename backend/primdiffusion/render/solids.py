@@ -23,10 +23,6 @@ HEADLIGHT = 0.55
 """Light from the viewer: HEADLIGHT * |n . ray|. SKY + HEADLIGHT is 1, so colours are never brightened."""
 
 
-class UnusableSolids(ValueError):
-    """Triangles with wrong shapes, or that are not finite."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Solids:
     """Opaque two-sided triangles in world space."""
@@ -39,14 +35,14 @@ class Solids:
     """Whether the triangle is a holdout: it hides what is behind it and leaves a hole."""
 
     def __post_init__(self) -> None:
-        """Raise UnusableSolids if shapes do not match or values are not finite."""
+        """Raise ValueError if shapes do not match or values are not finite."""
         count = len(self.corners)
         for name, shape in (("corners", (count, 3, 3)), ("colour", (count, 3)), ("holdout", (count,))):
             value = getattr(self, name)
             if value.shape != shape:
-                raise UnusableSolids(f"{name} of the solids has shape {value.shape}; it must be {shape}")
+                raise ValueError(f"{name} of the solids has shape {value.shape}; it must be {shape}")
             if not np.isfinite(value).all():
-                raise UnusableSolids(f"{name} of the solids holds NaN or infinite values: repair the meshes")
+                raise ValueError(f"{name} of the solids holds NaN or infinite values: repair the meshes")
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -7,7 +7,7 @@ import hashlib
 import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -22,6 +22,8 @@ from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.failures import describe
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.json_files import parse_json, read_json
+from primdiffusion.formats.requests import Count, Seed
+from primdiffusion.formats.schema import Range, check
 from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD
 from primdiffusion.people.payloads import store_person, voxels_from_payload
@@ -34,22 +36,20 @@ from primdiffusion.training.stored_people import read_person
 class EncodeSettings:
     """Settings of encoding."""
 
-    views: int = 8
+    views: Count = 8
     """Input images of one frame, spread around the subject; all if there are fewer."""
-    looks: int = 1
+    looks: Count = 1
     """Frames to encode, one payload each, evenly spaced from the first."""
-    refine_steps: int = 0
+    refine_steps: Annotated[int, Range(0)] = 0
     """Refinement steps on all images of all frames; 0 for none."""
-    refine_size: int = 256
+    refine_size: Count = 256
     """Largest side of the images used in refinement, pixels."""
-    seed: int = 0
+    seed: Seed = 0
     """Seed of the order of images in refinement."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values out of range."""
-        for name, least in (("views", 1), ("looks", 1), ("refine_steps", 0), ("refine_size", 1), ("seed", 0)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} is {getattr(self, name)}: it must be {least} or more")
+        """Raise FieldError for values out of range."""
+        check(self)
 
 
 def encode_people(
@@ -97,9 +97,8 @@ def looks_of(
     """Return the payloads of a subject, on the CPU, and the betas of the body that carries the boxes.
 
     Raises:
-        FileNotFoundError, ConditioningError, CaptureFileError, ArrayFileError, BodyFileError: captures are missing,
-            damaged or of another body.
-        ValueError: the pictures lead to numbers that are not finite.
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: captures are missing or damaged.
+        ValueError: they are of another body; the pictures lead to numbers that are not finite.
     """
     subject = captures.subject(name)
     given = body_betas(subject, model.body)

@@ -22,7 +22,9 @@ from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
+from primdiffusion.training.loop import Step
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.stored_people import PersonDataset, one_density
@@ -117,7 +119,7 @@ def _prepared_with(
     return Prepared(latents, unseen, codec, base.denoiser.prior, base.shapes, vocabulary, people.full_density)
 
 
-class CellTrainee:
+class CellTask(DiffusionTask):
     """Trains a `PersonDenoiser`: first its network over person components, then the one over the grid.
 
     The networks start with the weights of `base` if it is given.
@@ -143,26 +145,35 @@ class CellTrainee:
         self.denoiser = build() if base is None else tensor_file.load_network(build, base.denoiser.state_dict())
         self.denoiser.eval().requires_grad_(False).to(device)
         phases = {"person": config.person, "local": config.local}
-        self.phases: Mapping[str, PhaseConfig] = {
-            name: phase for name, phase in phases.items() if getattr(self.denoiser, name) is not None
-        }
+        self._phases = {name: phase for name, phase in phases.items() if getattr(self.denoiser, name) is not None}
         self._objectives: dict[str, PersonObjective | RestObjective] = {}
 
-    def network(self, name: str) -> nn.Module:
-        """The one over components ("person") or over the grid ("local")."""
-        return getattr(self.denoiser, name)
+    @property
+    def phases(self) -> Mapping[str, PhaseConfig]:
+        """Return the settings of the network over components ("person") and of that over the grid ("local")."""
+        return self._phases
 
-    def put(self, name: str, network: nn.Module) -> None:
+    def network(self, phase: str) -> nn.Module:
+        """Return one of the two networks."""
+        return getattr(self.denoiser, phase)
+
+    def put(self, phase: str, network: nn.Module) -> None:
         """Install a network, in the precision of its phase."""
-        setattr(self.denoiser, name, network)
-        fast = self.phases[name].bfloat16 and has_fast_bfloat16(self.device)
+        setattr(self.denoiser, phase, network)
+        fast = self.phases[phase].bfloat16 and has_fast_bfloat16(self.device)
         self.denoiser.network_dtype = torch.bfloat16 if fast else torch.float32
 
-    def loss(self, name: str, generator: torch.Generator) -> Tensor:
+    def loss(self, step: Step) -> Mapping[str, Tensor]:
         """Weighted x0 error of a random batch at random levels."""
-        if name not in self._objectives:
-            self._objectives[name] = self._objective(name)
-        return self._objectives[name].loss(generator)
+        loss = self.objective(step.phase).loss(step.generator)
+        step.timer.lap("forward")
+        return {"loss": loss}
+
+    def objective(self, phase: str) -> PersonObjective | RestObjective:
+        """Return the objective of a network."""
+        if phase not in self._objectives:
+            self._objectives[phase] = self._objective(phase)
+        return self._objectives[phase]
 
     def errors(self) -> Mapping[int, float]:
         """RMS x0 errors on the held-out set, in units of latents."""
@@ -185,15 +196,15 @@ class CellTrainee:
             CHAINS[str(self.config.chain)],
         )  # fmt: skip
 
-    def _objective(self, name: str) -> PersonObjective | RestObjective:
-        denoiser, phase = self.denoiser, self.phases[name]
-        if name == "local":
-            return RestObjective(denoiser, self.train, self.codec, self.vocabulary, phase)
+    def _objective(self, phase: str) -> PersonObjective | RestObjective:
+        denoiser, settings = self.denoiser, self.phases[phase]
+        if phase == "local":
+            return RestObjective(denoiser, self.train, self.codec, self.vocabulary, settings)
         prior = denoiser.prior
         coefficients = torch.cat([prior.split(chunk.float())[0] for chunk in self.train.latents.split(128)])
         # Components are fitted to these people and vary more over them than over new ones; the prior knows by how much.
         coefficients *= denoiser.component_std / coefficients.square().mean(0).sqrt()
-        return PersonObjective(denoiser, coefficients, self.train, self.vocabulary, phase)
+        return PersonObjective(denoiser, coefficients, self.train, self.vocabulary, settings)
 
 
 def _save_prepared(path: Path, prepared: Prepared) -> None:

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Annotated, Any, Literal
 
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.requests import Count, Share
+from primdiffusion.formats.schema import Range, check
 
 Weighting = Literal["whitened", "plain", "min_snr"]
 Tracker = Literal["tensorboard", "wandb"]
 Levels = Literal["uniform", "log_uniform", "log_normal"]
+NotNegative = Annotated[float, Range(0, 1e30)]
+Positive = Annotated[float, Range(1e-12, 1e30)]
+Decay = Annotated[float, Range(0, 0.999999)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,97 +53,85 @@ class PriorConfig:
 class PhaseConfig:
     """Training of one network."""
 
-    steps: int
+    steps: Count
     """Optimiser steps; the learning rate decays to a tenth along a cosine."""
-    batch: int
+    batch: Count
     """Samples per step, each at a random noise level."""
     optimiser: Literal["adamw", "muon"] = "adamw"
     """adamw; or muon, Muon for hidden layers at three times the learning rate, AdamW for the rest. Muon is for the
     default preset, and computes in bfloat16: devices that are slow in it take AdamW."""
-    learning_rate: float = 1e-3
+    learning_rate: Positive = 1e-3
     """Learning rate of AdamW after a warm-up of 100 steps."""
-    weight_decay: float = 0.01
+    weight_decay: NotNegative = 0.01
     """Weight decay of AdamW."""
-    gradient_clip: float = 1.0
+    gradient_clip: Positive = 1.0
     """Largest norm of the gradient."""
-    ema: float = 0.999
+    ema: Decay = 0.999
     """Decay of the averaged weights, which are evaluated and saved."""
     weighting: Weighting = "whitened"
     """Weighting of x0 errors: whitened, in units of the posterior std of the closed form; plain, as in the paper;
     min_snr, plain times min(SNR, gamma) (Hang et al. 2023)."""
-    error_power: float = 1.0
+    error_power: NotNegative = 1.0
     """Whitened errors, in units of posterior std s, are weighted by s^power: 2 is the paper's error on one level."""
     levels: Levels = "uniform"
     """Distribution of noise levels: uniform in t, as in the paper; log_uniform in noise over signal; log_normal in the
     same (Karras et al. 2022), with a fifth log_uniform."""
-    level_median: float = 2.0
+    level_median: Positive = 2.0
     """Median of log_normal levels: noise over signal, in units of the samples' standard deviation."""
-    level_width: float = 1.4
+    level_width: Positive = 1.4
     """Standard deviation of the logarithm of log_normal levels."""
-    min_snr_gamma: float = 5.0
+    min_snr_gamma: Positive = 5.0
     """Largest weight of a level with min_snr."""
-    blend: float = 0.3
+    blend: Share = 0.3
     """Fraction of samples that blend the colour variants of one geometry. Default preset only."""
-    unasked: float = 0.5
+    unasked: Share = 0.5
     """Fraction of samples trained without attributes; the others have a random subset. Default preset only."""
-    evaluate_every: int = 500
+    evaluate_every: Count = 500
     """Steps between evaluations on held-out people."""
     bfloat16: bool = False
     """Run the network in bfloat16 where the device multiplies it faster than float32."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values out of range."""
-        for name in ("steps", "batch", "evaluate_every"):
-            _check(name, getattr(self, name), getattr(self, name) >= 1, "1 or more")
-        for name in ("learning_rate", "gradient_clip", "min_snr_gamma", "level_median", "level_width"):
-            _check(name, getattr(self, name), 0 < getattr(self, name) < math.inf, "above 0")
-        for name in ("weight_decay", "error_power"):
-            _check(name, getattr(self, name), 0 <= getattr(self, name) < math.inf, "0 or more")
-        for name in ("blend", "unasked"):
-            _check(name, getattr(self, name), 0 <= getattr(self, name) <= 1, "from 0 to 1")
-        _check("ema", self.ema, 0 <= self.ema < 1, "0 or more, and below 1")
+        """Raise FieldError for values out of range."""
+        check(self)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RunSettings:
-    """How a run of stage 2 is stopped, measured and saved; the same for each of its networks."""
+    """Where a run is, and how it is stopped, measured and saved: the same for every task."""
 
-    minutes: float | None = None
-    """Time limit, after which the run can be resumed."""
+    data: Path
+    """Training set."""
+    run: Path
+    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
+    minutes: NotNegative | None = None
+    """Time limit, after which the run can be resumed; 0 writes the model of the last saved state."""
     seed: int = 0
     """Seed of all random numbers."""
-    holdout: float = 0.05
-    """Fraction of geometries, with all their colour variants, held out for evaluation."""
-    save_every: float = 60.0
+    save_every: NotNegative = 60.0
     """Seconds between checkpoints; 0 saves after every step."""
-    threads: int | None = None
+    threads: Count | None = None
     """CPU threads; the default is torch's."""
-    log_every: int = 50
+    log_every: Count = 50
     """Steps between lines of metrics.jsonl, which are running means."""
-    pictures_every: int = 1000
-    """Steps between images of samples from the averaged weights."""
+    pictures_every: Count = 1000
+    """Steps between images made with the averaged weights."""
     tracker: Tracker | None = None
     """Where metrics go besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values out of range."""
-        for name in ("log_every", "pictures_every", "threads"):
-            value = getattr(self, name)
-            _check(name, value, value is None or value >= 1, "1 or more")
-        for name in ("minutes", "save_every"):
-            value = getattr(self, name)
-            _check(name, value, value is None or value >= 0, "0 or more")
-        _check("holdout", self.holdout, 0 < self.holdout < 1, "between 0 and 1")
+        """Raise FieldError for values out of range."""
+        check(self)
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, kw_only=True)
 class TrainingConfig(RunSettings):
     """Train a diffusion model; the same command line resumes (docs/design/diffusion_training.md)."""
 
     data: Path
     """Training set of `primdiffusion payloads`: a folder of files, or of shards from `payloads pack`."""
-    run: Path
-    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
+    holdout: Annotated[float, Range(1e-6, 0.999999)] = 0.05
+    """Fraction of geometries, with all their colour variants, held out for evaluation."""
     more_data: Path | None = None
     """More humans, of `payloads --making from_mesh`: cheap, so they can be many, but blurred. The default preset learns
     from them what noise does not hide: the closed form, and its networks at levels above t = 300."""
@@ -195,11 +187,6 @@ class TrainingConfig(RunSettings):
                 raise ValueError(f"{name} is for the default preset: leave it out, or give --preset default")
 
 
-def _check(name: str, value: object, fits: bool, wanted: str) -> None:
-    if not fits:
-        raise ValueError(f"{name} is {value}: it must be {wanted}")
-
-
 def to_json(config: Any) -> str:
     """The configuration as readable JSON."""
     return json.dumps(dataclasses.asdict(config), indent=2, default=str)
@@ -232,16 +219,7 @@ _ADDED = {"unet.attention_context": "input", "slab.optimiser": "adamw"}
 """Settings of the paper preset that earlier runs do not name, and what they were."""
 
 
-class RunConfig(Protocol):
-    """Settings of a run of either stage: a dataclass with its folder and its data."""
-
-    @property
-    def run(self) -> Path: ...
-    @property
-    def data(self) -> Path: ...
-
-
-def check_resumable(saved: str, config: RunConfig) -> None:
+def check_resumable(saved: str, config: RunSettings) -> None:
     """Raise ValueError, naming the settings in which a saved run differs from `config`, except those allowed to."""
     try:
         before = _comparable(parse_json(saved))

@@ -9,26 +9,26 @@ from typing import Any
 
 import torch
 import tyro
-from accelerate import Accelerator, PartialState
+from accelerate import PartialState
 
 from primdiffusion import __version__
 from primdiffusion.device import device_info
 from primdiffusion.diffusion.checkpoint import file_hash, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.training.cells import CellTrainee, load_base, prepare
+from primdiffusion.training import loop
+from primdiffusion.training.cells import CellTask, load_base, prepare
 from primdiffusion.training.config import TrainingConfig
 from primdiffusion.training.latents import split_people
-from primdiffusion.training.phase import state_path, train_phase
-from primdiffusion.training.recorder import Interrupt
-from primdiffusion.training.run_folder import alone, begin, versions
+from primdiffusion.training.run_folder import begin, open_run, versions
 from primdiffusion.training.shards import open_people
-from primdiffusion.training.slabs import SlabTrainee
-from primdiffusion.training.state import AcceleratedState, accelerator_of
+from primdiffusion.training.slabs import SlabTask
+from primdiffusion.training.state import TrainingState
 from primdiffusion.training.stored_people import PersonDataset
-from primdiffusion.training.trackers import check_tracker, tracking
 
 MODEL = "model.safetensors"
+PHASES = ("person", "local", "slab")
+"""Networks of both presets."""
 DATA = "humans dressed from MakeHuman's CC0 assets, in T pose, as primitives fitted to renders of their meshes"
 LIMITS = (
     "The humans are adults from MakeHuman's bodies, in their assets' outfits, shoes and hair styles, with colours and "
@@ -48,7 +48,6 @@ DISTANCE_LIMIT = (
 )
 
 
-@alone
 def train(config: TrainingConfig) -> DiffusionModel:
     """Run or resume a training run; returns the model as trained so far, which is also in run/model.safetensors.
 
@@ -57,54 +56,37 @@ def train(config: TrainingConfig) -> DiffusionModel:
 
     Raises:
         ValueError: invalid settings, or settings or people other than those the run in this folder began with; people
-            of different full densities; a loss or gradient that is not finite (NotFiniteError); out of memory; a
-            damaged file (ShardError among them).
+            of different full densities; a loss or gradient that is not finite; out of memory; a
+            damaged file (FileError among them).
         FileNotFoundError: there are fewer than two people.
         MissingPackageError: the tracker's package is not installed.
         OSError: the disk is full; the last saved state remains.
     """
-    if config.threads:
-        torch.set_num_threads(config.threads)
-    check_tracker(config.tracker)
-    accelerator = accelerator_of()
-    people = open_people(config.data)
-    chosen, held = split_people(range(len(people.names)), config.holdout, config.seed)
-    with accelerator.main_process_first():
+    with open_run(config) as accelerator:
+        people = open_people(config.data)
+        chosen, held = split_people(range(len(people.names)), config.holdout, config.seed)
+        with accelerator.main_process_first():
+            if accelerator.is_main_process:
+                unseen = {"held": [people.names[index] for index in held]}
+                begin(config, people.names, unseen, PHASES, accelerator.num_processes)
+            task = _task(config, people, chosen, held, accelerator.device)
+        states = loop.train(task, config, accelerator)
+        model = task.model()
         if accelerator.is_main_process:
-            _begin(config, people, held, accelerator)
-        trainee = _trainee(config, people, chosen, held, accelerator)
-    tracker = config.tracker if accelerator.is_main_process else None
-    with Interrupt(config.minutes) as interrupt, tracking(tracker, config.run) as tracked:
-        states = {name: train_phase(config, trainee, name, accelerator, interrupt, tracked) for name in trainee.phases}
-    model = trainee.model()
-    if accelerator.is_main_process:
-        model = dataclasses.replace(model, card=_card(config, people, chosen, held, trainee, states))
-        save_checkpoint(config.run / MODEL, model, str(config.schedule))
-    accelerator.end_training()
-    return model
+            card = _card(config, people, chosen, held, task, states)
+            model = dataclasses.replace(model, card=card)
+            save_checkpoint(config.run / MODEL, model, str(config.schedule))
+        return model
 
 
-def _begin(config: TrainingConfig, people: PersonDataset, held: Sequence[int], accelerator: Accelerator) -> None:
-    """Record the start in the run folder, and drop metrics of steps that were lost in a kill."""
-    names = ("person", "local", "slab")
-    steps = {name: AcceleratedState.saved_step(state_path(config, name)) for name in names}
-    begin(
-        config,
-        people.names,
-        {"held": [people.names[index] for index in held]},
-        {"steps": {name: done for name, done in steps.items() if done}, "processes": accelerator.num_processes},
-        lambda row: row["step"] <= steps[row["phase"]],
-    )
-
-
-def _trainee(
-    config: TrainingConfig, people: PersonDataset, chosen: Sequence[int], held: Sequence[int], accelerator: Accelerator
-) -> CellTrainee | SlabTrainee:
+def _task(
+    config: TrainingConfig, people: PersonDataset, chosen: Sequence[int], held: Sequence[int], device: torch.device
+) -> CellTask | SlabTask:
     if config.preset == "paper":
-        return SlabTrainee(config, people, chosen, held, accelerator.device)
+        return SlabTask(config, people, chosen, held, device)
     base = None if config.start_from is None else load_base(config.start_from)
     more = None if config.more_data is None else open_people(config.more_data)
-    return CellTrainee(config, prepare(config, people, chosen, held, base, more), accelerator.device, base)
+    return CellTask(config, prepare(config, people, chosen, held, base, more), device, base)
 
 
 def _card(
@@ -112,8 +94,8 @@ def _card(
     people: PersonDataset,
     chosen: Sequence[int],
     held: Sequence[int],
-    trainee: CellTrainee | SlabTrainee,
-    states: Mapping[str, AcceleratedState],
+    task: CellTask | SlabTask,
+    states: Mapping[str, TrainingState],
 ) -> dict[str, Any]:
     """The model card: data, settings and held-out errors."""
     processes = next(iter(states.values())).accelerator.num_processes if states else 1
@@ -127,23 +109,23 @@ def _card(
         "full_density": people.full_density,
         "schedule": config.schedule,
         "seed": config.seed,
-        "device": _device_name(trainee.device),
+        "device": _device_name(task.device),
         **versions(),
         "steps": {name: state.step for name, state in states.items()},
         "seconds": {name: round(state.seconds, 1) for name, state in states.items()},
-        "batch": {name: trainee.phases[name].batch * processes for name in states},
-        "weighting": {name: trainee.phases[name].weighting for name in states},
+        "batch": {name: task.phases[name].batch * processes for name in states},
+        "weighting": {name: task.phases[name].weighting for name in states},
         "parameters": sum(p.numel() for state in states.values() for p in state.network.parameters()),
     }
     if config.start_from is not None:
         card |= {"started_from": file_hash(config.start_from)}
     if config.made_of == "makehuman":
         card |= {"licence": "CC0-1.0", "data": DATA, "limits": _limits(config)}
-    if isinstance(trainee, SlabTrainee):
-        return {**card, "held_out_rms_x0_error": _rounded({"denoiser": trainee.errors()})}
-    if blurred := len(trainee.train.betas) - len(chosen):
+    if isinstance(task, SlabTask):
+        return {**card, "held_out_rms_x0_error": _rounded({"denoiser": task.errors()})}
+    if blurred := len(task.train.betas) - len(chosen):
         card |= {"blurred_geometries": blurred}
-    errors = trainee.errors_beside_closed_forms()
+    errors = task.errors_beside_closed_forms()
     better = all(errors["denoiser"][level] < errors["gaussian"][level] for level in errors["gaussian"])
     return {**card, "held_out_rms_x0_error": _rounded(errors), "beats_gaussian_at_every_level": better}
 

@@ -2,39 +2,44 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import json
 import logging
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import torch
 import tyro
-from accelerate import PartialState
-from accelerate.utils import set_seed
-from torch import Tensor
-from tqdm.contrib.logging import logging_redirect_tqdm
+from accelerate import Accelerator, PartialState
+from torch import Tensor, nn
 
 from primdiffusion import __version__
-from primdiffusion.capture.dataset import Position, ProcessRank
+from primdiffusion.capture.conditioning import default_betas
+from primdiffusion.capture.dataset import CaptureDataset, Position, ProcessRank, SampleSettings
 from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.encoder.blocks import UntiedConv
 from primdiffusion.encoder.config import PRESETS
-from primdiffusion.encoder.model import EncoderModel
+from primdiffusion.encoder.model import EncoderModel, save_encoder
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.failures import out_of_memory
+from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
-from primdiffusion.training.fit_data import FitDataset, FitSample, betas_of, fit_batches, fit_dataset
+from primdiffusion.training.fit_data import Batch, FitSample, betas_of, fit_batches, fit_dataset
 from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
-from primdiffusion.training.fit_run import MODEL, STATE, FitRecorder, FitState, begin, save
-from primdiffusion.training.recorder import Interrupt, StepMetrics, StepTimer
-from primdiffusion.training.run_folder import alone, versions
-from primdiffusion.training.state import NotFiniteError, accelerator_of, agreed
-from primdiffusion.training.trackers import check_tracker, tracking
+from primdiffusion.training.loop import Step, StepTimer, Task, train
+from primdiffusion.training.run_folder import begin, open_run, versions, write_picture
+from primdiffusion.training.state import TrainingState, adamw
+
+MODEL = "encoder.safetensors"
+SIZE = 256
+"""Width and height of the images that are evaluated and drawn, pixels."""
+PEOPLE = 6
+"""Number of subjects that are evaluated and drawn."""
+SEED = 7
+"""Seed of their frames and views."""
 
 
 def run(arguments: Sequence[str]) -> None:
@@ -46,7 +51,6 @@ def run(arguments: Sequence[str]) -> None:
         print(f"{config.run / MODEL}  {model.card['steps']} of {config.steps} steps")
 
 
-@alone
 def fit(config: FitConfig) -> EncoderModel:
     """Start or resume a run; returns the encoder, which is also saved as run/encoder.safetensors.
 
@@ -55,151 +59,142 @@ def fit(config: FitConfig) -> EncoderModel:
 
     Raises:
         ValueError: settings that cannot be, or others than those with which the run in this folder began; captures
-            without a frame, or of another body; objective or gradient that are not finite (NotFiniteError); too little
+            without a frame, or of another body; objective or gradient that are not finite; too little
             memory (says which batch to try).
-        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError, WeightsFileError: files are missing or
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: files are missing or
             damaged.
         OSError: there is no room; the last whole state remains.
     """
-    if config.threads:
-        torch.set_num_threads(config.threads)
-    check_tracker(config.tracker)
-    accelerator = accelerator_of(config.mixed_precision)
-    perceptual = _features(config, accelerator.device)
-    captures = open_captures(config.data)
-    held = None if config.held is None else open_captures(config.held)
-    if held is not None:
-        betas_of(held)
-    dataset = fit_dataset(captures, config)
-    if not len(dataset):
-        raise ValueError(f"the captures in {config.data} have no frames: render some")
-    if accelerator.is_main_process:
-        begin(config, captures, accelerator.num_processes)
-    accelerator.wait_for_everyone()
-    set_seed(config.seed)
-    with _memory_named(config):
-        state = FitState(Encoder(PRESETS[config.encoder]), config, accelerator)
-        if (config.run / STATE).exists():
-            state.load(config.run / STATE)
-    with tracking(config.tracker if accelerator.is_main_process else None, config.run) as tracker:
-        recorder = FitRecorder(config, captures, held, state, tracker) if accelerator.is_main_process else None
-        _run(config, state, dataset, recorder, perceptual)
-    accelerator.end_training()
-    return model_of(config, state, captures)
+    with open_run(config, config.mixed_precision) as accelerator:
+        captures = open_captures(config.data)
+        task = EncoderTask(config, captures, accelerator)
+        with accelerator.main_process_first():
+            if accelerator.is_main_process:
+                about = {"captures": dict(captures.about)}
+                begin(config, captures.subjects, about, list(task.phases), accelerator.num_processes)
+        (state,) = train(task, config, accelerator).values()
+        if accelerator.is_main_process and not (config.run / MODEL).exists():
+            task.save(state)  # stopped before the first step
+        return task.model(state)
 
 
-def _run(
-    config: FitConfig, state: FitState, dataset: FitDataset, recorder: FitRecorder | None, perceptual: Features | None
-) -> None:
-    """Steps until the last one or an interrupt, saved now and then."""
-    captures = dataset.samples.captures
-    saved = began = time.monotonic()
-    before = state.seconds
-    with contextlib.ExitStack() as stack:
-        interrupt = stack.enter_context(Interrupt(config.minutes))
-        if recorder is not None:
-            stack.enter_context(logging_redirect_tqdm())
-            stack.enter_context(recorder)
-        for progress in steps(config, state, dataset, perceptual):
-            state.seconds = before + time.monotonic() - began
-            if recorder is not None:
-                recorder(progress)
-            stop = agreed(state.accelerator, interrupt.due()) or progress.step >= config.steps
-            if recorder is not None and (stop or time.monotonic() - saved > config.save_every):
-                save(config, state, model_of(config, state, captures))
-                saved = time.monotonic()
-            if stop:
-                break
-    state.accelerator.wait_for_everyone()
+class EncoderTask(Task):
+    """An encoder in training; its only network has no name, its place in the data is in the state's file."""
 
+    smaller = "fewer --targets, or a smaller --size"
 
-def steps(
-    config: FitConfig, state: FitState, dataset: FitDataset, perceptual: Features | None = None
-) -> Iterator[StepMetrics]:
-    """Optimiser steps from where the state is to `config.steps`; the caller owns progress, saving and stopping."""
-    accelerator = state.accelerator
-    share = ProcessRank(accelerator.process_index, accelerator.num_processes)
-    start = Position(*parse_json(state.place.get("position", "[0, 0]")))
-    source = fit_batches(dataset, config, start, share)
-    settings = MarchSettings(step=config.step)
-    while state.step < config.steps:
-        clock = StepTimer(accelerator.device)
-        sample, position = next(source)
-        with _memory_named(config):
-            sample = sample.to(accelerator.device)
-            clock.lap("data")
-            terms = objective(config, state, sample, settings, clock, perceptual)
-            gradient = state.update(_total(terms, state.step))
-        clock.lap("backward")
-        state.place["position"] = json.dumps(list(position))
-        values = {name: float(value.detach()) for name, value in terms.items()}
-        yield StepMetrics(state.step, values, gradient, clock.seconds)
+    def __init__(self, config: FitConfig, captures: Captures, accelerator: Accelerator) -> None:
+        """Open the data: raises as `fit` for captures, held-out ones and weights of the perceptual loss."""
+        self.config, self.captures, self.accelerator = config, captures, accelerator
+        self.perceptual = _features(config, accelerator.device)
+        self.held = None if config.held is None else open_captures(config.held)
+        if self.held is not None:
+            betas_of(self.held)
+        self.dataset = fit_dataset(captures, config)
+        if not len(self.dataset):
+            raise ValueError(f"the captures in {config.data} have no frames: render some")
+        self._batches: Iterator[Batch] | None = None
 
+    @property
+    def phases(self) -> Mapping[str, FitConfig]:
+        """Return the settings of the run."""
+        return {"": self.config}
 
-def objective(
-    config: FitConfig,
-    state: FitState,
-    sample: FitSample,
-    settings: MarchSettings,
-    clock: StepTimer,
-    perceptual: Features | None = None,
-) -> dict[str, Tensor]:
-    """The weighted terms of one batch."""
-    with state.accelerator.autocast():
-        payload = state.prepared(sample.found, sample.axis_angle)
-    payload = payload.to(dtype=torch.float32)
-    if state.step < config.hold_scale:
-        # Multiplied by zero, because distributed training needs a gradient of every parameter.
-        start = payload.delta_scale.new_tensor(PRESETS[config.encoder].extent)
-        payload = dataclasses.replace(payload, delta_scale=start + 0 * payload.delta_scale)
-    clock.lap("forward")
-    primitives = Primitives.place(sample.frames, payload)
-    picture = render_targets(primitives, sample, settings)
-    target = sample.target.image.float() / 255
-    mask = sample.target.mask.float() / 255
-    image = encode_srgb(picture.rgb)
-    terms = loss_terms(image, picture.alpha, primitives.half_extent, target, mask, config.loss, perceptual)
-    clock.lap("march")
-    return terms
+    def network(self, phase: str) -> Encoder:
+        """Return the encoder as initialised."""
+        torch.manual_seed(self.config.seed)
+        return Encoder(PRESETS[self.config.encoder])
 
+    def put(self, phase: str, network: nn.Module) -> None:
+        """Use an encoder."""
+        self.encoder = network
 
-def _total(terms: dict[str, Tensor], step: int) -> Tensor:
-    total = torch.stack(list(terms.values())).sum()
-    if not torch.isfinite(total):
-        bad = ", ".join(name for name, value in terms.items() if not torch.isfinite(value))
-        raise NotFiniteError(
-            f"the loss ({bad}) at step {step} is not finite: lower the learning rate in a new run folder"
+    def optimiser(self, phase: str, network: nn.Module) -> torch.optim.Optimizer:
+        """An untied bias is used once per image, a weight at every pixel: with equal rates the weights diverge."""
+        biases = [module.bias for module in network.modules() if isinstance(module, UntiedConv)]
+        known = {id(bias) for bias in biases}
+        others = [parameter for parameter in network.parameters() if id(parameter) not in known]
+        return adamw(self.config, others, (biases, self.config.place_rate))
+
+    def loss(self, step: Step) -> Mapping[str, Tensor]:
+        """Return the weighted terms for the next batch."""
+        if self._batches is None:
+            start = Position(*parse_json(step.place.get("position", "[0, 0]")))
+            share = ProcessRank(self.accelerator.process_index, self.accelerator.num_processes)
+            self._batches = fit_batches(self.dataset, self.config, start, share)
+        sample, position = next(self._batches)
+        step.place["position"] = json.dumps(list(position))
+        sample = sample.to(self.accelerator.device)
+        step.timer.lap("data")
+        return self.terms(sample, step.number, step.timer)
+
+    def terms(self, sample: FitSample, number: int, timer: StepTimer) -> Mapping[str, Tensor]:
+        """Return the weighted terms for a batch, after `number` steps."""
+        config = self.config
+        with self.accelerator.autocast():
+            payload = self.encoder(sample.found, sample.axis_angle)
+        payload = payload.to(dtype=torch.float32)
+        if number < config.hold_scale:
+            # Multiplied by zero, because distributed training needs a gradient of every parameter.
+            start = payload.delta_scale.new_tensor(PRESETS[config.encoder].extent)
+            payload = dataclasses.replace(payload, delta_scale=start + 0 * payload.delta_scale)
+        timer.lap("forward")
+        primitives = Primitives.place(sample.frames, payload)
+        views = primitives.map(lambda tensor: tensor[:, None])
+        picture = march(views, sample.target.camera, MarchSettings(step=config.step))
+        target, mask = sample.target.image.float() / 255, sample.target.mask.float() / 255
+        terms = loss_terms(
+            encode_srgb(picture.rgb), picture.alpha, primitives.half_extent, target, mask, config.loss, self.perceptual
         )
-    return total
+        timer.lap("march")
+        return terms
+
+    def held_out(self) -> Mapping[str, float]:
+        """Return the PSNR of training subjects and of those held out."""
+        found = {"psnr_train": measure(self._in_use(), self.captures)}
+        return found if self.held is None else {**found, "psnr_held": measure(self._in_use(), self.held)}
+
+    def draw(self, path: Path) -> None:
+        """Write a row of images for each subject."""
+        write_pictures(path, self._in_use(), self.held or self.captures)
+
+    def save(self, state: TrainingState) -> None:
+        """Write the encoder, atomically. A kill before the state is written leaves one newer than the state.
+
+        Raises FileError, leaving the file as it was, if a weight is not finite; OSError.
+        """
+        save_encoder(self.config.run / MODEL, self.model(state))
+
+    def model(self, state: TrainingState) -> EncoderModel:
+        """Return the averaged weights with their card."""
+        config, captures = self.config, self.captures
+        card = {
+            "name": f"PrimDiffusion encoder, {config.encoder}",
+            "version": __version__,
+            "encoder": config.encoder,
+            "people": len(captures.subjects),
+            "captures": {name: value for name, value in captures.about.items() if name != "part_names"},
+            "views": config.views,
+            "targets": config.targets,
+            "size": config.size,
+            "steps": state.step,
+            "batch": config.batch * self.accelerator.num_processes,
+            "seconds": round(state.seconds, 1),
+            "device": str(self.accelerator.device),
+            "seed": config.seed,
+            "loss": parse_json(json.dumps(dataclasses.asdict(config.loss), default=str)),
+            "full_density": PRESETS[config.encoder].full_density,
+            **versions(),
+        }
+        return EncoderModel(_encoder(state.average), card)
+
+    def _in_use(self) -> EncoderModel:
+        return EncoderModel(_encoder(self.encoder), {})
 
 
-def render_targets(primitives: Primitives, sample: FitSample, settings: MarchSettings) -> Rendering:
-    """Render the target views [b, v] of humans [b]."""
-    return march(primitives.map(lambda tensor: tensor[:, None]), sample.target.camera, settings)
-
-
-def model_of(config: FitConfig, state: FitState, captures: Captures) -> EncoderModel:
-    """The averaged weights with their card."""
-    card = {
-        "name": f"PrimDiffusion encoder, {config.encoder}",
-        "version": __version__,
-        "encoder": config.encoder,
-        "people": len(captures.subjects),
-        "captures": dict(captures.about),
-        "views": config.views,
-        "targets": config.targets,
-        "size": config.size,
-        "steps": state.step,
-        "batch": config.batch * state.accelerator.num_processes,
-        "seconds": round(state.seconds, 1),
-        "device": str(state.accelerator.device),
-        "seed": config.seed,
-        "loss": parse_json(json.dumps(dataclasses.asdict(config.loss), default=str)),
-        "full_density": PRESETS[config.encoder].full_density,
-        **versions(),
-    }
-    card["captures"].pop("part_names", None)
-    return EncoderModel(state.encoder, card)
+def _encoder(network: nn.Module) -> Encoder:
+    assert isinstance(network, Encoder)
+    return network
 
 
 def _features(config: FitConfig, device: torch.device) -> Features | None:
@@ -207,16 +202,34 @@ def _features(config: FitConfig, device: torch.device) -> Features | None:
     return load_perceptual(path).to(device) if config.loss.perceptual and path is not None else None
 
 
-@contextlib.contextmanager
-def _memory_named(config: FitConfig) -> Iterator[None]:
-    """ValueError that says what to try, where memory runs out."""
-    try:
-        yield
-    except (RuntimeError, MemoryError) as error:
-        if not out_of_memory(error):
-            raise
-        remedy = f"--batch {config.batch // 2}" if config.batch > 1 else "fewer --targets, or a smaller --size"
-        raise ValueError(
-            f"{config.batch} subjects with {config.targets} targets of {config.size} x {config.size} pixels do not fit "
-            f"into memory: try {remedy} in a new run folder"
-        ) from error
+def measure(model: EncoderModel, captures: Captures, people: int = PEOPLE) -> float:
+    """Mean PSNR (dB, images of SIZE x SIZE pixels) of two views of each of a few subjects, in another pose."""
+    found = [psnr(image, target) for image, target, _ in _compared(model, captures, people, "whole")]
+    return float(torch.cat(found).mean())
+
+
+def write_pictures(path: Path, model: EncoderModel, captures: Captures, people: int = PEOPLE) -> None:
+    """Write a row for each subject: an input image, then twice a rendered one beside its capture, in another pose."""
+    rows = []
+    for image, target, given in _compared(model, captures, people, "crop"):
+        pairs = [side for pair in zip(image, target, strict=True) for side in pair]
+        rows.append(torch.cat([given, *pairs], dim=1))
+    write_picture(path, torch.cat(rows))
+
+
+@torch.no_grad()
+def _compared(
+    model: EncoderModel, captures: Captures, people: int, framing: str
+) -> Iterator[tuple[Tensor, Tensor, Tensor]]:
+    """Yield for each subject two rendered images, the captured ones and an input, sRGB-encoded on the CPU."""
+    settings = SampleSettings(8, 2, SIZE, "crop" if framing == "crop" else "whole", "first")
+    dataset = CaptureDataset(captures, settings, SEED)
+    device = model.encoder.scale_out.bias.device
+    for index in range(min(people, len(dataset))):
+        sample = dataset[0, index]
+        betas = default_betas(captures.subject(captures.subjects[int(sample.subject)]))
+        payload = model.encode(sample.conditioning, betas)
+        primitives = model.place(payload.to("cpu"), betas, sample.target.pose).to(device)
+        picture = march(primitives, sample.target.camera.to(device))
+        image = encode_srgb(picture.rgb).cpu()
+        yield image, sample.target.image.float() / 255, sample.conditioning.image[0].float() / 255

@@ -83,8 +83,8 @@ def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
     """Return the betas of all subjects on the default body.
 
     Raises:
-        ConditioningError: a subject was captured on another body model.
-        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a camera has no images, a file is damaged.
+        ValueError: a subject was captured on another body model.
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a camera has no images, a file is damaged.
     """
     return torch.stack([default_betas(captures.subject(name)) for name in captures.subjects])
 
@@ -99,7 +99,7 @@ def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: 
     """Yield the batches of a run, with the original errors of worker processes.
 
     Raises:
-        FileNotFoundError, CaptureFileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
         ChildProcessError: a worker was killed.
     """
     try:

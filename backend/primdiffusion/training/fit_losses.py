@@ -126,7 +126,7 @@ def load_perceptual(
 
     Raises:
         FileNotFoundError: there is no such file.
-        WeightsFileError: it is damaged, or of another network.
+        FileError: it is damaged, or of another network.
         ValueError: as `PerceptualLoss`.
     """
     loss = PerceptualLoss(layers, weights)

@@ -15,13 +15,9 @@ LOCK = ".lock"
 """The lock file in the folder. It stays there: removing it while another process opens it would let two in."""
 
 
-class FolderInUseError(ValueError):
-    """Another process works in the folder; the message names it."""
-
-
 @contextlib.contextmanager
 def lock_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder, created if need be, for one process at a time. Raises FolderInUseError, OSError.
+    """Hold a folder, created if need be, for one process at a time. Raises ValueError, OSError.
 
     The system releases the lock when the process ends, however it ends. On a disk without locks the file itself is the
     lock: it names its process, and counts for nothing once that has ended. A created folder that holds nothing else in
@@ -49,7 +45,7 @@ def _acquired(folder: Path) -> BaseFileLock:
             lock.acquire(timeout=0)
             return lock
         except Timeout:
-            raise FolderInUseError(f"another process works in {folder}: wait for it, or give another folder") from None
+            raise ValueError(f"another process works in {folder}: wait for it, or give another folder") from None
         except (OSError, NotImplementedError):
             if kind is SoftFileLock:
                 raise

@@ -16,17 +16,20 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import torch
 from torch import Tensor
 
 from primdiffusion import __version__
 from primdiffusion.capture.dataset import Views
+from primdiffusion.formats.requests import Count, RayStep
+from primdiffusion.formats.schema import Range, check
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Payload
+from primdiffusion.training.config import NotNegative
 from primdiffusion.training.refine_views import PosedView, psnr_of, render_view, scenes_of
 
 BETAS = (0.9, 0.99)
@@ -43,36 +46,32 @@ MEASURED = 32
 class RefineSettings:
     """Settings of refinement. The rates were tuned on humans in detailed clothes."""
 
-    steps: int = 300
+    steps: Count = 300
     """Optimiser steps."""
-    views: int = 2
+    views: Count = 2
     """Images per step."""
-    colour_rate: float = 0.04
+    colour_rate: NotNegative = 0.04
     """Learning rate of sRGB-encoded colours in 0 ... 1."""
-    density_rate: float = 0.04
+    density_rate: NotNegative = 0.04
     """Learning rate of densities in units of FULL_DENSITY."""
-    scale_rate: float = 0.03
+    scale_rate: NotNegative = 0.03
     """Learning rate of the logarithm of box sizes; 0 keeps them."""
-    last_rate: float = 0.1
+    last_rate: NotNegative = 0.1
     """Fraction of the rates at the end of their cosine decay."""
-    largest_density: float = FULL_DENSITY
+    largest_density: Annotated[float, Range(1)] = FULL_DENSITY
     """1/m; more gains a tenth of a dB, and exceeds the range of the training set of the diffusion model."""
-    silhouette: float = 0.05
+    silhouette: NotNegative = 0.05
     """Weight of the mean square error of the silhouette, relative to that of the colours."""
-    step: float = 0.006
+    step: RayStep = 0.006
     """Metres between samples of a ray."""
-    seconds: float = math.inf
+    seconds: Annotated[float, Range(0)] = math.inf
     """Time limit, checked after each step; the decay of the rates does not adapt to it."""
     seed: int = 0
     """Seed of the order of views."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError for values out of range."""
-        least = {"steps": 1, "views": 1, "colour_rate": 0, "density_rate": 0, "scale_rate": 0, "last_rate": 0,
-                 "largest_density": 1, "silhouette": 0, "step": 1e-4, "seconds": 0}  # fmt: skip
-        for name, lowest in least.items():
-            if not getattr(self, name) >= lowest:
-                raise ValueError(f"{name} of the refinement is {getattr(self, name)}: it must be {lowest} or more")
+        """Raise FieldError for values out of range."""
+        check(self)
 
 
 class RefineStep(NamedTuple):

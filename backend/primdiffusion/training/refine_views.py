@@ -128,7 +128,7 @@ def meshed_person(path: str | Path) -> Human:
 
     Raises:
         FileNotFoundError, GlbError: as `read_person`.
-        UnusableMesh: the mesh is empty.
+        ValueError: the mesh is empty.
     """
     person = read_person(path)
     return _as_human(person.mesh, torch.from_numpy(person.betas).float(), Path(path).name)

@@ -1,92 +1,150 @@
-"""The folder of a run, of either stage: starting, resuming and recording runs.
+"""The folder of a run: starting, resuming and recording runs.
 
-config.json      the settings
-run.json         the training set; step, processes, versions and commit of every start
-metrics.jsonl    metrics at intervals
-pictures/        images at intervals
+config.json                 the settings
+run.json                    the training set; steps, processes, versions and commit of every start
+metrics.jsonl               metrics at intervals, which TensorBoard or Weights & Biases get as well if asked for
+pictures/                   images at intervals
+[PHASE.]state.safetensors   the state of a network, to resume from
 """
 
 from __future__ import annotations
 
 import contextlib
-import functools
+import dataclasses
 import json
 import logging
 import os
 import platform
 import subprocess
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import accelerate
 import torch
+from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
+from jaxtyping import Float
+from PIL import Image
+from torch import Tensor
 
 from primdiffusion import __version__
+from primdiffusion.failures import optional_package
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import read_regular
-from primdiffusion.formats.whole_files import remove_abandoned, write_atomically
-from primdiffusion.training.config import RunConfig, check_resumable, to_json
+from primdiffusion.formats.whole_files import remove_abandoned, write_atomically, written_whole
+from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.folder_lock import lock_folder
+from primdiffusion.training.state import accelerator_of, saved_step
 
 log = logging.getLogger(__name__)
 
-Config = TypeVar("Config", bound=RunConfig)
-Made = TypeVar("Made")
 CONFIG, RUN, METRICS, PICTURES = "config.json", "run.json", "metrics.jsonl", "pictures"
 LARGEST_TEXT = 2**30
 """Bytes of any of them."""
+PROJECT = "primdiffusion"
+"""Name in Weights & Biases."""
 
 
-def alone(work: Callable[[Config], Made]) -> Callable[[Config], Made]:
-    """Let a run hold its folder, of several processes of one run the first. Raises FolderInUseError, OSError."""
+@contextlib.contextmanager
+def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accelerate.Accelerator]:
+    """Hold the folder of a run, by the first of its processes, and yield the accelerator of this process.
 
-    @functools.wraps(work)
-    def held(config: Config) -> Made:
-        is_first = os.environ.get("RANK", "0") == "0"
-        with lock_folder(config.run) if is_first else contextlib.nullcontext():
-            return work(config)
+    Raises MissingPackageError for the tracker's package; ValueError, OSError.
+    """
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    if config.tracker is not None:
+        optional_package(config.tracker, "tracking")
+    is_first = os.environ.get("RANK", "0") == "0"
+    with lock_folder(config.run) if is_first else contextlib.nullcontext():
+        accelerator = accelerator_of(mixed_precision)
+        yield accelerator
+        accelerator.end_training()
 
-    return held
+
+def write_picture(path: Path, picture: Float[Tensor, "H W 3"]) -> None:
+    """Write an sRGB-encoded picture as a PNG, atomically; its folder is created if missing. Raises OSError."""
+    values = (picture.clamp(0, 1) * 255).round().to(torch.uint8).contiguous().numpy()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(path) as unfinished:
+        Image.fromarray(values).save(unfinished, format="PNG")
+
+
+def state_path(run: Path, phase: str) -> Path:
+    """Path of the saved state of a phase."""
+    return run / (f"{phase}.state.safetensors" if phase else "state.safetensors")
 
 
 def begin(
-    config: RunConfig,
-    people: Sequence[str],
-    about: Mapping[str, Any],
-    start: Mapping[str, Any],
-    is_kept: Callable[[Mapping[str, Any]], bool],
+    config: RunSettings, people: Sequence[str], about: Mapping[str, Any], phases: Sequence[str], processes: int
 ) -> None:
     """Save settings, versions and names of the training set; when resuming, check that these are unchanged.
 
-    `about` is saved with the names; `start` describes this start: its step and number of "processes". Lines of
-    metrics.jsonl for which `is_kept` is false belong to steps lost in a kill and are removed.
+    `about` is saved with the names. Lines of metrics.jsonl of steps after the saved states, which were lost in a kill,
+    are removed.
 
     Raises:
         ValueError: settings or training set differ from those of the run, or files are damaged.
         OSError: the folder cannot be written to.
     """
+    steps = {phase: saved_step(state_path(config.run, phase)) for phase in phases}
     saved, noted = config.run / CONFIG, config.run / RUN
     started = {"people": list(people), **about, "starts": []}
     if saved.exists():
         check_resumable(_text(saved), config)
         if noted.exists():
-            started["starts"] = _earlier(config, people, _text(noted), start["processes"])
-        _cut_metrics(config.run / METRICS, is_kept)
+            started["starts"] = _earlier(config, people, _text(noted), processes)
+        _cut_metrics(config.run / METRICS, steps)
         remove_abandoned(config.run)
-    now = {**start, "primdiffusion": __version__, **versions()}
+    done = {"step": steps[""]} if "" in steps else {"steps": {phase: step for phase, step in steps.items() if step}}
+    now = {**done, "processes": processes, "primdiffusion": __version__, **versions()}
     write_atomically(saved, to_json(config))
     write_atomically(noted, json.dumps({**started, "starts": [*started["starts"], now]}, indent=1))
 
 
-def append_metrics(run: Path, row: Mapping[str, Any]) -> None:
-    """Append a line to metrics.jsonl. Raises OSError, naming the file."""
-    path = run / METRICS
+@dataclasses.dataclass(frozen=True)
+class Metrics:
+    """Writes lines of metrics.jsonl, and sends them to a tracker as well if the run has one."""
+
+    run: Path
+    tracker: GeneralTracker | None = None
+
+    def append(self, row: Mapping[str, float | str], step: int) -> None:
+        """Append a line; `step` rises over all phases of a run. Raises OSError, naming the file.
+
+        A tracker gets the numbers of the line, named PHASE/NAME if it has a phase.
+        """
+        path = self.run / METRICS
+        try:
+            with path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+        except OSError as error:
+            raise type(error)(error.errno, error.strerror, str(path)) from error
+        if self.tracker is not None:
+            prefix = f"{row['phase']}/" if "phase" in row else ""
+            numbers = {prefix + name: value for name, value in row.items() if not isinstance(value, str)}
+            self.tracker.log(numbers, step=step)
+
+
+@contextlib.contextmanager
+def open_metrics(config: RunSettings) -> Iterator[Metrics]:
+    """Open the metrics of a run with its tracker, in the main process alone.
+
+    TensorBoard's events are in run/tensorboard. Weights & Biases keeps its files in run/wandb, and follows its own
+    settings (WANDB_MODE and others).
+    """
+    if config.tracker is None:
+        yield Metrics(config.run)
+        return
+    if config.tracker == "wandb":
+        tracker: GeneralTracker = WandBTracker(PROJECT, name=config.run.name, dir=str(config.run))
+    else:
+        tracker = TensorBoardTracker("tensorboard", logging_dir=config.run)
+    tracker.start()
     try:
-        with path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(row) + "\n")
-    except OSError as error:
-        raise type(error)(error.errno, error.strerror, str(path)) from error
+        yield Metrics(config.run, tracker)
+    finally:
+        tracker.finish()
 
 
 def versions() -> dict[str, str]:
@@ -105,7 +163,7 @@ def versions() -> dict[str, str]:
         return found
 
 
-def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: int) -> list[Mapping[str, Any]]:
+def _earlier(config: RunSettings, people: Sequence[str], saved: str, processes: int) -> list[Mapping[str, Any]]:
     """Return the earlier starts of the run. Raises ValueError for another training set."""
     try:
         before = parse_json(saved)
@@ -123,17 +181,18 @@ def _earlier(config: RunConfig, people: Sequence[str], saved: str, processes: in
     return starts
 
 
-def _cut_metrics(path: Path, is_kept: Callable[[Mapping[str, Any]], bool]) -> None:
+def _cut_metrics(path: Path, steps: Mapping[str, int]) -> None:
     if path.exists():
         lines = _text(path).splitlines()
-        write_atomically(path, "".join(line + "\n" for line in lines if _is_kept(line, is_kept)))
+        write_atomically(path, "".join(line + "\n" for line in lines if _is_kept(line, steps)))
 
 
-def _is_kept(line: str, is_kept: Callable[[Mapping[str, Any]], bool]) -> bool:
-    """Also False for a truncated line."""
+def _is_kept(line: str, steps: Mapping[str, int]) -> bool:
+    """Whether a line is complete and of a step that is saved."""
     try:
-        return is_kept(parse_json(line))
-    except (ValueError, KeyError, TypeError):
+        row = parse_json(line)
+        return row["step"] <= steps[row.get("phase", "")]
+    except (ValueError, LookupError, TypeError, AttributeError):
         return False
 
 

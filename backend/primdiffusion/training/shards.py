@@ -29,7 +29,7 @@ from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import is_plain_path, open_regular
+from primdiffusion.formats.regular_files import FileError, is_plain_path, open_regular
 from primdiffusion.formats.whole_files import remove_abandoned, staged, write_atomically, written_whole
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.tensor_file import TensorFile
@@ -40,10 +40,6 @@ PEOPLE_EACH = 32
 LARGEST_SHARD = 4 * 2**30
 """Bytes."""
 _KINDS = {"voxels": ("U8",), "betas": ("F32",), "delta_scale": ("F16", "F32")}
-
-
-class ShardError(ValueError):
-    """A damaged shard or index; the message names the file and the remedy."""
 
 
 def open_people(folder: Path) -> PersonDataset:
@@ -68,7 +64,7 @@ def pack_people(folder: Path, out: Path, people_each: int = PEOPLE_EACH) -> Iter
         raise ValueError(f"{people_each} humans per shard: choose 1 or more")
     if (out / INDEX).exists():
         remove_abandoned(out)  # of a process that was killed after the index had its place
-        raise ShardError(f"{out} already contains shards: choose another folder, or remove it")
+        raise FileError(out, "already contains shards", "choose another folder, or remove it")
     people = PersonFolder(folder)
     with staged(out, last=INDEX) as unfinished:
         shards, done = [], 0
@@ -110,12 +106,12 @@ def _digest(file: io.BufferedReader | io.BytesIO) -> str:
 
 
 def damaged_shards(folder: Path) -> list[str]:
-    """Return an error message for each damaged shard; raises ShardError for a damaged index."""
+    """Return an error message for each damaged shard; raises FileError for a damaged index."""
     people, found = PackedPeople(folder), []
     for number in range(len(people.paths)):
         try:
             people.check(number)
-        except (ShardError, OSError) as error:
+        except (FileError, OSError) as error:
             found.append(str(error))
     return found
 
@@ -124,7 +120,7 @@ class PackedPeople:
     """People in shards; each shard is checked against its SHA-256 when first read (half a second for 256 MiB)."""
 
     def __init__(self, folder: Path) -> None:
-        """Read the index. Raises FileNotFoundError, and ShardError if it is damaged or of another version."""
+        """Read the index. Raises FileNotFoundError, and FileError if it is damaged or of another version."""
         self._index = folder / INDEX
         index = _read_index(self._index)
         try:
@@ -138,7 +134,7 @@ class PackedPeople:
             self._stored: Sequence[Mapping[str, Any]] = [dict(person["attributes"]) for person in people]
             self._firsts = [0, *itertools.accumulate(len(shard["people"]) for shard in index["shards"])]
         except (KeyError, TypeError, ValueError) as error:
-            raise ShardError(f"{folder / INDEX} is damaged ({error!s:.100}): pack the humans again") from error
+            raise FileError(folder / INDEX, f"is damaged ({error!s:.100})", "pack the humans again") from error
         if len(self.names) < 2:
             raise FileNotFoundError(f"{folder / INDEX} lists {len(self.names)} humans: training needs two or more")
         self._open: dict[int, TensorFile] = {}
@@ -150,12 +146,12 @@ class PackedPeople:
         try:
             return attributes_of(self._stored[index], betas, self.variants[index])
         except (TypeError, AttributeError, LookupError) as error:
-            raise ShardError(
-                f"{self._index} is damaged: the attributes of {self.names[index]!r:.60} ({error!s:.80}): pack again"
+            raise FileError(
+                self._index, f"is damaged: the attributes of {self.names[index]!r:.60} ({error!s:.80})", "pack again"
             ) from error
 
     def person(self, index: int) -> PersonVariants:
-        """Read a person. Raises ShardError, naming a damaged shard, and OSError."""
+        """Read a person. Raises FileError, naming a damaged shard, and OSError."""
         shard, place, rows = self._rows(index)
         voxels, scale, betas = self._slice(shard, "voxels")[rows], self._scale(shard, rows), self._slice(shard, "betas")
         return PersonVariants(voxels, scale, betas[place], self.known(index), self.full_density)
@@ -167,7 +163,7 @@ class PackedPeople:
         return self._slice(shard, "voxels")[row][0], self._scale(shard, row)[0]
 
     def check(self, shard: int) -> None:
-        """Check a shard against its SHA-256. Raises ShardError, FileNotFoundError."""
+        """Check a shard against its SHA-256. Raises FileError, FileNotFoundError."""
         with self._checked(shard):
             pass
 
@@ -179,7 +175,7 @@ class PackedPeople:
             raise FileNotFoundError(f"there is no {path}, which {INDEX} names: pack the humans again")
         with open_regular(path, LARGEST_SHARD) as file:
             if _digest(file) != self._digests[shard]:
-                raise ShardError(f"{path} is damaged: its SHA-256 differs from {INDEX}: pack the humans again")
+                raise FileError(path, f"is damaged: its SHA-256 differs from {INDEX}", "pack the humans again")
             yield file
 
     def _check_content(self, number: int, file: TensorFile) -> None:
@@ -219,8 +215,8 @@ class PackedPeople:
                     file = TensorFile(opened)
                     self._check_content(number, file)
                 except ValueError as error:
-                    raise ShardError(
-                        f"{self.paths[number]} is no shard ({error!s:.100}): pack the humans again"
+                    raise FileError(
+                        self.paths[number], f"is no shard ({error!s:.100})", "pack the humans again"
                     ) from error
             self._open[number] = file
         return self._open[number]
@@ -252,10 +248,10 @@ def _read_index(path: Path) -> dict[str, Any]:
     except FileNotFoundError:
         raise FileNotFoundError(f"there is no {path}: pack humans with `primdiffusion payloads pack`") from None
     except ValueError as error:
-        raise ShardError(f"{path} is damaged ({error!s:.100}): pack the humans again") from error
+        raise FileError(path, f"is damaged ({error!s:.100})", "pack the humans again") from error
     if not isinstance(index, dict) or index.get("format") != FORMAT:
-        raise ShardError(f"{path} is not the index of packed humans: choose another folder")
+        raise FileError(path, "is not the index of packed humans", "choose another folder")
     if index.get("version") != VERSION:
         version = index.get("version")
-        raise ShardError(f"{path} has version {version!s:.20}, this program reads {VERSION}: pack again")
+        raise FileError(path, f"has version {version!s:.20}, this program reads {VERSION}", "pack again")
     return index

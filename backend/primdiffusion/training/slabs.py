@@ -16,6 +16,8 @@ from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet
 from primdiffusion.primitives.slab import pack
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.diffusion_task import DiffusionTask
+from primdiffusion.training.loop import Step
 from primdiffusion.training.losses import level_weight, random_steps, x0_errors
 from primdiffusion.training.stored_people import PersonDataset, payload_of_bytes
 
@@ -24,7 +26,7 @@ MEASURED = 4
 """Held-out humans used in evaluation, one colouring each: a slab takes 15 MB, its evaluation the time of a step."""
 
 
-class SlabTrainee:
+class SlabTask(DiffusionTask):
     """A `SlabUNet` and its training data: unweighted x0 error at uniform levels, as in the paper."""
 
     def __init__(
@@ -41,18 +43,17 @@ class SlabTrainee:
         self.config, self.people, self.held, self.device = config.slab, people, held[:MEASURED], device
         self.places = [(index, number) for index in train for number in range(people.variants[index])]
         self.denoiser: nn.Module = SlabUNet(config.unet).to(device)
-        self.began = self.denoiser
 
     @property
     def phases(self) -> Mapping[str, PhaseConfig]:
         """Return the single phase."""
         return {NETWORK: self.config}
 
-    def network(self, name: str) -> nn.Module:
+    def network(self, phase: str) -> nn.Module:
         """Return the U-Net."""
-        return self.began
+        return self.denoiser
 
-    def put(self, name: str, network: nn.Module) -> None:
+    def put(self, phase: str, network: nn.Module) -> None:
         """Use a network as the denoiser."""
         self.denoiser = network
 
@@ -63,8 +64,9 @@ class SlabTrainee:
         payload = payload_of_bytes(torch.stack(voxels).to(self.device), torch.stack(scales).to(self.device), density)
         return pack(payload, density)
 
-    def loss(self, name: str, generator: torch.Generator) -> Tensor:
+    def loss(self, step: Step) -> Mapping[str, Tensor]:
         """x0 error of a random batch at random levels (paper eq. 9)."""
+        generator = step.generator
         chosen = torch.randint(
             len(self.places), (self.config.batch,), generator=generator, device=generator.device
         ).tolist()
@@ -73,7 +75,9 @@ class SlabTrainee:
         x = self.schedule.q_sample(slab, t, gaussian_noise(slab, generator))
         error = self._guess(x, t) - slab
         signal, noise = self.schedule.levels(t, slab)
-        return (level_weight(signal, noise, self.config) * error.square()).mean()
+        loss = (level_weight(signal, noise, self.config) * error.square()).mean()
+        step.timer.lap("forward")
+        return {"loss": loss}
 
     def errors(self) -> Mapping[int, float]:
         """Evaluate on the first colourings of a few held-out humans, in units of the slab."""

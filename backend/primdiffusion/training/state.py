@@ -1,11 +1,11 @@
-"""State of a training run on any number of processes, saved so that it can be resumed exactly."""
+"""State of a network in training on any number of processes, saved so that a run can be resumed exactly."""
 
 from __future__ import annotations
 
 import copy
 import datetime
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -17,17 +17,19 @@ from torch import Tensor, nn
 from primdiffusion import tensor_file
 from primdiffusion.device import best_device
 from primdiffusion.formats.whole_files import write_atomically
-from primdiffusion.training.muon import BETAS
+from primdiffusion.training.muon import BETAS, MuonAdamW
 
 PATIENCE = datetime.timedelta(hours=3)
 """How long processes wait for the main process, which alone evaluates, renders and prepares data."""
 
 
-class OptimiserConfig(Protocol):
-    """Settings of the optimiser, as in `PhaseConfig`."""
+class PhaseSettings(Protocol):
+    """Settings of the training of one network, as in `PhaseConfig` and `FitConfig`."""
 
     @property
     def steps(self) -> int: ...
+    @property
+    def batch(self) -> int: ...
     @property
     def learning_rate(self) -> float: ...
     @property
@@ -40,93 +42,91 @@ class OptimiserConfig(Protocol):
     def evaluate_every(self) -> int: ...
 
 
-class NotFiniteError(FloatingPointError, ValueError):
-    """Training diverged; the message names the step and the remedy."""
-
-
 class TrainingState:
-    """A network with optimiser, weight average, random state and position; saved and loaded as one file."""
+    """A network with optimiser, weight average and number of steps; saved and loaded as one file.
 
-    def __init__(self, network: nn.Module, config: OptimiserConfig, seed: int):
-        self.network, self.config = network, config
+    Gradients go through accelerate: they are averaged over all processes.
+    """
+
+    def __init__(
+        self,
+        network: nn.Module,
+        settings: PhaseSettings,
+        accelerator: Accelerator,
+        optimiser: torch.optim.Optimizer | None = None,
+    ) -> None:
+        """Move a network to its device; the default optimiser is `adamw` of all its parameters."""
+        self.network, self.settings, self.accelerator = network.to(accelerator.device), settings, accelerator
         self.average = copy.deepcopy(network).eval().requires_grad_(False)
-        self.optimiser = self._optimiser()
-        self.generator = torch.Generator().manual_seed(seed)
+        optimiser = optimiser or adamw(settings, network.parameters())
+        self._kind = "muon" if isinstance(optimiser, MuonAdamW) else "adamw"
+        self.prepared, self.optimiser = accelerator.prepare(self.network, optimiser)
+        """The network as called in training, wrapped by accelerate."""
         self.step, self.seconds = 0, 0.0
         self.place: dict[str, str] = {}
         """Further state of the run, saved in the file's metadata and restored by `load`."""
 
-    def _groups(self) -> list[dict[str, object]]:
-        """Parameter groups, each with its factor on the configured learning rate."""
-        return [{"params": list(self.network.parameters()), "factor": 1.0}]
-
-    def _optimiser(self) -> torch.optim.Optimizer:
-        return torch.optim.AdamW(
-            self._groups(), lr=self.config.learning_rate, weight_decay=self.config.weight_decay, betas=BETAS
-        )
-
     def update(self, loss: Tensor) -> float:
-        """Take one optimiser step and update the average; returns the gradient norm.
+        """Take one optimiser step and update the average; returns the gradient's norm before clipping.
 
-        Raises NotFiniteError if the gradient is not finite.
+        Raises ValueError if the gradient is not finite.
         """
-        rate = self.config.learning_rate * learning_rate_factor(self.step, self.config.steps)
+        rate = self.settings.learning_rate * learning_rate_factor(self.step, self.settings.steps)
         for group in self.optimiser.param_groups:
             group["lr"] = rate * group["factor"]
         self.optimiser.zero_grad(set_to_none=True)
-        norm = self._gradient(loss)
-        if not norm < float("inf"):
-            raise NotFiniteError(
+        self.accelerator.backward(loss)
+        norm = self.accelerator.clip_grad_norm_(self.prepared.parameters(), self.settings.gradient_clip)
+        if norm is None or not norm < math.inf:
+            raise ValueError(
                 f"the gradient at step {self.step} is not finite: lower the learning rate in a new run folder"
             )
         self.optimiser.step()
-        decay = min(self.config.ema, (1 + self.step) / (10 + self.step))
+        decay = min(self.settings.ema, (1 + self.step) / (10 + self.step))
         with torch.no_grad():
             for mean, now in zip(self.average.parameters(), self.network.parameters(), strict=True):
                 mean.lerp_(now, 1 - decay)
         self.step += 1
-        return norm
-
-    def _gradient(self, loss: Tensor) -> float:
-        """Compute and clip the gradient; returns its norm before clipping."""
-        loss.backward()
-        return float(nn.utils.clip_grad_norm_(self.network.parameters(), self.config.gradient_clip))
+        return float(norm)
 
     def save(self, path: Path) -> None:
         """Write everything to one safetensors file, atomically.
 
-        Raises NotFiniteError, leaving the file as it was, if a weight is not finite; OSError.
+        Raises ValueError, leaving the file as it was, if a weight is not finite; OSError.
         """
         tensors = {f"network.{k}": v for k, v in self.network.state_dict().items()}
         tensors |= {f"average.{k}": v for k, v in self.average.state_dict().items()}
         for index, moments in self.optimiser.state_dict()["state"].items():
             tensors |= {f"optimiser.{index}.{name}": torch.as_tensor(value) for name, value in moments.items()}
         if bad := _not_finite(tensors):
-            raise NotFiniteError(
+            raise ValueError(
                 f"{bad} is not finite after step {self.step}: lower the learning rate in a new run folder; {path} "
                 "was not overwritten"
             )
-        tensors |= {"random.data": self.generator.get_state(), "random.torch": torch.get_rng_state()}
+        self.place["optimiser"] = self._kind
         place = {"step": str(self.step), "seconds": repr(self.seconds), **self.place}
         write_atomically(
             path, tensor_file.save({k: v.detach().contiguous() for k, v in tensors.items()}, metadata=place)
         )
 
     def load(self, path: Path) -> None:
-        """Restore a saved state; ValueError if it belongs to another network or is damaged."""
+        """Restore a saved state; ValueError if it belongs to another network or optimiser, or is damaged."""
         try:
             tensors, place = tensor_file.read(path)
             step, seconds = int(place.pop("step")), float(place.pop("seconds"))
             for name, module in (("network", self.network), ("average", self.average)):
                 module.load_state_dict(_under(tensors, name))
             self._load_moments(_under(tensors, "optimiser"))
-            self.generator.set_state(tensors["random.data"])
-            torch.set_rng_state(tensors["random.torch"])
         except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
             reason = " ".join(str(error).split())[:200]
             raise ValueError(
                 f"{path} does not fit this network or is damaged ({reason}): start a new run folder"
             ) from error
+        if (before := place.get("optimiser", self._kind)) != self._kind:
+            raise ValueError(
+                f"{path} was trained with {before}, but this device trains with {self._kind} (Muon needs "
+                "bfloat16): resume on a device like the first, or begin a new run with --start-from"
+            )
         self.step, self.seconds, self.place = step, seconds, place
 
     def _load_moments(self, tensors: dict[str, Tensor]) -> None:
@@ -135,6 +135,24 @@ class TrainingState:
             index, name = key.split(".")
             moments.setdefault(int(index), {})[name] = value
         self.optimiser.load_state_dict({**self.optimiser.state_dict(), "state": moments})
+
+
+def adamw(
+    settings: PhaseSettings, parameters: Iterable[nn.Parameter], *others: tuple[list, float]
+) -> torch.optim.AdamW:
+    """AdamW of a network's parameters; `others` are further ones, each with a factor on their learning rate."""
+    groups = [{"params": list(group), "factor": factor} for group, factor in ((parameters, 1.0), *others)]
+    return torch.optim.AdamW(groups, lr=settings.learning_rate, weight_decay=settings.weight_decay, betas=BETAS)
+
+
+def saved_step(path: Path) -> int:
+    """The step of a saved state; 0 without one. Raises ValueError for a damaged file."""
+    if not path.exists():
+        return 0
+    try:
+        return int(tensor_file.read_metadata(path)["step"])
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"{path} is damaged ({error!s:.100}): start a new run folder") from error
 
 
 def learning_rate_factor(step: int, steps: int, warm_up: int = 100, last: float = 0.1) -> float:
@@ -156,31 +174,6 @@ def accelerator_of(mixed_precision: str = "no") -> Accelerator:
     patience = InitProcessGroupKwargs(timeout=PATIENCE)
     on_cpu = best_device().type == "cpu"
     return Accelerator(mixed_precision=mixed_precision, cpu=on_cpu, kwargs_handlers=[patience])
-
-
-class AcceleratedState(TrainingState):
-    """`TrainingState` whose gradients go through accelerate: averaged over all processes."""
-
-    def __init__(self, network: nn.Module, config: OptimiserConfig, seed: int, accelerator: Accelerator) -> None:
-        super().__init__(network.to(accelerator.device), config, seed)
-        self.accelerator = accelerator
-        self.prepared, self.optimiser = accelerator.prepare(self.network, self.optimiser)
-        """The network as called in training, wrapped by accelerate."""
-
-    def _gradient(self, loss: Tensor) -> float:
-        self.accelerator.backward(loss)
-        norm = self.accelerator.clip_grad_norm_(self.prepared.parameters(), self.config.gradient_clip)
-        return float("nan") if norm is None else float(norm)
-
-    @staticmethod
-    def saved_step(path: Path) -> int:
-        """The step of a saved state; 0 without one. Raises ValueError for a damaged file."""
-        if not path.exists():
-            return 0
-        try:
-            return int(tensor_file.read_metadata(path)["step"])
-        except (OSError, KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path} is damaged ({error!s:.100}): start a new run folder") from error
 
 
 def agreed(accelerator: Accelerator, stop: bool) -> bool:

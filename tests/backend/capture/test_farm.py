@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from primdiffusion.capture.farm import Farm, FarmError, render_on, subjects_of
+from primdiffusion.capture.farm import Farm, render_on, subjects_of
 from support.errors import refused
 
 pytest.importorskip("ray", reason="Ray is not installed")
@@ -35,10 +35,10 @@ def test_people_whose_worker_or_renderer_is_killed_are_finished_by_another_witho
 
 
 def test_a_renderer_that_is_not_there_is_one_sentence():
-    with refused(FarmError, "no-such-blender"):
+    with refused(ValueError, "no-such-blender"):
         subjects_of(["no-such-blender"])
 
 
 def test_a_renderer_without_people_is_one_sentence():
-    with refused(FarmError):
+    with refused(ValueError, "the folder is empty"):
         subjects_of([sys.executable, "-c", "import sys; sys.exit('the folder is empty')"])

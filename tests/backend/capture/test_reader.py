@@ -18,12 +18,13 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.body.smpl_pickle import UnsafePickleError
 from primdiffusion.capture.dataset import PACK_FOLDER, pack
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.reader import CaptureFileError, open_captures
+from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import render, set_up_capture
 from primdiffusion.capture.sheet import default_joints, draw_sheet, reprojection_error
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.capture_repair import verify
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.removing import OutsideFolderError
 from primdiffusion.raster.multisample import render_view
 from support.errors import refused
@@ -99,7 +100,7 @@ def test_cameras_as_far_as_no_camera_is_are_rejected(root):
     cameras = json.loads(path.read_text())
     cameras["camera0001"]["K"][0][2] = 2.0**63
     path.write_text(json.dumps(cameras))
-    with refused(CaptureFileError, "camera 1"):
+    with refused(FileError, "camera 1"):
         open_captures(root).view(NAME, 1, 2)
 
 
@@ -163,7 +164,7 @@ def test_a_pickle_without_parameters_is_rejected_by_name(root, content):
 @pytest.mark.parametrize("name", ["../../etc", "/etc", ".ssh", "a/b", "..", "a b"])
 def test_a_list_that_names_folders_outside_is_rejected(root, name):
     (root / capture_layout.LIST_FILE).write_text(f"{NAME}\n{name}\n")
-    with refused(CaptureFileError, capture_layout.LIST_FILE):
+    with refused(FileError, capture_layout.LIST_FILE):
         open_captures(root)
 
 
@@ -282,7 +283,7 @@ def test_info_and_sheet_say_and_show_what_is_there(root, tmp_path, capsys):
 def test_depth_with_several_channels_is_rejected(root, mode):
     path = capture_layout.picture_path(root / NAME, "depth", 0, 0)
     Image.new(mode, Image.open(path).size).save(path)
-    with refused(CaptureFileError, "channels"):
+    with refused(FileError, "channels"):
         open_captures(root).view(NAME, 0, 0)
 
 
@@ -313,14 +314,14 @@ def claim_pixels(root, width, height, padding=0):
 
 def test_passes_of_a_view_are_limited_together_before_any_is_decoded(root):
     claim_pixels(root, 6400, 6400)  # each alone would be decoded
-    with refused(CaptureFileError, "6400 x 6400 pixels") as error:
+    with refused(FileError, "6400 x 6400 pixels") as error:
         open_captures(root).view(NAME, 0, 0)
     assert str(root / NAME) in str(error.value)
     claim_pixels(root, 6400, 6400, padding=1_500_000)
-    with refused(CaptureFileError):
+    with refused(FileError):
         open_captures(root).view(NAME, 0, 0)
     claim_pixels(root, 5700, 5700)
-    with refused(CaptureFileError):
+    with refused(FileError):
         open_captures(root).view(NAME, 0, 0)
 
 

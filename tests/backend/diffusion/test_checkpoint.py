@@ -5,18 +5,13 @@ import json
 import pytest
 import torch
 from diffusion_people import VOCABULARY, small_model
-from primdiffusion.diffusion.checkpoint import (
-    CheckpointError,
-    default_checkpoint,
-    load_checkpoint,
-    read_card,
-    save_checkpoint,
-)
+from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint, read_card, save_checkpoint
 from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES, WholeSlab
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
+from primdiffusion.formats.regular_files import FileError
 from safetensors import safe_open
 from safetensors.torch import save_file
 from support.errors import refused
@@ -80,7 +75,7 @@ def test_a_checkpoint_with_a_detail_decoder_is_rejected_with_what_reads_it(path)
         return metadata | {"architecture": json.dumps(json.loads(metadata["architecture"]) | {"detail": {}})}
 
     rewrite(path, change_metadata=with_detail)
-    with refused(CheckpointError):
+    with refused(FileError):
         load_checkpoint(path)
 
 
@@ -109,7 +104,7 @@ def test_a_codec_of_another_network_is_named(path):
         return {k: v[:, :-1].contiguous() if k in ("codec.basis", "codec.parity") else v for k, v in tensors.items()}
 
     rewrite(path, narrow)
-    with refused(CheckpointError, "(3, 32, 32)", "(4, 32, 32)"):
+    with refused(FileError, "(3, 32, 32)", "(4, 32, 32)"):
         load_checkpoint(path)
 
 
@@ -143,25 +138,25 @@ def test_a_missing_file_is_named(tmp_path):
 def test_a_truncated_file_is_rejected(path, keep):
     content = path.read_bytes()
     path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
-    with refused(CheckpointError):
+    with refused(FileError):
         load_checkpoint(path)
 
 
 def test_a_file_of_another_kind_is_rejected(path):
     rewrite(path, change_metadata=lambda m: {"format": "pt"})
-    with refused(CheckpointError, "pt"):
+    with refused(FileError, "pt"):
         load_checkpoint(path)
 
 
 def test_another_version_is_rejected(path):
     rewrite(path, change_metadata=lambda m: m | {"format_version": "99"})
-    with refused(CheckpointError, "version 99"):
+    with refused(FileError, "version 99"):
         load_checkpoint(path)
 
 
 def test_weights_that_are_not_numbers_are_named(path):
     rewrite(path, lambda t: t | {"denoiser.person.outer.bias": torch.full((6,), float("nan"))})
-    with refused(CheckpointError, "person.outer.bias"):
+    with refused(FileError, "person.outer.bias"):
         load_checkpoint(path)
 
 
@@ -176,7 +171,7 @@ def test_weights_that_are_not_numbers_are_named(path):
 )
 def test_weights_that_do_not_fit_are_rejected(path, damage):
     rewrite(path, damage)
-    with refused(CheckpointError):
+    with refused(FileError):
         load_checkpoint(path)
 
 
@@ -195,7 +190,7 @@ def test_an_impossible_architecture_is_rejected(path, changes):
         return metadata | {"architecture": json.dumps(json.loads(metadata["architecture"]) | changes)}
 
     rewrite(path, change_metadata=change)
-    with refused(CheckpointError):
+    with refused(FileError):
         load_checkpoint(path)
 
 
@@ -207,14 +202,14 @@ def test_a_network_larger_than_its_file_is_not_built(path, local):
         return metadata | {"architecture": json.dumps(architecture)}
 
     rewrite(path, change_metadata=change)
-    with refused(CheckpointError):
+    with refused(FileError):
         load_checkpoint(path)
 
 
 def test_an_unfinished_model_is_not_saved(tmp_path):
     model = small_model()
     model.denoiser.person.outer.bias.fill_(float("inf"))
-    with refused(CheckpointError, "NaN"):
+    with refused(FileError, "NaN"):
         save_checkpoint(tmp_path / "bad.safetensors", model, "linear")
     assert list(tmp_path.iterdir()) == []
 

@@ -5,11 +5,12 @@ import json
 
 import pytest
 import torch
-from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint, read_card
+from primdiffusion.diffusion.checkpoint import load_checkpoint, read_card
 from primdiffusion.diffusion.model import sample
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.pretrained import load_pretrained, save_pretrained
 from primdiffusion.diffusion.schedule import linear
+from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 from tiny_model import save_tiny_checkpoint, tiny_model
 
@@ -63,7 +64,7 @@ def test_a_repository_of_a_hub_cache_loads_its_main_or_only_snapshot(tmp_path, c
 
 @pytest.mark.parametrize(("commits", "main"), [(("a", "b"), None), ((), None), (("a",), "../snapshots/a")])
 def test_a_folder_without_one_model_is_refused(tmp_path, commits, main):
-    with pytest.raises(CheckpointError):
+    with refused(FileError):
         load_pretrained(hub(tmp_path / "models--us--tiny", *commits, main=main))
 
 

@@ -5,9 +5,9 @@ import json
 
 import pytest
 import torch
-from primdiffusion.diffusion.checkpoint import CheckpointError
 from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
+from primdiffusion.formats.regular_files import FileError
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from support.errors import refused
@@ -49,7 +49,7 @@ def test_a_missing_file_is_named(tmp_path):
 @pytest.mark.parametrize("kept", [0, 5, 400, -100])
 def test_a_truncated_file_is_rejected(saved, tmp_path, kept):
     (tmp_path / "cut").write_bytes(saved.read_bytes()[:kept])
-    with refused(CheckpointError):
+    with refused(FileError):
         load_encoder(tmp_path / "cut")
 
 
@@ -69,7 +69,7 @@ def test_a_truncated_file_is_rejected(saved, tmp_path, kept):
     ],
 )
 def test_a_file_that_is_something_else_is_rejected_in_one_line(saved, tmp_path, metadata):
-    with refused(CheckpointError, str(tmp_path / "other")) as error:
+    with refused(FileError, str(tmp_path / "other")) as error:
         load_encoder(changed(saved, tmp_path / "other", **metadata))
     assert "\n" not in str(error.value)
 
@@ -77,9 +77,9 @@ def test_a_file_that_is_something_else_is_rejected_in_one_line(saved, tmp_path, 
 def test_weights_that_are_missing_or_not_finite_are_rejected(saved, tmp_path):
     tensors = load_file(saved)
     key = next(iter(tensors))
-    with refused(CheckpointError):
+    with refused(FileError):
         load_encoder(changed(saved, tmp_path / "less", {k: v for k, v in tensors.items() if k != key}))
-    with refused(CheckpointError, "NaN"):
+    with refused(FileError, "NaN"):
         load_encoder(changed(saved, tmp_path / "nan", {**tensors, key: torch.full_like(tensors[key], float("nan"))}))
 
 
@@ -90,7 +90,7 @@ def test_weights_that_half_precision_cannot_hold_replace_no_file(saved, tmp_path
     encoder = Encoder(TINY)
     with torch.no_grad():
         encoder.scale_out.bias[0, 0, 0] = bad
-    with refused(CheckpointError, "scale_out.bias"):
+    with refused(FileError, "scale_out.bias"):
         save_encoder(path, EncoderModel(encoder, {}))
     assert path.read_bytes() == saved.read_bytes()
     assert [file.name for file in tmp_path.iterdir()] == [path.name]

@@ -14,7 +14,8 @@ from primdiffusion.evaluation.image_metrics import (
     psnr,
     ssim,
 )
-from primdiffusion.evaluation.pretrained_networks import ALEXNET, VGG16, PictureFeatures, WeightsFileError
+from primdiffusion.evaluation.pretrained_networks import ALEXNET, VGG16, PictureFeatures
+from primdiffusion.formats.regular_files import FileError
 from safetensors.torch import save_file
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from support.errors import refused
@@ -156,11 +157,11 @@ def test_gradients_of_lpips_are_finite_also_in_black():
 def test_files_of_another_network_are_rejected(tmp_path):
     torch.save(PictureFeatures(VGG16, ["relu5_3"]).state_dict(), tmp_path / "vgg16.pth")
     alex = torchmetrics_lpips.__file__.removesuffix("lpips.py") + "lpips_models/alex.pth"
-    with refused(WeightsFileError, "linear.0.weight"):
+    with refused(FileError, "linear.0.weight"):
         load_lpips([tmp_path / "vgg16.pth"])
-    with refused(WeightsFileError, "linear.1.weight", "(1, 192, 1, 1)", "(1, 128, 1, 1)"):
+    with refused(FileError, "linear.1.weight", "(1, 192, 1, 1)", "(1, 128, 1, 1)"):
         load_lpips([tmp_path / "vgg16.pth", alex])
-    with refused(WeightsFileError):
+    with refused(FileError):
         load_lpips([alex])
 
 
@@ -169,13 +170,13 @@ def test_damaged_missing_and_foreign_files_are_named(tmp_path):
         load_lpips([tmp_path / "nothing.pth"])
     for name, held in (("half.pth", b"PK\x03\x04"), ("empty.pth", b""), ("half.safetensors", b"12345678{")):
         (tmp_path / name).write_bytes(held)
-        with pytest.raises(WeightsFileError, match=name):
+        with pytest.raises(FileError, match=name):
             load_lpips([tmp_path / name])
     torch.save(nn.Linear(2, 2), tmp_path / "pickled.pth")
-    with refused(WeightsFileError, "state_dict"):
+    with refused(FileError, "state_dict"):
         load_lpips([tmp_path / "pickled.pth"])
     torch.save([1, 2], tmp_path / "list.pth")
-    with refused(WeightsFileError):
+    with refused(FileError):
         load_lpips([tmp_path / "list.pth"])
 
 

@@ -13,7 +13,11 @@ from primdiffusion.evaluation.pose_depth_network import (
     load_pose_depth_network,
     save_pose_depth_network,
 )
-from primdiffusion.evaluation.pose_depth_training import (
+from primdiffusion.evaluation.shots import JOINTS
+from primdiffusion.people.assets import AssetsMissingError, open_assets
+from support.errors import refused
+
+from scripts.train_pose_depth_network import (
     SWAPPED,
     TrainingShots,
     augmented,
@@ -23,9 +27,6 @@ from primdiffusion.evaluation.pose_depth_training import (
     joint_loss,
     training_shots,
 )
-from primdiffusion.evaluation.shots import JOINTS
-from primdiffusion.people.assets import AssetsMissingError, open_assets
-from support.errors import refused
 
 
 def dots(count: int) -> TrainingShots:

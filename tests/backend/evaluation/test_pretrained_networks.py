@@ -8,11 +8,11 @@ from primdiffusion.evaluation.pretrained_networks import (
     ClipVision,
     Inception,
     PictureFeatures,
-    WeightsFileError,
     average_pooled,
     load_clip_vision,
     load_inception,
 )
+from primdiffusion.formats.regular_files import FileError
 from safetensors.torch import save_file
 from support.errors import refused
 from torch import nn
@@ -117,7 +117,7 @@ def test_clip_is_found_in_a_file_with_the_text_network(clip, tmp_path):
 @pytest.mark.parametrize("load", [load_inception, load_clip_vision])
 def test_a_file_of_another_network_is_named(load, tmp_path):
     save_file({"layer.weight": torch.zeros(3)}, tmp_path / "other.safetensors")
-    with refused(WeightsFileError, "other.safetensors"):
+    with refused(FileError, "other.safetensors"):
         load(tmp_path / "other.safetensors")
     with pytest.raises(FileNotFoundError):
         load(tmp_path / "none.pth")

@@ -8,7 +8,7 @@ import torch
 from capture_scenes import captured
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
-from primdiffusion.capture.conditioning import ConditioningError, spread_cameras
+from primdiffusion.capture.conditioning import spread_cameras
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.commands import evaluate as command
 from primdiffusion.encoder.config import EncoderConfig
@@ -129,7 +129,7 @@ def test_chosen_subjects_frames_and_cameras_are_kept_to(captures):
 
 
 def test_frames_that_are_not_there_are_rejected(captures):
-    with refused(ConditioningError, "0 to 2"):
+    with refused(ValueError, "0 to 2"):
         list(evaluate(Grey(), captures, EvaluationSettings(given_frame=7, size=32)))
     with refused(KeyError, "nobody"):
         list(evaluate(Grey(), captures, EvaluationSettings(("nobody",), size=32)))

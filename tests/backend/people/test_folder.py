@@ -20,7 +20,7 @@ from primdiffusion.people import folder as folder_module
 from primdiffusion.people import load_base_mesh, make_person, open_assets
 from primdiffusion.people.assets import licence_of
 from primdiffusion.people.fitting import cover
-from primdiffusion.people.folder import OtherPeopleError, PeopleSet, is_whole, make_people
+from primdiffusion.people.folder import PeopleSet, is_whole, make_people
 from primdiffusion.people.wardrobe import SKIRTS
 from support.errors import refused
 
@@ -72,9 +72,9 @@ def test_damaged_people_are_made_anew_and_whole_ones_kept(assets, two):
 
 
 def test_other_sets_of_people_are_rejected(assets, two):
-    with refused(OtherPeopleError, "seed 3", "seed 4"):
+    with refused(ValueError, "seed 3", "seed 4"):
         list(make_people(assets, PeopleSet(two, 4, 2), 1))
-    with refused(OtherPeopleError, "person_000004"):
+    with refused(ValueError, "person_000004"):
         list(make_people(assets, PeopleSet(two, 3, 1), 1))
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import torch
 import trimesh
 from primdiffusion.geometry.camera import look_at
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, from_mesh, nearest, surface_field, voxel_centres
 from primdiffusion.primitives.primitives import Frames, Primitives
 from primdiffusion.raster.rasterise import RasterImage, rasterise
@@ -215,11 +215,11 @@ def test_unusable_input_is_rejected():
     ball, frames = two_coloured_ball(), frames_on_ball(8)
     part = ball.parts[0]
     broken = dataclasses.replace(part, vertices=np.full_like(part.vertices, np.nan))
-    with refused(UnusableMesh, "NaN"):
+    with refused(ValueError, "NaN"):
         from_mesh(TexturedMesh((broken,)), frames)
-    with refused(UnusableMesh):
+    with refused(ValueError, "0 parts"):
         from_mesh(TexturedMesh(()), frames)
-    with refused(UnusableMesh):
+    with refused(ValueError, "texture"):
         from_mesh(TexturedMesh((dataclasses.replace(part, texture=np.zeros((0, 0, 4), np.uint8)),)), frames)
     with refused(ValueError, "frames", "NaN"):
         from_mesh(ball, dataclasses.replace(frames, position=frames.position * float("nan")))

@@ -6,7 +6,7 @@ import pytest
 import torch
 import trimesh
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.raster.rasterise import OrthographicView, rasterise, view_along
 from support.errors import refused
 
@@ -189,13 +189,13 @@ def test_a_view_along_a_direction_holds_the_whole_box():
 def test_unusable_meshes_are_rejected():
     good = part([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     broken = dataclasses.replace(good, vertices=np.full((3, 3), np.nan))
-    with refused(UnusableMesh, "0 parts"):
+    with refused(ValueError, "0 parts"):
         rasterise(TexturedMesh(()), FRONT)
-    with refused(UnusableMesh, "vertices"):
+    with refused(ValueError, "vertices"):
         rasterise(TexturedMesh((broken,)), FRONT)
-    with refused(UnusableMesh, "0 to 7"):
+    with refused(ValueError, "0 to 7"):
         rasterise(TexturedMesh((dataclasses.replace(good, faces=np.array([[0, 1, 7]], np.int32)),)), FRONT)
-    with refused(UnusableMesh):
+    with refused(ValueError, "texture"):
         rasterise(TexturedMesh((dataclasses.replace(good, texture=np.zeros((0, 4, 4), np.uint8)),)), FRONT)
     with refused(ValueError, "supersample is 0"):
         rasterise(TexturedMesh((good,)), FRONT, 0)

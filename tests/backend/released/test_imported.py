@@ -13,14 +13,15 @@ import torch
 from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
-from primdiffusion.diffusion.checkpoint import CheckpointError, load_checkpoint, read_card
+from primdiffusion.diffusion.checkpoint import load_checkpoint, read_card
 from primdiffusion.diffusion.codec import ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, place_skinned
-from primdiffusion.human_file import HumanFileError, load_human, save_human
+from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.anchors import build_anchors
 from primdiffusion.primitives.body_setup import BodySetupError, body_setup_from_files
 from primdiffusion.primitives.primitives import K, Payload
@@ -189,14 +190,14 @@ def test_a_missing_body_is_named_by_its_file(copied, person):
     body["smpl"]["sha256"] = "0" * 64
     tensors = safetensors.torch.load_file(saved)
     safetensors.torch.save_file(tensors, saved, {**metadata, "body": json.dumps(body)})
-    with refused(HumanFileError, "person.human"):
+    with refused(FileError, "person.human"):
         load_human(saved)
     safetensors.torch.save_file(tensors, saved, {**metadata, "body": "{}"})
-    with refused(HumanFileError, "smpl"):
+    with refused(FileError, "smpl"):
         load_human(saved)
     del tensors["rest_half_extent"]
     safetensors.torch.save_file(tensors, saved, metadata)
-    with refused(HumanFileError):
+    with refused(FileError):
         load_human(saved)
 
 
@@ -210,11 +211,11 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
     with refused(BodySetupError, "anchors"):
         load_checkpoint(path)
     safetensors.torch.save_file({**tensors, "stand.betas": torch.zeros(9)}, path, metadata)
-    with refused(CheckpointError, "imported.safetensors", "(9,)"):
+    with refused(FileError, "imported.safetensors", "(9,)"):
         load_checkpoint(path)
     del tensors["denoiser.time_embed.0.bias"]
     safetensors.torch.save_file(tensors, path, metadata)
-    with refused(CheckpointError, "time_embed.0.bias"):
+    with refused(FileError, "time_embed.0.bias"):
         load_checkpoint(path)
 
 

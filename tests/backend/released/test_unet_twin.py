@@ -186,11 +186,11 @@ def test_networks_of_the_first_versions_are_told_apart_and_compute_as_they_did(t
 
 def test_runs_of_the_first_versions_resume_with_their_own_attention(tmp_path):
     def settings(**changes: object) -> TrainingConfig:
-        return TrainingConfig(tmp_path / "people", tmp_path / "run", preset="paper", **changes)
+        return TrainingConfig(data=tmp_path / "people", run=tmp_path / "run", preset="paper", **changes)
 
     old = without_the_entry(to_json(settings()))
     check_resumable(old, settings(unet=UNetConfig(attention_context="input")))
     with refused(ValueError, "unet.attention_context"):
         check_resumable(old, settings())
-    usual = TrainingConfig(tmp_path / "people", tmp_path / "run")
+    usual = TrainingConfig(data=tmp_path / "people", run=tmp_path / "run")
     check_resumable(without_the_entry(to_json(usual)), usual)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, UnusableMesh
+from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.payloads import fitted_payloads, orbit_camera
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.cpu import march_cpu
@@ -140,7 +140,7 @@ def test_a_mesh_without_textures_is_named():
         "body", corners, np.array([[0, 1, 2]], np.int32), np.zeros((1, 3, 2), np.float32),
         np.zeros((0, 0, 4), np.uint8), np.zeros((3, 1), np.int32), np.ones((3, 1)),
     )  # fmt: skip
-    with refused(UnusableMesh, "body"):
+    with refused(ValueError, "body"):
         fitted_payloads([TexturedMesh((bare,))], sheet_frames(), np.zeros(10))
     with refused(ValueError, "colouring"):
         fitted_payloads([], sheet_frames(), np.zeros(10))

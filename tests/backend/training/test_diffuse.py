@@ -23,14 +23,14 @@ from primdiffusion.failures import describe
 from primdiffusion.human import generate
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import S
-from primdiffusion.training import phase, slabs
-from primdiffusion.training.cells import CellTrainee, prepare
+from primdiffusion.training import slabs
+from primdiffusion.training.cells import CellTask, prepare
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
+from primdiffusion.training.loop import Interrupt, Step, StepTimer, step_seed
 from primdiffusion.training.losses import LEVELS
-from primdiffusion.training.phase import step_seed
 from primdiffusion.training.shards import INDEX, pack_people
-from primdiffusion.training.slabs import SlabTrainee
+from primdiffusion.training.slabs import SlabTask
 from primdiffusion.training.stored_people import PersonFolder
 from safetensors.torch import load_file
 from support.errors import refused
@@ -113,6 +113,10 @@ def sentence(error):
     return str(failure)
 
 
+def first_step(phase):
+    return Step(phase, 0, torch.Generator().manual_seed(0), {}, StepTimer(torch.device("cpu")))
+
+
 def test_a_run_leaves_settings_people_metrics_pictures_states_and_a_model(people, whole):
     assert {path.name for path in whole.iterdir()} == DEFAULT_FILES
     assert json.loads((whole / "config.json").read_text())["person"]["steps"] == 6
@@ -158,15 +162,13 @@ def test_a_card_claims_nothing_of_people_it_does_not_know(people, run):
 
 
 def test_a_run_in_parts_is_bit_identical_to_one_in_one_go(people, whole, run, monkeypatch):
-    due = phase.Interrupt.due
+    due = Interrupt.due
     for last in (2, 3, 4, 1):  # steps done before it is asked to stop: within, between and before phases
         asked = []
-        monkeypatch.setattr(
-            phase.Interrupt, "due", lambda self, last=last, asked=asked: asked.append(0) or len(asked) > last
-        )
+        monkeypatch.setattr(Interrupt, "due", lambda self, last=last, asked=asked: asked.append(0) or len(asked) > last)
         train(settings(people, run))
         torch.randn(3)  # whatever else is drawn in between does not matter
-    monkeypatch.setattr(phase.Interrupt, "due", due)
+    monkeypatch.setattr(Interrupt, "due", due)
     train(settings(people, run))
     for name in ("person.state.safetensors", "local.state.safetensors", MODEL):
         assert same_tensors(run / name, whole / name), name
@@ -179,11 +181,11 @@ def test_a_new_run_starts_from_a_checkpoints_closed_form_and_weights(people, who
     base = load_checkpoint(whole / MODEL)
     config = settings(people, tmp_path / "run", start_from=whole / MODEL, person=PhaseConfig(steps=1, batch=4))
     folder = PersonFolder(people)
-    trainee = CellTrainee(config, prepare(config, folder, [0, 1], [2], base), torch.device("cpu"), base)
-    for name, value in trainee.denoiser.state_dict().items():
+    task = CellTask(config, prepare(config, folder, [0, 1], [2], base), torch.device("cpu"), base)
+    for name, value in task.denoiser.state_dict().items():
         assert torch.equal(value, base.denoiser.state_dict()[name]), name
-    assert torch.equal(trainee.codec.basis, base.codec.codec.basis)
-    assert trainee.vocabulary == base.vocabulary
+    assert torch.equal(task.codec.basis, base.codec.codec.basis)
+    assert task.vocabulary == base.vocabulary
     model = train(config)
     assert model.card["started_from"] == base.card["sha256"]
     assert torch.equal(model.denoiser.prior.basis, base.denoiser.prior.basis)
@@ -263,7 +265,7 @@ def test_a_damaged_file_of_the_run_is_named(people, whole, tmp_path, name):
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_with_a_sentence(people, run, monkeypatch):
-    monkeypatch.setattr(CellTrainee, "loss", lambda self, name, generator: self.denoiser.person.outer.weight.sum() / 0)
+    monkeypatch.setattr(CellTask, "loss", lambda self, step: {"loss": self.denoiser.person.outer.weight.sum() / 0})
     with refused(ValueError, "person", "step 0", "--person.learning-rate") as error:
         train(settings(people, run))
     sentence(error.value)
@@ -272,10 +274,10 @@ def test_a_loss_that_is_not_finite_stops_the_run_with_a_sentence(people, run, mo
 
 
 def test_memory_that_runs_out_names_a_batch_to_try(people, run, monkeypatch):
-    def greedy(self, name, generator):
+    def greedy(self, step):
         raise RuntimeError("DefaultCPUAllocator: not enough memory: you tried to allocate 99 bytes")
 
-    monkeypatch.setattr(CellTrainee, "loss", greedy)
+    monkeypatch.setattr(CellTask, "loss", greedy)
     with refused(ValueError, "--person.batch 8"):
         train(settings(people, run))
 
@@ -313,7 +315,7 @@ def test_the_paper_preset_trains_saves_loads_and_generates(paper):
 @pytest.mark.slow
 def test_the_paper_preset_goes_on_bit_for_bit(few, paper, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
-        patch.setattr(phase.Interrupt, "due", after(1))
+        patch.setattr(Interrupt, "due", after(1))
         train(settings(few, tmp_path / "run", preset="paper"))
     train(settings(few, tmp_path / "run", preset="paper"))
     for name in ("slab.state.safetensors", MODEL):
@@ -322,10 +324,10 @@ def test_the_paper_preset_goes_on_bit_for_bit(few, paper, tmp_path, monkeypatch)
 
 def test_the_paper_preset_learns_slabs_of_the_people(few):
     config = settings(few, Path("unused"), preset="paper")
-    trainee = SlabTrainee(config, PersonFolder(few), [0, 2], [1], torch.device("cpu"))
-    assert trainee.places == [(0, 0), (0, 1), (2, 0), (2, 1)]
-    (slab,) = trainee.slabs([(2, 1)])
-    payload = trainee.model().decode(slab)
+    task = SlabTask(config, PersonFolder(few), [0, 2], [1], torch.device("cpu"))
+    assert task.places == [(0, 0), (0, 1), (2, 0), (2, 1)]
+    (slab,) = task.slabs([(2, 1)])
+    payload = task.model().decode(slab)
     stored = PersonFolder(few).person(2).payload(1)
     for name in ("rgb", "density", "delta_scale"):
         assert torch.allclose(getattr(payload, name), getattr(stored, name), atol=1e-4), name
@@ -334,9 +336,9 @@ def test_the_paper_preset_learns_slabs_of_the_people(few):
 def test_an_untrained_paper_network_has_the_loss_of_guessing_nothing(few):
     # it starts at 0, so the plain error is the mean square of the slabs themselves, at any level
     config = settings(few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=2, weighting="plain"))
-    trainee = SlabTrainee(config, PersonFolder(few), [0], [1], torch.device("cpu"))
-    energy = trainee.slabs([(0, 0)]).square().mean().item(), trainee.slabs([(0, 1)]).square().mean().item()
-    loss = trainee.loss("slab", torch.Generator().manual_seed(0)).item()
+    task = SlabTask(config, PersonFolder(few), [0], [1], torch.device("cpu"))
+    energy = task.slabs([(0, 0)]).square().mean().item(), task.slabs([(0, 1)]).square().mean().item()
+    loss = task.loss(first_step("slab"))["loss"].item()
     assert min(energy) - 1e-6 <= loss <= max(energy) + 1e-6
 
 
@@ -346,15 +348,15 @@ def test_bfloat16_computes_the_network_in_it_where_that_is_faster(few, monkeypat
     config = settings(
         few, Path("unused"), preset="paper", slab=PhaseConfig(steps=1, batch=1, weighting="plain", bfloat16=True)
     )
-    trainee = SlabTrainee(config, PersonFolder(few), [0], [1], torch.device("cpu"))
+    task = SlabTask(config, PersonFolder(few), [0], [1], torch.device("cpu"))
     seen, layer = [], torch.nn.Conv2d(56, 56, 1)  # processors are slow at convolutions in bfloat16
 
     def network(x, t):
         seen.append((out := layer(x)).dtype)
         return out
 
-    trainee.denoiser = network
-    loss = trainee.loss("slab", torch.Generator().manual_seed(0))
+    task.denoiser = network
+    loss = task.loss(first_step("slab"))["loss"]
     assert seen == [dtype]
     assert loss.dtype == torch.float32
 

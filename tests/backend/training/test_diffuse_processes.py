@@ -1,5 +1,6 @@
 """Stage 2 on several processes, as `accelerate launch` or `torchrun` start them."""
 
+import dataclasses
 import json
 import subprocess
 import sys
@@ -10,17 +11,17 @@ import torch
 from diffuse_runs import DEFAULT_FILES, child_environment, logged, make_small, settings
 from diffusion_people import write_people
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.training.cells import CellTrainee
+from primdiffusion.training.cells import CellTask
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.diffuse import MODEL, train
-from primdiffusion.training.phase import step_seed
+from primdiffusion.training.loop import step_seed
 from safetensors.torch import load_file
 
 SCRIPT = Path(__file__).parents[1] / "diffuse_runs.py"
 PHASES = {"person": {"steps": 2, "batch": 8, "evaluate_every": 2}, "local": {"steps": 1, "batch": 2}}
 TWINS = {step_seed(0, name, step, 0): step_seed(0, name, step, 1) for name in PHASES for step in range(2)}
 """Seeds of the second process by those of the first."""
-ALONE = CellTrainee.loss
+ALONE = CellTask.loss
 
 
 @pytest.fixture(scope="module")
@@ -35,13 +36,13 @@ def small(monkeypatch):
     make_small(monkeypatch)
 
 
-def of_both(trainee, name, generator):
+def of_both(task, step):
     """The mean of what two processes would compute, each with numbers of its own."""
     losses = []
-    for seed in (generator.initial_seed(), TWINS[generator.initial_seed()]):
+    for seed in (step.generator.initial_seed(), TWINS[step.generator.initial_seed()]):
         torch.manual_seed(seed)
-        losses.append(ALONE(trainee, name, torch.Generator().manual_seed(seed)))
-    return torch.stack(losses).mean()
+        losses.append(ALONE(task, dataclasses.replace(step, generator=torch.Generator().manual_seed(seed)))["loss"])
+    return {"loss": torch.stack(losses).mean()}
 
 
 @pytest.mark.slow
@@ -57,7 +58,7 @@ def test_two_processes_train_on_batches_of_their_own_and_average_gradients(peopl
     assert logged(tmp_path / "two") == [("person", 1), ("person", 2), ("local", 1)]
     assert json.loads((tmp_path / "two" / "run.json").read_text())["starts"][0]["processes"] == 2
     assert load_checkpoint(tmp_path / "two" / MODEL).card["batch"] == {"person": 16, "local": 4}
-    monkeypatch.setattr(CellTrainee, "loss", of_both)
+    monkeypatch.setattr(CellTask, "loss", of_both)
     train(settings(people, tmp_path / "one", **{name: PhaseConfig(**phase) for name, phase in PHASES.items()}))
     for name in ("person.state.safetensors", "local.state.safetensors"):
         states = [load_file(tmp_path / folder / name) for folder in ("two", "one")]

@@ -4,7 +4,8 @@ import math
 
 import pytest
 import torch
-from primdiffusion.evaluation.pretrained_networks import VGG16, VGG19, PictureFeatures, WeightsFileError
+from primdiffusion.evaluation.pretrained_networks import VGG16, VGG19, PictureFeatures
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.training.fit_config import LossConfig
 from primdiffusion.training.fit_losses import (
     VGG_LAYERS,
@@ -154,7 +155,7 @@ def test_only_the_layers_asked_for_are_computed(vgg_file):
 
 def test_a_file_of_another_network_is_rejected(tmp_path):
     torch.save(PictureFeatures(VGG16, ["relu5_3"]).state_dict(), tmp_path / "vgg16.pth")
-    with refused(WeightsFileError, "vgg16.pth", "VGG19"):
+    with refused(FileError, "vgg16.pth", "VGG19"):
         load_perceptual(tmp_path / "vgg16.pth")
 
 
@@ -162,7 +163,7 @@ def test_weights_that_are_not_finite_are_rejected(vgg_file, tmp_path):
     state = torch.load(vgg_file, weights_only=True)
     state["features.0.bias"][0] = torch.nan
     torch.save(state, tmp_path / "nan.pth")
-    with refused(WeightsFileError, "features.0.bias", "NaN"):
+    with refused(FileError, "features.0.bias", "NaN"):
         load_perceptual(tmp_path / "nan.pth")
 
 

@@ -8,10 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 from capture_scenes import captured
-from fit_scenes import WHOLE, child_environment, files, flags, logged, make_small, settings
+from fit_scenes import STATE, WHOLE, child_environment, files, flags, logged, make_small, settings
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.training.fit import fit
-from primdiffusion.training.fit_run import MODEL, STATE
+from primdiffusion.training.fit import MODEL, fit
 from safetensors.torch import load_file
 
 SCRIPT = Path(__file__).parents[1] / "fit_scenes.py"
@@ -53,7 +52,6 @@ def test_two_processes_of_one_person_train_as_one_of_two_and_save_once(captures,
     fit(one)
     states = [load_file(run / STATE) for run in (config.run, one.run)]
     assert states[0].keys() == states[1].keys()
-    assert states[0]["random.data"].equal(states[1]["random.data"])
     for name, value in states[0].items():
         if name.startswith(("network.", "average.")):
             assert torch.allclose(value, states[1][name], atol=1e-5), name

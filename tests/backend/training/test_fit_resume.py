@@ -13,16 +13,27 @@ from pathlib import Path
 import pytest
 import torch
 from capture_scenes import captured
-from fit_scenes import WHOLE, child_environment, files, logged, make_small, rows, same_tensors, sentence, settings
+from fit_scenes import (
+    STATE,
+    WHOLE,
+    child_environment,
+    files,
+    logged,
+    make_small,
+    rows,
+    same_tensors,
+    sentence,
+    settings,
+    stop_after,
+)
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.training import recorder as recorder_module
-from primdiffusion.training.fit import fit
+from primdiffusion.training import loop
+from primdiffusion.training.fit import MODEL, fit
 from primdiffusion.training.fit_config import LossConfig
-from primdiffusion.training.fit_run import MODEL, STATE, FitState
-from primdiffusion.training.recorder import Interrupt
+from primdiffusion.training.loop import Interrupt
 from primdiffusion.training.run_folder import CONFIG, METRICS, RUN
-from primdiffusion.training.state import TrainingState
+from primdiffusion.training.state import TrainingState, saved_step
 from safetensors import safe_open
 from support.errors import refused
 from tiny_encoder import TINY
@@ -75,8 +86,9 @@ def one_step(captures, tmp_path_factory):
     """A run of one step."""
     with pytest.MonkeyPatch.context() as patch:
         make_small(patch)
-        config = settings(captures, tmp_path_factory.mktemp("one_step") / "run", minutes=0.0)
-        fit(config)
+        config = settings(captures, tmp_path_factory.mktemp("one_step") / "run")
+        with stop_after(1):
+            fit(config)
         return config.run
 
 
@@ -84,7 +96,7 @@ def one_step(captures, tmp_path_factory):
 def begun(captures, one_step, tmp_path):
     """The settings of a run that took one step."""
     shutil.copytree(one_step, tmp_path / "run")
-    return settings(captures, tmp_path / "run", minutes=0.0)
+    return settings(captures, tmp_path / "run")
 
 
 def timeless(run: Path) -> list[dict]:
@@ -104,7 +116,8 @@ def contents(run: Path) -> dict[str, bytes]:
 def test_a_run_in_parts_is_bit_identical_to_one_in_one_go(captures, whole, tmp_path):
     run = tmp_path / "run"
     for workers in (0, 1, 0):
-        fit(settings(captures, run, minutes=0.0, workers=workers))
+        with stop_after(1):
+            fit(settings(captures, run, workers=workers))
         torch.randn(3)  # whatever else is drawn in between does not matter
     assert place(run) == {"step": "3", "position": "[0, 3]"}
     fit(settings(captures, run))
@@ -123,7 +136,7 @@ def test_a_kill_in_the_middle_of_a_save_loses_one_interval_and_leaves_whole_file
         env=child_environment(), capture_output=True, timeout=300, check=False,
     )  # fmt: skip
     assert died.returncode == -signal.SIGKILL
-    assert FitState.saved_step(run / STATE) == 2
+    assert saved_step(run / STATE) == 2
     assert load_encoder(run / MODEL).card["steps"] == 3
     assert logged(run) == [1, 2, 3]
     assert len(list(run.glob(".*.partial*"))) == 1
@@ -141,7 +154,8 @@ def test_a_kill_before_the_first_save_begins_again(captures, whole, tmp_path):
     (run / CONFIG).write_bytes((whole / CONFIG).read_bytes())
     (run / RUN).write_bytes((whole / RUN).read_bytes())
     (run / METRICS).write_bytes((whole / METRICS).read_bytes())
-    fit(settings(captures, run, minutes=0.0))
+    with stop_after(1):
+        fit(settings(captures, run))
     assert logged(run) == [1]
 
 
@@ -190,7 +204,7 @@ def test_weights_that_are_not_finite_replace_nothing(captures, begun, monkeypatc
         return norm
 
     monkeypatch.setattr(TrainingState, "update", diverge)
-    with refused(ValueError, "stem.0.bias"):
+    with refused(ValueError, "stem.0.bias"), stop_after(1):
         fit(begun)
     assert (begun.run / STATE).read_bytes() == before[STATE]
     assert torch.isfinite(load_encoder(begun.run / MODEL).encoder.stem[0].bias).all()
@@ -230,7 +244,7 @@ def test_a_damaged_file_of_the_run_is_named_and_kept(captures, begun, name):
 
 
 def test_a_state_of_another_encoder_is_rejected_in_one_sentence(captures, begun, tmp_path):
-    other = settings(captures, tmp_path / "other", minutes=0.0, encoder="no_attention")
+    other = settings(captures, tmp_path / "other", steps=1, encoder="no_attention")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(PRESETS, "no_attention", TINY)
         fit(other)
@@ -255,7 +269,7 @@ def test_a_polite_kill_asks_to_stop_and_a_second_ctrl_c_stops_at_once(monkeypatc
         os.kill(os.getpid(), signal.SIGTERM)
         assert interrupt.due()
         os.kill(os.getpid(), signal.SIGINT)  # within the two seconds in which launchers pass the same one on
-        monkeypatch.setattr(recorder_module, "IMPATIENT", 0.0)
+        monkeypatch.setattr(loop, "IMPATIENT", 0.0)
         with pytest.raises(KeyboardInterrupt):
             os.kill(os.getpid(), signal.SIGINT)
     assert signal.getsignal(signal.SIGTERM) is before

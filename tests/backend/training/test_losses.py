@@ -10,7 +10,7 @@ import pytest
 import torch
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.schedule import fine_linear, linear, sqrt_linear
-from primdiffusion.training.cells import CellTrainee
+from primdiffusion.training.cells import CellTask
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import (
@@ -151,12 +151,12 @@ def test_every_weighting_trains_both_networks(prepared_once, name):
     losses = []
     for weighting in ("whitened", "plain", "min_snr"):
         phases = {key: dataclasses.replace(getattr(config, key), weighting=weighting) for key in ("person", "local")}
-        trainee = CellTrainee(dataclasses.replace(config, **phases), prepared, torch.device("cpu"))
-        trainee.network(name).requires_grad_(True)
-        loss = trainee.loss(name, torch.Generator().manual_seed(0))
+        task = CellTask(dataclasses.replace(config, **phases), prepared, torch.device("cpu"))
+        task.network(name).requires_grad_(True)
+        loss = task.objective(name).loss(torch.Generator().manual_seed(0))
         loss.backward()
         losses.append(loss.item())
-        assert trainee.network(name).outer.weight.grad.abs().max() > 0
+        assert task.network(name).outer.weight.grad.abs().max() > 0
     assert len(set(losses)) == 3
     assert np.isfinite(losses).all()
 

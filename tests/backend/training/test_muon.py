@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 import torch
-from primdiffusion.training import phase
+from primdiffusion.training import diffusion_task
 from primdiffusion.training.config import PhaseConfig
-from primdiffusion.training.phase import PhaseState
+from primdiffusion.training.diffusion_task import DiffusionTask
+from primdiffusion.training.loop import begin_phase
 from primdiffusion.training.state import accelerator_of
 from support.errors import refused
 from torch import nn
@@ -23,21 +24,44 @@ class Net(nn.Module):
         return self.outer(torch.tanh(self.hidden(self.inner(x))))
 
 
+class NetTask(DiffusionTask):
+    """As much of a task as a state needs."""
+
+    def __init__(self, memory_format, **settings):
+        torch.manual_seed(3)
+        self.net, self.device = Net().to(memory_format=memory_format), torch.device("cpu")
+        self.config = PhaseConfig(steps=50, batch=4, weight_decay=0.0, optimiser="muon", **settings)
+
+    @property
+    def phases(self):
+        return {"net": self.config}
+
+    def network(self, phase):
+        return self.net
+
+    def put(self, phase, network):
+        self.net = network
+
+    def loss(self, step): ...
+
+    def errors(self): ...
+
+    def model(self): ...
+
+
 @pytest.fixture(autouse=True)
 def fast(monkeypatch):
     """A device that multiplies bfloat16 fast."""
-    monkeypatch.setattr(phase, "has_fast_bfloat16", lambda device: True)
+    monkeypatch.setattr(diffusion_task, "has_fast_bfloat16", lambda device: True)
 
 
 def started(memory_format=torch.channels_last, **settings):
-    torch.manual_seed(3)
-    config = PhaseConfig(steps=50, batch=4, weight_decay=0.0, optimiser="muon", **settings)
-    return PhaseState(Net().to(memory_format=memory_format), config, 0, accelerator_of())
+    return begin_phase(NetTask(memory_format, **settings), "net", accelerator_of())
 
 
 def advance(state, steps):
     for _ in range(steps):
-        x = torch.randn(4, 2, 5, 5, generator=state.generator)
+        x = torch.randn(4, 2, 5, 5, generator=torch.Generator().manual_seed(state.step))
         state.update((state.network(x) - x.sum(1, keepdim=True)).square().mean())
 
 
@@ -88,7 +112,7 @@ def test_a_saved_state_goes_on_bit_for_bit(tmp_path):
 def test_a_device_that_is_slow_in_bfloat16_takes_adamw(monkeypatch, tmp_path):
     state = started()
     state.save(tmp_path / "muon.safetensors")
-    monkeypatch.setattr(phase, "has_fast_bfloat16", lambda device: False)
+    monkeypatch.setattr(diffusion_task, "has_fast_bfloat16", lambda device: False)
     slow = started()
     advance(slow, 1)
     assert all("exp_avg" in slow.optimiser.state[parameter] for parameter in slow.network.parameters())

@@ -9,11 +9,12 @@ import pytest
 import torch
 from diffusion_people import write_people
 from primdiffusion import tensor_file
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.whole_files import temporary_name
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import K
 from primdiffusion.training import shards
-from primdiffusion.training.shards import INDEX, PackedPeople, ShardError, damaged_shards, open_people, pack_people
+from primdiffusion.training.shards import INDEX, PackedPeople, damaged_shards, open_people, pack_people
 from primdiffusion.training.stored_people import PersonFolder, read_person
 from support.errors import refused
 
@@ -91,7 +92,7 @@ def test_a_damaged_shard_is_named_before_anything_of_it_is_used(copied, harm):
         path.write_bytes(content if harm == "a flipped bit" else content[: len(content) // 2])
     people = open_people(copied)
     people.person(0)
-    with refused((ShardError, FileNotFoundError), "shard_0001"):
+    with refused((FileError, FileNotFoundError), "shard_0001"):
         people.variant(2, 0)
     assert [("shard_0001" in found) for found in damaged_shards(copied)] == [True]
 
@@ -116,7 +117,7 @@ def test_a_shard_is_checked_once(packed, monkeypatch):
 )
 def test_an_index_that_cannot_be_used_is_rejected(copied, content):
     (copied / INDEX).write_text(content)
-    with pytest.raises(ShardError):
+    with refused(FileError):
         open_people(copied)
 
 
@@ -157,7 +158,7 @@ def test_a_full_disk_while_packing_is_named_and_leaves_nothing(folder, tmp_path,
 
 def test_packing_into_packed_people_is_rejected(folder, copied):
     before = (copied / INDEX).read_bytes()
-    with refused(ShardError, "already"):
+    with refused(FileError, "already"):
         list(pack_people(folder, copied))
     assert (copied / INDEX).read_bytes() == before
 
@@ -166,7 +167,7 @@ def test_packing_again_removes_what_a_kill_left_beside_the_finished_shards(folde
     left = temporary_name(copied / "files")
     left = left.with_name(left.name.replace(str(os.getpid()), "9999999"))  # above any process' number
     left.mkdir()
-    with refused(ShardError, "already"):
+    with refused(FileError, "already"):
         list(pack_people(folder, copied))
     assert not left.exists()
 
@@ -199,7 +200,7 @@ def test_an_index_names_only_files_beside_it(copied, name):
     index = json.loads((copied / INDEX).read_text())
     index["shards"][0]["file"] = name
     (copied / INDEX).write_text(json.dumps(index))
-    with refused(ShardError, "index"):
+    with refused(FileError, "index"):
         PackedPeople(copied)
 
 
@@ -218,20 +219,20 @@ def test_a_shard_with_the_right_checksum_and_other_tensors_is_rejected(copied, n
     index = json.loads((copied / INDEX).read_text())
     index["shards"][0]["sha256"] = shards.digest_of(path)
     (copied / INDEX).write_text(json.dumps(index))
-    with refused(ShardError, "shard_0000"):
+    with refused(FileError, "shard_0000"):
         PackedPeople(copied).person(0)
 
 
 def test_a_shard_that_is_listed_twice_is_rejected(tmp_path):
     index = _changed_index(tmp_path, lambda shards: shards.append(shards[0]))
-    with refused(ShardError, "shard_0000.safetensors"):
+    with refused(FileError, "shard_0000.safetensors"):
         PackedPeople(index.parent)
 
 
 @pytest.mark.parametrize("variants", [0, -3, 1.5, "1", True])
 def test_a_number_of_colourings_that_is_none_is_rejected(tmp_path, variants):
     index = _changed_index(tmp_path, lambda shards: shards[0]["people"][0].update(variants=variants))
-    with refused(ShardError, "colourings"):
+    with refused(FileError, "colourings"):
         PackedPeople(index.parent)
 
 

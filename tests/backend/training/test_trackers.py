@@ -9,8 +9,7 @@ from diffuse_runs import make_small, rows, settings
 from primdiffusion.failures import MissingPackageError, describe
 from primdiffusion.training.config import check_resumable, to_json
 from primdiffusion.training.diffuse import train
-from primdiffusion.training.fit_run import FitRecorder
-from primdiffusion.training.trackers import tracking
+from primdiffusion.training.run_folder import open_metrics
 
 
 class Wandb(types.ModuleType):
@@ -61,14 +60,12 @@ def test_wandb_is_started_in_the_run_folder_and_steps_never_fall(people, tmp_pat
     assert any("local/loss" in values for _, values in wandb.lines)
 
 
-def test_the_encoder_s_lines_are_sent_too(tmp_path, monkeypatch):
+def test_lines_without_a_phase_are_sent_too(tmp_path, monkeypatch):
     PartialState()  # as a run has, and as tests before this one may have: trackers log through it
     wandb = Wandb()
     monkeypatch.setitem(sys.modules, "wandb", wandb)
-    with tracking("wandb", tmp_path) as tracker:
-        recorder = FitRecorder.__new__(FitRecorder)
-        recorder.run, recorder.tracker, recorder.state = tmp_path, tracker, types.SimpleNamespace(step=3)
-        recorder.append({"step": 3, "loss": 0.5})
+    with open_metrics(settings(tmp_path, tmp_path, tracker="wandb")) as metrics:
+        metrics.append({"step": 3, "loss": 0.5}, 3)
     assert wandb.lines == [(3, {"step": 3, "loss": 0.5})]
 
 

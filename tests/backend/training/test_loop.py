@@ -1,4 +1,4 @@
-"""Stopping a run by Ctrl-C."""
+"""The training loop: stopping a run by Ctrl-C."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import os
 import signal
 import threading
 
-from primdiffusion.training.recorder import Interrupt
+from primdiffusion.training.loop import Interrupt
 
 
 def test_ctrl_c_stops_after_the_step_and_the_handler_is_given_back():

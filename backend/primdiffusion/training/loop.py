@@ -1,0 +1,330 @@
+"""The loop in which every network is trained: steps, metrics, pictures, saved states, and a stop between two steps.
+
+    states = train(task, config, accelerator)       # resumes from the states in the run's folder
+
+A task gives networks, the loss of each, held-out errors and pictures: `fit.EncoderTask`, `cells.CellTask`,
+`slabs.SlabTask`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import logging
+import math
+import os
+import signal
+import threading
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from types import FrameType
+
+import torch
+from accelerate import Accelerator
+from torch import Tensor, nn
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from primdiffusion.failures import out_of_memory
+from primdiffusion.formats.json_files import parse_message
+from primdiffusion.training.config import RunSettings
+from primdiffusion.training.run_folder import PICTURES, Metrics, open_metrics, state_path
+from primdiffusion.training.state import PhaseSettings, TrainingState, adamw, agreed
+
+log = logging.getLogger(__name__)
+
+MEMORY = 25
+"""Approximate window of the running means in metrics.jsonl, steps."""
+IMPATIENT = 2.0
+"""Seconds after the first Ctrl-C before a second one stops at once: launchers forward the first one twice."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class StepTimer:
+    """Measures seconds between laps, synchronising the device."""
+
+    def __init__(self, device: torch.device) -> None:
+        self.device, self.seconds = device, {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """End a lap."""
+        if self.device.type == "cuda":
+            torch.cuda.synchronize(self.device)
+        elif self.device.type == "mps":
+            torch.mps.synchronize()
+        now = time.perf_counter()
+        self.seconds[name] = now - self._last
+        self._last = now
+
+
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """One optimiser step, as its loss sees it."""
+
+    phase: str
+    number: int
+    """Completed steps."""
+    generator: torch.Generator
+    """Random numbers on the device that depend on seed, phase, step and process only, as torch's own do in a step."""
+    place: dict[str, str]
+    """State of the task in this phase, saved and restored with the network."""
+    timer: StepTimer
+
+
+@dataclasses.dataclass(frozen=True)
+class StepMetrics:
+    """Metrics of one optimiser step."""
+
+    terms: Mapping[str, float]
+    """Weighted terms of the objective on the batch of this process."""
+    gradient: float
+    """Norm of the gradient before clipping."""
+    seconds: Mapping[str, float]
+    """Times of the parts of a step; the last includes the update."""
+
+
+class Task(ABC):
+    """What is trained: networks, one after another."""
+
+    smaller: str
+    """What to try if a batch of 1 does not fit into memory."""
+
+    @property
+    @abstractmethod
+    def phases(self) -> Mapping[str, PhaseSettings]:
+        """Return the settings of each network by its name, in the order of training; a single one may be named ""."""
+
+    @abstractmethod
+    def network(self, phase: str) -> nn.Module:
+        """Return a network as initialised."""
+
+    @abstractmethod
+    def put(self, phase: str, network: nn.Module) -> None:
+        """Use this network from now on: the one in training, or its average."""
+
+    def optimiser(self, phase: str, network: nn.Module) -> torch.optim.Optimizer:
+        """Return the optimiser of a network; the "factor" of a parameter group multiplies the learning rate."""
+        return adamw(self.phases[phase], network.parameters())
+
+    @abstractmethod
+    def loss(self, step: Step) -> Mapping[str, Tensor]:
+        """Return the weighted terms of the objective on a random batch."""
+
+    @abstractmethod
+    def held_out(self) -> Mapping[str, float]:
+        """Evaluate the networks in use."""
+
+    @abstractmethod
+    def draw(self, path: Path) -> None:
+        """Write a picture of what the networks in use make. Raises OSError."""
+
+    @abstractmethod
+    def save(self, state: TrainingState) -> None:
+        """Write what belongs to a state that is about to be saved."""
+
+
+def train(task: Task, config: RunSettings, accelerator: Accelerator) -> dict[str, TrainingState]:
+    """Train or resume the networks of a task until their last steps or an interrupt; returns their states.
+
+    The averages are in use afterwards. States are saved at intervals and at the end. Ctrl-C, SIGTERM and the time limit
+    end a run between two steps.
+
+    Raises:
+        ValueError: loss, gradient or weights are not finite; out of memory; a saved state is damaged
+            or of another network.
+        OSError: the disk is full; the last saved state remains.
+    """
+    recorded = open_metrics(config) if accelerator.is_main_process else contextlib.nullcontext()
+    with Interrupt(config.minutes) as interrupt, logging_redirect_tqdm(), recorded as metrics:
+        return {phase: _train_phase(task, phase, config, accelerator, interrupt, metrics) for phase in task.phases}
+
+
+def _train_phase(
+    task: Task, phase: str, config: RunSettings, accelerator: Accelerator, interrupt: Interrupt, metrics: Metrics | None
+) -> TrainingState:
+    path, steps = state_path(config.run, phase), task.phases[phase].steps
+    state = begin_phase(task, phase, accelerator)
+    if path.exists():
+        state.load(path)
+    saved, seconds = state.step, state.seconds
+    began = last = time.monotonic()
+    with Recorder(task, phase, config, state, metrics) if metrics else contextlib.nullcontext() as recorder:
+        while state.step < steps and not agreed(accelerator, interrupt.due()):
+            progress = take_step(task, phase, config.seed, state)
+            state.seconds = seconds + time.monotonic() - began
+            if recorder is None:
+                continue
+            recorder(progress)
+            if time.monotonic() - last >= config.save_every:
+                _save(task, state, path)
+                saved, last = state.step, time.monotonic()
+        if recorder is not None and state.step > saved:
+            _save(task, state, path)
+    accelerator.wait_for_everyone()
+    task.put(phase, state.average)
+    return state
+
+
+def begin_phase(task: Task, phase: str, accelerator: Accelerator) -> TrainingState:
+    """Return the state of a network before its first step, and use the network. Raises ValueError: out of memory."""
+    with _memory_named(task, phase):
+        network = task.network(phase).requires_grad_(True).to(accelerator.device)
+        state = TrainingState(network, task.phases[phase], accelerator, task.optimiser(phase, network))
+    task.put(phase, state.prepared)
+    return state
+
+
+def take_step(task: Task, phase: str, seed: int, state: TrainingState) -> StepMetrics:
+    """Take one optimiser step; its random numbers depend only on seed, phase, step and process.
+
+    Raises ValueError: the loss or its gradient is not finite; out of memory.
+    """
+    device = state.accelerator.device
+    seed = step_seed(seed, phase, state.step, state.accelerator.process_index)
+    torch.manual_seed(seed)
+    generator, timer = torch.Generator(device).manual_seed(seed), StepTimer(device)
+    state.prepared.train()
+    with _memory_named(task, phase):
+        terms = task.loss(Step(phase, state.step, generator, state.place, timer))
+        values = {name: float(term.detach()) for name, term in terms.items()}
+        if bad := [name for name, value in values.items() if not math.isfinite(value)]:
+            which = f"of {phase!r}" if phase else f"({', '.join(bad)})"
+            raise ValueError(
+                f"the loss {which} at step {state.step} is not finite: lower {_option(phase, 'learning-rate')} in a "
+                "new run folder"
+            )
+        gradient = state.update(torch.stack(list(terms.values())).sum())
+    timer.lap("backward")
+    return StepMetrics(values, gradient, timer.seconds)
+
+
+def step_seed(seed: int, phase: str, step: int, process: int) -> int:
+    """The seed of one step's random numbers on one process, 0 ... 2^63 - 1."""
+    digest = hashlib.sha256(f"{seed}/{phase}/{step}/{process}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") >> 1
+
+
+def _save(task: Task, state: TrainingState, path: Path) -> None:
+    task.save(state)
+    state.save(path)
+
+
+def _option(phase: str, name: str) -> str:
+    return f"--{phase}.{name}" if phase else f"--{name}"
+
+
+@contextlib.contextmanager
+def _memory_named(task: Task, phase: str) -> Iterator[None]:
+    """Turn out-of-memory errors into a ValueError that says what to try."""
+    try:
+        yield
+    except (RuntimeError, MemoryError) as error:
+        if not out_of_memory(error):
+            raise
+        batch = task.phases[phase].batch
+        remedy = f"{_option(phase, 'batch')} {batch // 2}" if batch > 1 else task.smaller
+        raise ValueError(f"out of memory for a batch of {batch}: try {remedy} in a new run folder") from error
+
+
+class Recorder:
+    """Writes metrics and pictures of a phase and shows a progress bar, in the main process.
+
+    Running means are saved in the state, so that a resumed run writes the same lines as an uninterrupted one.
+    """
+
+    def __init__(self, task: Task, phase: str, config: RunSettings, state: TrainingState, metrics: Metrics) -> None:
+        self.task, self.phase, self.config, self.state, self.metrics = task, phase, config, state, metrics
+        self.settings = task.phases[phase]
+        self.means: dict[str, float] = parse_message(state.place.get("means", "{}"))
+        earlier = list(task.phases)[: list(task.phases).index(phase)]
+        self._before = sum(task.phases[name].steps for name in earlier)
+
+    def __enter__(self) -> Recorder:
+        self.bar = tqdm(
+            total=self.settings.steps, initial=self.state.step, desc=self.phase or None, unit="step", disable=None
+        )
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.bar.close()
+
+    def __call__(self, progress: StepMetrics) -> None:
+        """Record a step. Raises OSError if the disk is full."""
+        step = self.state.step
+        row = {**progress.terms, "gradient": progress.gradient}
+        row |= {f"seconds_{name}": value for name, value in progress.seconds.items()}
+        for name, value in row.items():
+            before = self.means.get(name, value)
+            self.means[name] = before + (value - before) / min(step, MEMORY)
+        self.state.place["means"] = json.dumps(self.means)
+        self.bar.update()
+        if self._due(self.config.log_every):
+            self._write(self.means)
+        if self._due(self.settings.evaluate_every):
+            with self._averaged():
+                self._write(self.task.held_out())
+        if self._due(self.config.pictures_every):
+            name = f"{self.phase}_{step:07d}.png" if self.phase else f"{step:07d}.png"
+            with self._averaged():
+                self.task.draw(self.config.run / PICTURES / name)
+
+    def _due(self, every: int) -> bool:
+        return self.state.step % every == 0 or self.state.step == self.settings.steps
+
+    @contextlib.contextmanager
+    def _averaged(self) -> Iterator[None]:
+        self.task.put(self.phase, self.state.average)
+        try:
+            yield
+        finally:
+            self.task.put(self.phase, self.state.prepared)
+
+    def _write(self, values: Mapping[str, float]) -> None:
+        step, steps = self.state.step, self.settings.steps
+        left = (steps - step) * sum(value for name, value in self.means.items() if name.startswith("seconds_"))
+        shown = " ".join(f"{name}={value:.4g}" for name, value in values.items())
+        of = f"{self.phase}, " if self.phase else ""
+        log.info("%sstep %d of %d, %s left: %s", of, step, steps, tqdm.format_interval(left), shown)
+        phase = {"phase": self.phase} if self.phase else {}
+        self.metrics.append({**phase, "step": step, "seconds": self.state.seconds, **values}, self._before + step)
+
+
+class Interrupt:
+    """Stops loops after the current step: at a deadline, on SIGINT (Ctrl-C) or SIGTERM, so that no step is cut short.
+
+    A second Ctrl-C, IMPATIENT seconds later, raises KeyboardInterrupt wherever the loop is.
+    """
+
+    def __init__(self, minutes: float | None):
+        self.deadline = time.monotonic() + 60 * minutes if minutes is not None else float("inf")
+        self.pressed = False
+        self._at = 0.0
+        self._process = os.getpid()
+        self._before = {}
+
+    def __enter__(self) -> Interrupt:
+        if threading.current_thread() is threading.main_thread():
+            self._before = {number: signal.signal(number, self._press) for number in SIGNALS}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _press(self, number: int, _frame: FrameType | None) -> None:
+        if os.getpid() != self._process:
+            return  # a loader's worker, which inherited this handler; its parent ends it
+        if not self.pressed:
+            log.info("stopping after this step")
+            self.pressed, self._at = True, time.monotonic()
+        elif number == signal.SIGINT and time.monotonic() - self._at > IMPATIENT:
+            raise KeyboardInterrupt
+
+    def due(self) -> bool:
+        """Return whether to stop now."""
+        return self.pressed or time.monotonic() > self.deadline
