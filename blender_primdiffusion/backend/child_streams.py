@@ -135,7 +135,7 @@ def stdin_has_ended() -> bool:
 
     What arrives there is dropped. Never waits.
     """
-    if os.name == "nt":
+    if sys.platform == "win32":
         return _windows_pipe_is_broken(0)
     import select  # of no use on Windows
 
