@@ -155,9 +155,10 @@ def _resident() -> int:
 
 def trim() -> None:
     """Return the memory that the C library has freed to the system, so that resident memory is memory in use."""
-    release = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if release is not None:
-        release(0)
+    if sys.platform == "linux":
+        release = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc alone
+        if release is not None:
+            release(0)
 
 
 def resident_mb() -> float:

@@ -332,7 +332,8 @@ def run(command: Sequence[str], **variables: str) -> None:
 
 def environment() -> dict[str, str]:
     """The environment of commands. Without byte code, hundreds of child processes would each compile the backend."""
-    return {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    kept = {name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+    return {**kept, "PYTHONIOENCODING": "utf-8"} if WINDOWS else kept  # programs print into files and pipes
 
 
 def answer_of(command: Sequence[str]) -> str:
