@@ -138,7 +138,7 @@ def blender_extension_tool() -> Path | None:
 def validate(archive: Path, tool: Path) -> None:
     """Raises BuildError with the tool's output if Blender would reject the zip."""
     command = [sys.executable, str(tool), "validate", "--valid-tags", "", str(archive)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, encoding="utf-8")
     if done.returncode != 0:
         raise BuildError(f"Blender's extension tool rejects {archive.name}: {(done.stdout + done.stderr).strip()}")
 
@@ -149,7 +149,7 @@ def write_index(folder: Path, tool: Path) -> Path:
     `blender --command extension server-generate` does the same. Raises BuildError with the tool's output.
     """
     command = [sys.executable, str(tool), "server-generate", "--repo-dir", str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, capture_output=True, text=True, check=False, encoding="utf-8")
     if done.returncode != 0:
         raise BuildError(f"no index was written for {folder}: {(done.stdout + done.stderr).strip()}")
     return folder / "index.json"

@@ -62,7 +62,7 @@ def main() -> None:
     ]
     Image.fromarray(np.concatenate(rows, 0)).save(arguments.out, optimize=True)
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps({"seconds_sample": float(np.median(seconds))}))
+        arguments.json.write_text(json.dumps({"seconds_sample": float(np.median(seconds))}), encoding="utf-8")
 
 
 def grid(people: list[Human], columns: int, width: int, picture: Picture) -> list[np.ndarray]:

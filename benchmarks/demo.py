@@ -57,7 +57,7 @@ def main() -> None:
             run_stage(name, [sys.executable, ROOT / script, *options, *figures_option], logs / f"{len(rows)}.log")
         )
         if figures_file:
-            figures.update(json.loads(written.read_text()))
+            figures.update(json.loads(written.read_text(encoding="utf-8")))
 
     stage("build the extension", "build_addon.py", "--out", out, figures_file=False)
     archive = next(out.glob("primdiffusion-*.zip"))
@@ -111,11 +111,11 @@ def run_stage(name: str, command: Sequence[str | Path], log: Path) -> Stage:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 code = process.wait(PRINT_S)
                 break
-            lines = log.read_text(errors="replace").split("\n")
+            lines = log.read_text(errors="replace", encoding="utf-8").split("\n")
             last = next((line.strip() for line in reversed(lines) if line.strip()), "")
             print(f"  {time.perf_counter() - began:3.0f} s  {last[:LINE]}", flush=True)
     if code != 0:
-        tail = "\n".join(log.read_text(errors="replace").splitlines()[-25:])
+        tail = "\n".join(log.read_text(errors="replace", encoding="utf-8").splitlines()[-25:])
         raise StageFailed(f"{name} ended with exit code {code}; the whole output is in {log}:\n{tail}")
     return Stage(name, took)
 

@@ -148,7 +148,7 @@ def main() -> None:
     marching.add_argument("--frames", type=int, required=True)
     marching.add_argument("--frame", type=int, required=True, help="frame of the walk, counted from 0")
     arguments = parser.parse_args()
-    arguments.json.write_text(json.dumps(arguments.stage(arguments)))
+    arguments.json.write_text(json.dumps(arguments.stage(arguments)), encoding="utf-8")
 
 
 def share_on_body(position: torch.Tensor) -> float:

@@ -52,7 +52,7 @@ def main() -> None:
         figures |= {f"{key}_{name}": value for key, value in measure(Path(python), arguments).items()}
     if arguments.json is not None and arguments.json.exists() and set(arguments.parts) != set(PARTS):
         about = record.surroundings()
-        before = json.loads(arguments.json.read_text())
+        before = json.loads(arguments.json.read_text(encoding="utf-8"))
         figures = {name: value for name, value in before.items() if name not in about} | figures
     record.report(figures, arguments.json)
 
@@ -76,7 +76,7 @@ def measure(python: Path, arguments: argparse.Namespace) -> dict[str, float | st
 
 def version(python: Path) -> str:
     command = [str(python), "-c", "import bpy; print('bpy', bpy.app.version_string)"]
-    lines = subprocess.run(command, check=True, capture_output=True, text=True).stdout.splitlines()
+    lines = subprocess.run(command, check=True, capture_output=True, text=True, encoding="utf-8").stdout.splitlines()
     return next(line.removeprefix("bpy ") for line in lines if line.startswith("bpy "))
 
 
@@ -85,7 +85,7 @@ def run(python: Path, part: str, folder: Path, *options: str) -> dict[str, float
     command = [str(python), __file__, "part", part, str(folder), *options]
     environment = {**os.environ, "PRIMDIFFUSION_PYTHON": sys.executable}
     print(f"{part} ...", file=sys.stderr, flush=True)
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, encoding="utf-8")
     lines = [line for line in done.stdout.splitlines() if line.startswith("figures ")]
     if not lines:
         raise SystemExit(f"{part} failed on {python}:\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}")

@@ -185,6 +185,7 @@ def run(*words: str, is_shown: bool = True) -> str:
             stdout=subprocess.PIPE,
             text=True,
             check=False,
+            encoding="utf-8",
         )
     if done.returncode not in (0, 1):
         raise SystemExit(f"{' '.join(words)} ended with exit code {done.returncode}: {done.stdout[-500:]}")

@@ -97,11 +97,13 @@ def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--window", type=Path, nargs="+", help="figures of scripts/window/look.py and of viewport.py")
     arguments = parser.parse_args()
-    before = json.loads(arguments.json.read_text()) if arguments.json and arguments.json.exists() else {}
+    recorded = arguments.json and arguments.json.exists()
+    before = json.loads(arguments.json.read_text(encoding="utf-8")) if recorded else {}
     with tempfile.TemporaryDirectory(prefix="primdiffusion_first_sight_") as folder:
         figures = measured(Path(folder)) | sidebar.measured()
         figures["proxy_cpu_seconds"] = proxy_cpu_seconds(Path(folder))
-    window = in_window([json.loads(path.read_text()) for path in arguments.window]) if arguments.window else before
+    read = [json.loads(path.read_text(encoding="utf-8")) for path in arguments.window or ()]
+    window = in_window(read) if read else before
     report({**{name: window.get(name) for name in WINDOW}, **figures}, arguments.json)
 
 

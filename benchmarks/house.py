@@ -204,7 +204,7 @@ def walk() -> Mapping[str, float | None]:
     with tempfile.TemporaryDirectory(prefix="primdiffusion_house_") as folder:
         path = Path(folder) / "walk.json"
         subprocess.run([sys.executable, str(ROOT / "benchmarks" / "walk.py"), "--json", str(path)], check=True)
-        figures = json.loads(path.read_text())
+        figures = json.loads(path.read_text(encoding="utf-8"))
     return {name: figures[name] for name in ("walk_extension_files", "walk_backend_files")}
 
 

@@ -90,7 +90,7 @@ def device() -> str:
     if torch.cuda.is_available():
         return torch.cuda.get_device_name()
     with contextlib.suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
+        for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
     return platform.processor() or platform.machine()
@@ -106,6 +106,7 @@ def commit() -> str:
             capture_output=True,
             text=True,
             check=True,
+            encoding="utf-8",
         ).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
@@ -154,9 +155,10 @@ def _resident() -> int:
 
 def trim() -> None:
     """Return the memory that the C library has freed to the system, so that resident memory is memory in use."""
-    release = getattr(ctypes.CDLL(None), "malloc_trim", None)
-    if release is not None:
-        release(0)
+    if sys.platform == "linux":
+        release = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc alone
+        if release is not None:
+            release(0)
 
 
 def resident_mb() -> float:

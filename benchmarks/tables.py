@@ -170,7 +170,7 @@ def judged(
         some = seeds[first : first + TOGETHER]
         path = None if found is None else found / f"{name}_{some[0]}_{len(some)}.json"
         if path is not None and path.is_file():
-            parts.append(json.loads(path.read_text()))
+            parts.append(json.loads(path.read_text(encoding="utf-8")))
             continue
         one = judge(shots(some), networks)
         features = {key: values.tolist() for key, values in one.features.items()}
@@ -178,7 +178,7 @@ def judged(
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             with written_whole(path) as unfinished:
-                unfinished.write_text(json.dumps(parts[-1]))
+                unfinished.write_text(json.dumps(parts[-1]), encoding="utf-8")
         print(name, first + len(some), "of", len(seeds), flush=True)
     features = {key: torch.cat([torch.tensor(part["features"][key]) for part in parts]) for key in parts[0]["features"]}
     correct, depth = ([value for part in parts for value in part[key]] for key in ("own", "depth"))

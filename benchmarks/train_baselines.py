@@ -110,8 +110,8 @@ def train(denoiser: PersonDenoiser, name: str, run: Run, seconds: float, export:
     network = getattr(denoiser, name).requires_grad_(True)
     plan, stored = run.folder / f"{name}.json", run.folder / f"{name}.state.safetensors"
     if not plan.is_file():
-        plan.write_text(json.dumps(planned_steps(denoiser, name, run, seconds)))
-    config = dataclasses.replace(run.phases[name], steps=json.loads(plan.read_text()))
+        plan.write_text(json.dumps(planned_steps(denoiser, name, run, seconds)), encoding="utf-8")
+    config = dataclasses.replace(run.phases[name], steps=json.loads(plan.read_text(encoding="utf-8")))
     state = TrainingState(network, config, accelerator_of())
     if stored.is_file():
         state.load(stored)

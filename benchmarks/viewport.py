@@ -78,7 +78,7 @@ def in_blender(folder: Path) -> None:
                 np.save(folder / "picture.npy", np.array(march.colour.read()).reshape(size[1], size[0], 4)[::-1])
         figures[f"viewport_ms_{count}"] = round(statistics.median(times[2:]), 2)
     figures["viewport_ms_1080p_gpu"] = figures["viewport_ms_1"] if size == SIZE else None
-    (folder / "figures.json").write_text(json.dumps(figures))
+    (folder / "figures.json").write_text(json.dumps(figures), encoding="utf-8")
 
 
 def main() -> None:
@@ -104,7 +104,7 @@ def main() -> None:
         if "python" not in arguments.blender.name:
             words[1:2] = ["-b", "--factory-startup", "--python", words[1], "--"]
         subprocess.run(words, check=True, stdout=sys.stderr)
-        figures = json.loads((folder / "figures.json").read_text())
+        figures = json.loads((folder / "figures.json").read_text(encoding="utf-8"))
         drawn = np.load(folder / "picture.npy")
     size = (drawn.shape[1], drawn.shape[0])
     matrices = (torch.from_numpy(matrix).float() for matrix in camera(1, size, 0.0))

@@ -101,7 +101,7 @@ def _traced_python(path: Path, log: Path) -> Path:
     """An executable like this Python that traces the child (`-m primdiffusion.serve`)."""
     python, script = shlex.quote(sys.executable), shlex.quote(str(Path(__file__).resolve()))
     traced = f'if [ "$1" = -m ]; then shift; exec {python} {script} --as-child {shlex.quote(str(log))} "$@"; fi'
-    path.write_text(f'#!/bin/sh\n{traced}\nexec {python} "$@"\n')
+    path.write_text(f'#!/bin/sh\n{traced}\nexec {python} "$@"\n', encoding="utf-8")
     path.chmod(0o755)
     return path
 

@@ -1,5 +1,7 @@
 """Shape annotations of the backend's maths are checked at run time in tests."""
 
+import os
+
 import pytest
 from jaxtyping import install_import_hook
 from primdiffusion.machine import share_processors
@@ -21,6 +23,13 @@ CHECKED = [
     )
 ]
 install_import_hook(CHECKED, "beartype.beartype")
+
+
+def pytest_collection_modifyitems(items):
+    if os.name == "nt":
+        for item in items:
+            if item.get_closest_marker("unix"):
+                item.add_marker(pytest.mark.skip(reason="Windows has nothing of the kind"))
 
 
 @pytest.fixture(scope="module")

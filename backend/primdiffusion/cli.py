@@ -119,12 +119,13 @@ def _with_device(arguments: Sequence[str]) -> list[str]:
 
 
 def _repair_streams() -> None:
-    """Let closed streams swallow text, and names of files be printed that are no UTF-8."""
+    """Let closed streams swallow text, and print every name of a file: also what is not UTF-8, or not in cp1252."""
     for name in ("stdout", "stderr"):
         if getattr(sys, name) is None:
             setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115  open to the end
     if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="surrogateescape")
+        unprintable = "surrogateescape" if sys.stdout.encoding.lower() == "utf-8" else "backslashreplace"  # Windows
+        sys.stdout.reconfigure(errors=unprintable)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

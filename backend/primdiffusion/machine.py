@@ -41,7 +41,7 @@ def peak_memory_gb() -> float:
     if sys.platform == "darwin":
         return peak / GB
     # Linux's ru_maxrss begins with the peak of the program that started this one; not every sandbox has VmHWM.
-    own = re.search(r"^VmHWM:\s+(\d+) kB$", Path("/proc/self/status").read_text(), re.MULTILINE)
+    own = re.search(r"^VmHWM:\s+(\d+) kB$", Path("/proc/self/status").read_text(encoding="utf-8"), re.MULTILINE)
     return (int(own[1]) if own else peak) * 1024 / GB
 
 

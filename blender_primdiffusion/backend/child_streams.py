@@ -140,7 +140,7 @@ def stdin_has_ended() -> bool:
 
     What arrives there is dropped. Never waits.
     """
-    if os.name == "nt":
+    if sys.platform == "win32":
         return _windows_pipe_is_broken(0)
     while select.select([0], [], [], 0)[0]:
         if not os.read(0, 4096):

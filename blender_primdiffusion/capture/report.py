@@ -6,7 +6,7 @@ import dataclasses
 import json
 from pathlib import Path
 
-from ..formats.whole_files import replacing
+from ..formats.whole_files import write_atomically
 
 
 @dataclasses.dataclass
@@ -30,8 +30,7 @@ class Report:
 
     def write(self, root: Path, shard: tuple[int, int]) -> None:
         """To report.json, or report-i-of-n.json of one shard among several."""
-        with replacing(report_path(root, shard)) as path:
-            path.write_text(json.dumps(dataclasses.asdict(self), indent=1), encoding="utf-8")
+        write_atomically(report_path(root, shard), json.dumps(dataclasses.asdict(self), indent=1))
 
 
 def report_path(root: Path, shard: tuple[int, int]) -> Path:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, all_finite, array_names, read_arrays
 from ..formats.json_files import parse_json
-from ..formats.regular_files import open_regular, real_path
+from ..formats.regular_files import open_regular, portable_name, real_path
 from ..motion.files import POSE_KEYS, MotionFileError, motion_from_arrays
 
 ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
@@ -120,7 +120,7 @@ def _rank(path: Path) -> int:
 
 def _slug(path: Path) -> str:
     stem = path.stem if path.stem.lower() not in _GENERIC else real_path(path).parent.name
-    return re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("_.") or "person"
+    return portable_name(re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("_.")) or "person"
 
 
 def _parameters(path: Path) -> Path | None:

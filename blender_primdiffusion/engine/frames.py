@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import os
 import tempfile
 from pathlib import Path
@@ -52,6 +53,9 @@ class SharedFrames:
         self._folders: dict[str, Path] = {}
         """At most one; two threads that need one at once agree by `setdefault`, which is atomic."""
         self._spare: dict[str, Frame] = {}
+        self._numbers = itertools.count(1)
+        self._dropped: list[Path] = []
+        """Files of dropped frames that are still mapped, on Windows, which removes no mapped file."""
 
     @property
     def folder(self) -> Path:
@@ -79,10 +83,17 @@ class SharedFrames:
         return frame
 
     def drop(self, name: str) -> None:
-        """Remove the frame of this name; its last user still maps it."""
+        """Remove the frame of this name; its last user still maps it. On Windows its file goes at a later call."""
         frame = self._spare.pop(name, None)
-        if frame is not None:
-            remove_file(frame.path, frame.path.parent)
+        if frame is None:
+            return
+        dropped, self._dropped = [*self._dropped, frame.path], []
+        del frame
+        for path in dropped:
+            try:
+                remove_file(path, path.parent)
+            except PermissionError:
+                self._dropped.append(path)
 
     def close(self) -> None:
         """Remove the folder."""
@@ -93,14 +104,15 @@ class SharedFrames:
 
     def _allocate(self, name: str, size: int) -> Path:
         """A file of `size` allocated bytes: otherwise a full memory file system would crash the process later."""
+        file = f"{name}_{next(self._numbers)}.frame"  # a dropped frame may keep its name
         try:
-            return _reserve(self.folder / f"{name}_{size}.frame", size)
+            return _reserve(self.folder / file, size)
         except OSError:
             if self.folder.parent != SHARED_MEMORY:
                 raise
         self.close()
         folder = self._folders.setdefault(_FOLDER, _new_folder(None))
-        return _reserve(folder / f"{name}_{size}.frame", size)
+        return _reserve(folder / file, size)
 
 
 def _new_folder(within: Path | None) -> Path:
@@ -114,12 +126,12 @@ def _reserve(path: Path, size: int) -> Path:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(descriptor, 0, size)
         else:
-            os.truncate(descriptor, size)
+            os.ftruncate(descriptor, size)
     except OSError:
+        os.close(descriptor)
         remove_file(path, path.parent)
         raise
-    finally:
-        os.close(descriptor)
+    os.close(descriptor)
     return path
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 from collections.abc import Iterator
@@ -100,7 +101,8 @@ def stored(solids: SceneSolids, folder: Path) -> Path | None:
     with replacing(path) as partial:
         np.savez(partial, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
     for old in sorted(folder.glob("solids_*.npz"), key=lambda file: file.stat().st_mtime_ns)[:-_MOST_FILES]:
-        remove_file(old, folder)
+        with contextlib.suppress(PermissionError):  # Windows removes no file that the child reads: next time
+            remove_file(old, folder)
     return path
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
+from ..formats.regular_files import portable_name
 from .armature import build_armature
 from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, volumes_may_wait
 from .body_file import saved_body
@@ -70,7 +71,7 @@ def next_folder(name: str) -> Path:
     taken = {collection.name for collection in bpy.data.collections if collection.library is None}
     numbered = (f"{name}.{number:03d}" for number in itertools.count(1))
     free = name if name not in taken else next(candidate for candidate in numbered if candidate not in taken)
-    return humans_folder() / bpy.path.clean_name(free)
+    return humans_folder() / portable_name(bpy.path.clean_name(free))
 
 
 def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: Sequence[Path]) -> bpy.types.Collection:

@@ -14,7 +14,7 @@ from typing import Any
 
 import bpy
 
-from ..formats.regular_files import check_regular, exists_in_its_folder, read_regular, real_path
+from ..formats.regular_files import check_regular, exists_in_its_folder, portable_name, read_regular, real_path
 from ..formats.removing import OutsideFolderError, check_inside
 from ..formats.whole_files import written_whole
 from .blend_values import file_path, stored_name, stored_record
@@ -108,7 +108,7 @@ def unwritten_in(folder: Path) -> list[Path]:
 
 def folder_of(collection: bpy.types.Collection) -> Path:
     """The folder for a human's files: `<blendname>_humans/<collection name>` (see `humans_folder`)."""
-    return humans_folder() / bpy.path.clean_name(collection.name)
+    return humans_folder() / portable_name(bpy.path.clean_name(collection.name))
 
 
 def folders_of(collection: bpy.types.Collection) -> list[Path]:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
+from ..formats.regular_files import portable_name
 from .armature import model_origin
 from .blend_values import as_numbers, stored_record
 from .body_file import shape_model_of, stored_body_name
@@ -175,7 +176,7 @@ def _rounded(betas: NDArray) -> list[float]:
 
 
 def _material(name: str, texture: Path) -> bpy.types.Material:
-    file = f"{bpy.path.clean_name(name)}.png"
+    file = f"{portable_name(bpy.path.clean_name(name))}.png"
     with tempfile.TemporaryDirectory(dir=bpy.app.tempdir or None) as folder:
         shutil.copyfile(texture, Path(folder) / file)  # exporters name textures after the file that was packed
         image = bpy.data.images.load(str(Path(folder) / file))

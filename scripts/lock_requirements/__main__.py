@@ -77,7 +77,9 @@ def resolved(target: Target) -> list[tuple[str, str]]:
         command += ["--python-version", target.python, "--python-platform", target.uv_platform]
         command += ["--only-binary", ":all:", "--no-header", "--no-annotate"]
         environment = {**os.environ, "MACOSX_DEPLOYMENT_TARGET": "14.0"}  # torch has no wheels for older ones
-        text = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=environment).stdout
+        text = subprocess.run(
+            command, check=True, stdout=subprocess.PIPE, text=True, env=environment, encoding="utf-8"
+        ).stdout
     found = re.findall(r"^([a-z0-9-]+)==(\S+)$", text, re.MULTILINE)
     return sorted(pin for pin in found if not (target.without_cuda and _OF_CUDA.fullmatch(pin[0])))
 

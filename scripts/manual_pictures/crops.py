@@ -108,7 +108,8 @@ def _are_there(shots: Path, *names: str) -> bool:
 
 
 def _read(shots: Path, name: str) -> tuple[Image.Image, dict[str, list[int]]]:
-    return Image.open(shots / f"{name}.png").convert("RGB"), json.loads((shots / f"{name}.json").read_text())
+    where = json.loads((shots / f"{name}.json").read_text(encoding="utf-8"))
+    return Image.open(shots / f"{name}.png").convert("RGB"), where
 
 
 def _row(pictures: list[Image.Image]) -> Image.Image:

@@ -97,14 +97,14 @@ def where() -> dict[str, list[int]]:
 def ask(what: dict) -> Generator[float, None, object]:
     """Send a request and wait until it is done; returns the answer, if there is one."""
     request = Path(REQUEST)
-    request.with_suffix(".part").write_text(json.dumps(what))
+    request.with_suffix(".part").write_text(json.dumps(what), encoding="utf-8")
     request.with_suffix(".part").rename(request)
     while request.exists():
         yield 0.1
     answer = request.with_suffix(".answer")
     if not answer.exists():
         return None
-    found = json.loads(answer.read_text())
+    found = json.loads(answer.read_text(encoding="utf-8"))
     answer.unlink()
     return found
 

@@ -61,9 +61,9 @@ def serve(blender: subprocess.Popen, scratch: Path, out: Path, display: str, tim
             blender.kill()
             print(f"Blender was ended after {time_s:.0f} s", file=sys.stderr)
         if request.is_file():
-            answer = do(json.loads(request.read_text()), out, display)
+            answer = do(json.loads(request.read_text(encoding="utf-8")), out, display)
             if answer is not None:
-                request.with_suffix(".answer").write_text(json.dumps(answer))
+                request.with_suffix(".answer").write_text(json.dumps(answer), encoding="utf-8")
             request.unlink()
         time.sleep(0.05)
     return blender.returncode
@@ -79,7 +79,7 @@ def do(request: dict, out: Path, display: str) -> list[int] | None:
     if "picture" in request:
         path = out / f"{request['picture']}.png"
         subprocess.run(["import", "-display", f":{display}", "-window", "root", str(path)], check=True)
-        path.with_suffix(".json").write_text(json.dumps(request["where"]))
+        path.with_suffix(".json").write_text(json.dumps(request["where"]), encoding="utf-8")
         print(f"saved {path.name}", flush=True)
     if "figures" in request:
         note(request["figures"], out)
@@ -110,8 +110,8 @@ def do(request: dict, out: Path, display: str) -> list[int] | None:
 def note(figures: dict, out: Path) -> None:
     """Add to the file of figures."""
     path = out / FIGURES
-    before = json.loads(path.read_text()) if path.is_file() else {}
-    path.write_text(json.dumps({**before, **figures}, indent=2) + "\n")
+    before = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else {}
+    path.write_text(json.dumps({**before, **figures}, indent=2) + "\n", encoding="utf-8")
     print(figures, flush=True)
 
 
@@ -119,7 +119,8 @@ def differing(one: Path, other: Path, left: int, top: int, right: int, bottom: i
     """How many pixels of a box differ visibly between two pictures."""
     box = f"[{right - left}x{bottom - top}+{left}+{top}]"
     command = ["compare", "-metric", "AE", "-fuzz", VISIBLY, f"{one}{box}", f"{other}{box}", "null:"]
-    found = subprocess.run(command, capture_output=True, text=True, check=False)  # it exits 1 where pictures differ
+    # exits with 1 where pictures differ
+    found = subprocess.run(command, capture_output=True, text=True, encoding="utf-8", check=False)
     if found.returncode > 1:
         raise RuntimeError(found.stderr)
     return int(float(found.stderr.split()[0]))

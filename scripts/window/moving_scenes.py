@@ -38,7 +38,7 @@ def opening(module: str, python: str) -> Steps:
     yield from wait(found.is_file, 120)
     yield "opening_at_once"
     yield from wait(lambda: blender.poll() is not None, 240)
-    yield {"figures": json.loads(found.read_text())}
+    yield {"figures": json.loads(found.read_text(encoding="utf-8"))}
 
 
 def turning(module: str, python: str) -> Steps:

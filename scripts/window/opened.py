@@ -70,7 +70,7 @@ def watch() -> None:
 
 def write() -> None:
     part = Path(FIGURES).with_suffix(".part")
-    part.write_text(json.dumps(found))
+    part.write_text(json.dumps(found), encoding="utf-8")
     part.replace(FIGURES)
 
 

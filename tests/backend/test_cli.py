@@ -313,3 +313,11 @@ def test_results_for_which_the_disk_has_no_room_are_one_sentence():
         )
     assert (done.returncode, done.stderr.count(b"\n")) == (1, 1)
     assert b"no space left on device" in done.stderr.lower()
+
+
+@pytest.mark.parametrize(("encoding", "printed"), [("cp1252", b"\\u0417"), ("utf-8", "З".encode())])
+def test_a_name_that_the_terminal_cannot_show_is_printed_all_the_same(encoding, printed):
+    program = "from primdiffusion import cli; cli._repair_streams(); print('\\u0417')"
+    environment = {**os.environ, "PYTHONIOENCODING": encoding}
+    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, check=True)
+    assert done.stdout.strip() == printed

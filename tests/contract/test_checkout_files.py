@@ -9,6 +9,9 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from primdiffusion.formats.regular_files import portable_name
+
+from scripts.setup import TARGETS
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -17,7 +20,7 @@ def libraries(name: str) -> list[str]:
     return re.findall(r"\blib[a-z]+\d?(?:-\d+|\d+)\b", (ROOT / name).read_text(encoding="utf-8"))
 
 
-@pytest.mark.parametrize("name", ["README.md", "Dockerfile"])
+@pytest.mark.parametrize("name", ["README.md", "Dockerfile", ".github/workflows/ci.yml"])
 def test_the_system_libraries_are_those_of_continuous_integration(name):
     assert len(libraries(".ci/run")) == 9
     assert libraries(name) == libraries(".ci/run")
@@ -51,10 +54,27 @@ def test_the_package_demands_no_exact_version():
     assert not [asked for asked in project["dependencies"] if "==" in asked]
 
 
-def test_help_lists_every_target_that_has_no_file():
+def test_make_has_every_target_of_the_command_and_its_help_lists_them():
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
-    (phony,) = re.findall(r"^\.PHONY: (.*)$", makefile, re.MULTILINE)
+    (targets,) = re.findall(r"^TARGETS := (.*)$", makefile, re.MULTILINE)
     command = ["make", "--no-print-directory", "help"]
     printed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     listed = [line.split()[1] for line in printed.stdout.splitlines()]
-    assert sorted(listed) == sorted(phony.split())
+    assert listed == targets.split()
+
+
+def test_every_file_of_the_checkout_can_have_its_name_on_every_system():
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True, check=True)
+    paths = [Path(line) for line in listed.stdout.splitlines()]
+    assert len({str(path).lower() for path in paths}) == len(paths) > 0
+    assert max(len(str(path)) for path in paths) < 120  # of the 259 that Windows allows
+    for path in paths:
+        assert all(part == portable_name(part) and not set(part) & set('<>:"\\|?*') for part in path.parts), path
+
+
+def test_the_workflow_pins_its_actions_and_calls_targets_that_exist():
+    workflow = (ROOT / ".github/workflows/ci.yml").read_text(encoding="utf-8")
+    actions = re.findall(r"uses: (\S+)@(\S+)", workflow)
+    assert len(actions) == 3
+    assert all(re.fullmatch(r"[0-9a-f]{40}", version) for _, version in actions)
+    assert {*re.findall(r"scripts\.setup ([\w.-]+)", workflow)} == {"lint", "demo", "test"} <= TARGETS.keys()

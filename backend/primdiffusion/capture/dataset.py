@@ -34,7 +34,7 @@ from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import LARGEST_BYTES, read_json
 from primdiffusion.formats.regular_files import FileError, read_regular
 from primdiffusion.formats.removing import check_inside
-from primdiffusion.formats.whole_files import replacing
+from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 
@@ -82,8 +82,8 @@ def pack_subject(subject: Subject) -> None:
         for frame in range(shape[0]):
             for camera in range(shape[1]):
                 file.write(subject.rgba(frame, camera).data)
-    with replacing(pack_path(subject).with_suffix(".json")) as path:
-        path.write_text(json.dumps({"format": PACK_FORMAT, "version": PACK_VERSION, "source": stamp}), encoding="utf-8")
+    about = {"format": PACK_FORMAT, "version": PACK_VERSION, "source": stamp}
+    write_atomically(pack_path(subject).with_suffix(".json"), json.dumps(about))
 
 
 def open_pack(subject: Subject) -> UInt8[np.ndarray, "F C H W 4"] | None:
@@ -115,7 +115,8 @@ def source_stamp(subject: Subject) -> str:
     else:
         for path in sorted(p for kind in ("img", "mask") for p in (subject.folder / kind).rglob("*.*")):
             about = path.stat()
-            digest.update(f"{path.relative_to(subject.folder)} {about.st_size} {about.st_mtime_ns}\n".encode())
+            name = path.relative_to(subject.folder).as_posix()
+            digest.update(f"{name} {about.st_size} {about.st_mtime_ns}\n".encode())
     return digest.hexdigest()
 
 

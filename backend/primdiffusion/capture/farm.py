@@ -23,6 +23,9 @@ LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
 MARK = "PRIMDIFFUSION "
 _LINES_OF_ERROR = 5
 _SET_PARENT_DEATH_SIGNAL = 1
+_NO_WINDOW = getattr(subprocess, "CREATE_NO_WINDOW", 0)
+_LARGEST_EXIT_CODE = 0x7FFFFFFF
+"""Windows states crashes as larger numbers, other systems signals as negative ones."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,7 +57,10 @@ class Farm:
 def subjects_of(command: Sequence[str]) -> list[str]:
     """List the subjects that a renderer's command would render. Raises ValueError if there are none."""
     try:
-        ran = subprocess.run([*command, *LIST], capture_output=True, text=True, check=False)
+        ran = subprocess.run(
+            [*command, *LIST],
+            capture_output=True, encoding="utf-8", errors="replace", check=False, creationflags=_NO_WINDOW,
+        )  # fmt: skip
     except OSError as e:
         raise ValueError(f"the renderer {command[0]!r} cannot be started ({e!s:.160}): give its path") from e
     listed = [parse_json(line.removeprefix(MARK)) for line in ran.stdout.splitlines() if line.startswith(MARK)]
@@ -102,11 +108,12 @@ def render_one(command: list[str], subject: str, attempts: int) -> FarmResult:
     for _ in range(attempts):
         process = subprocess.Popen(
             [*command, *ONLY, subject],
-            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, preexec_fn=_die_with_parent,
+            stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, encoding="utf-8", errors="replace",
+            preexec_fn=_die_with_parent if sys.platform == "linux" else None, creationflags=_NO_WINDOW,
         )  # fmt: skip
         error = _tail(process.communicate()[1])
         exit_code = process.returncode
-        if exit_code >= 0:
+        if 0 <= exit_code <= _LARGEST_EXIT_CODE:
             break
     return FarmResult(subject, exit_code, time.monotonic() - began, error if exit_code else "")
 
@@ -126,9 +133,8 @@ def _started(farm: Farm) -> Any:
 
 
 def _die_with_parent() -> None:
-    """End the renderer with its worker, because another worker takes over the subject."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+    """End the renderer with its worker, because another worker takes over the subject. Linux only."""
+    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
 
 
 def _tail(text: str) -> str:

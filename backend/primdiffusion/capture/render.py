@@ -26,7 +26,7 @@ from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.removing import check_unlinked
 from primdiffusion.formats.requests import PASSES
-from primdiffusion.formats.whole_files import replacing
+from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.raster.multisample import Figure, RenderedView, figure_from_mesh, render_view
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
@@ -288,5 +288,4 @@ def _write_report(job: RenderJob, outcomes: Sequence[SubjectResult]) -> None:
         ],
         "skipped": [outcome.subject for outcome in outcomes if outcome.status == "skipped"],
     }
-    with replacing(job.out / f"{job.part}.json") as path:
-        path.write_text(json.dumps(report, indent=1), encoding="utf-8")
+    write_atomically(job.out / f"{job.part}.json", json.dumps(report, indent=1))

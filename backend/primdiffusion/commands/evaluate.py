@@ -31,7 +31,7 @@ from primdiffusion.evaluation.generation import compare, open_reference_set, rea
 from primdiffusion.evaluation.image_metrics import load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary
 from primdiffusion.formats.requests import Sampling
-from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.human import generate, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.training.latents import split_people
@@ -177,9 +177,7 @@ class EvaluateGeneration:
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as unfinished:
-        unfinished.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_atomically(path, json.dumps(record, indent=1) + "\n")
 
 
 def run(arguments: Sequence[str]) -> None:

@@ -58,8 +58,8 @@ def save_pretrained(model: DiffusionModel, folder: Path | str) -> Path:
             "format_version": metadata["format_version"],
             **parse_json(metadata["architecture"]),
         }
-        (unfinished / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8")
-        (unfinished / CARD).write_text(_hub_card(read_card(weights)), encoding="utf-8")
+        (unfinished / CONFIG).write_text(json.dumps(config, indent=2) + "\n", encoding="utf-8", newline="\n")
+        (unfinished / CARD).write_text(_hub_card(read_card(weights)), encoding="utf-8", newline="\n")
     return folder
 
 

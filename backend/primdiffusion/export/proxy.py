@@ -200,9 +200,9 @@ def write_proxy_obj(path: str | Path, proxy: MeshProxy) -> None:
     for face, uv in zip((proxy.faces + 1).tolist(), coordinate.tolist(), strict=True):
         lines.append("f " + " ".join(f"{v}/{t}/{v}" for v, t in zip(face, uv, strict=True)))
     with staged(path.parent) as folder:
-        (folder / path.name).write_text("\n".join(lines) + "\n", encoding="utf-8")
+        (folder / path.name).write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
         material = f"newmtl person\nKd 1 1 1\nKs 0 0 0\nmap_Kd {name}.png\n"
-        (folder / f"{name}.mtl").write_text(material, encoding="utf-8")
+        (folder / f"{name}.mtl").write_text(material, encoding="utf-8", newline="\n")
         Image.fromarray(proxy.texture).save(folder / f"{name}.png")
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from .camera_rig import View
 from .capture_layout import picture_path, write_npz
 from .requests import LAYOUTS
-from .whole_files import replacing
+from .whole_files import write_atomically
 
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
@@ -36,8 +36,7 @@ def write_cameras(subject: Path, views: Sequence[View]) -> None:
         f"camera{i:04d}": {"K": v.intrinsics.tolist(), "R": v.rotation.tolist(), "T": v.translation.tolist()}
         for i, v in enumerate(views)
     }
-    with replacing(subject / "cameras.json") as path:
-        path.write_text(json.dumps(named, indent=1), encoding="utf-8")
+    write_atomically(subject / "cameras.json", json.dumps(named, indent=1))
 
 
 def write_opencv(subject: Path, views: Sequence[View]) -> None:
@@ -70,8 +69,8 @@ def write_nerf(subject: Path, views: Sequence[View], frame: int) -> None:
         )
     first = views[0]
     angle = 2 * float(np.arctan(first.width / (2 * first.intrinsics[0, 0])))
-    with replacing(subject / "nerf" / f"{frame:04d}" / "transforms.json") as path:
-        path.write_text(json.dumps({"camera_model": "OPENCV", "camera_angle_x": angle, "frames": frames}, indent=1))
+    record = {"camera_model": "OPENCV", "camera_angle_x": angle, "frames": frames}
+    write_atomically(subject / "nerf" / f"{frame:04d}" / "transforms.json", json.dumps(record, indent=1))
 
 
 def write_colmap(subject: Path, views: Sequence[View], frame: int) -> None:
@@ -89,8 +88,7 @@ def write_colmap(subject: Path, views: Sequence[View], frame: int) -> None:
         images += [f"{i} {pose} {i} {name}", ""]
     files = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": ["# no points"]}
     for file, lines in files.items():
-        with replacing(subject / "colmap" / f"{frame:04d}" / file) as path:
-            path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+        write_atomically(subject / "colmap" / f"{frame:04d}" / file, "\n".join(lines) + "\n")
 
 
 def _quaternion(rotation: NDArray) -> NDArray[np.float64]:

@@ -23,7 +23,6 @@ write different subjects, or views, of one dataset. `camera_files` and `picture_
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 import json
@@ -41,7 +40,7 @@ from .camera_rig import View
 from .json_files import parse_json, read_json
 from .regular_files import open_regular, read_regular
 from .removing import check_inside, remove_file
-from .whole_files import remove_abandoned, replacing, temporary_name
+from .whole_files import remove_abandoned, temporary_name, write_atomically
 
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png", "rgba": ".png"}
@@ -75,8 +74,7 @@ def write_npz(path: Path, **arrays: NDArray) -> None:
     """Write an .npz atomically, built in memory: numpy's writer leaves an open archive behind if the disk is full."""
     made = io.BytesIO()
     np.savez(made, **arrays)  # type: ignore[arg-type]
-    with replacing(path) as partial:
-        partial.write_bytes(made.getvalue())
+    write_atomically(path, made.getvalue())
 
 
 def claim(root: Path, about: Mapping[str, Any]) -> None:
@@ -94,9 +92,13 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
         root.mkdir(parents=True, exist_ok=True)
         unlike = temporary_name(root / DATASET_FILE)
         try:  # a link fails where another process was first, which a rename would not
-            unlike.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
-            with contextlib.suppress(FileExistsError):
+            unlike.write_text(json.dumps(wanted, indent=1), encoding="utf-8", newline="\n")
+            try:
                 os.link(unlike, root / DATASET_FILE)
+            except FileExistsError:
+                pass
+            except OSError:  # a disk without links: exFAT, some network folders
+                os.replace(unlike, root / DATASET_FILE)
         except OSError as e:
             raise type(e)(e.errno, e.strerror or str(e), str(root / DATASET_FILE)) from e
         finally:
@@ -138,8 +140,7 @@ def read_list(root: Path) -> list[str]:
 
 def write_list(root: Path, subjects: Sequence[str]) -> None:
     """Write the sorted list of subjects."""
-    with replacing(root / LIST_FILE) as path:
-        path.write_text("".join(f"{name}\n" for name in sorted(subjects)), encoding="utf-8")
+    write_atomically(root / LIST_FILE, "".join(f"{name}\n" for name in sorted(subjects)))
 
 
 def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas: NDArray, translation: NDArray) -> None:
@@ -181,8 +182,7 @@ def complete(subject: Path) -> None:
         for path in sorted(subject.rglob("*"))
         if path.is_file() and not path.name.startswith(".") and path.name != COMPLETE_FILE
     }
-    with replacing(subject / COMPLETE_FILE) as path:
-        path.write_text(json.dumps(files, indent=0), encoding="utf-8")
+    write_atomically(subject / COMPLETE_FILE, json.dumps(files, indent=0))
 
 
 def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:

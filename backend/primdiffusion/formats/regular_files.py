@@ -14,6 +14,8 @@ from pathlib import Path
 
 _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 """Starts of UNC paths, Windows' devices and URLs."""
+_DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(?=\.|$)", re.IGNORECASE)
+"""Stems of names that are devices in every folder of Windows."""
 _LONGEST_PATH = 4096
 COPIED_BYTES = 256 * 2**20
 """Files up to this size are copied into memory before they are checked and used; larger ones are mapped."""
@@ -145,6 +147,11 @@ def is_plain_path(path: str) -> bool:
 def is_local_path(path: str) -> bool:
     """Return whether a path is absolute and of this computer: no server, device or URL. Folders may have any name."""
     return 0 < len(path) <= _LONGEST_PATH and "\0" not in path and not _REMOTE.match(path) and os.path.isabs(path)
+
+
+def portable_name(name: str) -> str:
+    """Return `name` as a file or folder may be called on every system: CON, nul.png and `x. ` are not, on Windows."""
+    return _DEVICE.sub(r"\1_", name.rstrip(". "))
 
 
 def exists_in_its_folder(path: Path) -> bool:

@@ -12,6 +12,7 @@ import contextlib
 import errno
 import hashlib
 import os
+import platform
 import re
 import secrets
 import shutil
@@ -125,7 +126,10 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, content: str | bytes) -> None:
-    """Write a file atomically; creates its folder. Raises OSError, naming `path`."""
+    """Write a file atomically, text as UTF-8 with its line ends as they are on every system; creates its folder.
+
+    Raises OSError, naming `path`.
+    """
     with replacing(path) as unfinished:
         unfinished.write_bytes(content.encode() if isinstance(content, str) else content)
 
@@ -254,7 +258,7 @@ def _space() -> str:
         boot = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")
         known = f"{boot} {os.readlink('/proc/self/ns/pid')}"
     except OSError:
-        known = secrets.token_hex(8) if sys.platform != "darwin" else os.uname().nodename
+        known = platform.node() if sys.platform in ("darwin", "win32") else secrets.token_hex(8)
     return hashlib.sha256(known.encode()).hexdigest()[:8]
 
 

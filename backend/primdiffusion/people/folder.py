@@ -28,7 +28,7 @@ from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.regular_files import TooLargeError, read_regular
 from primdiffusion.formats.removing import remove_folder
 from primdiffusion.formats.requests import check_seed
-from primdiffusion.formats.whole_files import remove_abandoned, temporary_name, written_whole
+from primdiffusion.formats.whole_files import remove_abandoned, temporary_name, write_atomically
 from primdiffusion.people.assets import UNKNOWN, Assets, licence_of
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.gltf import Skeleton, glb
@@ -112,7 +112,7 @@ def write_person(assets: Assets, folder: Path, seed: int) -> None:
     try:
         partial.mkdir()
         (partial / GLB).write_bytes(binary)
-        (partial / CARD).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8")
+        (partial / CARD).write_text(json.dumps(card, indent=1) + "\n", encoding="utf-8", newline="\n")
         remove_folder(folder, folder.parent)
         partial.replace(folder)
     except OSError as error:
@@ -190,8 +190,7 @@ def _write_manifest(people: PeopleSet) -> None:
         "assets": [{"path": path, "licence": licences[path]} for path in sorted(licences)],
         "people": [name_of(seed) for seed in people.seeds],
     }
-    with written_whole(people.root / MANIFEST) as path:
-        path.write_text(json.dumps(manifest, indent=1) + "\n", encoding="utf-8")
+    write_atomically(people.root / MANIFEST, json.dumps(manifest, indent=1) + "\n")
 
 
 def _read_card(folder: Path) -> dict[str, Any] | None:

@@ -33,7 +33,7 @@ from ...console import (
 from ...formats import whole_files
 from ...formats.json_files import parse_json, read_json
 from ...formats.removing import remove_file
-from ...formats.whole_files import remove_abandoned, replacing, temporary_folder
+from ...formats.whole_files import remove_abandoned, temporary_folder, write_atomically
 from ...places import EXTENSION, new_backend, preference
 
 _TICK_S = 0.03
@@ -160,8 +160,7 @@ def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> N
                     f"{wanted.get(name)!s:.60}: choose another folder, or add --resume to keep it"
                 )
     try:
-        with replacing(path) as unfinished:
-            unfinished.write_text(json.dumps(wanted, indent=1), encoding="utf-8")
+        write_atomically(path, json.dumps(wanted, indent=1))
     except OSError as error:
         raise _unwritable(path.parent, error) from error
 

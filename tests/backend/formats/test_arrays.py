@@ -221,6 +221,7 @@ def test_two_arrays_of_one_name_are_rejected(tmp_path, names):
             read(tmp_path / "a.npz")
 
 
+@pytest.mark.unix
 def test_a_mapped_array_is_that_of_the_file_whose_header_was_checked(tmp_path, monkeypatch):
     path, other = tmp_path / "a.npy", tmp_path / "b.npy"
     np.save(path, np.arange(100))
@@ -235,6 +236,7 @@ def test_a_mapped_array_is_that_of_the_file_whose_header_was_checked(tmp_path, m
     assert np.array_equal(map_npy(path), np.arange(100))
 
 
+@pytest.mark.unix
 def test_what_is_no_longer_a_regular_file_when_it_is_opened_is_not_read(tmp_path, monkeypatch):
     path = tmp_path / "a.npz"
     np.savez(path, pose=np.zeros(3))

@@ -111,6 +111,7 @@ def test_temporary_names_are_random_and_keep_the_ending():
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows does not say whether a process has ended: age decides there")
+@pytest.mark.unix
 def test_what_an_ended_process_left_goes_but_not_what_a_living_one_writes(tmp_path):
     living, dead = temporary_name(tmp_path / "files"), temporary_name(tmp_path / "files")
     dead = dead.with_name(dead.name.replace(str(os.getpid()), str(ended())))
@@ -139,6 +140,7 @@ def test_elsewhere_only_age_tells_that_a_process_has_ended(tmp_path, monkeypatch
     assert list(tmp_path.iterdir()) == [young]
 
 
+@pytest.mark.unix
 def test_the_next_writing_of_a_file_removes_what_a_killed_one_left(tmp_path):
     code = (
         "import os, signal, sys\nfrom pathlib import Path\nfrom primdiffusion.formats.whole_files import *\n"

@@ -1,0 +1,36 @@
+"""Files, captures and the child's streams keep the rules of Windows, as far as Linux can apply them."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+UNDER_THE_RULES = [
+    "tests/support/windows_rules_hold.py",
+    "tests/backend/formats",
+    "tests/contract/test_capture_layout.py",
+    "tests/contract/test_client.py",
+    "tests/contract/test_client_messages.py",
+    "tests/contract/test_shared_frames.py",
+    "tests/backend/capture/test_dataset.py::test_packs_hold_the_same_samples_and_are_used",
+    "tests/backend/capture/test_render.py::test_captures_have_the_layouts_files_and_are_whole",
+    "tests/backend/capture/test_render.py::test_what_is_there_is_kept_and_what_is_missing_is_made",
+]
+TOO_LONG = "not many_deaths and not cancel_fails and not killed_child_is_one"
+"""They pass too, in half a minute."""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the rules are applied by looking into /proc")
+def test_tests_of_files_and_children_pass_under_the_rules_of_windows():
+    command = [sys.executable, "-X", "warn_default_encoding", "-m", "pytest", "-p", "support.windows_rules"]
+    options = ["-q", "-p", "no:cacheprovider", "-m", "not slow and not gpu and not unix", "-k", TOO_LONG]
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTEST")}
+    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT / "backend"), str(ROOT), str(ROOT / "tests")])
+    done = subprocess.run(
+        [*command, *options, *UNDER_THE_RULES],
+        cwd=ROOT, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, encoding="utf-8", check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stdout[-4000:]

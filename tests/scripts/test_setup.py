@@ -1,0 +1,140 @@
+"""The command that sets up the environments: what is missing is said before anything is installed."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from scripts import setup
+
+
+@pytest.fixture
+def checkout(tmp_path, monkeypatch):
+    """An empty checkout in place of ours; the commands that would run are listed instead."""
+    commands: list[list[str]] = []
+
+    def run(command, **_):
+        commands.append([str(word) for word in command])
+        if "venv" in command:
+            python = Path(setup.program(Path(command[-1])))
+            python.parent.mkdir(parents=True)
+            python.touch()
+
+    monkeypatch.setattr(setup, "run", run)
+    monkeypatch.setattr(setup, "ROOT", tmp_path)
+    for name in ("VENV", "VENV45", "VENV52"):
+        monkeypatch.setattr(setup, name, tmp_path / getattr(setup, name).name)
+    sizes = {tmp_path / folder.name: size for folder, size in setup.MEGABYTES.items()}
+    monkeypatch.setattr(setup, "MEGABYTES", sizes)
+    monkeypatch.setattr(setup, "packages_of", lambda python: str(Path(python).parent))
+    monkeypatch.setattr(setup, "python311", lambda: "python3.11")
+    monkeypatch.setattr(setup.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0))
+    for name in ("pyproject.toml", "requirements.lock", "requirements52.lock"):
+        (tmp_path / name).touch()
+    return SimpleNamespace(folder=tmp_path, commands=commands)
+
+
+@pytest.fixture
+def disks(checkout, monkeypatch):
+    """Set what is free on the disk of the checkout and on that of the temporary folder, MB; None: it is the same."""
+
+    def free(here: int, there: int | None = None) -> None:
+        temporary = checkout.folder / "temporary"
+        temporary.mkdir(exist_ok=True)
+        monkeypatch.setattr(setup, "temporary_folder", lambda: Path("/proc") if there is not None else temporary)
+        monkeypatch.setattr(
+            setup.shutil,
+            "disk_usage",
+            lambda folder: SimpleNamespace(free=(here if folder == setup.ROOT else there) * 2**20),
+        )
+
+    return free
+
+
+def test_what_is_free_and_what_is_needed_is_one_sentence(checkout, disks):
+    disks(900)
+    with pytest.raises(setup.Stop) as raised:
+        setup.check_room([setup.VENV, setup.VENV45])
+    wanted = f"0.9 GB are free on the disk of {checkout.folder}, and 6.0 GB are needed"
+    assert wanted in str(raised.value)
+    disks(6100)
+    setup.check_room([setup.VENV, setup.VENV45])
+
+
+def test_what_is_installed_is_not_asked_for_again(checkout, disks):
+    setup.VENV.mkdir()
+    (setup.VENV / "ready").touch()
+    disks(1)
+    setup.check_room([setup.VENV])
+    with pytest.raises(setup.Stop):
+        setup.check_room([setup.VENV, setup.VENV45])
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc is another disk")
+def test_pips_temporary_folder_on_another_disk_counts_by_itself(disks):
+    disks(3800, 1600)
+    setup.check_room([setup.VENV])
+    disks(9000, 100)
+    with pytest.raises(setup.Stop) as raised:
+        setup.check_room([setup.VENV])
+    assert "0.1 GB are free on the disk of /proc, and 1.5 GB are needed" in str(raised.value)
+    assert "TMPDIR" in str(raised.value)
+
+
+def test_all_tests_run_on_three_blenders_in_environments_that_are_made_once(checkout, disks, monkeypatch):
+    disks(99_999)
+    monkeypatch.setattr(setup, "python313", lambda: "python3.13")
+    setup.test([])
+    pythons = [setup.program(folder) for folder in (setup.VENV, setup.VENV45, setup.VENV52)]
+    tests = [command[0] for command in checkout.commands if command[1:3] == ["-m", "pytest"]]
+    assert tests == pythons
+    installed = [command for command in checkout.commands if "install" in command]
+    assert [command[0] for command in installed] == [pythons[0], pythons[0], pythons[0], pythons[2]]
+    assert all("requirements.lock" in command for command in installed[:2])
+    checkout.commands.clear()
+    setup.test([])
+    assert len(checkout.commands) == 3
+    os.utime(setup.VENV / "ready", (1, 1))  # the lock is newer
+    checkout.commands.clear()
+    setup.test([])
+    assert [command[0] for command in checkout.commands if "install" in command] == [pythons[0]] * 3
+
+
+def test_without_a_python_for_it_blender_52_is_left_out_and_named(checkout, disks, monkeypatch, capsys):
+    disks(99_999)
+    monkeypatch.setenv("PYTHON313", "")
+    setup.test_52([])
+    assert "PYTHON313" in capsys.readouterr().out
+    assert checkout.commands == []
+
+
+def test_another_python_than_311_that_was_chosen_is_an_error_that_names_it(monkeypatch):
+    monkeypatch.setattr(setup.sys, "version_info", (3, 12, 0))
+    monkeypatch.setenv("PYTHON", sys.executable)
+    with pytest.raises(setup.Stop) as raised:
+        setup.python311()
+    assert sys.executable in str(raised.value)
+
+
+def test_a_command_that_fails_ends_it_with_its_code():
+    with pytest.raises(SystemExit) as ended:
+        setup.run([sys.executable, "-c", "raise SystemExit(7)"])
+    assert ended.value.code == 7
+
+
+def test_commands_write_byte_code_even_where_a_container_forbids_it(monkeypatch):
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    assert "PYTHONDONTWRITEBYTECODE" not in setup.environment()
+
+
+def test_an_unknown_target_is_an_error_that_lists_all():
+    command = [sys.executable, "-m", "scripts.setup", "tset"]
+    root = Path(__file__).parents[2]
+    done = subprocess.run(command, cwd=root, capture_output=True, encoding="utf-8", check=False)
+    assert done.returncode == 1
+    assert all(name in done.stderr for name in ("tset", *setup.TARGETS))
