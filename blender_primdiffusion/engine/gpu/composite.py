@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 
 import gpu
 import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
+from .caching import cache_until_exit
 from .march import GpuMarch
 from .relief import ReliefPicture
 
@@ -170,7 +170,7 @@ def restore() -> None:
     gpu.state.depth_mask_set(False)
 
 
-@functools.cache
+@cache_until_exit
 def _picture_shader() -> gpu.types.GPUShader:
     info, between = gpu.types.GPUShaderCreateInfo(), gpu.types.GPUStageInterfaceInfo("primdiffusion_picture")
     between.smooth("VEC2", "uv")
@@ -195,7 +195,7 @@ def _picture_shader() -> gpu.types.GPUShader:
     return gpu.shader.create_from_info(info)
 
 
-@functools.cache
+@cache_until_exit
 def _bones_shader() -> gpu.types.GPUShader:
     info = gpu.types.GPUShaderCreateInfo()
     info.vertex_in(0, "VEC2", "pos")

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Iterable
 
 from ...scene.human_file import FileVersion, file_version, read_payload
 from ..boxes import Boxes, boxes_of
 from ..picture import PosedHuman
+from .caching import cache_until_exit
 from .march import GpuPayload
 
 PAYLOADS_KEPT = 4
@@ -44,7 +44,7 @@ class GpuHumans:
             del self._payloads[version]
 
 
-@functools.cache
+@cache_until_exit
 def gpu_humans() -> GpuHumans:
     """The humans on the GPU."""
     return GpuHumans()

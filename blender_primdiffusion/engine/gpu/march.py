@@ -17,7 +17,6 @@ common one near the boxes. Records and lists are textures: Python gets storage b
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Iterator, Sequence
 
 import bpy
@@ -29,6 +28,7 @@ from ..boxes import Boxes
 from ..relief import relief_of
 from ..view import PinholeView
 from . import shaders
+from .caching import cache_until_exit
 from .relief import GpuRelief
 from .shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
 
@@ -405,7 +405,7 @@ def _texture(values: NDArray, format_: str) -> gpu.types.GPUTexture:
     )
 
 
-@functools.cache
+@cache_until_exit
 def gpu_marcher() -> GpuMarcher | str:
     """The marcher on the GPU, or why there is none. Asked for while a view is drawn."""
     try:

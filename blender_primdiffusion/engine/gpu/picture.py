@@ -7,7 +7,6 @@ humans let through shows the solid or the background. Outlines are antialiased b
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import gpu
@@ -17,6 +16,7 @@ from mathutils import Matrix
 from ..boxes import Boxes
 from ..solids import SceneSolids
 from ..view import NO_SURFACE_M, PinholeView, opengl_projection
+from .caching import cache_until_exit
 from .march import GpuMarch, GpuMarcher, GpuPayload
 from .relief import ReliefPicture
 from .shaders import TILE, compiled, shader_of
@@ -162,7 +162,7 @@ class GpuPicture:
         return composed
 
 
-@functools.cache
+@cache_until_exit
 def _solids_shader() -> gpu.types.GPUShader:
     info, between = gpu.types.GPUShaderCreateInfo(), gpu.types.GPUStageInterfaceInfo("primdiffusion_solids")
     between.smooth("VEC3", "world")
@@ -183,7 +183,7 @@ def _solids_shader() -> gpu.types.GPUShader:
     return shader_of(info)
 
 
-@functools.cache
+@cache_until_exit
 def _compose_shader() -> gpu.types.GPUShader:
     info = gpu.types.GPUShaderCreateInfo()
     for slot, name in enumerate(("humans", "solids", "ends", "before")):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 
 import gpu
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 from ..boxes import Boxes
 from ..relief import VISIBLE, Relief
 from ..view import NO_SURFACE_M, PinholeView, opengl_projection
+from .caching import cache_until_exit
 from .shaders import BOXES_A_ROW, shader_of
 
 _ROWS = 3
@@ -115,7 +115,7 @@ def _places(boxes: Boxes, view: PinholeView) -> gpu.types.GPUTexture:
     return gpu.types.GPUTexture(size, format="RGBA32F", data=gpu.types.Buffer("FLOAT", rows.size, rows.ravel()))
 
 
-@functools.cache
+@cache_until_exit
 def relief_shader() -> gpu.types.GPUShader:
     """Raises RuntimeError where it does not compile."""
     info, between = gpu.types.GPUShaderCreateInfo(), gpu.types.GPUStageInterfaceInfo("primdiffusion_relief")
