@@ -33,7 +33,7 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place
-from primdiffusion.human_file import export_for_blender, save_human
+from primdiffusion.human_file import save_human
 from primdiffusion.render.march import march
 from record import command_line, report, run
 
@@ -63,8 +63,7 @@ def stage(human: Human, folder: Path) -> bpy.types.Object:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
     save_human(folder / "person.human.safetensors", human)
-    export_for_blender(folder / "human.npz", human)
-    person = build_human(bpy.context, folder / "human.npz", keep=[folder / "person.human.safetensors"])
+    person = build_human(bpy.context, folder / "person.human.safetensors")
     scene = bpy.context.scene
     scene.render.engine = "PRIMDIFFUSION"
     scene.render.resolution_x = scene.render.resolution_y = SIZE
@@ -192,10 +191,9 @@ def picture_stage(folder: Path, seed: int) -> bpy.types.Collection:
     """Set up a person who walks and waves between two cubes and a ball on a floor, and a camera; returns the person."""
     human = generated((seed,))[0]
     save_human(folder / "person.human.safetensors", human)
-    export_for_blender(folder / "human.npz", human)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
-    person = build_human(bpy.context, folder / "human.npz", keep=[folder / "person.human.safetensors"])
+    person = build_human(bpy.context, folder / "person.human.safetensors")
     pose_from_joint_rotations(armature_of(person), walk_and_wave(WALK_FRAMES)[SHOWN])
     bpy.ops.mesh.primitive_plane_add(size=40)
     paint((0.5, 0.48, 0.45))

@@ -110,7 +110,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     context = bpy.context
     start = time.perf_counter()
     folder = arguments.folder / "person"
-    collection = build_human(context, folder / "human.npz", "Human", [folder / "person.human.safetensors"])
+    collection = build_human(context, folder / "person.human.safetensors")
     bpy.ops.primdiffusion.volumes_in_viewport()
     context.view_layer.update()
     built = time.perf_counter() - start
@@ -138,7 +138,7 @@ def memory(arguments: argparse.Namespace) -> dict[str, float]:
 
     record.trim()
     before = record.resident_mb()
-    build_human(bpy.context, arguments.folder / "person" / "human.npz")
+    build_human(bpy.context, arguments.folder / "person" / "person.human.safetensors")
     bpy.ops.primdiffusion.volumes_in_viewport()
     bpy.context.view_layer.update()
     record.trim()
@@ -154,7 +154,7 @@ def merged(arguments: argparse.Namespace) -> dict[str, float]:
     from blender_primdiffusion.scene.cycles import setup_cycles_preview
 
     folder = arguments.folder / "person"
-    build_human(bpy.context, folder / "human.npz", "Human", [folder / "person.human.safetensors"])
+    build_human(bpy.context, folder / "person.human.safetensors")
     setup_cycles_preview(bpy.context.scene, size=arguments.size, samples=1, world=0.48)
     many = _render_seconds(arguments.folder / "cycles_volumes.png")
     start = time.perf_counter()

@@ -41,24 +41,26 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import blender_isolated  # noqa: F401  before bpy
 import bpy
 import numpy as np
 import sidebar
 from march_people import checkered_human
-from primdiffusion.human_file import export_for_blender, save_human
+from primdiffusion.human_file import save_human
 from record import command_line, report, resident_mb, trim
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from blender_primdiffusion.scene import states
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.build import build_written, next_folder
+from blender_primdiffusion.scene.build import build_prepared
 from blender_primdiffusion.scene.edit import select_human
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.scene.human_npz import Destination, WrittenHuman, write_volumes
+from blender_primdiffusion.scene.pending import write_all_pending
 from blender_primdiffusion.scene.place import stand_at_cursor
-from blender_primdiffusion.scene.unwritten import unwritten, write_unwritten
+from blender_primdiffusion.scene.states import PreparedHuman
 
 FRAMES = 60
 _ENTERING = (
@@ -127,10 +129,9 @@ def measured(folder: Path) -> dict[str, float]:
     figures: dict[str, float] = {}
     for seed, prefix in enumerate(("", "second_")):
         human = checkered_human(seed)
-        npz, person = folder / "human.npz", folder / "person.human.safetensors"
-        export_for_blender(npz, human)
+        person = folder / "person.human.safetensors"
         save_human(person, human)
-        figures |= {prefix + name: value for name, value in one_human(npz, person).items()}
+        figures |= {prefix + name: value for name, value in one_human(person).items()}
     return figures
 
 
@@ -148,39 +149,40 @@ def children_seconds() -> float:
     return times.children_user + times.children_system
 
 
-def one_human(npz: Path, person: Path) -> dict[str, float]:
+def one_human(person: Path) -> dict[str, float]:
     trim()
     memory = resident_mb()
     steps: list[float] = []
-    prepared = prepare(npz, steps)
+    prepared = prepared_in_slices(person, steps)
     found: list[bpy.types.Collection] = []
-    steps.append(seconds(lambda: found.append(enter(prepared, person))))
+    steps.append(seconds(lambda: found.append(enter(prepared))))
     del prepared
     figures = {"stand_seconds": sum(steps), "longest_step_seconds": max(steps)}
     trim()
     figures["person_memory_mb"] = resident_mb() - memory
     figures["person_frame_ms"] = frame_ms(armature_of(found[0]))
     figures["outliner_rows"] = outliner_rows(found[0])
-    figures["volumes_seconds"] = sum(seconds(lambda path=path: list(write_unwritten(path))) for path in unwritten())
+    figures["volumes_seconds"] = seconds(write_all_pending)
     return figures
 
 
-def prepare(npz: Path, steps: list[float]) -> WrittenHuman:
-    """The slices before the human enters; their durations are appended to `steps`."""
-    writing = write_volumes(npz, Destination(next_folder("Human"), later=True))
+def prepared_in_slices(person: Path, steps: list[float]) -> PreparedHuman:
+    """The slices before the human enters, as with a window; their durations are appended to `steps`."""
+    preparing = states.prepare(person)
     while True:
         began = time.perf_counter()
         try:
-            next(writing)
+            with mock.patch.object(states, "volumes_may_wait", return_value=True):
+                next(preparing)
         except StopIteration as done:
             return done.value
         finally:
             steps.append(time.perf_counter() - began)
 
 
-def enter(prepared: WrittenHuman, person: Path) -> bpy.types.Collection:
+def enter(prepared: PreparedHuman) -> bpy.types.Collection:
     """What blocks the window."""
-    collection = build_written(bpy.context, prepared, "Human", [person])
+    collection = build_prepared(bpy.context, prepared)
     stand_at_cursor(bpy.context, collection)
     bpy.context.view_layer.update()
     select_human(bpy.context, collection)

@@ -26,7 +26,7 @@ from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.formats.requests import DENSITY_GAIN, MergeRequest, PosedPerson
 from primdiffusion.human import body_of, framing, generate, place_skinned, pose_body
-from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import march
@@ -144,11 +144,10 @@ def main() -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(folder.resolve() / "shot.blend"))
     blender_primdiffusion.register()
     save_human(folder / "person.human.safetensors", human)
-    export_for_blender(folder / "human.npz", human)
     figures: dict[str, float | int | str | None] = {"size": SIZE, "samples": 1}
     before = psutil.Process().memory_info().rss
     began = time.perf_counter()
-    person = build_human(bpy.context, folder / "human.npz", keep=[folder / "person.human.safetensors"])
+    person = build_human(bpy.context, folder / "person.human.safetensors")
     figures["build_seconds"] = time.perf_counter() - began
     show_in_viewport(person, True)
     bpy.context.view_layer.update()

@@ -3,8 +3,7 @@
 `python benchmarks/reshape.py --json reshape.json`, or `--quick` with fewer moves. Milliseconds are medians of wall
 time. reshape_ms: setting the betas, which moves bones, body mesh and volumes. reshape_evaluate_ms: Blender's work
 before it can draw again, mostly rebuilding the dependency graph, as after every edit of bones. graph_ms: that rebuild
-alone, triggered by linking an empty object. body_file_mb is the file on disk that all people on one body share;
-human_npz_mb is the file that the backend hands over.
+alone, triggered by linking an empty object.
 
 `python benchmarks/reshape.py boxes --json F`, or `--quick` with small pictures, compares rules for the growth of boxes
 on another body: reshaped people against people made for that body. The default body with a checkered
@@ -35,13 +34,13 @@ from primdiffusion.body.model import default_body
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, place
-from primdiffusion.human_file import export_for_blender
+from primdiffusion.human_file import save_human
 from primdiffusion.render.image import over, to_png
 from primdiffusion.render.march import march
 from record import command_line, report, run
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from blender_primdiffusion.scene.body_file import shape_model_of
+from blender_primdiffusion.scene.body import shape_model_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.reshape import reshape
 
@@ -67,8 +66,8 @@ def main() -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     folder = Path(tempfile.mkdtemp(prefix="reshape_", dir=bpy.app.tempdir))
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
-    export_for_blender(folder / "human.npz", checkered_human(0))
-    person = build_human(bpy.context, folder / "human.npz")
+    save_human(folder / "a.human", checkered_human(0))
+    person = build_human(bpy.context, folder / "a.human")
     bpy.context.view_layer.update()
     model, rng = shape_model_of(person), np.random.default_rng(0)
     setting, evaluating, resting, linking = [], [], [], []
@@ -79,15 +78,12 @@ def main() -> None:
         evaluating.append(milliseconds(bpy.context.view_layer.update))
         bpy.context.scene.collection.objects.link(bpy.data.objects.new("Empty", None))
         linking.append(milliseconds(bpy.context.view_layer.update))
-    (body,) = (folder / "shot_humans").glob("body_*.npz")
     figures = {
         "reshape_rest_ms": statistics.median(resting),
         "reshape_ms": statistics.median(setting),
         "reshape_evaluate_ms": statistics.median(evaluating),
         "graph_ms": statistics.median(linking),
         "reshape_volumes": sum(obj.type == "VOLUME" for obj in person.all_objects),
-        "body_file_mb": body.stat().st_size / 1e6,
-        "human_npz_mb": (folder / "human.npz").stat().st_size / 1e6,
     }
     report(figures, given.json)
 

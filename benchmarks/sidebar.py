@@ -250,7 +250,7 @@ def measured() -> dict[str, float]:
     import blender_primdiffusion
     from blender_primdiffusion.jobs.queue import JobOutcome, queue
     from blender_primdiffusion.scene import shape
-    from blender_primdiffusion.scene.body_file import shape_model_of
+    from blender_primdiffusion.scene.body import shape_model_of
     from blender_primdiffusion.scene.build import build_human
     from blender_primdiffusion.ui import generate_panel
 
@@ -259,7 +259,7 @@ def measured() -> dict[str, float]:
     generate_panel.draw_set_up = lambda _layout: True
     queue.outcomes["generate"] = JobOutcome(MagicMock(), "Generated in 47.6 s, and after that built in 2.9 s.")
     with tempfile.TemporaryDirectory() as folder:
-        person = build_human(bpy.context, synthetic_shape.write(Path(folder) / "human.npz"))
+        person = build_human(bpy.context, synthetic_shape.write(Path(folder) / "human"))
         shape.DEFAULT_BODY_VERTICES = len(shape_model_of(person).template)  # sliders with their names
         for tab, pixels in tabs(bpy.context).items():
             names = [cls.bl_label for cls in open_panels(bpy.context) if cls.bl_category == tab]

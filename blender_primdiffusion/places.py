@@ -50,16 +50,6 @@ def backend_is_named() -> bool:
         return True  # a wrong preference: trying says what is wrong
 
 
-def body_data(name: str) -> Path:
-    """body.npz or layout.npz of the default body, which every build has. Raises FileNotFoundError."""
-    root = Path(__file__).resolve().parent
-    for folder in (root / "bundled", root.parent / "backend"):
-        path = folder / "primdiffusion" / "body" / "data" / name
-        if path.is_file():
-            return path
-    raise FileNotFoundError(f"the extension lacks {name} of the default body: install its zip again")
-
-
 def own_folder() -> Path:
     """The extension's writable folder; a temporary one in a checkout."""
     try:

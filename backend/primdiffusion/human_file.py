@@ -1,4 +1,4 @@
-"""Files of a human: `.human.safetensors` to save and share, `human.npz` for Blender. Neither contains pickles.
+"""Files of a human: `.human.safetensors`, and `body.safetensors` for Blender. Neither contains pickles.
 
 A `.human.safetensors` file contains the tensors rgb, density, delta_scale and betas, and the metadata `format`,
 `format_version` and `provenance`, a JSON object with these entries, among others:
@@ -19,7 +19,6 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from primdiffusion import tensor_file
@@ -27,13 +26,11 @@ from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyModel
 from primdiffusion.diffusion.fixed_threads import GRID_THREADS, fixed_threads
 from primdiffusion.formats import compact_human
-from primdiffusion.formats.arrays import write_stored
 from primdiffusion.formats.human_metadata import check_provenance, provenance_of, version_fault
-from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.regular_files import FileError, TooLargeError
 from primdiffusion.formats.whole_files import written_whole
-from primdiffusion.human import Human, body_of
-from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach
+from primdiffusion.human import Human
+from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
 from primdiffusion.primitives.primitives import K, Payload, S
 
@@ -42,8 +39,7 @@ FORMAT_VERSION = 1
 """Version for humans on the default body."""
 FORMAT_VERSION_ON_FILES = 2
 """Version for humans on a body of the user's files."""
-BLENDER_FORMAT_VERSION = 2
-"""Version of human.npz."""
+BODY_FORMAT = "primdiffusion.body"
 LARGEST_FILE = 256 * 2**20
 _FLOATS = (torch.float64, torch.float32, torch.float16, torch.bfloat16)
 SHAPES = {"rgb": (K, 3, S, S, S), "density": (K, S, S, S), "delta_scale": (K, 3), "betas": (10,)}
@@ -174,65 +170,34 @@ def _check_values(human: Human) -> None:
 
 
 @fixed_threads(GRID_THREADS)
-def export_for_blender(path: str | Path, human: Human) -> None:
-    """Write `human.npz`: the human in the T pose, with skinning to 24 joints.
+def save_body(path: str | Path, body: BodyModel, anchors: Anchors) -> None:
+    """Write `body.safetensors`, by which Blender places a human on a body of the user's files. Raises OSError.
 
-    Plain arrays in metres, y up, facing z. Body: vertices [V,3], faces [F,3], uv_corner [F,3,2] (v up), skin_weights
-    [V,24], joints [24,3], parents [24], joint_names [24]. Primitives: position [K,3], rotation [K,3,3] local to rest
-    (columns T, B, N), half_extent [K,3] with the delta scale in it, primitive_weights [K,24], rgb [K,8,8,8,3] float16
-    linear and density [K,8,8,8] (1/m, without the window), voxels in the order D, H, W = along N, B, T. meta: JSON.
-
-    Since format version 2 also the dependence on betas: template [V,3] and shape_basis [V,3,10] of the
-    surface, joint_template [24,3] and joint_basis [24,3,10], and the inputs of `attach`: face [K], barycentric [K,3],
-    stencil_vertex [K,m], stencil_du [K,m], stencil_dv [K,m]. Half extents and weights do not depend on the shape:
-    rest_half_extent [K,3] is without the delta scale. A body with pose-dependent correctives also has pose_basis
-    [U,3,207] (SMPL eq. 9) of the U vertices that stencil_vertex and face use, in ascending order.
+    Metres, y up, facing z. The dependence on betas: template [V,3] and shape_basis [V,3,10] of the surface,
+    joint_template [24,3] and joint_basis [24,3,10]. The surface: faces [F,3], uv_corner [F,3,2] (v up), skin_weights
+    [V,24]. The inputs of `attach`: face [K], barycentric [K,3], stencil_vertex [K,m], stencil_du [K,m], stencil_dv
+    [K,m], rest_half_extent [K,3]. A body with pose-dependent correctives also has pose_basis [U,3,207] (SMPL eq. 9) of
+    the U vertices that stencil_vertex and face use, in ascending order.
     """
-    human.validate()
-    body, anchors = body_of(human)
-    shaped = body.shape(human.betas)
-    frames = attach(anchors, shaped.vertices, body.faces)
-    arrays = {
-        "betas": human.betas,
-        "parents": body.parents,
-        "joints": shaped.joints,
-        "vertices": shaped.vertices,
-        "faces": body.faces.to(torch.int32),
-        "uv_corner": body.uv[body.uv_faces],
-        "skin_weights": body.skin_weights,
-        "position": frames.position,
-        "rotation": frames.rotation,
-        "half_extent": frames.half_extent * human.payload.delta_scale,
-        "primitive_weights": anchor_skin_weights(anchors, body),
-        "rgb": human.payload.rgb.movedim(1, -1).to(torch.float16),
-        "density": human.payload.density,
-        **_shape_fields(body, anchors, len(human.betas)),
-    }
-    plain = {name: value.detach().cpu().contiguous().numpy() for name, value in arrays.items()}
-    described = {
-        "format_version": np.array(BLENDER_FORMAT_VERSION, np.int64),
-        "meta": np.array(json.dumps(dict(human.provenance))),
-        "joint_names": np.array(JOINT_NAMES),
-    }
-    with written_whole(path) as unfinished:
-        write_stored(unfinished, {**described, **plain})
-
-
-def _shape_fields(body: BodyModel, anchors: Anchors, betas: int) -> dict[str, torch.Tensor]:
-    """Return the dependence of the rest body and its frames on the first `betas` shape coefficients."""
-    basis = body.shape_basis[..., :betas]
+    basis = body.shape_basis[..., : SHAPES["betas"][0]]
     regressor = body.joint_regressor.double()
     used = torch.cat([anchors.stencil_vertex.flatten(), body.faces[anchors.face].flatten()]).unique()
-    return {
+    arrays = {
         **({"pose_basis": body.pose_basis[used]} if body.pose_basis.numel() else {}),
-        "rest_half_extent": anchors.rest_half_extent,
         "template": body.template,
         "shape_basis": basis,
         "joint_template": (regressor @ body.template.double()).float(),
         "joint_basis": torch.einsum("jv,vcn->jcn", regressor, basis.double()).float(),
+        "faces": body.faces.to(torch.int32),
+        "uv_corner": body.uv[body.uv_faces],
+        "skin_weights": body.skin_weights,
         "face": anchors.face.to(torch.int32),
         "barycentric": anchors.barycentric,
         "stencil_vertex": anchors.stencil_vertex.to(torch.int32),
         "stencil_du": anchors.stencil_du,
         "stencil_dv": anchors.stencil_dv,
+        "rest_half_extent": anchors.rest_half_extent,
     }
+    plain = {name: value.detach().cpu().contiguous() for name, value in arrays.items()}
+    with written_whole(path) as unfinished:
+        unfinished.write_bytes(tensor_file.save(plain, {"format": BODY_FORMAT, "format_version": "1"}))

@@ -171,7 +171,7 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
             tried[python] = False
             last = f" ({request.error.log[-1]})" if request.error.kind == "died" and request.error.log else ""
             raise SetUpFailed(f"the self-test failed: {request.error.message}{last}")
-        if not request.result.human.is_file():
+        if not request.result.person.is_file():
             raise SetUpFailed("the self-test failed: the backend made no human and did not say why")
         return {
             "device": request.info.get("device_name") or "",

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from ..scene.body_file import read_body_file
+from ..scene.body import body_of_file
 from ..scene.human_file import HumanPayload, file_version, read_sizes
 from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, stretch_of, tangent_frames
 from .picture import PosedHuman
@@ -23,10 +23,6 @@ EDGE_PX = 4.0
 """Around what shows boxes: pictures with fewer pixels are drawn smoothly."""
 SHAPES_CACHED = 32
 """On one body; 1.2 MB each."""
-
-
-class EarlierVersionError(ValueError):
-    """A human's files are of an earlier version and lack what places its boxes."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -52,11 +48,6 @@ class BoxRig:
     """
 
     def __init__(self, model: ShapeModel) -> None:
-        """Raises EarlierVersionError for a model without skinning."""
-        if model.skin_weights is None:
-            raise EarlierVersionError(
-                "the body's file is of an earlier version, without skinning: edit the human, or generate it again"
-            )
         self._model, used = model, model.used()
         self._template, self._basis = model.template[used].astype(np.float64), model.shape_basis[used]
         corners = (model.faces[model.face], model.barycentric)
@@ -69,16 +60,11 @@ class BoxRig:
     def place(self, human: PosedHuman, payload: HumanPayload) -> Boxes:
         """The boxes of `human`, whose file holds `payload`.
 
-        Raises EarlierVersionError where neither body nor payload has the boxes' sizes, and ValueError for a payload on
-        another body, and for an object or joint scaled to zero.
+        Raises ValueError for a payload on another body, and for an object or joint scaled to zero.
         """
         own = payload.betas.astype(np.float64)
         betas = own if human.betas is None else np.array(human.betas, np.float64)
         extent = self._model.rest_half_extent if payload.rest_half_extent is None else payload.rest_half_extent
-        if extent is None:
-            raise EarlierVersionError(
-                "the body's file is of an earlier version, without sizes of boxes: edit the human, or generate it again"
-            )
         if len(extent) != len(payload.delta_scale) or len(extent) != len(self._model.face):
             raise ValueError(f"the body's file does not fit {human.file.name!r}: generate the human again")
         flat = np.abs(np.linalg.det(human.joints[:, :, :3])) < SMALLEST_SCALE**3
@@ -143,14 +129,10 @@ class BoxRig:
 def boxes_of(human: PosedHuman) -> Boxes:
     """The boxes of a human in the scene.
 
-    Raises FileNotFoundError or ValueError for a file of the human or its body that is missing or damaged,
-    EarlierVersionError, and as `BoxRig.place`.
+    Raises FileNotFoundError or ValueError for a file of the human or its body that is missing or damaged, and as
+    `BoxRig.place`.
     """
-    if human.body is None:
-        raise EarlierVersionError(
-            f"the human of {human.file.name!r} was made by an earlier version: generate the human again"
-        )
-    return _rig(read_body_file(human.body)).place(human, read_sizes(file_version(human.file)))
+    return _rig(body_of_file(human.file)).place(human, read_sizes(file_version(human.file)))
 
 
 @functools.lru_cache(maxsize=4)

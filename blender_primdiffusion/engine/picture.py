@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..scene.armature import model_origin
 from ..scene.blend_values import stored_numbers
-from ..scene.body_file import body_file
 from ..scene.convention import transforms_to_backend
 from ..scene.human import BETA_COUNT, BETAS, MARK, person_file
 from .solids import scene_solids, stored, visible_instances
@@ -36,8 +35,6 @@ class PosedHuman:
     """The body's shape; None for the file's."""
     pelvis: NDArray[np.float64]
     """Position [3] in Blender's world."""
-    body: Path | None
-    """The body's file; None for a human of an early version, whose collection does not name one."""
 
     def params(self) -> dict[str, object]:
         """Parameters of the child's `draw`."""
@@ -178,7 +175,6 @@ def pose_of(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collec
         transforms_to_backend(np.linalg.inv(origin) @ posed @ np.linalg.inv(rest) @ origin),
         _betas(armature, owner.name),
         (matrix @ posed[0])[:3, 3],
-        body_file(owner),
     )
 
 

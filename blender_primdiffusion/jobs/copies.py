@@ -14,7 +14,7 @@ from bpy.app.handlers import persistent
 
 from ..scene.copies import any_copies, separate_copies
 from ..scene.human import any_humans
-from .late_volumes import keep_writing
+from .deferred_volumes import keep_writing
 from .windows import in_the_way, window_of
 
 SOON_S = 0.2

@@ -1,4 +1,4 @@
-"""Jobs that change a human in place: edits, and volumes restored after their files were lost."""
+"""Jobs that change a human in place: edits, and a human generated again after its files were lost."""
 
 from __future__ import annotations
 
@@ -12,16 +12,18 @@ import numpy as np
 
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
+from ..formats.human_metadata import provenance_of as made_of
 from ..scene.attachment import in_viewport
 from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_warning_in
-from ..scene.edit import Replaced, edit_destination, replace_person, restore_destination, restore_volumes
+from ..scene.edit import Replaced, replace_person
 from ..scene.human import person_file, provenance_of
-from ..scene.human_npz import Destination, read_human, write_now
+from ..scene.human_file import read_tensors
+from ..scene.pending import pending_of, write_pending
+from ..scene.states import prepare_now
 from ..scene.volumes import free_unused_grids
 from .follow import building
 from .missing_files import look
-from .open_human import opened
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .target import HumanTarget
 
@@ -31,9 +33,12 @@ _STEP_PICTURE_PX = 256
 
 def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, result: HumanAnswer) -> Replaced:
     """Show the human of the child's `result` in place of `person`. Raises as `replace_person` does."""
-    written = building.take(result.human) or write_now(result.human, edit_destination(person))
-    done = replace_person(person, written, result.person)
+    prepared = building.take(result.person) or prepare_now(result.person, replaced=person)
+    done = replace_person(person, prepared)
     if in_viewport(person):
+        if (pending := pending_of(person)) is not None:  # of volumes that undo has brought back meanwhile
+            for _ in write_pending(pending):
+                pass
         context.view_layer.update()  # evaluated data holds the old grids
         free_unused_grids()
     return done
@@ -71,14 +76,14 @@ class EditJob(Job):
         previews = {"size": PREVIEW_PX, "picture_px": _STEP_PICTURE_PX}
         return {**asked, "person": self.target.file_now(), **previews, **checkpoint, "out_dir": str(folder)}
 
-    def place(self) -> Destination:
-        return edit_destination(self.target.found())
+    def replaced(self) -> bpy.types.Collection:
+        return self.target.found()
 
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         person = self.target.found()
         done = show_in_place(context, person, result)
         shape = ", the body's shape too" if done.reshaped else ""
-        message = f"{self.made} in {result.seconds:.1f} s; {done.volumes} of {done.of} volumes of {person.name} changed"
+        message = f"{self.made} in {result.seconds:.1f} s; {done.volumes} volumes of {person.name} changed"
         warnings = (done.warning, overlap_warning_in(context.scene, person))
         return " ".join([f"{message}{shape}.", *(sentence(text) for text in warnings if text)])
 
@@ -112,38 +117,6 @@ class BlendJob(EditJob):
 
 
 @dataclasses.dataclass(frozen=True)
-class RestoreJob(Job):
-    """Write exactly the lost volumes again, from the human's own file."""
-
-    kind = "restore_volumes"
-    method = "human_npz"
-    undo = "Restore Volumes"
-
-    target: HumanTarget
-    file: str
-
-    @property
-    def label(self) -> str:
-        return f"Restore Volumes of {self.target.name}"
-
-    def params(self, folder: Path) -> dict[str, Any]:
-        return {"person": self.file, "out_dir": str(folder), "size": PREVIEW_PX}
-
-    def result_here(self, folder: Path) -> HumanAnswer | None:
-        return opened(Path(self.file), folder)
-
-    def place(self) -> Destination:
-        return restore_destination(self.target.found())
-
-    def finish(self, _context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
-        person = self.target.found()
-        written = building.take(result.human) or write_now(result.human, restore_destination(person))
-        count = restore_volumes(person, written, Path(self.file))
-        look()
-        return f"{count} volumes of {person.name} restored from their file in {result.seconds:.1f} s"
-
-
-@dataclasses.dataclass(frozen=True)
 class RegenerateJob(Job):
     """Generate a human that has lost all files again from its seed, in its place."""
 
@@ -165,13 +138,13 @@ class RegenerateJob(Job):
         checkpoint = {"checkpoint": self.checkpoint} if self.checkpoint else {}
         return {"seed": self.made["seed"], **asked, **checkpoint, "size": PREVIEW_PX, "out_dir": str(folder)}
 
-    def place(self) -> Destination:
-        return edit_destination(self.target.found())
+    def replaced(self) -> bpy.types.Collection:
+        return self.target.found()
 
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         """Raises ValueError where another checkpoint has generated another human."""
         person = self.target.found()
-        made, before = read_human(result.human).meta, provenance_of(person)
+        made, before = made_of(read_tensors(result.person).metadata), provenance_of(person)
         for name in ("checkpoint_sha256", "checkpoint"):
             if name in before and made.get(name) != before[name]:
                 other = as_shown(before.get("checkpoint"))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+import time
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -13,15 +14,16 @@ import numpy as np
 
 from ..engine.picture import pose_of
 from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
+from ..formats.regular_files import exists_in_its_folder
 from ..formats.removing import remove_file
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import rest_joints
 from ..motion.skeleton import unchain
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
-from ..scene.body_file import shape_model_of, stored_body_name
+from ..scene.body import body_of_file, shape_model_of
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
-from ..scene.human import armature_of, person_file
+from ..scene.human import BODY_FILE, PERSON_FILE, armature_of, person_file
 from ..scene.human_file import (
     HumanMotion,
     compacted,
@@ -34,10 +36,10 @@ from ..scene.human_file import (
 )
 from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
+from ..scene.rest_human import read_human
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
 from ..scene.surface import carrier_of, primitives_of
 from .generate import build_person
-from .open_human import opened
 from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
 
@@ -86,8 +88,7 @@ class ProxyJob(Job):
         """The proxy as an object, in no collection, with the current shape of the body."""
         made = np.array(result.betas, np.float64)
         proxy = build_proxy(person, read_proxy(result.proxy), result.texture, made)
-        if stored_body_name(person) is not None:
-            follow_shape(person, proxy, betas_of(person))
+        follow_shape(person, proxy, betas_of(person))
         return proxy
 
 
@@ -190,10 +191,8 @@ def write_human(
     """
     human = read_tensors(person_file(person))
     if has_custom_shape(person):
-        betas, growth = betas_of(person), None
-        if stored_body_name(person) is not None:  # humans of earlier versions have none, and boxes of fixed size
-            growth = shape_model_of(person).growth(generated_betas(person), betas)
-        human = reshaped(human, betas, growth)
+        betas = betas_of(person)
+        human = reshaped(human, betas, shape_model_of(person).growth(generated_betas(person), betas))
     motion = None if frames is None else _motion(context, person, frames)
     write_tensors(path, with_motion(compacted(human) if compact else expanded(human), motion))
 
@@ -284,7 +283,7 @@ class ImportHumanJob(Job):
     """Add the human of a .human file, with its motion if any."""
 
     kind = "import_human"
-    method = "human_npz"
+    method = "open_human"
     undo = "Import Human"
 
     path: str
@@ -315,6 +314,27 @@ class ImportHumanJob(Job):
             armature.location.xy = self.at[:2]
             armature.location.z += self.at[2]
         return notice
+
+
+def opened(source: Path, folder: Path) -> HumanAnswer | None:
+    """Write the human of a file, without a motion, into `folder`, and the file of its body where it has one.
+
+    None for files that only the backend can read: humans on a body of the user's files without BODY_FILE beside them,
+    and files of other kinds. Raises ValueError for a damaged human, OSError.
+    """
+    began = time.monotonic()
+    try:
+        human = read_tensors(source)
+    except ValueError:
+        return None
+    body = source.with_name(BODY_FILE)
+    if "body" in human.metadata and (not exists_in_its_folder(body) or body_of_file(source).uv_corner is None):
+        return None
+    read_human(source)
+    write_tensors(folder / PERSON_FILE, with_motion(human, None))
+    if "body" in human.metadata:
+        shutil.copyfile(body, folder / BODY_FILE)
+    return HumanAnswer(person=folder / PERSON_FILE, seconds=time.monotonic() - began)
 
 
 def name_of(path: str) -> str:

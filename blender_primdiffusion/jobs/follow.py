@@ -1,7 +1,7 @@
 """Follow jobs to their end: by a timer while there is a window, by waiting in background mode.
 
 A result is read, and volumes that viewports show are written, in slices of time before the operator runs, so that it
-returns quickly. Other volumes are written afterwards (`late_volumes`).
+returns quickly. Other volumes are written afterwards (`deferred_volumes`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import in_words, sentence
 from ..formats.answers import HumanAnswer
 from ..places import backend_is_named
-from ..scene.human_npz import Destination, VolumeWriter, WrittenHuman
-from .late_volumes import keep_writing
+from ..scene.states import Preparation, PreparedHuman
+from .deferred_volumes import keep_writing
 from .memory import release_when_idle
 from .picture_in_view import follow_picture
 from .pictures import so_far
@@ -37,19 +37,19 @@ class Building:
 
     def __init__(self) -> None:
         self._entry: Entry | None = None
-        self._human: Path | None = None
-        self._writing: VolumeWriter | None = None
+        self._person: Path | None = None
+        self._preparing: Preparation | None = None
         self._shown = 0
 
     @property
     def fraction(self) -> float:
         """Progress from 0 to 1; 1 when there is nothing to build."""
-        return 1.0 if self._writing is None or self._writing.over else self._writing.fraction
+        return 1.0 if self._preparing is None or self._preparing.over else self._preparing.fraction
 
     @property
     def busy(self) -> bool:
         """The human is left to read, or volumes to write."""
-        return self._writing is not None and not self._writing.over
+        return self._preparing is not None and not self._preparing.over
 
     def moved(self) -> bool:
         """Whether the bar has advanced a step since the last call."""
@@ -61,37 +61,35 @@ class Building:
         if entry is self._entry:
             return
         self.close()
-        self._entry = entry
-        place = _place(entry.job) if isinstance(result, HumanAnswer) else None
-        if place is not None:
-            self._human = result.human
-            self._writing = VolumeWriter(self._human, place)
+        self._entry, job = entry, entry.job
+        if not isinstance(result, HumanAnswer):
+            return
+        try:
+            replaced = job.replaced()
+        except (ValueError, OSError):  # reported by the operator
+            return
+        if job.new_person or replaced is not None:
+            self._person = result.person
+            self._preparing = Preparation(self._person, job.new_person or "Human", replaced)
 
     def advance(self, *, may_work: bool) -> bool:
         """Do some of the work if `may_work`; whether more is left before the operator runs."""
         if not self.busy:
             return False  # after a failure the operator tries again and reports it
         if may_work:
-            self._writing.work(SLICE_S)
+            self._preparing.work(SLICE_S)
         return True  # the operator has a tick of its own
 
-    def take(self, human: Path) -> WrittenHuman | None:
-        """The written human of this human.npz, whose files are the caller's from now on; None if not written."""
-        return self._writing.take() if self._writing is not None and human == self._human else None
+    def take(self, person: Path) -> PreparedHuman | None:
+        """The prepared human of this file, whose files are the caller's from now on; None if not prepared."""
+        return self._preparing.take() if self._preparing is not None and person == self._person else None
 
     def close(self) -> None:
         """Stop, and remove files that were written but not taken."""
-        if self._writing is not None:
-            self._writing.stop()
-        self._entry = self._human = self._writing = None
+        if self._preparing is not None:
+            self._preparing.stop()
+        self._entry = self._person = self._preparing = None
         self._shown = 0
-
-
-def _place(job: Job) -> Destination | None:
-    try:
-        return job.place()
-    except (ValueError, OSError):  # reported by the operator
-        return None
 
 
 building = Building()

@@ -13,12 +13,12 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer, ReconstructAnswer
 from ..formats.requests import ReconstructRequest
-from ..scene.build import build_written, next_folder
+from ..scene.build import build_prepared
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import select_human
 from ..scene.human import armature_of, humans
-from ..scene.human_npz import Destination, write_now
 from ..scene.place import stand_at_cursor
+from ..scene.states import prepare_now
 from .follow import building
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .views import bring_into_view, eye
@@ -34,8 +34,8 @@ def build_person(
 
     Raises as `build_human` does, and then leaves nothing.
     """
-    written = building.take(result.human) or write_now(result.human, Destination(next_folder(name)))
-    collection = build_written(context, written, name, [result.person])  # which the engine draws
+    prepared = building.take(result.person) or prepare_now(result.person, name)
+    collection = build_prepared(context, prepared, name)
     stand_at_cursor(context, collection, eye())
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, collection)
@@ -45,7 +45,7 @@ def build_person(
     warnings = list(result.warnings) if isinstance(result, ReconstructAnswer) else []
     if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)
-    notice = f"{made} in {result.seconds + time.monotonic() - written.began:.1f} s"
+    notice = f"{made} in {result.seconds + time.monotonic() - prepared.began:.1f} s"
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])
 
 

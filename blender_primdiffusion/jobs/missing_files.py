@@ -7,7 +7,9 @@ import dataclasses
 import bpy
 from bpy.app.handlers import persistent
 
-from ..scene.human import any_humans
+from ..scene import collect
+from ..scene.human import PERSON_FILE, any_humans
+from ..scene.missing import missing_files
 from .windows import redraw
 
 SOON_S = 0.5
@@ -19,9 +21,9 @@ class State:
     """What the last look found."""
 
     summary: str = ""
-    """For instance: 12 volumes of 'Human'; empty when nothing is missing."""
+    """For instance: person.human.safetensors of 'Human'; empty when nothing is missing."""
     without_person_file: tuple[str, ...] = ()
-    """Names of humans that cannot be restored from their own file."""
+    """Names of humans that have lost their own file."""
 
 
 state = State()
@@ -36,10 +38,8 @@ def look() -> None:
 
 
 def _found() -> tuple[str, tuple[str, ...]]:
-    from ..scene.missing import find_person, missing_files  # needs numpy
-
     lost = missing_files()
-    alone = [one.person.name for one in lost if one.person_file and not one.linked and find_person(one) is None]
+    alone = [one.person.name for one in lost if one.file == PERSON_FILE and not one.linked]
     return "; ".join(one.summary() for one in lost), tuple(alone)
 
 
@@ -81,8 +81,6 @@ def _tick() -> float:
 def collect_before_saving(blend_path: str, *_: object) -> None:
     """Handler of save_pre."""
     if any_humans():
-        from ..scene import collect  # needs numpy
-
         collect.collect_before_saving(blend_path)
 
 
@@ -90,8 +88,6 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
 def finish_saving(blend_path: str, *_: object) -> None:
     """Handler of save_post."""
     if any_humans():
-        from ..scene import collect  # needs numpy
-
         collect.finish_saving(blend_path)
 
 
@@ -99,8 +95,6 @@ def finish_saving(blend_path: str, *_: object) -> None:
 def give_up_saving(*_: object) -> None:
     """Handler of save_post_fail."""
     if any_humans():
-        from ..scene import collect  # needs numpy
-
         collect.give_up_saving()
 
 

@@ -20,9 +20,6 @@ from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestEr
 from ..formats.regular_files import is_local_path
 from ..formats.removing import remove_folder
 from ..places import new_backend, preference
-from ..scene.attachment import volumes_may_wait
-from ..scene.build import next_folder
-from ..scene.human_npz import Destination
 from .remedies import defect_in_the_scene, error_in_the_scene
 
 PREVIEW_PX = 16
@@ -70,13 +67,12 @@ class Job(abc.ABC):
         more to do now. Called while the child is running, and afterwards until nothing is left, before `finish`."""
         return False
 
-    def place(self) -> Destination | None:
-        """Where the result's volumes go, which are prepared before `finish`; None for jobs that show no human.
+    def replaced(self) -> bpy.types.Collection | None:
+        """The human in whose place the result's human is shown; None for other jobs.
 
-        Evaluated when the result has arrived. ValueError and OSError are ignored: `finish` raises them again."""
-        if not self.new_person:
-            return None
-        return Destination(next_folder(self.new_person), later=volumes_may_wait())
+        Evaluated when the result has arrived, whose files are prepared before `finish`. ValueError and OSError are
+        ignored: `finish` raises them again."""
+        return None
 
 
 def chosen_checkpoint(name: str) -> str:

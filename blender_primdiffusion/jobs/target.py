@@ -6,7 +6,7 @@ import dataclasses
 
 import bpy
 
-from ..scene.human import check_editable, human_of, humans, person_file, person_file_name
+from ..scene.human import check_editable, human_of, humans, person_file, state_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -16,14 +16,14 @@ class HumanTarget:
     uid: int
     """Of the collection; valid while the file is open."""
     name: str
-    file: str
-    """Name of the human's own file."""
+    state: str
+    """Of the human, by `state_of`."""
 
     @classmethod
     def of(cls, person: bpy.types.Collection) -> HumanTarget:
         """Raises ValueError for a human that cannot be edited."""
         check_editable(person)
-        return cls(person.session_uid, person.name, person_file_name(person))
+        return cls(person.session_uid, person.name, state_of(person))
 
     def found(self) -> bpy.types.Collection:
         """The human. Raises ValueError where it is no longer in a scene, or has changed."""
@@ -34,7 +34,7 @@ class HumanTarget:
                 f"the human {self.name!r} was removed during the edit; nothing was changed. Undo the "
                 "removal and edit again"
             )
-        if person_file_name(person) != self.file:
+        if state_of(person) != self.state:
             raise ValueError(
                 f"the human {person.name!r} changed during the edit (by undo or redo); nothing was changed. Edit again"
             )

@@ -13,10 +13,11 @@ import bpy
 
 from ..formats.answers import VariationFiles, VariationsAnswer
 from ..formats.removing import remove_folder
+from ..scene.human import BODY_FILE, PERSON_FILE
 from .pictures import icons
 from .queue import Job, chosen_checkpoint
 
-NAMES = {"human": "human.npz", "person": "person.human.safetensors", "picture": "picture.png"}
+NAMES = {"person": PERSON_FILE, "picture": "picture.png"}
 """Files of a human, by their names in the child's result."""
 
 
@@ -26,12 +27,8 @@ class Variation:
 
     seed: int
     folder: Path
-    """Holds NAMES."""
+    """Holds NAMES, and BODY_FILE where the human is on a body of the user's files."""
     chosen: bool = False
-
-    @property
-    def human(self) -> Path:
-        return self.folder / NAMES["human"]
 
     @property
     def person(self) -> Path:
@@ -62,6 +59,8 @@ class Sheet:
                 own.mkdir()
                 for name, file in NAMES.items():
                     shutil.move(getattr(person, name), own / file)
+                if (body := person.person.with_name(BODY_FILE)).is_file():
+                    shutil.copyfile(body, own / BODY_FILE)
                 made.append(Variation(person.seed, own))
         except OSError:
             remove_folder(folder, folder.parent)

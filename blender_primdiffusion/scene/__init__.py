@@ -1,1 +1,1 @@
-"""Humans in Blender: armature, body mesh, volumes and material, built from a human.npz; their files; mesh proxies."""
+"""Humans in Blender: armature, body mesh, volumes and material, built from a .human file; their files; mesh proxies."""

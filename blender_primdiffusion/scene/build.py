@@ -13,81 +13,53 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..formats.regular_files import portable_name
 from .armature import build_armature
-from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, volumes_may_wait
-from .body_file import saved_body
+from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
-from .human import (
-    BETAS,
-    BODY_MARK,
-    HOME,
-    MARK,
-    ORIGIN,
-    PERSON,
-    available_name,
-    folder_of,
-    humans_folder,
-    stored_path,
-)
-from .human_npz import Destination, WrittenHuman, write_now
+from .human import BETAS, BODY_MARK, HOME, MARK, ORIGIN, stored_path, volume_name
 from .material import volume_material
 from .stand_in import build_stand_in
+from .states import NAME_LENGTH, PreparedHuman, prepare_now
 
-_NAME_LENGTH = 40
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
 
 
-def build_human(
-    context: bpy.types.Context, human_npz: str | Path, name: str = "Human", keep: Sequence[Path] = ()
-) -> bpy.types.Collection:
-    """Write the volumes of a human.npz, where they may not come later, and build it in the scene; see `build_written`.
+def build_human(context: bpy.types.Context, person: str | Path, name: str = "Human") -> bpy.types.Collection:
+    """Build the human of a file in the scene, with its volumes where they cannot come later; see `build_prepared`.
 
-    Raises HumanNpzError or VolumeWriteError, and then leaves neither data nor files.
+    Raises as `states.prepare`, and then leaves neither data nor files.
     """
-    written = write_now(human_npz, Destination(next_folder(name), later=volumes_may_wait()))
-    return build_written(context, written, name, keep)
+    return build_prepared(context, prepare_now(Path(person), name), name)
 
 
-def build_written(
-    context: bpy.types.Context, written: WrittenHuman, name: str = "Human", keep: Sequence[Path] = ()
-) -> bpy.types.Collection:
-    """Build a human whose volumes are written: armature, hidden body mesh and a volume for every primitive.
+def build_prepared(context: bpy.types.Context, prepared: PreparedHuman, name: str = "Human") -> bpy.types.Collection:
+    """Build a human whose files are there: armature, hidden body mesh and a volume for every primitive.
 
     The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
-    space, the backend's axes are turned z up and the body is raised by ORIGIN. The files in `keep` are copied to
-    `folder_of(collection)`, and the volumes too where they were written elsewhere because the name was taken since.
-    Raises VolumeWriteError, and then leaves neither data nor files. Makes no undo step.
+    space, the backend's axes are turned z up and the body is raised by ORIGIN. Raises ValueError, and then leaves
+    neither data nor files. Makes no undo step.
     """
-    with written.entering(lambda: folder_of(collection)):
-        collection = _build(context, written, name, keep)
-    return collection
+    with prepared.entering():
+        return _build(context, prepared, name)
 
 
-def next_folder(name: str) -> Path:
-    """`folder_of` the next human that is built under this name, as far as can be foreseen: Blender numbers names."""
-    name = name[:_NAME_LENGTH]
-    taken = {collection.name for collection in bpy.data.collections if collection.library is None}
-    numbered = (f"{name}.{number:03d}" for number in itertools.count(1))
-    free = name if name not in taken else next(candidate for candidate in numbered if candidate not in taken)
-    return humans_folder() / portable_name(bpy.path.clean_name(free))
-
-
-def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: Sequence[Path]) -> bpy.types.Collection:
-    human = written.human
+def _build(context: bpy.types.Context, prepared: PreparedHuman, name: str) -> bpy.types.Collection:
+    human, model, rest = prepared.human, prepared.human.model, prepared.human.rest
+    if model.uv_corner is None:
+        raise ValueError("the body's file is of an earlier version, without texture coordinates: import it again")
     with _no_data_left_on_failure():
-        collection = bpy.data.collections.new(name[:_NAME_LENGTH])
+        collection = bpy.data.collections.new(name[:NAME_LENGTH])
         label = collection.name
-        vertices = points_to_blender(human.vertices)
+        vertices = points_to_blender(rest.vertices)
         origin = floor_below(vertices)
-        armature = build_armature(label, points_to_blender(human.joints) + origin)
+        armature = build_armature(label, points_to_blender(rest.joints) + origin)
         armature.data[ORIGIN] = origin.tolist()
-        armature[BETAS] = human.betas.tolist()
+        armature[BETAS] = human.payload.betas.tolist()
         armature.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
         collection.objects.link(armature)
         body = build_body_mesh(
-            f"{label}_body", armature, vertices + origin, human.faces, human.uv_corner, human.skin_weights
+            f"{label}_body", armature, vertices + origin, model.faces, model.uv_corner, model.skin_weights
         )
         collection.objects.link(body)
         collection.objects.link(build_stand_in(label, armature, body))
@@ -95,29 +67,20 @@ def _build(context: bpy.types.Context, written: WrittenHuman, name: str, keep: S
         primitives.hide_viewport = not VOLUMES_IN_VIEWPORT
         primitives.objects.link(armature)  # the Outliner then shows the volumes inside the armature's closed row
         collection.children.link(primitives)
-        folder = folder_of(collection)
-        copies = {available_name(path, folder, path.name): path for path in keep}
-        with (
-            written.files_in(folder, range(len(human.density)), copies) as files,
-            saved_body(collection, human.shape_model, folder.parent),
-        ):
-            attach_volumes(
-                label,
-                armature,
-                primitives,
-                list(files.values()),
-                points_to_blender(human.position) + origin,
-                frames_to_blender(human.rotation),
-                human.primitive_weights,
-                volume_material(),
-            )
-            collection[MARK] = written.provenance
-            collection[HOME] = str(folder)
-            collection[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
-            for new_name, path in copies.items():
-                if new_name != path.name:  # the usual name belongs to a human that was deleted
-                    collection[PERSON] = new_name
-            context.scene.collection.children.link(collection)
+        attach_volumes(
+            label,
+            armature,
+            primitives,
+            [prepared.folder / volume_name(k) for k in range(len(rest.position))],
+            points_to_blender(rest.position) + origin,
+            frames_to_blender(rest.rotation),
+            model.primitive_weights(),
+            volume_material(),
+        )
+        collection[MARK] = prepared.provenance
+        collection[HOME] = str(prepared.folder)
+        collection[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
+        context.scene.collection.children.link(collection)
     return collection
 
 

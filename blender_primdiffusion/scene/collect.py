@@ -2,7 +2,7 @@
 
 Whatever is saved has all files of its humans in `humans_folder` of its own name: those from a temporary folder, from
 the .blend that it was saved from under another name, and of appended humans. So no .blend depends on another one's
-folder, except those that link humans from it.
+folder, except those that link humans from it. What is copied are whole folders of states.
 """
 
 from __future__ import annotations
@@ -11,49 +11,47 @@ import contextlib
 import dataclasses
 import itertools
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
 from bpy.app.handlers import persistent
 
-from ..formats.regular_files import exists_in_its_folder, real_path
-from ..formats.removing import OutsideFolderError, check_inside, remove_file
+from ..formats.regular_files import exists_in_its_folder, portable_name, real_path
+from ..formats.removing import OutsideFolderError, remove_file
 from ..formats.whole_files import remove_empty
-from .blend_values import as_shown, stored_folder, stored_name, stored_text
-from .body_file import BODY_FILE, BODY_NPZ, body_file, body_files, stored_body_name
+from .blend_values import as_shown, stored_folder, stored_text
+from .earlier_files import EARLIER, earlier_volumes
 from .human import (
+    BODY_FILE,
     HOME,
     MARK,
     MERGED_VDB,
-    PERSON,
-    PERSON_FILES,
+    PERSON_FILE,
     PRIMITIVE_VDB,
-    UNWRITTEN_NPZ,
+    STATE,
     VolumeWriteError,
-    available_name,
     copy_file,
-    folders_of,
     humans_folder,
     is_own,
-    person_file_name,
+    note_state,
+    same_file,
     sequence_files,
+    state_folder,
     stored_path,
-    unwritten_in,
     volume_path,
+    was_newest,
 )
-from .vdb import readable_format
-from .volumes import format_of, reload_volume
-
-_OURS = (PRIMITIVE_VDB, PERSON_FILES, BODY_NPZ, MERGED_VDB, UNWRITTEN_NPZ)
+from .pending import pending_of
+from .volumes import reload_volume
 
 
 @dataclasses.dataclass(frozen=True)
 class Collected:
     """What was copied."""
 
-    volumes: int
-    """Volumes that show another file now."""
+    humans: int
+    """Humans whose files are in another folder now."""
     files: int
     """Files that did not exist before."""
     size: int
@@ -66,8 +64,8 @@ class _Changes:
 
     paths: dict[bpy.types.Volume, str] = dataclasses.field(default_factory=dict)
     """Paths of volumes before."""
-    names: dict[bpy.types.Collection, str | None] = dataclasses.field(default_factory=dict)
-    """Names of the humans' own files before; None where none was stored."""
+    homes: dict[bpy.types.Collection, str | None] = dataclasses.field(default_factory=dict)
+    """HOME of humans before; None where none was stored."""
     made: list[Path] = dataclasses.field(default_factory=list)
     """Files that did not exist before."""
     target: Path | None = None
@@ -78,22 +76,23 @@ class _Changes:
             with contextlib.suppress(OSError):
                 remove_file(path, path.parent)
         if self.target is not None:
-            remove_empty([*{path.parent for path in self.made} - {self.target}, self.target])
+            states = {path.parent for path in self.made}
+            remove_empty([*states, *({state.parent for state in states} - {self.target}), self.target])
         self.made.clear()
 
     def take_back(self) -> None:
         for volume, path in self.paths.items():
             volume.filepath = path
-        for person, name in self.names.items():
-            if name is None:
-                del person[PERSON]
+        for person, home in self.homes.items():
+            if home is None:
+                del person[HOME]
             else:
-                person[PERSON] = name
+                person[HOME] = home
         self.forget()
 
     def forget(self) -> None:
         self.paths.clear()
-        self.names.clear()
+        self.homes.clear()
         self.made.clear()
 
 
@@ -102,24 +101,24 @@ _saving = _Changes()
 
 
 def collect_own_files(blend_path: str) -> Collected:
-    """Copy files of humans from elsewhere to the folder of `blend_path`, and point to the copies.
+    """Copy the folders of humans from elsewhere to the folder of `blend_path`, and point to the copies.
 
     Elsewhere are temporary folders, also those of an earlier Blender that has crashed, and the folders of other .blend
-    files. Missing files are left out, and those that the .blend does not use stay, for undo. In a .blend never saved,
-    paths become absolute: Blender makes them relative when it first writes it. Raises VolumeWriteError when the folder
-    beside the .blend cannot be written.
+    files. Missing files are left out, and folders of states that the .blend does not use stay, for undo. In a .blend
+    never saved, paths become absolute: Blender makes them relative when it first writes it. Raises VolumeWriteError
+    when the folder beside the .blend cannot be written.
     """
-    return _collect(blend_path, _elsewhere(humans_folder(blend_path)), _saving)
+    return _collect(blend_path, _own_humans(), _saving)
 
 
-def collect_unwritten() -> Collected:
-    """Copy files of humans elsewhere, whose volumes are still to be written or written again, to the temporary folder
-    of this Blender, and point to the copies: they are written there. Linked humans are among them, in this session.
+def collect_pending() -> Collected:
+    """Copy the folders of humans elsewhere, whose volumes are still to be written, to the temporary folder of this
+    Blender, and point to the copies: they are written there. Linked humans are among them, in this session.
 
-    Only paths of volumes change, and names of the backend's files. Raises VolumeWriteError.
+    Raises VolumeWriteError.
     """
-    waiting = _waiting(bpy.data.filepath)
-    return _collect("", waiting, _Changes()) if waiting else Collected(0, 0, 0)
+    elsewhere = (person for person in bpy.data.collections if MARK in person and not is_own(state_folder(person)))
+    return _collect("", [person for person in elsewhere if pending_of(person) is not None], _Changes())
 
 
 def collect_files() -> Collected:
@@ -130,24 +129,14 @@ def collect_files() -> Collected:
     """
     if not bpy.data.filepath:
         raise ValueError("this file was never saved: save it first, which collects the files of its humans too")
-    away = _elsewhere(humans_folder())
-    present = _present(away)
-    gone = [path for volume, path in away.items() if volume not in present]
+    people = _own_humans()
+    gone = [person for person in people if not exists_in_its_folder(state_folder(person) / PERSON_FILE)]
     if gone:
         raise FileNotFoundError(
-            f"{len(gone)} volumes have lost their files, {str(gone[0])!r} among them: press Find Missing Volumes in "
-            "the panel Human first"
+            f"{len(gone)} humans have lost their files, {gone[0].name!r} among them: press Find Missing Volumes in the "
+            "panel Human first"
         )
-    return _collect(bpy.data.filepath, away, _Changes())
-
-
-def store_folders() -> None:
-    """Store with each human where its files are, in case the .blend is moved without them."""
-    for person in bpy.data.collections:
-        if MARK in person and person.library is None:
-            home = folders_of(person)[0]
-            if os.path.isdir(home) and stored_folder(person, HOME) != home:
-                person[HOME] = str(home)
+    return _collect(bpy.data.filepath, people, _Changes())
 
 
 @persistent
@@ -162,7 +151,6 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
         collect_own_files(blend_path)
     except OSError as error:
         print(f"PrimDiffusion: humans of this file depend on files elsewhere: {error}")
-    store_folders()
 
 
 def finish_saving(blend_path: str) -> None:
@@ -179,22 +167,14 @@ def give_up_saving() -> None:
 
 
 def ignored_values() -> list[str]:
-    """Names and paths of files that this .blend stores with its humans and that no file of a human can have, each in a
-    sentence. They count as missing."""
+    """Paths that this .blend stores with its humans and that no file of a human can have, each in a sentence. They
+    count as missing."""
     found = []
-    for person in bpy.data.collections:
-        if MARK not in person or person.library is not None:
-            continue
-        valid = {
-            PERSON: stored_name(person, PERSON, PERSON_FILES) is not None,
-            BODY_FILE: stored_body_name(person) is not None,
-            HOME: stored_folder(person, HOME) is not None,
-        }
-        found += [
-            f"the custom property {name!r} of {as_shown(person.name)!r} is ignored: it does not name what it should"
-            for name, is_valid in valid.items()
-            if name in person and not is_valid
-        ]
+    for person in _own_humans():
+        if HOME in person and stored_folder(person, HOME) is None:
+            found.append(
+                f"the custom property {HOME!r} of {as_shown(person.name)!r} is ignored: it does not name what it should"
+            )
         volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME" and obj.data.filepath}
         if strange := sorted(volume.name for volume in volumes if volume_path(volume) is None):
             found.append(
@@ -207,167 +187,104 @@ def ignored_values() -> list[str]:
 def unused(folder: Path) -> list[Path]:
     """Files in `folder`, of earlier states of humans, that nothing in the current .blend points to.
 
-    Undo may still need them, and so may other .blend files that share the folder.
+    Undo may still need them, and so may other .blend files that share the folder. None while a human could not be
+    converted from the earlier layout.
     """
-    if not folder.is_dir():
+    if not folder.is_dir() or earlier_volumes():
         return []
-    used = {real_path(path) for volume in bpy.data.volumes for path in sequence_files(volume)}
-    in_use = _person_files() | body_files()
-    later = {path.parent for path in used if not path.is_file()}
-    found = []
-    for path in sorted(folder.rglob("*")):
-        named_so = any(pattern.fullmatch(path.name) for pattern in _OURS)
-        needed = UNWRITTEN_NPZ.fullmatch(path.name) and real_path(path.parent) in later
-        if named_so and path.name not in in_use and real_path(path) not in used and not needed:
-            found.append(path)
-    return found
+    states = {real_path(state_folder(person)) for person in bpy.data.collections if MARK in person}
+    merged = {real_path(path) for volume in bpy.data.volumes for path in sequence_files(volume)}
+    ours = [path for path in sorted(folder.rglob("*")) if _is_ours(path)]
+    return [path for path in ours if real_path(path.parent) not in states and real_path(path) not in merged]
 
 
-def _person_files() -> set[str]:
-    """Names of the backend's files that humans of this .blend use, linked ones included."""
-    return {person_file_name(collection) for collection in bpy.data.collections if MARK in collection}
+def _is_ours(path: Path) -> bool:
+    in_state = path.name in (PERSON_FILE, BODY_FILE) or PRIMITIVE_VDB.fullmatch(path.name) is not None
+    return (in_state and STATE.fullmatch(path.parent.name) is not None) or any(
+        pattern.fullmatch(path.name) for pattern in (MERGED_VDB, *EARLIER)
+    )
 
 
-def _local() -> dict[bpy.types.Volume, Path]:
-    """Volumes of humans in this .blend that are not linked, and their paths."""
-    shown = {
-        obj.data: None
-        for person in bpy.data.collections
-        if MARK in person
-        for obj in person.all_objects
-        if obj.type == "VOLUME" and obj.data.library is None
-    }
-    paths = {volume: volume_path(volume) for volume in shown}
-    return {volume: path for volume, path in paths.items() if path is not None}
+def _own_humans() -> list[bpy.types.Collection]:
+    """The humans of this .blend that are not linked."""
+    return [person for person in bpy.data.collections if MARK in person and person.library is None]
 
 
-def _waiting(blend_path: str) -> dict[bpy.types.Volume, Path]:
-    """Volumes of humans, linked ones included, that are to be written in a folder that is not the own one of
-    `blend_path`, from a file there or since a newer Blender wrote them; and their paths."""
-    found: dict[bpy.types.Volume, Path] = {}
-    for person in bpy.data.collections:
-        if MARK not in person or is_own(folder := folders_of(person)[0], blend_path):
-            continue
-        volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME"}
-        paths = {volume: path for volume in volumes if (path := volume_path(volume)) is not None}
-        beside = {volume: path for volume, path in paths.items() if path.parent == folder}
-        missing = not all(map(exists_in_its_folder, beside.values()))
-        if (missing and unwritten_in(folder)) or _is_newer(next(iter(beside.values()), None)):
-            found |= beside
-    return found
-
-
-def _is_newer(path: Path | None) -> bool:
-    """Whether only a newer Blender can read this volume; those of a human are alike."""
-    return path is not None and (format_of(path) or 0) > readable_format()
-
-
-def _elsewhere(target: Path) -> dict[bpy.types.Volume, Path]:
-    """Volumes of humans in this .blend that are not linked and whose files are not in `target`, and their paths."""
-    paths = _local()
-    outside = {folder: not _inside(folder / "file", target) for folder in {path.parent for path in paths.values()}}
-    return {volume: path for volume, path in paths.items() if outside[path.parent]}
-
-
-def _collect(blend_path: str, away: Mapping[bpy.types.Volume, Path], changes: _Changes) -> Collected:
-    """Copy the files of the volumes `away` and of their humans; what changes is added to `changes`."""
-    target = humans_folder(blend_path)
-    sources = _present(away)
-    files = _files_by_folder(sources)
-    homes = {folder: _home(folder, paths, target) for folder, paths in files.items()}
-    moved = {volume: homes[path.parent] / path.name for volume, path in sources.items()}
-    copies = {path: homes[folder] / path.name for folder, paths in files.items() for path in paths}
-    names = {}
-    for person in bpy.data.collections:
-        if MARK in person:
-            copies |= _of_person(person, moved, target, names)
-    made, changes.target = changes.made, target
+def _collect(blend_path: str, people: Sequence[bpy.types.Collection], changes: _Changes) -> Collected:
+    """Copy the folders of these humans, and their merged volumes; what changes is added to `changes`."""
+    changes.target = target = humans_folder(blend_path)
+    homes: dict[Path, Path] = {}
+    states = {person: folder for person in people if os.path.isdir(folder := state_folder(person))}
+    merged = {volume: path for person in people for volume, path in _merged_of(person).items()}
     try:
-        for source, destination in copies.items():
-            if not _there(source, destination) and copy_file(source, destination, target, may_link=True):
-                made.append(destination)
+        for person, folder in states.items():
+            if folder not in homes:
+                homes[folder] = folder if _inside(folder, target) else _copied_state(folder, person, changes)
+        outside = {volume: path for volume, path in merged.items() if not _inside(path, target)}
+        moved = {volume: _copied_merged(volume, path, changes) for volume, path in outside.items()}
     except (OSError, OutsideFolderError) as error:
         changes.remove_made()
         raise VolumeWriteError(
             f"the files of humans could not be copied to {str(target)!r} ({error}); save the .blend in a folder with "
             "write permission and free space"
         ) from error
+    for person, folder in states.items():
+        volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME"}
+        paths = {volume: path for volume in volumes if (path := volume_path(volume)) is not None}
+        moved |= {volume: homes[folder] / path.name for volume, path in paths.items() if path.parent == folder}
+        if person.library is None:
+            changes.homes[person] = stored_text(person, HOME)
+            person[HOME] = str(homes[folder])
     for volume, path in moved.items():
-        changes.paths[volume] = volume.filepath
-        volume.filepath = stored_path(path) if blend_path else str(path)
-        if volume.grids.error_message:  # its file was missing, and was written since
-            reload_volume(volume)
-    for person, name in names.items():
-        changes.names[person] = stored_text(person, PERSON)
-        person[PERSON] = name
-    return Collected(len(moved), len(made), sum(path.stat().st_size for path in made))
+        if volume_path(volume) != path:
+            changes.paths[volume] = volume.filepath
+            volume.filepath = stored_path(path) if blend_path else str(path)
+            if volume.grids.error_message:  # its file was missing, and was written since
+                reload_volume(volume)
+    count = sum(folder != homes[folder] for folder in states.values())
+    return Collected(count, len(changes.made), sum(path.stat().st_size for path in changes.made))
 
 
-def _of_person(
-    person: bpy.types.Collection,
-    moved: dict[bpy.types.Volume, Path],
-    target: Path,
-    names: dict[bpy.types.Collection, str],
-) -> dict[Path, Path]:
-    """Copies of the backend's and the body's file to where the human's volumes go, or to `human.folder_of` it without
-    any; new names are added to `names`."""
-    near = folders_of(person)
-    volume = next((obj.data for obj in person.all_objects if obj.type == "VOLUME"), None)
-    stays = person.library is not None if volume is None else volume not in moved
-    if stays:
-        return {}
-    home, copies = target / bpy.path.clean_name(person.name) if volume is None else moved[volume].parent, {}
-    name = person_file_name(person)
-    file = next((path for path in (folder / name for folder in near) if exists_in_its_folder(path)), None)
-    if file is not None and file.parent != home:
-        name = available_name(file, home, file.name)
-        copies[file] = home / name
-        if name != person_file_name(person):
-            names[person] = name
-    body = body_file(person)
-    if body is not None and exists_in_its_folder(body):
-        copies[body] = target / body.name
-    return copies
+def _copied_state(folder: Path, person: bpy.types.Collection, changes: _Changes) -> Path:
+    """Copy the folder of a human's state, under the same names where these are free; returns the copy."""
+    home = changes.target / portable_name(bpy.path.clean_name(folder.parent.name or person.name))
+    first = int(folder.name) if STATE.fullmatch(folder.name) else 1
+    numbered = (home / f"{number:04d}" for number in itertools.count(first))
+    state = next(state for state in numbered if _is_free(state, folder))
+    note_state(state)
+    volumes = (path.name for path in sorted(folder.glob("prim_*.vdb")) if PRIMITIVE_VDB.fullmatch(path.name))
+    for name in (PERSON_FILE, BODY_FILE, *volumes):
+        _copy(folder / name, state / name, changes)
+    return state
 
 
-def _files_by_folder(sources: Mapping[bpy.types.Volume, Path]) -> dict[Path, list[Path]]:
-    """The files of volumes, and those that volumes are written from, by their folder."""
-    found: dict[Path, dict[Path, None]] = {path.parent: {} for path in sources.values()}
-    for volume, path in sources.items():
-        found[path.parent] |= {file: None for file in sequence_files(volume) if exists_in_its_folder(file)}
-    for folder, files in found.items():
-        files |= dict.fromkeys(unwritten_in(folder))
-    return {folder: list(files) for folder, files in found.items()}
+def _is_free(state: Path, folder: Path) -> bool:
+    """Whether `state` can become the copy of a folder: it is new, or holds nothing but the same human."""
+    if not os.path.lexists(state):
+        return int(state.name) > was_newest(state.parent)
+    return same_file(folder / PERSON_FILE, state / PERSON_FILE) and not any(map(os.path.islink, state.iterdir()))
 
 
-def _home(folder: Path, files: Iterable[Path], target: Path) -> Path:
-    """Where in `target` the files of `folder` go: a folder of the same name, with a number where other files have the
-    names or it leads out of `target`."""
-    files, name = list(files), folder.name or "human"
-    numbered = (target / f"{name}_{number}" for number in itertools.count(2))
-    return next(home for home in itertools.chain([target / name], numbered) if _is_free(home, files, target))
+def _copied_merged(volume: bpy.types.Volume, path: Path, changes: _Changes) -> Path:
+    """Copy the files of a merged volume, under the same names; returns the copy of `path`."""
+    home = changes.target / portable_name(bpy.path.clean_name(path.parent.name))
+    for file in sequence_files(volume):
+        _copy(file, home / file.name, changes)
+    return home / path.name
 
 
-def _is_free(home: Path, files: Iterable[Path], target: Path) -> bool:
-    try:
-        check_inside(home / "file", target)
-    except OutsideFolderError:
-        return False
-    taken = os.path.lexists(home) and not os.path.isdir(home)
-    return not taken and all(_there(path, home / path.name) or not os.path.lexists(home / path.name) for path in files)
+def _copy(source: Path, destination: Path, changes: _Changes) -> None:
+    """Copy a file that exists; one that is there already stays: the folder tells what is in it."""
+    new = exists_in_its_folder(source) and not exists_in_its_folder(destination)
+    if new and copy_file(source, destination, changes.target, may_link=True):
+        changes.made.append(destination)
 
 
-def _there(source: Path, destination: Path) -> bool:
-    """Whether a copy is there already: names of volumes and bodies identify the content."""
-    if not exists_in_its_folder(destination) or PERSON_FILES.fullmatch(destination.name):
-        return False
-    return destination.stat().st_size == source.stat().st_size
-
-
-def _present(paths: Mapping[bpy.types.Volume, Path]) -> dict[bpy.types.Volume, Path]:
-    """Those volumes whose file exists or will be written."""
-    later = {folder for folder in {path.parent for path in paths.values()} if unwritten_in(folder)}
-    return {volume: path for volume, path in paths.items() if path.parent in later or exists_in_its_folder(path)}
+def _merged_of(person: bpy.types.Collection) -> dict[bpy.types.Volume, Path]:
+    """Volumes of a human that show a merged file and are not linked, and their paths."""
+    volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME" and obj.data.library is None}
+    paths = {volume: volume_path(volume) for volume in volumes}
+    return {volume: path for volume, path in paths.items() if path is not None and MERGED_VDB.fullmatch(path.name)}
 
 
 def _inside(path: Path, folder: Path) -> bool:

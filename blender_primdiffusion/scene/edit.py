@@ -1,36 +1,19 @@
-"""Edits of a human: the region painted for one, its result in place of the human before, and restored volumes."""
+"""Edits of a human: the region painted for one, and its result in place of the human before."""
 
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
+import os
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.regular_files import exists_in_its_folder, real_path
-from .attachment import volumes_may_wait
-from .body_file import saved_body
-from .human import (
-    MARK,
-    PERSON,
-    armature_of,
-    available_name,
-    check_editable,
-    content_name,
-    home_of,
-    own_data,
-    person_file_name,
-    stored_path,
-    volume_path,
-    volumes_of,
-)
-from .human_npz import Destination, WrittenHuman
+from .human import HOME, MARK, armature_of, check_editable, own_data, stored_path, volume_name, volumes_of
 from .proxy import follow_shape, proxy_of
 from .reshape import apply_growth, apply_rest, check_shapeable
-from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
-from .volumes import reload_volume
+from .shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
+from .states import PreparedHuman
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,130 +21,54 @@ class Replaced:
     """What an edit has changed."""
 
     volumes: int
-    """How many show another file."""
-    of: int
-    """How many the human has."""
+    """How many the human has; all show another file."""
     reshaped: bool
     """The body has another shape: bones, body mesh and volumes have moved."""
     warning: str
     """What could not be done, in a sentence; empty otherwise."""
 
 
-def edit_destination(collection: bpy.types.Collection) -> Destination:
-    """Where `replace_person` wants the volumes of the edited human."""
-    return Destination(home_of(collection), tuple(volumes_of(collection)), volumes_may_wait(collection))
+def replace_person(collection: bpy.types.Collection, prepared: PreparedHuman) -> Replaced:
+    """Show the prepared human where `collection` shows another: its next state.
 
+    Armature, pose, animation, transform, names, materials and other changes by hand stay, as do deleted volumes. Where
+    the edit has changed the betas, the bones' rest, the body mesh and the volumes' places follow, unless the user has
+    given the human a custom shape, which stays. Makes no undo step.
 
-def replace_person(collection: bpy.types.Collection, written: WrittenHuman, person: Path) -> Replaced:
-    """Show the written human where `collection` shows another, and store the backend's file `person` of it.
-
-    Armature, pose, animation, transform, names, materials and other changes by hand stay, as do deleted volumes.
-    Volumes whose file differs get the new one. Where the edit has changed the betas, the bones' rest, the body mesh and
-    the volumes' places follow, unless the user has given the human a custom shape, which stays. Makes no undo step.
-
-    Raises VolumeWriteError, ValueError or FileNotFoundError before the scene is touched.
+    Raises ValueError or FileNotFoundError before the scene is touched, and then leaves no files.
     """
-    with written.entering(lambda: home_of(collection)):
-        return _replace(collection, written, person)
+    with prepared.entering():
+        return _replace(collection, prepared)
 
 
-def _replace(collection: bpy.types.Collection, written: WrittenHuman, person: Path) -> Replaced:
-    human = written.human
+def _replace(collection: bpy.types.Collection, prepared: PreparedHuman) -> Replaced:
+    human, betas = prepared.human, prepared.human.payload.betas.astype(np.float64)
     check_editable(collection)
-    shown = volumes_of(collection)
-    if max(shown) >= len(human.density):
+    shown, count = volumes_of(collection), len(human.payload.density)
+    if max(shown) >= count:
         raise ValueError(
-            f"the human {collection.name!r} has a volume {max(shown)} and the edited one only {len(human.density)}; "
+            f"the human {collection.name!r} has a volume {max(shown)} and the edited one only {count}; "
             "use an add-on and a backend of the same release"
         )
-    new_betas = not np.allclose(human.betas, generated_betas(collection), atol=SAME_BETAS)
+    new_betas = not np.allclose(betas, generated_betas(collection), atol=SAME_BETAS)
     custom = has_custom_shape(collection)
     reshaped = new_betas and not custom
     if reshaped:
         check_shapeable(collection)
-    growth = np.ones((len(human.density), 3))
-    if custom and human.shape_model is not None:
-        growth = human.shape_model.growth(human.betas, betas_of(collection))
-    home, name = home_of(collection), content_name(person)
-    with (
-        written.files_in(home, shown, {name: person}) as files,
-        saved_body(collection, human.shape_model, home.parent),
-    ):
-        pass  # the files must exist before volumes point to them: Blender keeps the error of a missing one
-    rest = Rest(human.vertices, human.joints, human.position, human.rotation)
-    warning = apply_rest(collection, rest, human.betas, growth) if reshaped else ""
-    if reshaped and human.shape_model is not None:
-        follow_shape(collection, proxy_of(collection), human.betas)
+    growth = human.model.growth(betas, betas_of(collection)) if custom else np.ones((count, 3))
+    warning = apply_rest(collection, human.rest, betas, growth) if reshaped else ""
+    if reshaped:
+        follow_shape(collection, proxy_of(collection), betas)
     if new_betas and custom:
         apply_growth(collection, growth)
-    changed = 0
+    folder = stored_path(prepared.folder)
     for k, objects in shown.items():
         for obj in objects:
-            if volume_path(obj.data) != files[k]:
-                own_data(obj, collection).filepath = stored_path(files[k])
-                changed += 1
-            if obj.data.grids.error_message:  # its file was missing
-                reload_volume(obj.data)
-    collection[MARK] = written.provenance
-    collection[PERSON] = name
+            own_data(obj, collection).filepath = os.path.join(folder, volume_name(k))
+    collection[MARK] = prepared.provenance
+    collection[HOME] = str(prepared.folder)
     armature_of(collection).update_tag()
-    return Replaced(changed, sum(map(len, shown.values())), reshaped, warning)
-
-
-def restore_destination(collection: bpy.types.Collection) -> Destination:
-    """Where `restore_volumes` wants the volumes whose files are missing."""
-    missing = _without_files(collection)
-    which = tuple(k for k, objects in volumes_of(collection).items() if missing.intersection(objects))
-    return Destination(home_of(collection), which)
-
-
-def restore_volumes(collection: bpy.types.Collection, written: WrittenHuman, person: Path) -> int:
-    """Point volumes without files to the written ones, and count them.
-
-    `written` is what the backend has made of its file `person` of this human. Everything else stays: pose, shape,
-    names, and volumes that have their files. The backend's and the body's files are put back too. Raises
-    VolumeWriteError or ValueError before the scene is touched. Makes no undo step.
-    """
-    shown = [obj for objects in volumes_of(collection).values() for obj in objects]
-    made = {real_path(path) for path in written.made}
-    written_again = {obj for obj in shown if (path := volume_path(obj.data)) is not None and real_path(path) in made}
-    lost = _without_files(collection) | written_again
-    with written.entering(lambda: home_of(collection)):
-        return _restore(collection, written, lost, person)
-
-
-def _without_files(collection: bpy.types.Collection) -> set[bpy.types.Object]:
-    shown = volumes_of(collection)
-    paths = {obj: volume_path(obj.data) for objects in shown.values() for obj in objects}
-    return {obj for obj, path in paths.items() if path is None or not exists_in_its_folder(path)}
-
-
-def _restore(collection: bpy.types.Collection, written: WrittenHuman, lost: set[bpy.types.Object], person: Path) -> int:
-    human = written.human
-    check_editable(collection)
-    shown = volumes_of(collection)
-    if max(shown) >= len(human.density):
-        raise ValueError(
-            f"the human {collection.name!r} has a volume {max(shown)} and {person.name!r} only {len(human.density)}: "
-            "it is the file of another human"
-        )
-    home = home_of(collection)
-    which = [k for k, objects in shown.items() if lost.intersection(objects)]
-    name = available_name(person, home, person_file_name(collection))
-    with (
-        written.files_in(home, which, {name: person}) as files,
-        saved_body(collection, human.shape_model, home.parent),
-    ):
-        pass  # as in `_replace`
-    for k in which:
-        for obj in lost.intersection(shown[k]):
-            obj.data.filepath = stored_path(files[k])
-    if name != person_file_name(collection):
-        collection[PERSON] = name
-    restored = {obj.data for obj in lost}
-    for volume in restored:
-        reload_volume(volume)
-    return len(restored)
+    return Replaced(sum(map(len, shown.values())), reshaped, warning)
 
 
 def painted_weights(body: bpy.types.Object, group: str) -> NDArray[np.float32]:

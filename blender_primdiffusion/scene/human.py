@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import filecmp
 import hashlib
+import itertools
 import os
 import re
 import shutil
@@ -14,35 +16,28 @@ from typing import Any
 
 import bpy
 
-from ..formats.regular_files import check_regular, exists_in_its_folder, portable_name, read_regular, real_path
-from ..formats.removing import OutsideFolderError, check_inside
+from ..formats.regular_files import check_regular, exists_in_its_folder, portable_name, real_path
+from ..formats.removing import OutsideFolderError, check_inside, remove_folder
 from ..formats.whole_files import written_whole
-from .blend_values import file_path, stored_name, stored_record
+from .blend_values import file_path, stored_folder, stored_record, stored_text
 
 LARGEST_PERSON = 256 << 20
 """Bytes of a human of the backend."""
 TEMPORARY = "primdiffusion_humans"
 """Folder, among Blender's temporary files, for the humans of a .blend that was never saved."""
 PERSON_FILE = "person.human.safetensors"
-"""The human as the backend saves it, beside the volumes."""
-NPZ_FILE = "human.npz"
-"""The human for Blender, beside PERSON_FILE."""
-PERSON = "primdiffusion_person_file"
-"""Custom property of a human's collection: the name of the backend's file since the last edit. Undo switches it back,
-as it does the paths of the volumes."""
+"""The human as the backend saves it, in the folder of its state. The volumes beside it are made from it."""
+BODY_FILE = "body.safetensors"
+"""The body of a human on a body of the user's files, beside PERSON_FILE."""
+STATE = re.compile(r"[0-9]{4,9}")
+"""Names of folders of states."""
 HOME = "primdiffusion_folder"
-"""Custom property of a human's collection: the absolute folder of its files when the .blend was last saved. Paths of
+"""Custom property of a human's collection: the absolute folder of its state when the .blend was last saved. Paths of
 volumes are relative to the .blend, which may be moved alone, or opened as a copy in a temporary folder."""
-PERSON_FILES = re.compile(r"person(_[0-9a-f]{12})?\.human\.safetensors")
-"""Names that PERSON may hold; the hash is of the content."""
-PRIMITIVE_VDB = re.compile(r"prim_([0-9]{4,6})_[0-9a-f]{12}\.vdb")
-"""File names of the volumes of primitives; the hash is of the content."""
+PRIMITIVE_VDB = re.compile(r"prim_([0-9]{4,6})\.vdb")
+"""File names of the volumes of primitives."""
 MERGED_VDB = re.compile(r"merged_[0-9a-f]{12}(_[0-9]{4,6})?\.vdb")
 """File names of merged volumes; those of a sequence end in the frame, counted from 1."""
-
-
-UNWRITTEN_NPZ = re.compile(r"unwritten_[0-9a-f]{12}\.npz")
-"""File names of humans whose volumes are written later (see `unwritten`); the hash is of the volumes' names."""
 
 
 class VolumeWriteError(OSError):
@@ -97,33 +92,36 @@ def sequence_files(volume: bpy.types.Volume) -> list[Path]:
     return sorted(path.parent.glob(path.name.replace(match[1], "_*")))
 
 
-def unwritten_in(folder: Path) -> list[Path]:
-    """Files in a folder from which volumes are still to be written there; none where the folder cannot be read."""
-    try:
-        found = sorted(folder / name for name in os.listdir(folder) if UNWRITTEN_NPZ.fullmatch(name))
-    except OSError:
-        return []
-    return [path for path in found if exists_in_its_folder(path)]
+def volume_name(k: int) -> str:
+    """The file name of a primitive's volume."""
+    return f"prim_{k:04d}.vdb"
 
 
 def folder_of(collection: bpy.types.Collection) -> Path:
-    """The folder for a human's files: `<blendname>_humans/<collection name>` (see `humans_folder`)."""
+    """The folder for a human's states: `<blendname>_humans/<collection name>` (see `humans_folder`)."""
     return humans_folder() / portable_name(bpy.path.clean_name(collection.name))
 
 
-def folders_of(collection: bpy.types.Collection) -> list[Path]:
-    """Where a human's files may be: beside the volumes wherever these are, else `folder_of`.
+def state_folder(collection: bpy.types.Collection) -> Path:
+    """The folder of a human's state: where its volumes are; of a human without, where it was when it was last saved.
 
-    Volumes keep their paths when a collection is renamed and when a .blend is saved elsewhere. A merged volume may be
-    in another folder than those of the primitives, which have the files beside them.
+    Holds PERSON_FILE, and the volumes as far as they are written. Volumes keep their paths when a collection is renamed
+    and when a .blend is saved elsewhere, and undo switches them back.
     """
-    merged: list[Path] = []
     for obj in collection.all_objects:
-        if obj.type == "VOLUME" and (path := volume_path(obj.data)) is not None:
-            if PRIMITIVE_VDB.fullmatch(path.name):
-                return [path.parent, folder_of(collection)]
-            merged.append(path.parent)
-    return [*merged[:1], folder_of(collection)]
+        path = volume_path(obj.data) if obj.type == "VOLUME" else None
+        if path is not None and PRIMITIVE_VDB.fullmatch(path.name):
+            return path.parent
+    home = stored_folder(collection, HOME)
+    if home is None:
+        return folder_of(collection) / "0001"
+    moved = humans_folder() / home.parent.name / home.name
+    return moved if not exists_in_its_folder(home / PERSON_FILE) else home
+
+
+def state_of(collection: bpy.types.Collection) -> str:
+    """Identifies a human's state, wherever its files are: it changes with each edit, and undo switches it back."""
+    return hashlib.sha256((stored_text(collection, MARK) or "").encode()).hexdigest()[:12]
 
 
 def is_own(folder: Path, blend_path: str | None = None) -> bool:
@@ -136,60 +134,81 @@ def is_own(folder: Path, blend_path: str | None = None) -> bool:
 
 
 def home_of(collection: bpy.types.Collection) -> Path:
-    """The folder for new files of a human: the one of its files, if that belongs to this .blend.
+    """The folder for new states of a human: the one of its states, if that belongs to this .blend.
 
-    Otherwise (the .blend was saved under another name, the human appended from another .blend) `folder_of`, which then
-    gets all files, so that they are never in two places.
+    Otherwise (the .blend was saved under another name, the human appended from another .blend) `folder_of`.
     """
-    folders = folders_of(collection)
-    name = person_file_name(collection)
-    home = next((folder for folder in folders if exists_in_its_folder(folder / name)), folders[0])
-    return home if is_own(real_path(home).parent) else folder_of(collection)  # bodies are in the parent
+    home = state_folder(collection).parent
+    return home if is_own(home.parent) else folder_of(collection)
 
 
-def person_file_name(collection: bpy.types.Collection) -> str:
-    """The name of `person_file`, which each edit changes."""
-    return stored_name(collection, PERSON, PERSON_FILES) or PERSON_FILE
+_newest: dict[Path, int] = {}
+"""The highest number of a state in each folder of a human that this Blender may have read: it keeps grids by path, also
+those of a state whose folder was removed."""
+
+
+def note_state(folder: Path) -> None:
+    """Give the number of this state to no other one while this Blender runs."""
+    if STATE.fullmatch(folder.name):
+        _newest[folder.parent] = max(was_newest(folder.parent), int(folder.name))
+
+
+def was_newest(home: Path) -> int:
+    """The highest number in `home` that `note_state` has noted; 0 for none."""
+    return _newest.get(home, 0)
+
+
+def new_state(home: Path) -> Path:
+    """Make the folder of a human's next state in `home`; numbers count up. Raises VolumeWriteError."""
+    try:
+        check_inside(home / "state", home.parent)
+        home.mkdir(parents=True, exist_ok=True)
+        there = (int(name) for name in os.listdir(home) if STATE.fullmatch(name))
+        for number in itertools.count(max((was_newest(home), *there)) + 1):
+            with contextlib.suppress(FileExistsError):  # another Blender may have made it just now
+                (home / f"{number:04d}").mkdir()
+                note_state(home / f"{number:04d}")
+                return home / f"{number:04d}"
+    except OutsideFolderError as error:
+        raise link_error(home) from error
+    except OSError as error:
+        raise write_error(home, error) from error
+    raise AssertionError("numbers do not end")
+
+
+def remove_state(folder: Path) -> None:
+    """Remove the folder of a state, and the folders around it where they are empty now. Raises no OSError.
+
+    A file that the system has locked stays, and counts as unused.
+    """
+    remove_folder(folder, folder.parent)
+    with contextlib.suppress(OSError):
+        folder.parent.rmdir()
+        folder.parent.parent.rmdir()
+
+
+def write_error(folder: Path, error: BaseException) -> VolumeWriteError:
+    """For errors of the system and of openvdb."""
+    return VolumeWriteError(
+        f"the volumes could not be written to {str(folder)!r} ({error!s:.160}); save the .blend in a folder with "
+        "write permission and free space"
+    )
 
 
 def person_file(collection: bpy.types.Collection) -> Path:
     """The backend's file of a human. Raises MissingPersonFile."""
-    name, folders = person_file_name(collection), folders_of(collection)
-    for folder in folders:
-        if exists_in_its_folder(folder / name):
-            return folder / name
+    path = state_folder(collection) / PERSON_FILE
+    if exists_in_its_folder(path):
+        return path
     raise MissingPersonFile(
-        f"the file of the human {collection.name!r} is missing: {str(folders[0] / name)!r}; put it back beside "
-        "the human's volumes, press Find Missing Volumes in the panel Human, or generate the human again"
+        f"the file of the human {collection.name!r} is missing: {str(path)!r}; put it back, press Find Missing Volumes "
+        "in the panel Human, or generate the human again"
     )
 
 
-def content_name(person: Path) -> str:
-    """A name for the backend's file of a human that no other content has."""
-    return f"person_{hashlib.sha256(read_regular(person, LARGEST_PERSON)).hexdigest()[:12]}.human.safetensors"
-
-
-def available_name(person: Path, folder: Path, name: str) -> str:
-    """The name for a copy of the backend's file in `folder`: `name`, unless another human's file has it, which undo
-    may need."""
-    taken = folder / name
-    if not os.path.lexists(taken) or _same_file(person, taken):
-        return name
-    return content_name(person)
-
-
-def _same_file(one: Path, other: Path) -> bool:
-    return exists_in_its_folder(other) and filecmp.cmp(one, other, shallow=False)
-
-
-def is_there(source: Path, destination: Path) -> bool:
-    """Whether `destination` is a copy of `source` already. Raises FileExistsError where it is another file."""
-    if not os.path.lexists(destination):
-        return False
-    if not _same_file(source, destination):
-        message = "another file of this name is there and is not replaced: move it away"
-        raise FileExistsError(errno.EEXIST, message, str(destination))
-    return True
+def same_file(one: Path, other: Path) -> bool:
+    """Whether both exist and have the same content."""
+    return exists_in_its_folder(one) and exists_in_its_folder(other) and filecmp.cmp(one, other, shallow=False)
 
 
 def copy_file(source: Path, destination: Path, folder: Path, *, may_link: bool = False) -> bool:
@@ -204,8 +223,11 @@ def copy_file(source: Path, destination: Path, folder: Path, *, may_link: bool =
     check_regular(source)
     if not exists_in_its_folder(source):
         raise OutsideFolderError(f"{source} is a link out of its folder and is not copied: remove it")
-    if is_there(source, destination):
-        return False
+    if os.path.lexists(destination):
+        if same_file(source, destination):
+            return False
+        message = "another file of this name is there and is not replaced: move it away"
+        raise FileExistsError(errno.EEXIST, message, str(destination))
     destination.parent.mkdir(parents=True, exist_ok=True)
     if may_link and _linked(source, destination):
         return True
@@ -325,7 +347,7 @@ def check_editable(collection: bpy.types.Collection) -> None:
 def remove_human(collection: bpy.types.Collection) -> None:
     """Remove a human from the .blend: objects, their data, and actions without other users.
 
-    The VDB files stay for undo, and for older copies of the .blend.
+    The files stay for undo, and for older copies of the .blend.
     """
     objects = list(collection.all_objects)
     data = [obj.data for obj in objects if obj.data is not None]

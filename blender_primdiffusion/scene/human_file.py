@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import io
 import json
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -71,6 +72,16 @@ def read_tensors(path: Path) -> HumanTensors:
         raise ValueError(f"{path.name!r} contains no human but something else; {_REMEDY}")
     arrays = {name: (one.dtype, one.shape, layout.raw(data, name)) for name, one in layout.tensors.items()}
     return HumanTensors(layout.metadata, arrays)
+
+
+def body_arrays(path: Path) -> dict[str, NDArray]:
+    """The arrays of a body's file. Raises ValueError for a file of another kind or a damaged one, OSError."""
+    data = read_regular(path, LARGEST_PERSON)
+    layout = read_layout(io.BytesIO(data))
+    check_limits(layout)
+    if layout.metadata.get("format") != "primdiffusion.body":
+        raise ValueError("it contains no body")
+    return {name: layout.array(data, name) for name in layout.tensors}
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -239,7 +250,18 @@ def write_tensors(path: Path, human: HumanTensors) -> None:
             file.write(human.arrays[name][2])
 
 
-def _stored(array: NDArray[np.float32]) -> tuple[str, tuple[int, ...], bytes | memoryview]:
+def write_body(path: Path, arrays: Mapping[str, NDArray]) -> None:
+    """Write a body's file, as `body_arrays` reads it. Raises OSError."""
+    stored = {
+        name: ("I32", array.shape, np.ascontiguousarray(array, "<i4").tobytes())
+        if array.dtype.kind in "iu"
+        else _stored(array)
+        for name, array in arrays.items()
+    }
+    write_tensors(path, HumanTensors({"format": "primdiffusion.body", "format_version": "1"}, stored))
+
+
+def _stored(array: NDArray) -> tuple[str, tuple[int, ...], bytes | memoryview]:
     return "F32", array.shape, np.ascontiguousarray(array, "<f4").tobytes()
 
 

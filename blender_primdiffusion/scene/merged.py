@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
 from ..formats.removing import OutsideFolderError, remove_file
 from .blend_values import stored_record
-from .human import VolumeWriteError, armature_of, copy_file, home_of, link_error, person_file_name, stored_path
+from .human import VolumeWriteError, armature_of, copy_file, home_of, link_error, state_of, stored_path
 from .material import person_material
 from .volumes import write_vdb
 
@@ -154,15 +154,15 @@ def remove_merged(collection: bpy.types.Collection) -> None:
 
 
 def merged_folder(collection: bpy.types.Collection) -> Path:
-    """Where merged files go: beside the human's volumes, if these are in a folder of this .blend."""
+    """Where merged files go: beside the folders of the human's states, if these are of this .blend."""
     return home_of(collection)
 
 
 def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequence[float] | None) -> str:
-    """Identifies a human in a pose: hash of the file name, the shape and the joints [24, 3, 4]."""
+    """Identifies a human in a pose: hash of its state, the shape and the joints [24, 3, 4]."""
     rounded = np.round(np.asarray(joints, np.float64), _DECIMALS) + 0.0  # no negative zeros
     shape = [] if betas is None else [round(float(value), _DECIMALS) for value in betas]
-    digest = hashlib.sha256(f"{person_file_name(collection)} {shape}".encode())
+    digest = hashlib.sha256(f"{state_of(collection)} {shape}".encode())
     digest.update(rounded.tobytes())
     return digest.hexdigest()[:16]
 

@@ -1,7 +1,7 @@
 """Find missing files of humans and repair the paths to them.
 
-Names of volumes and bodies contain a hash, so a file of the right name is the right file wherever it is. The backend's
-file of a human that was never edited has a plain name: it is identified by the volumes beside it, or by its betas.
+What a human needs is its own file: the volumes beside it are written from it. So a human is found where a file is that
+says that it was made alike, and has its betas; all of its volumes then point to that folder.
 """
 
 from __future__ import annotations
@@ -9,33 +9,34 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import os
-from collections.abc import Iterable, Iterator, Sequence
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import bpy
 import numpy as np
 
+from ..formats.human_metadata import provenance_of as provenance_in
 from ..formats.regular_files import exists_in_its_folder, real_path
 from .blend_values import as_shown, stored_folder
-from .body_file import stored_body_name
 from .human import (
+    BODY_FILE,
     HOME,
     MARK,
     MERGED_VDB,
     PERSON_FILE,
     PRIMITIVE_VDB,
-    copy_file,
+    STATE,
     folder_of,
-    folders_of,
-    home_of,
     humans_folder,
-    person_file_name,
+    provenance_of,
+    state_folder,
     stored_path,
-    unwritten_in,
     volume_path,
 )
-from .human_file import read_tensors
+from .human_file import file_version, payload_in, read_sizes, read_tensors
 from .shape import generated_betas
+from .volumes import reload_volume
 
 _LONGEST_SEQUENCE = 100_000
 """Frames of a merged volume whose files are looked for."""
@@ -44,50 +45,17 @@ _MOST_FOLDERS = 20_000
 _SAME_BETAS = 1e-4
 
 
-class Listing:
-    """File names by folder. Each folder is read once: a thousand single checks take a second on a network drive."""
-
-    def __init__(self) -> None:
-        self._names: dict[Path, frozenset[str]] = {}
-
-    def names(self, folder: Path) -> frozenset[str]:
-        """Names of the files in a folder; none where it does not exist or cannot be read."""
-        if folder not in self._names:
-            try:
-                with os.scandir(folder) as entries:  # a pipe named like a volume would hang Blender
-                    self._names[folder] = frozenset(entry.name for entry in entries if _is_file(entry))
-            except OSError:
-                self._names[folder] = frozenset()
-        return self._names[folder]
-
-    def __contains__(self, path: Path) -> bool:
-        return path.name in self.names(path.parent)
-
-    def found(self, wanted: Iterable[str], folders: Iterable[Path]) -> dict[str, Path]:
-        """Paths of the wanted names, each in the first of the folders that has it."""
-        left, paths = set(wanted), {}
-        for folder in folders:
-            if not left:
-                break
-            for name in left & self.names(folder):
-                paths[name] = folder / name
-            left -= paths.keys()
-        return paths
-
-
 @dataclasses.dataclass(frozen=True)
 class MissingFiles:
     """The missing files of one human. Holds references to Blender's data, so it must not be stored."""
 
     person: bpy.types.Collection
     volumes: tuple[bpy.types.Volume, ...]
-    """Volumes of primitives without their file, if that is not yet to be written."""
+    """Volumes of primitives, where the human's own file is missing."""
     merged: tuple[bpy.types.Volume, ...]
     """Merged volumes without all of their files."""
-    person_file: str
-    """Name of the backend's file; empty when it exists."""
-    body_file: str
-    """Name of the body's file; empty when it exists."""
+    file: str
+    """Name of the human's own file or that of its body; empty where both exist."""
 
     @property
     def linked(self) -> str:
@@ -96,137 +64,99 @@ class MissingFiles:
         return as_shown(holder.library.filepath or holder.library.name) if holder is not None else ""
 
     def summary(self) -> str:
-        """For messages, for instance: 12 volumes of 'Human'."""
-        parts = []
-        if self.volumes:
-            parts.append(f"{len(self.volumes)} {'volume' if len(self.volumes) == 1 else 'volumes'}")
-        parts += [name for name in (self.person_file, self.body_file) if name]
+        """For messages, for instance: person.human.safetensors of 'Human'."""
+        parts = [self.file] if self.file else []
         parts += ["the merged volume"] if self.merged else []
         return f"{', '.join(parts)} of {self.person.name!r}"
 
 
 def missing_files() -> list[MissingFiles]:
-    """Missing files of all humans in the .blend, linked ones included. Reads each folder once."""
-    listing, lost = Listing(), []
+    """Missing files of all humans in the .blend, linked ones included."""
+    lost = []
     for person in bpy.data.collections:
         if MARK not in person:
             continue
-        single, several = _without_files(person, listing)
-        near = folders_of(person)
-        name, body = person_file_name(person), stored_body_name(person) or ""
-        has_person = any(folder / name in listing for folder in near)
-        has_body = not body or any(path / body in listing for folder in near for path in (folder.parent, folder))
-        if single or several or not (has_person and has_body):
-            wanted = "" if has_person else name
-            lost.append(MissingFiles(person, tuple(single), tuple(several), wanted, "" if has_body else body))
+        file = _missing_file(state_folder(person))
+        merged = [volume for volume in _volumes(person, MERGED_VDB) if not _is_complete(volume, None)]
+        if file or merged:
+            volumes = _volumes(person, PRIMITIVE_VDB) if file else []
+            lost.append(MissingFiles(person, tuple(volumes), tuple(merged), file))
     return lost
 
 
-def find_files(lost: Sequence[MissingFiles], directory: Path | None = None) -> dict[str, Path]:
-    """Paths, by name, of files of volumes, bodies and edited humans.
+def _missing_file(state: Path) -> str:
+    """The name of the file that a state's folder lacks; empty where it is whole."""
+    if not exists_in_its_folder(state / PERSON_FILE):
+        return PERSON_FILE
+    if exists_in_its_folder(state / BODY_FILE):
+        return ""
+    try:
+        sizes = read_sizes(file_version(state / PERSON_FILE))
+        return "" if sizes.rest_half_extent is None else BODY_FILE
+    except (OSError, ValueError):  # damaged, not missing
+        return ""
+
+
+def repair(lost: Sequence[MissingFiles], directory: Path | None = None) -> int:
+    """Point humans, and merged volumes, to the folders that have their files; returns how many. Linked ones stay.
 
     Looks beside the .blend, in the folders of its humans when it was last saved, in the folders of other humans, and
     then in `directory` and below. Raises NotADirectoryError where that is no folder.
     """
     if directory is not None and not os.path.isdir(directory):
-        raise NotADirectoryError(f"there is no folder {str(directory)!r:.200}: choose the one that the volumes are in")
-    wanted = {
-        *(_name(volume) for one in lost for volume in one.volumes),
-        *(name for one in lost for volume in one.merged for name in _sequence_names(volume)),
-        *(one.body_file for one in lost),
-        *(one.person_file for one in lost if one.person_file != PERSON_FILE),
-    } - {""}
-    return Listing().found(wanted, _search_folders(directory))
-
-
-def find_person(lost: MissingFiles, directory: Path | None = None) -> Path | None:
-    """Where the backend's file of a human is now; None where it is not found. Does not raise."""
-    if not lost.person_file:
-        near = [folder / person_file_name(lost.person) for folder in folders_of(lost.person)]
-        return next((path for path in near if exists_in_its_folder(path)), None)
-    listing = Listing()
-    own = {_name(obj.data) for obj in lost.person.all_objects if obj.type == "VOLUME"}
-    for folder in _search_folders(directory):
-        if lost.person_file not in listing.names(folder):
-            continue
-        path = folder / lost.person_file
-        if lost.person_file != PERSON_FILE or own & listing.names(folder) or _has_betas(path, lost.person):
-            return path
-    return None
-
-
-def repair(lost: Sequence[MissingFiles], found: dict[str, Path]) -> int:
-    """Point volumes to the files that were found; returns how many. Linked volumes stay as they are."""
+        raise NotADirectoryError(f"there is no folder {str(directory)!r:.200}: choose the one that the humans are in")
     repaired = 0
     for one in lost:
-        for volume in one.volumes:
-            path = found.get(_name(volume))
-            if path is not None and volume.library is None:
-                volume.filepath = stored_path(path)
-                repaired += 1
+        if one.linked:
+            continue
+        state = next((folder for folder in _search_folders(directory) if _holds(folder, one.person)), None)
+        if one.file and state is not None:
+            for volume in one.volumes:
+                _point(volume, state / volume_path(volume).name)
+            one.person[HOME] = str(state)
+            repaired += 1
         for volume in one.merged:
-            path = found.get(_name(volume))
-            complete = path is not None and {*_sequence_names(volume)} <= Listing().names(path.parent)
-            if complete and volume.library is None:
-                volume.filepath = stored_path(path)
+            folder = next((folder for folder in _search_folders(directory) if _is_complete(volume, folder)), None)
+            if folder is not None:
+                _point(volume, folder / volume_path(volume).name)
                 repaired += 1
     return repaired
 
 
-def copy_back(lost: Sequence[MissingFiles], found: dict[str, Path], directory: Path | None = None) -> int:
-    """Copy the backend's and the body's files that were found to the human's folder; returns how many.
-
-    Call `repair` first. Raises OSError, and ValueError where that folder lies behind a link or what was found is one.
-    """
-    copied = 0
-    for one in lost:
-        if one.linked or not os.path.isdir(folders_of(one.person)[0]):
-            continue
-        home = home_of(one.person)
-        if one.person_file and not os.path.lexists(home / one.person_file):
-            source = find_person(one, directory)
-            copied += source is not None and copy_file(source, home / one.person_file, home.parent)
-        paths = [home.parent / one.body_file, home / one.body_file]
-        if one.body_file in found and not any(exists_in_its_folder(path) for path in paths):
-            copied += copy_file(found[one.body_file], paths[0], home.parent)
-    return copied
+def _point(volume: bpy.types.Volume, path: Path) -> None:
+    volume.filepath = stored_path(path)
+    if volume.grids.error_message and exists_in_its_folder(path):
+        reload_volume(volume)
 
 
-def _without_files(
-    person: bpy.types.Collection, listing: Listing
-) -> tuple[list[bpy.types.Volume], list[bpy.types.Volume]]:
-    single, several = [], []
-    later = {folder for folder in folders_of(person)[:1] if unwritten_in(folder)}
-    for volume in {obj.data: None for obj in person.all_objects if obj.type == "VOLUME"}:
-        path = volume_path(volume)
-        if path is None:
-            continue
-        if PRIMITIVE_VDB.fullmatch(path.name) and path not in listing:
-            single += [] if path.parent in later else [volume]
-        elif MERGED_VDB.fullmatch(path.name) and not {*_sequence_names(volume)} <= listing.names(path.parent):
-            several.append(volume)
-    return single, several
+def _holds(folder: Path, person: bpy.types.Collection) -> bool:
+    """Whether a folder is whole and its human was made as this one, and has its betas."""
+    if not exists_in_its_folder(folder / PERSON_FILE) or _missing_file(folder):
+        return False
+    try:
+        tensors = read_tensors(folder / PERSON_FILE)
+        made, betas = provenance_in(tensors.metadata), payload_in(tensors, PERSON_FILE).betas
+        wanted = provenance_of(person)
+        return made.items() <= wanted.items() and np.allclose(betas, generated_betas(person), atol=_SAME_BETAS)
+    except (OSError, ValueError):
+        return False
 
 
-def _is_file(entry: os.DirEntry[str]) -> bool:
-    return exists_in_its_folder(Path(entry.path)) if entry.is_symlink() else os.path.isfile(entry)
+def _volumes(person: bpy.types.Collection, pattern: re.Pattern[str]) -> list[bpy.types.Volume]:
+    """Volumes of a human whose files have such names."""
+    paths = {obj.data: volume_path(obj.data) for obj in person.all_objects if obj.type == "VOLUME"}
+    return [volume for volume, path in paths.items() if path is not None and pattern.fullmatch(path.name)]
 
 
-def _name(volume: bpy.types.Volume) -> str:
-    """The name of a volume's file; empty where it has none."""
+def _is_complete(volume: bpy.types.Volume, folder: Path | None) -> bool:
+    """Whether all files of a merged volume are in a folder, or where it shows them."""
     path = volume_path(volume)
-    return path.name if path is not None else ""
-
-
-def _sequence_names(volume: bpy.types.Volume) -> list[str]:
-    """Names of all files of a merged volume, missing or not."""
-    name = _name(volume)
-    match = MERGED_VDB.fullmatch(name)
+    match, folder = MERGED_VDB.fullmatch(path.name), path.parent if folder is None else folder
     if match is None or match[1] is None or not volume.is_sequence:
-        return [name]
-    width = len(match[1]) - 1
-    last = min(volume.frame_duration, _LONGEST_SEQUENCE)
-    return [name.replace(match[1], f"_{number:0{width}d}") for number in range(1, last + 1)]
+        return exists_in_its_folder(folder / path.name)
+    width, last = len(match[1]) - 1, min(volume.frame_duration, _LONGEST_SEQUENCE)
+    names = (path.name.replace(match[1], f"_{number:0{width}d}") for number in range(1, last + 1))
+    return all(exists_in_its_folder(folder / name) for name in names)
 
 
 def _search_folders(directory: Path | None) -> Iterator[Path]:
@@ -242,18 +172,18 @@ def _search_folders(directory: Path | None) -> Iterator[Path]:
 
 def _likely_folders() -> Iterator[Path]:
     humans = [person for person in bpy.data.collections if MARK in person]
-    yield from (folder_of(person) for person in humans)
     homes = [home for person in humans if (home := stored_folder(person, HOME)) is not None]
-    yield from homes
-    shown = {path.parent for volume in bpy.data.volumes if (path := volume_path(volume)) is not None}
-    yield from sorted(shown)
-    roots = [humans_folder(), *(folder.parent for folder in (*homes, *sorted(shown)))]
+    shown = sorted({path.parent for volume in bpy.data.volumes if (path := volume_path(volume)) is not None})
+    yield from (*homes, *shown)
+    yield from (humans_folder() / folder.parent.name / folder.name for folder in (*homes, *shown))
+    around = (folder.parent if STATE.fullmatch(folder.name) else folder for folder in (*homes, *shown))
+    roots = [humans_folder(), *(human.parent for human in around)]
     blend = Path(bpy.data.filepath)
     if blend.name:
         roots += _folders_in(real_path(blend).parent, "_humans")  # of a .blend that had another name
-    for root in dict.fromkeys(roots):
-        yield root
-        yield from _folders_in(root)
+    for human in itertools.chain(map(folder_of, humans), *map(_folders_in, dict.fromkeys(roots))):
+        yield human
+        yield from reversed(_folders_in(human))
 
 
 def _folders_in(folder: Path, ending: str = "") -> list[Path]:
@@ -272,14 +202,3 @@ def _folders_below(directory: Path) -> Iterator[Path]:
         yield Path(folder)
         if len(Path(folder).parts) - len(directory.parts) >= _DEEPEST:
             inside.clear()
-
-
-def _has_betas(path: Path, person: bpy.types.Collection) -> bool:
-    """Whether a file holds the betas that the human was generated with."""
-    try:
-        dtype, _, raw = read_tensors(path).arrays["betas"]
-        betas = np.frombuffer(raw, "<f4") if dtype == "F32" else np.empty(0)
-        wanted = generated_betas(person)
-    except (OSError, ValueError, KeyError):
-        return False
-    return betas.shape == wanted.shape and np.allclose(betas, wanted, atol=_SAME_BETAS)

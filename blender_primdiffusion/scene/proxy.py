@@ -25,10 +25,10 @@ from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import portable_name
 from .armature import model_origin
 from .blend_values import as_numbers, stored_record
-from .body_file import shape_model_of, stored_body_name
+from .body import shape_model_of
 from .build import build_body_mesh, floor_below
 from .convention import points_to_blender
-from .human import BETA_COUNT, BODY_MARK, ORIGIN, armature_of, own_data, person_file_name
+from .human import BETA_COUNT, BODY_MARK, ORIGIN, armature_of, own_data, state_of
 from .shape import SAME_BETAS, ShapeModel
 
 PROXY_MARK = "primdiffusion_proxy"
@@ -102,7 +102,7 @@ def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas
     """Whether the human was edited since, or has a shape that the proxy could not follow."""
     shown = shown_betas(proxy)
     same_shape = shown is None if betas is None else shown is not None and np.allclose(shown, betas, atol=1e-4)
-    return stored_record(proxy, PROXY_MARK).get("file") != person_file_name(collection) or not same_shape
+    return stored_record(proxy, PROXY_MARK).get("file") != state_of(collection) or not same_shape
 
 
 def shown_betas(proxy: bpy.types.Object) -> NDArray[np.float64] | None:
@@ -162,13 +162,13 @@ def _model_origin(collection: bpy.types.Collection, betas: NDArray | None) -> ND
     """The origin of the body model in the armature's space [3] when the human has these betas [10], not those it has
     now: see `human.ORIGIN`. Raises as `shape_model_of`."""
     bones = armature_of(collection).data
-    if ORIGIN not in bones or betas is None or stored_body_name(collection) is None:
+    if ORIGIN not in bones or betas is None:
         return model_origin(bones)
     return floor_below(points_to_blender(shape_model_of(collection).surface(betas)))
 
 
 def _origin(collection: bpy.types.Collection, betas: NDArray | None) -> dict[str, object]:
-    return {"file": person_file_name(collection), "betas": None if betas is None else _rounded(betas)}
+    return {"file": state_of(collection), "betas": None if betas is None else _rounded(betas)}
 
 
 def _rounded(betas: NDArray) -> list[float]:

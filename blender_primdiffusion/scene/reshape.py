@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from .armature import move_rest_joints
-from .body_file import shape_model_of
+from .body import shape_model_of
 from .build import floor_below
 from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, ORIGIN, armature_of, body_of, own_data, volumes_of

@@ -71,10 +71,12 @@ class ShapeModel:
     """dP/du = sum over m of stencil_du[k, m] * vertices[stencil_vertex[k, m]], metres per cell of the grid."""
     stencil_dv: NDArray[np.float32]
     """Likewise dP/dv; du x dv points out of the body."""
-    skin_weights: NDArray[np.float32] | None = None
-    """Skinning of the vertices [V, 24]; rows sum to one. None, like the next one, in files of earlier versions."""
-    rest_half_extent: NDArray[np.float32] | None = None
+    skin_weights: NDArray[np.float32]
+    """Skinning of the vertices [V, 24]; rows sum to one."""
+    rest_half_extent: NDArray[np.float32]
     """Half sides of the boxes along T, B, N before their delta scale [K, 3], metres."""
+    uv_corner: NDArray[np.float32] | None = None
+    """Texture coordinates of each triangle corner [F, 3, 2], v up; None in files of an earlier version."""
     pose_basis: NDArray[np.float32] | None = None
     """Pose-dependent correctives (SMPL eq. 9) of the vertices `used` [U, 3, 207]; None for a body without."""
 
@@ -84,10 +86,9 @@ class ShapeModel:
         names = [*FIELDS, *(name for name in OPTIONAL_FIELDS if name in arrays)]
         return cls(**{name: arrays[name].astype(np.int32 if name in INTEGERS else np.float32) for name in names})
 
-    def arrays(self) -> dict[str, NDArray]:
-        """The arrays of the model's file."""
-        optional = [name for name in OPTIONAL_FIELDS if getattr(self, name) is not None]
-        return {name: getattr(self, name) for name in (*FIELDS, *optional)}
+    def primitive_weights(self) -> NDArray[np.float64]:
+        """Skinning of each primitive [K, 24]; rows sum to one."""
+        return np.einsum("kc,kcj->kj", self.barycentric, self.skin_weights[self.faces[self.face]], dtype=np.float64)
 
     def used(self) -> NDArray[np.int32]:
         """The vertices that determine the primitives' frames [U], ascending."""
@@ -163,18 +164,20 @@ FIELDS: dict[str, tuple[int | str, ...]] = {
     "joint_template": (24, 3), "joint_basis": (24, 3, BETA_COUNT),
     "faces": ("F", 3), "face": ("K",), "barycentric": ("K", 3),
     "stencil_vertex": ("K", "m"), "stencil_du": ("K", "m"), "stencil_dv": ("K", "m"),
+    "skin_weights": ("V", 24), "rest_half_extent": ("K", 3),
 }  # fmt: skip
 """Shapes of a ShapeModel's arrays, which files store under the same names."""
 OPTIONAL_FIELDS: dict[str, tuple[int | str, ...]] = {
-    "skin_weights": ("V", 24), "rest_half_extent": ("K", 3), "pose_basis": ("U", 3, 207),
+    "uv_corner": ("F", 3, 2), "pose_basis": ("U", 3, 207),
 }  # fmt: skip
 INTEGERS = ("faces", "face", "stencil_vertex")
 
 
 def faulty_field(model: ShapeModel) -> str | None:
     """The first field that holds impossible values, if any."""
-    for name, values in model.arrays().items():
-        if not all_finite(values):
+    for name in (*FIELDS, *OPTIONAL_FIELDS):
+        values = getattr(model, name)
+        if values is not None and not all_finite(values):
             return name
     limits = {"faces": len(model.template), "face": len(model.faces), "stencil_vertex": len(model.template)}
     for name, limit in limits.items():
@@ -183,8 +186,12 @@ def faulty_field(model: ShapeModel) -> str | None:
             return name
     if model.pose_basis is not None and len(model.pose_basis) != len(model.used()):
         return "pose_basis"
-    weights = model.barycentric
-    return "barycentric" if weights.min() < -1e-3 or np.abs(weights.sum(-1) - 1).max() > 1e-3 else None
+    if model.rest_half_extent.min() <= 0:
+        return "rest_half_extent"
+    least = {"barycentric": -1e-3, "skin_weights": 0.0}
+    rows = {name: getattr(model, name) for name in least}
+    wrong = (name for name, w in rows.items() if w.min() < least[name] or np.abs(w.sum(-1) - 1).max() > 1e-3)
+    return next(wrong, None)
 
 
 class BodyMeasures(NamedTuple):

@@ -16,7 +16,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .body_file import shape_model_of
+from .body import shape_model_of
 from .human import armature_of, body_of, own_data, volumes_of
 from .shape import ShapeModel, betas_of, generated_betas
 

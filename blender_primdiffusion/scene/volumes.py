@@ -5,13 +5,10 @@ from __future__ import annotations
 import ctypes
 import dataclasses
 import functools
-import hashlib
 import os
-import shutil
 import struct
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
@@ -19,9 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.regular_files import exists_in_its_folder, open_regular
-from ..formats.removing import OutsideFolderError, check_inside, remove_folder
-from ..formats.whole_files import publish, remove_abandoned, temporary_folder, temporary_name
-from .human import UNWRITTEN_NPZ, VolumeWriteError, folders_of, is_there, link_error, unwritten_in, volume_path
+from ..formats.whole_files import temporary_folder
+from .human import volume_path
 from .vdb import grid_bytes, openvdb, readable_format
 
 VOXELS = 8
@@ -108,107 +104,22 @@ def index_to_local(half_extent: NDArray, blender_version: tuple[int, ...]) -> ND
     return transform
 
 
-def file_name(grids: Grids, k: int, blender_version: tuple[int, ...]) -> str:
-    """prim_<k>_<hash>.vdb: Blender caches grids by path, so other content must have another name."""
-    digest = hashlib.sha256()
-    digest.update(index_to_local(grids.half_extent[k], blender_version).tobytes())
-    digest.update(np.ascontiguousarray(grids.density[k]).tobytes())
-    digest.update(np.ascontiguousarray(grids.colour[k]).tobytes())
-    return f"prim_{k:04d}_{digest.hexdigest()[:12]}.vdb"
-
-
-class Staging:
-    """A hidden folder inside a human's folder, whose files move into the latter together; made by `staged`."""
-
-    def __init__(self, hidden: Path, folder: Path):
-        self._hidden, self._folder = hidden, folder
-        self.names: list[str] = []
-        """Of the files written or copied so far."""
-
-    @property
-    def paths(self) -> list[Path]:
-        """Where the files will be."""
-        return [self._folder / name for name in self.names]
-
-    def write(self, grids: Grids, which: Sequence[int]) -> Iterator[float]:
-        """Write a VDB for each primitive in `which`; yields the fraction written before each.
-
-        Raises VolumeWriteError.
-        """
-        for number, k in enumerate(which):
-            yield number / len(which)
-            try:
-                self.names.append(write_file(grids, k, self._hidden, bpy.app.version))
-            except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
-                raise write_error(self._folder, error) from error
-
-    def copy(self, files: Mapping[str, Path]) -> None:
-        """Add copies of `files` under the names given. Raises VolumeWriteError, also where another file has a name."""
-        try:
-            for name, path in files.items():
-                if not (self._is_unwritten(name) or is_there(path, self._folder / name)):
-                    shutil.copyfile(path, self._hidden / name)
-                self.names.append(name)
-        except OSError as error:
-            raise write_error(self._folder, error) from error
-
-    def _is_unwritten(self, name: str) -> bool:
-        """Whether the file that volumes are written from is there: its name tells which, whatever else is in it."""
-        return bool(UNWRITTEN_NPZ.fullmatch(name)) and exists_in_its_folder(self._folder / name)
-
-
-@contextmanager
-def staged(folder: Path) -> Iterator[Staging]:
-    """Stage new files of `folder`, which move into it when the block ends well.
-
-    When the block or a move fails, neither the files nor folders made for them remain. Raises VolumeWriteError when
-    the folder cannot be written, is a link out of the folder that it is in, or the disk is full.
-    """
-    existing = next(parent for parent in (folder, *folder.parents) if parent.exists())
-    try:
-        check_inside(folder / "volumes", folder.parent)
-        folder.mkdir(parents=True, exist_ok=True)
-        remove_abandoned(folder)
-        hidden = temporary_name(folder / "volumes")
-        hidden.mkdir()
-    except OutsideFolderError as error:
-        raise link_error(folder) from error
-    except OSError as error:
-        remove_empty(folder, existing)
-        raise write_error(folder, error) from error
-    try:
-        yield Staging(hidden, folder)
-        try:
-            publish([(hidden, folder)])
-        except OSError as error:
-            raise write_error(folder, error) from error
-    finally:
-        remove_folder(hidden, hidden.parent)
-        remove_empty(folder, existing)
-
-
-def write_file(grids: Grids, k: int, folder: Path, blender_version: tuple[int, ...]) -> str:
-    """Write a primitive's volume into a folder under its `file_name`, which is returned.
+def write_volume(grids: Grids, k: int, blender_version: tuple[int, ...], path: Path) -> None:
+    """Write a primitive's volume to `path`, where it appears whole or not at all.
 
     Raises OSError, and RuntimeError when the disk is full.
     """
     part = tuple(slice(first, last + 1) for first, last in zip(grids.first[k], grids.last[k], strict=True))
-    name = file_name(grids, k, blender_version)
-    write_vdb(
-        folder / name,
-        grids.density[k][part],
-        grids.colour[k][part],
-        index_to_local(grids.half_extent[k], blender_version),
-        tuple((grids.first[k] - PAD).tolist()),
-        _ALL_ACTIVE,
-    )
-    return name
-
-
-def write_one(grids: Grids, k: int, blender_version: tuple[int, ...], path: Path) -> None:
-    """Write a primitive's volume to `path`, where it appears whole or not at all. Raises as `write_file`."""
     with temporary_folder(path.parent / "volume") as hidden:
-        os.replace(hidden / write_file(grids, k, hidden, blender_version), path)
+        write_vdb(
+            hidden / path.name,
+            grids.density[k][part],
+            grids.colour[k][part],
+            index_to_local(grids.half_extent[k], blender_version),
+            tuple((grids.first[k] - PAD).tolist()),
+            _ALL_ACTIVE,
+        )
+        os.replace(hidden / path.name, path)
 
 
 def write_vdb(
@@ -254,22 +165,6 @@ def is_readable(path: Path) -> bool:
     return exists_in_its_folder(path) and (format_of(path) or 0) <= readable_format()
 
 
-def write_error(folder: Path, error: BaseException) -> VolumeWriteError:
-    """For errors of the system and of openvdb."""
-    return VolumeWriteError(
-        f"the volumes could not be written to {str(folder)!r} ({error!s:.160}); save the .blend in a folder with "
-        "write permission and free space"
-    )
-
-
-def remove_empty(folder: Path, existing: Path) -> None:
-    """Remove `folder` and its parents below `existing`, as far as they are empty."""
-    for path in (folder, *folder.parents):
-        if path == existing or not path.is_dir() or any(path.iterdir()):
-            return
-        path.rmdir()
-
-
 _LOWEST_LIMIT_MB = 1
 
 
@@ -305,22 +200,22 @@ class Memory:
 
 
 def person_memory(collection: bpy.types.Collection) -> Memory:
-    """Memory of all of a human's volumes, shown or hidden, without missing files; zero until all are written.
+    """Memory of all of a human's volumes, shown or hidden; zero until all are written.
 
     Reads the files' headers once, about .2 s for 1024 of them, and caches the result by their names.
     """
-    if unwritten_in(folders_of(collection)[0]):
-        return Memory(0, 0)
-    paths = {volume_path(obj.data) for obj in collection.all_objects if obj.type == "VOLUME"}
-    return _memory_of(tuple(sorted(path for path in paths if path is not None)))
+    shown = {volume_path(obj.data) for obj in collection.all_objects if obj.type == "VOLUME"}
+    paths = sorted(path for path in shown if path is not None)
+    return _memory_of(tuple(paths)) if all(map(exists_in_its_folder, paths)) else Memory(0, 0)
 
 
 @functools.lru_cache(maxsize=64)
 def _memory_of(paths: Sequence[Path]) -> Memory:
     files = grids = 0
     for path in paths:
-        if not exists_in_its_folder(path):
+        try:
+            files += path.stat().st_size
+        except OSError:  # a missing one
             continue
-        files += path.stat().st_size
         grids += grid_bytes(path)
     return Memory(files, grids)

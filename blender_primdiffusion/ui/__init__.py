@@ -12,7 +12,7 @@ from types import ModuleType
 
 import bpy
 
-from ..jobs import copies, follow, late_volumes, missing_files, picture_in_view, windows
+from ..jobs import copies, deferred_volumes, follow, missing_files, picture_in_view, windows
 from ..scene import stand_in
 from . import (
     advanced_panel,
@@ -47,7 +47,7 @@ from . import (
 MODULES = (
     *backend_state.MODULES, preferences, windows, follow, jobs_panel, attributes,
     generate_panel, variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, copies,
-    late_volumes, import_motion, motion_panel, handle_operators, pose_panel, asset_operators, render_operators,
+    deferred_volumes, import_motion, motion_panel, handle_operators, pose_panel, asset_operators, render_operators,
     render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings, captures_panel,
     reconstruct_panel, viewport_humans, picture_in_view, batch, manual, stand_in,
 )  # fmt: skip

@@ -8,16 +8,17 @@ import bpy
 
 from ..backend.requests import in_words, sentence
 from ..formats.removing import OutsideFolderError, remove_file
-from ..jobs.edit import RegenerateJob, RestoreJob, made_from_seed
+from ..formats.whole_files import remove_empty
+from ..jobs.deferred_volumes import deferred_volumes, keep_writing
+from ..jobs.edit import RegenerateJob, made_from_seed
 from ..jobs.follow import Reporting, submit
-from ..jobs.late_volumes import late_volumes
 from ..jobs.missing_files import look, state
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.collect import collect_files, ignored_values, unused
 from ..scene.duplicate import duplicate_human
 from ..scene.edit import leave_mode, select_human
-from ..scene.human import armature_of, check_editable, humans, humans_folder, person_file, remove_human
-from ..scene.missing import copy_back, find_files, find_person, missing_files, repair
+from ..scene.human import armature_of, check_editable, humans, humans_folder, note_state, person_file, remove_human
+from ..scene.missing import MissingFiles, missing_files, repair
 from ..scene.place import stand_beside_others
 from ..scene.volumes import free_unused_grids
 from .drawing import SidebarPanel, draw_job, draw_lines
@@ -25,7 +26,7 @@ from .on_person import OnPerson
 
 
 class PRIMDIFFUSION_OT_find_missing_volumes(bpy.types.Operator):
-    """Find missing files of humans, and restore those that cannot be found"""
+    """Find missing files of humans: their volumes are written again from them"""
 
     bl_idname = "primdiffusion.find_missing_volumes"
     bl_label = "Find Missing Volumes"
@@ -59,48 +60,34 @@ class PRIMDIFFUSION_OT_find_missing_volumes(bpy.types.Operator):
         directory = Path(bpy.path.abspath(self.directory)) if self.directory else None
         try:
             lost = missing_files()
-            found = find_files(lost, directory)
-            repaired = repair(lost, found)
-            copied = copy_back(lost, found, directory)
+            repaired = repair(lost, directory)
             if repaired:
                 bpy.ops.ed.undo_push(message="Find Missing Volumes")
-            restored, left = self._restore(context, directory)
+            if bpy.app.background:
+                deferred_volumes.finish()
+            keep_writing()
         except (OSError, ValueError) as error:
             self.report({"ERROR"}, in_words(error))
             return {"CANCELLED"}
         finally:
             look()
+        left = [_cannot_be_found(one) for one in missing_files()]
         if left:
-            done = repaired or copied or restored
-            self.report({"WARNING" if done else "ERROR"}, "; ".join(left))
-            return {"FINISHED"} if done else {"CANCELLED"}
-        message = f"{repaired + copied} files found" if lost else "No files of humans are missing"
-        self.report({"INFO"}, message)
+            self.report({"WARNING" if repaired else "ERROR"}, "; ".join(left))
+            return {"FINISHED"} if repaired else {"CANCELLED"}
+        self.report({"INFO"}, "All files of humans are found" if lost else "No files of humans are missing")
         return {"FINISHED"}
 
-    def _restore(self, context: bpy.types.Context, directory: Path | None) -> tuple[int, list[str]]:
-        """Queue jobs for humans whose files were not found; returns how many, and sentences on humans that are lost."""
-        jobs, left = [], []
-        for one in missing_files():
-            source = find_person(one, directory)
-            if one.linked:
-                left.append(
-                    f"{one.summary()}, linked from {one.linked!r}, cannot be found: open that file and search there"
-                )
-            elif source is None:
-                left.append(
-                    f"{one.summary()} cannot be found: put them back, choose the folder that they are in, or press "
-                    "Generate Again where a seed made them"
-                )
-            elif one.merged and not (one.volumes or one.person_file or one.body_file):
-                left.append(f"{one.summary()} cannot be found: press Merge again")
-            else:
-                try:
-                    jobs.append(RestoreJob(HumanTarget.of(one.person), str(source)))
-                except ValueError as error:
-                    left.append(str(error))
-        done = [job for job in jobs if submit(self, context, job) == {"FINISHED"}]
-        return len(done), left
+
+def _cannot_be_found(one: MissingFiles) -> str:
+    if one.linked:
+        return f"{one.summary()}, linked from {one.linked!r}, cannot be found: open that file and search there"
+    if not one.file:
+        return f"{one.summary()} cannot be found: press Merge again"
+    return (
+        f"{one.summary()} cannot be found: put it back, choose the folder that it is in, or press Generate Again where "
+        "a seed made the human"
+    )
 
 
 class PRIMDIFFUSION_OT_generate_again(OnPerson, bpy.types.Operator):
@@ -130,9 +117,9 @@ class PRIMDIFFUSION_OT_collect_files(Reporting, bpy.types.Operator):
             self.report({"WARNING"}, sentence(fault))
         look()
         where = humans_folder().name
-        if done.volumes:
+        if done.humans or done.files:
             size = f"{done.files} files, {done.size / 1e6:.1f} MB"
-            self.report({"INFO"}, f"{done.volumes} volumes are in {where!r} now ({size} copied); save this file")
+            self.report({"INFO"}, f"The files of {done.humans} humans are in {where!r} now ({size}); save this file")
         else:
             self.report({"INFO"}, f"All files of humans are in {where!r} already")
         return {"FINISHED"}
@@ -151,29 +138,33 @@ files that share the folder, may need them"""
 
     def execute(self, _context: bpy.types.Context) -> set[str]:
         removed = size = 0
+        folders = set()
         for path in unused(humans_folder()):
             try:
                 size += path.stat().st_size
                 remove_file(path, humans_folder())
                 removed += 1
+                folders.add(path.parent)
+                note_state(path.parent)
             except (OSError, OutsideFolderError) as error:
                 self.report({"WARNING"}, f"{str(path)!r} could not be removed ({error!s:.160})")
+        remove_empty([*folders, *({folder.parent for folder in folders} - {humans_folder(), humans_folder().parent})])
         self.report({"INFO"}, f"Removed {removed} files ({size / 1e6:.1f} MB) from {str(humans_folder())!r}")
         return {"FINISHED"}
 
 
 def draw_missing(layout: bpy.types.UILayout) -> None:
     """What is missing and what can be done about it; nothing when all files are there."""
-    if late_volumes.error:
-        draw_lines(layout, late_volumes.error, "ERROR")
-    if late_volumes.notice:
-        draw_lines(layout, late_volumes.notice, "INFO")
+    if deferred_volumes.error:
+        draw_lines(layout, deferred_volumes.error, "ERROR")
+    if deferred_volumes.notice:
+        draw_lines(layout, deferred_volumes.notice, "INFO")
     if not state.summary:
         return
     box = layout.box()
     draw_lines(box, f"Missing: {state.summary}", "ERROR")
     row = box.row(align=True)
-    draw_job(row.column(), "restore_volumes", "primdiffusion.find_missing_volumes", "VIEWZOOM")
+    row.operator("primdiffusion.find_missing_volumes", icon="VIEWZOOM")
     row.operator("primdiffusion.find_missing_volumes", text="", icon="FILE_FOLDER").choose = True
     for name in state.without_person_file:
         draw_job(box, "regenerate", "primdiffusion.generate_again", "FILE_REFRESH").human = name

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import bpy
 
+from ..jobs.deferred_volumes import keep_writing
 from ..jobs.follow import redraw
-from ..jobs.late_volumes import keep_writing
 from ..jobs.queue import queue
 from ..places import EXTENSION
 from .drawing import DATA

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..formats.requests import VOXEL
+from ..jobs.deferred_volumes import deferred_volumes
 from ..jobs.export import show, shown
 from ..jobs.follow import submit
 from ..jobs.merge import MergeFramesJob, MergeJob, Moment
@@ -16,11 +17,9 @@ from ..scene.attachment import (
     set_attachment,
     show_in_viewport,
 )
-from ..scene.collect import collect_unwritten
 from ..scene.human import armature_of, humans
 from ..scene.merged import merged_of, remove_merged
 from ..scene.proxy import proxy_of
-from ..scene.unwritten import write_all_unwritten
 from .declared import SKIP
 from .on_person import OnPerson
 
@@ -64,8 +63,7 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         visible = not in_viewport(person)
         if visible:
-            collect_unwritten()
-            write_all_unwritten()
+            deferred_volumes.finish()
         for each in humans(context.scene) if self.everyone else [person]:
             what = shown(each)
             show_in_viewport(each, visible)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..jobs.target import selected_person
-from ..scene.body_file import shape_model_of
+from ..scene.body import shape_model_of
 from ..scene.human import BETA_COUNT, BETAS, armature_of, humans
 from ..scene.reshape import check_shapeable, reshape
 from ..scene.shape import betas_of, betas_of_measures, generated_betas, slider_names

@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 
 from ..scene.actions import action_curves, end_repeat, loops, repeat
-from ..scene.body_file import shape_model_of
+from ..scene.body import shape_model_of
 from ..scene.duplicate import rename_human
 from ..scene.human import BETA_COUNT, LARGEST_BETA, MARK
 from ..scene.reshape import reshape

@@ -11,8 +11,8 @@ from bpy.app.handlers import persistent
 
 from ..backend.requests import sentence
 from ..formats.requests import VariationsRequest
+from ..jobs.deferred_volumes import keep_writing
 from ..jobs.follow import Reporting, redraw, submit
-from ..jobs.late_volumes import keep_writing
 from ..jobs.pictures import icons
 from ..jobs.queue import queue
 from ..jobs.variations import Variation, VariationsJob, sheet
@@ -227,7 +227,7 @@ def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bp
     context.window_manager.progress_begin(0, len(wanted))
     try:
         for variation in wanted:
-            person = build_human(context, variation.human, "Human", [variation.person])
+            person = build_human(context, variation.person)
             built.append(person)
             stand_at_cursor(context, person)
             context.window_manager.progress_update(len(built))

@@ -203,7 +203,7 @@ def render(module: str, python: str) -> Steps:
     """Engine and Cycles, attachment, merging, gain, memory."""
     yield from with_people(module, python, FIRST_SEED)
     names = ("render", *(f"advanced/{section}" for section in ("attachment", "merge", "look", "memory")))
-    writing = import_module(f"{module}.jobs.late_volumes")._tick
+    writing = import_module(f"{module}.jobs.deferred_volumes")._tick
     yield from wait(lambda: not bpy.app.timers.is_registered(writing), 120)
     yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
     press("primdiffusion.set_up_engine", engine="CYCLES")

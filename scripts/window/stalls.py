@@ -16,7 +16,7 @@ _NOTICED_S = 0.1
 _OURS = (
     ("jobs.follow", "Building", "advance"),
     ("jobs.follow", "", "enter"),
-    ("jobs.late_volumes", "LateVolumes", "work"),
+    ("jobs.deferred_volumes", "DeferredVolumes", "work"),
     ("jobs.picture_in_view", "PictureInView", "draw"),
     ("engine.gpu.overlay", "Overlay", "advance"),
     ("engine.gpu.overlay", "Overlay", "draw"),

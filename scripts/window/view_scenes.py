@@ -182,7 +182,7 @@ def stalls(module: str, python: str) -> Steps:
 def entering(module: str, seed: int, prefix: str) -> Steps:
     """Generate a person and measure from the child's answer until a view shows them and their volumes are written."""
     queue, overlay = queue_of(module), import_module(f"{module}.engine.gpu.overlay").overlay
-    writing = import_module(f"{module}.jobs.late_volumes")._tick
+    writing = import_module(f"{module}.jobs.deferred_volumes")._tick
     humans = len(armatures()) + 1
 
     def shown() -> set[tuple]:

@@ -12,10 +12,11 @@ import pytest
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.commands import info
+from primdiffusion.human_file import load_human
 from tiny_encoder import save_tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
-FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 
 
 @pytest.fixture(scope="module")
@@ -42,8 +43,7 @@ def fails(capsys, *arguments) -> tuple[int, str]:
 
 def test_generate_writes_the_person_and_its_pictures(person):
     assert sorted(path.name for path in person.iterdir()) == FILES
-    with np.load(person / "human.npz") as human:
-        assert json.loads(str(human["meta"]))["seed"] == 5
+    assert load_human(person / "person.human.safetensors").provenance["seed"] == 5
 
 
 def test_count_writes_a_folder_for_each_seed(checkpoint, tmp_path, capsys):
@@ -75,8 +75,7 @@ def test_a_batch_is_asked_for_and_written_together(checkpoint, tmp_path, capsys)
     cli.main([*line, "--attributes", "outfit=suit", "height=1.8"])
     assert sorted(path.name for path in out.iterdir()) == ["seed_000005", "seed_000006", "seed_000007"]
     for seed in (5, 6, 7):
-        with np.load(out / f"seed_{seed:06d}" / "human.npz") as human:
-            meta = json.loads(str(human["meta"]))
+        meta = load_human(out / f"seed_{seed:06d}" / "person.human.safetensors").provenance
         assert (meta["seed"], meta["attributes"]) == (seed, {"outfit": "suit", "height": 1.8})
     capsys.readouterr()
     line[line.index(str(out))] = str(tmp_path / "none")

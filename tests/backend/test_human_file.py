@@ -9,11 +9,11 @@ import safetensors.torch
 import torch
 from primdiffusion import tensor_file
 from primdiffusion.body.model import default_body
-from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, generate, place
-from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.human_file import load_human, save_body, save_human
+from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K
 from primdiffusion.render.march import march
 from support.errors import refused
@@ -72,9 +72,8 @@ def test_a_compact_file_with_a_single_colour_is_rejected(human, tmp_path):
 
 def test_a_person_with_nan_is_not_written(human, tmp_path):
     broken = dataclasses.replace(human, betas=torch.full((10,), float("nan")))
-    for write in (save_human, export_for_blender):
-        with refused(ValueError, "betas"):
-            write(tmp_path / "file", broken)
+    with refused(ValueError, "betas"):
+        save_human(tmp_path / "file", broken)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -244,59 +243,35 @@ def test_a_missing_file_is_named(tmp_path):
 
 
 @pytest.fixture(scope="module")
-def exported(human, tmp_path_factory) -> dict[str, np.ndarray]:
-    path = tmp_path_factory.mktemp("export") / "human.npz"
-    export_for_blender(path, human)
-    with np.load(path, allow_pickle=False) as stored:
-        return dict(stored)
+def body_file(tmp_path_factory) -> dict[str, torch.Tensor]:
+    path = tmp_path_factory.mktemp("body") / "body.safetensors"
+    save_body(path, default_body(), default_anchors())
+    tensors, metadata = tensor_file.read(path)
+    assert metadata == {"format": "primdiffusion.body", "format_version": "1"}
+    return tensors
 
 
-def test_the_export_has_the_shapes_blender_expects(exported):
+def test_a_bodys_file_has_the_shapes_blender_expects(body_file):
     body = default_body()
     v, f = len(body.template), len(body.faces)
-    shapes = {
-        "format_version": (), "meta": (), "betas": (10,), "parents": (24,), "joint_names": (24,), "joints": (24, 3),
-        "vertices": (v, 3), "faces": (f, 3), "uv_corner": (f, 3, 2), "skin_weights": (v, 24), "position": (K, 3),
-        "rotation": (K, 3, 3), "half_extent": (K, 3), "primitive_weights": (K, 24), "rgb": (K, 8, 8, 8, 3),
-        "density": (K, 8, 8, 8), "template": (v, 3), "shape_basis": (v, 3, 10), "joint_template": (24, 3),
-        "joint_basis": (24, 3, 10), "face": (K,), "barycentric": (K, 3), "stencil_vertex": (K, 64),
-        "stencil_du": (K, 64), "stencil_dv": (K, 64), "rest_half_extent": (K, 3),
+    assert {name: tuple(tensor.shape) for name, tensor in body_file.items()} == {
+        "faces": (f, 3), "uv_corner": (f, 3, 2), "skin_weights": (v, 24), "template": (v, 3),
+        "shape_basis": (v, 3, 10), "joint_template": (24, 3), "joint_basis": (24, 3, 10), "face": (K,),
+        "barycentric": (K, 3), "stencil_vertex": (K, 64), "stencil_du": (K, 64), "stencil_dv": (K, 64),
+        "rest_half_extent": (K, 3),
     }  # fmt: skip
-    assert {name: array.shape for name, array in exported.items()} == shapes
-    assert tuple(exported["joint_names"]) == JOINT_NAMES
-    assert exported["parents"][0] == -1
-    assert exported["rgb"].dtype == np.float16
-    assert json.loads(str(exported["meta"]))["seed"] == 3
-    assert exported["format_version"] == 2
 
 
-def test_joints_in_the_export_follow_the_shape_as_the_bodys_do(exported):
+def test_joints_in_a_bodys_file_follow_the_shape_as_the_bodys_do(body_file):
     betas = torch.linspace(-2, 2, 10)
-    joints = exported["joint_template"] + exported["joint_basis"] @ betas.numpy()
+    joints = body_file["joint_template"] + body_file["joint_basis"] @ betas
     np.testing.assert_allclose(joints, default_body().shape(betas).joints, atol=5e-6)
 
 
-def test_the_export_is_the_person_in_the_t_pose_with_delta_scale_in_the_boxes(exported, human):
-    primitives = place(human)
-    assert np.allclose(exported["position"], primitives.position, atol=1e-6)
-    assert np.allclose(exported["half_extent"], primitives.half_extent, atol=1e-7)
-    assert not np.allclose(exported["half_extent"], primitives.half_extent / human.payload.delta_scale, atol=1e-3)
-    assert np.allclose(exported["rotation"], primitives.rotation, atol=1e-4)
-    assert np.allclose(np.linalg.det(exported["rotation"]), 1, atol=1e-5)
-
-
-def test_voxels_are_exported_in_the_order_d_h_w_colour(exported, human):
-    k, d, h, w = 700, 1, 2, 5
-    assert np.allclose(exported["rgb"][k, d, h, w], human.payload.rgb[k, :, d, h, w], atol=1e-3)
-    assert exported["density"][k, d, h, w] == human.payload.density[k, d, h, w]
-    inner, outer = exported["density"][:, 0].mean(), exported["density"][:, 7].mean()
-    assert inner > outer + 50, "the tiny person is solid below the skin, which is small D"
-
-
-def test_weights_are_convex_and_move_a_primitive_with_the_skin_under_it(exported):
-    weights = exported["primitive_weights"]
-    assert (weights >= 0).all()
-    assert np.allclose(weights.sum(1), 1, atol=1e-5)
-    head = weights[:, JOINT_NAMES.index("head")] > 0.99
-    assert head.sum() > 20
-    assert (exported["position"][head, 1] > exported["joints"][JOINT_NAMES.index("neck"), 1]).all()
+def test_a_body_with_correctives_has_those_of_the_vertices_it_needs(tmp_path):
+    body, anchors = default_body(), default_anchors()
+    basis = torch.randn(len(body.template), 3, 207, generator=torch.Generator().manual_seed(0))
+    save_body(tmp_path / "body.safetensors", dataclasses.replace(body, pose_basis=basis), anchors)
+    stored = tensor_file.read(tmp_path / "body.safetensors")[0]["pose_basis"]
+    used = torch.cat([anchors.stencil_vertex.flatten(), body.faces[anchors.face].flatten()]).unique()
+    assert stored.equal(basis[used])

@@ -43,7 +43,7 @@ def written(checkpoint: Path, folder: Path, threads: int, steps: int) -> dict[st
     arguments = [str(checkpoint), str(folder), str(threads), str(steps)]
     environment = {**os.environ, "OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE"}
     subprocess.run([sys.executable, "-c", GENERATE_AND_VARY, *arguments], env=environment, check=True)
-    names = [f"{of}/{name}" for of in ("human", "variant") for name in (FILES.human, FILES.blender)]
+    names = [f"{of}/{FILES.human}" for of in ("human", "variant")]
     return {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in names}
 
 

@@ -20,7 +20,6 @@ from typing import Any
 import bpy
 import synthetic
 import synthetic_shape
-from exporting import write_person
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
@@ -28,24 +27,22 @@ import sidebar
 
 from blender_primdiffusion.jobs import missing_files
 from blender_primdiffusion.places import EXTENSION
-from blender_primdiffusion.scene import attachment, merged, proxy, stand_in, surface, unwritten
-from blender_primdiffusion.scene.body_file import BODY_FILE
+from blender_primdiffusion.scene import attachment, earlier_files, merged, proxy, stand_in, surface
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.edit import edit_destination, replace_person
+from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import (
     BETAS,
     BODY_MARK,
     HOME,
     MARK,
     ORIGIN,
-    PERSON,
     armature_of,
     body_of,
-    folder_of,
-    humans_folder,
+    state_folder,
     volume_path,
 )
-from blender_primdiffusion.scene.human_npz import write_now
+from blender_primdiffusion.scene.pending import write_all_pending
+from blender_primdiffusion.scene.states import prepare_now
 from blender_primdiffusion.ui.drawing import DATA
 from blender_primdiffusion.ui.on_person import FACTS
 
@@ -54,11 +51,11 @@ COUNT = 3
 SECRET = b"a user's file"
 HASH = "0123456789ab"
 LINK = {
-    PERSON: f"person_{HASH}.human.safetensors",
-    BODY_FILE: f"body_{HASH}.npz",
+    earlier_files._PERSON: f"person_{HASH}.human.safetensors",
+    earlier_files._BODY: f"body_{HASH}.npz",
     "volume.filepath": f"prim_0000_{HASH}.vdb",
 }
-"""Names that these may have, of links to a user's file and to a device."""
+"""Names that these may have, of links to a user's file and to a device; all are of the earlier layout."""
 LONGEST_SENTENCE = 400
 _LONGEST_LABEL, _LONGEST_PATH = 1000, 1024
 
@@ -67,7 +64,7 @@ class Stage:
     """The folders of one attempt.
 
     `home/.bashrc` is the user's; `home/me/project/shot.blend` is the stranger's file, saved by the user;
-    `downloads/zip/blender_0/primdiffusion_humans/Anna` has the files of its human, which saving copies.
+    `downloads/zip/blender_0/primdiffusion_humans/Anna/0001` has the files of its human, which saving copies.
     """
 
     def __init__(self, root: Path):
@@ -78,7 +75,7 @@ class Stage:
         self.humans = self.project / "shot_humans"
         self.source = root.with_name("source")
         """Files of the human as the backend would write them."""
-        self.shipped = root / "downloads" / "zip" / "blender_0" / "primdiffusion_humans" / "Anna"
+        self.shipped = root / "downloads" / "zip" / "blender_0" / "primdiffusion_humans" / "Anna" / "0001"
 
     def before(self) -> dict[Path, bytes]:
         """All files with their content; links with where they lead."""
@@ -108,11 +105,10 @@ def build(stage: Stage) -> None:
     first = stage.source
     first.mkdir()
     (first / "grid.vdb").write_bytes(b"merged")
-    npz = synthetic_shape.write(first / "human.npz", COUNT)
-    write_person(first / "person.human.safetensors", synthetic.arrays(COUNT)["betas"])
+    synthetic_shape.write(first, COUNT)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(stage.blend))
-    person = build_human(bpy.context, npz, "Anna", [first / "person.human.safetensors"])
+    person = build_human(bpy.context, first / "person.human.safetensors", "Anna")
     attachment.set_attachment(person, "SURFACE")
     armature = armature_of(person)
     bpy.context.view_layer.objects.active = armature
@@ -124,9 +120,7 @@ def build(stage: Stage) -> None:
     whole[merged.MARK] = json.dumps({"poses": ["0"], "voxel": 0.01, "start": 0})
     whole.data.filepath = str(stage.shipped / f"merged_{HASH}.vdb")
     person.objects.link(whole)
-    shutil.move(folder_of(person), stage.shipped)
-    body = next(humans_folder().glob("body_*.npz"))
-    shutil.move(body, stage.shipped.parent / body.name)
+    shutil.move(state_folder(person), stage.shipped)
     (stage.shipped / f"merged_{HASH}.vdb").write_bytes(b"merged")
     for name in LINK.values():
         (stage.shipped / name).symlink_to(os.path.relpath(stage.users, stage.shipped))
@@ -151,8 +145,9 @@ def _with(mark: str) -> Callable[[], bpy.types.Object]:
 
 
 HOLDERS: dict[str, Callable[[], Any]] = {
-    **dict.fromkeys((MARK, PERSON, HOME, BODY_FILE, attachment.ATTACHMENT, attachment._BEFORE), person),
+    **dict.fromkeys((MARK, HOME, attachment.ATTACHMENT, attachment._BEFORE), person),
     attachment.IN_VIEWPORT: person,
+    **dict.fromkeys((earlier_files._PERSON, earlier_files._BODY), person),
     BETAS: lambda: armature_of(person()),
     ORIGIN: lambda: armature_of(person()).data,
     BODY_MARK: lambda: body_of(person()),
@@ -253,9 +248,9 @@ def values(name: str, stage: Stage) -> dict[str, object]:
         "up": "../../../.bashrc",
         "up from the file": "//../../.bashrc",
         "up to a folder": "..",
-        "up and a volume": f"//../prim_0000_{HASH}.vdb",
-        "volume in a parent": f"{stage.shipped}/../prim_0000_{HASH}.vdb",
-        "volume at the root": f"/prim_0000_{HASH}.vdb",
+        "up and a volume": "//../prim_0000.vdb",
+        "volume in a parent": f"{stage.shipped}/../prim_0000.vdb",
+        "volume at the root": "/prim_0000.vdb",
         "absolute": str(stage.users),
         "server": r"\\host\share\x",
         "two slashes": "//x",
@@ -324,11 +319,9 @@ def operators_fault() -> str:
 def edit_fault(stage: Stage, source: Path) -> str:
     """What goes wrong when an edit's result and a merged volume enter the scene; empty when nothing does."""
     try:
-        written = write_now(source / "human.npz", edit_destination(person()))
-        replace_person(person(), written, source / "person.human.safetensors")
+        replace_person(person(), prepare_now(source / "person.human.safetensors", replaced=person()))
         merged.publish([source / "grid.vdb"], ["a"], merged.merged_folder(person()))
-        for path in unwritten.unwritten():
-            list(unwritten.write_unwritten(path))
+        write_all_pending()
     except (ValueError, OSError):
         return ""
     except Exception as error:
@@ -400,7 +393,7 @@ def figures() -> dict[str, int]:
 
     outside = 0
     with tempfile.TemporaryDirectory() as root, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("FAKE_HUMAN", str(synthetic.write(Path(root) / "prepared.npz", COUNT)))
+        patch.setenv("FAKE_HUMAN", str(synthetic.write(Path(root) / "prepared", COUNT)))
         use_this_python(patch, FAKE_CHILD)
         bpy.ops.wm.read_factory_settings(use_empty=True)
         blender_primdiffusion.register()

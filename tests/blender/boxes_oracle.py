@@ -1,7 +1,7 @@
 """The backend by itself: a human's files, and where `place_skinned` puts the boxes in random poses.
 
-python boxes_oracle.py FOLDER CASES own|default: writes human.npz, person.human.safetensors and cases.npz. With "own"
-the human has a body of the user's, with pose-dependent correctives.
+python boxes_oracle.py FOLDER CASES own|default: writes person.human.safetensors and cases.npz. With "own" the human has
+a body of the user's, with pose-dependent correctives, in body.safetensors.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.human import Human, place_skinned, pose_body
-from primdiffusion.human_file import export_for_blender, save_human
+from primdiffusion.human_file import save_body, save_human
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, FileFingerprint
 from primdiffusion.primitives.primitives import Payload
@@ -36,7 +36,8 @@ payload = Payload(
 )
 human = Human(payload, torch.randn(10, generator=g), {"seed": 1, "full_density": 100.0}, setup)
 save_human(folder / "person.human.safetensors", human)
-export_for_blender(folder / "human.npz", human)
+if setup is not None:
+    save_body(folder / "body.safetensors", setup.body, setup.anchors)
 cases = {name: [] for name in ("betas", "joints", "object", "position", "rotation", "half_extent", "density_scale")}
 for case in range(count):
     betas = human.betas if case % 3 == 0 else 1.5 * torch.randn(10, generator=g)

@@ -76,7 +76,7 @@ def addon(saved_scene, tmp_path, monkeypatch):
     import blender_primdiffusion
     from blender_primdiffusion.jobs.queue import queue
 
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared.npz", 8)))
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic.write(tmp_path / "prepared", 8)))
     use_this_python(monkeypatch, FAKE_CHILD)
     queue.outcomes.clear()
     queue.info = {}

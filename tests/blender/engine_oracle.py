@@ -20,7 +20,7 @@ from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, place
-from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Primitives
@@ -31,7 +31,7 @@ from primdiffusion.reshaping import reshaped
 
 
 def make(folder: Path, seed: int, betas: list[float]) -> None:
-    """A person in a random checkered suit: human.npz and person.human.safetensors in `folder`."""
+    """A person in a random checkered suit: person.human.safetensors in `folder`."""
     body, shape = default_body(), torch.tensor(betas)
     vertices = body.shape(shape).vertices
     frames = attach(default_anchors(), vertices, body.faces)
@@ -50,7 +50,6 @@ def make(folder: Path, seed: int, betas: list[float]) -> None:
     human = Human(from_mesh(TexturedMesh((skin,)), frames), shape, {"seed": seed, "full_density": 100.0})
     folder.mkdir(parents=True, exist_ok=True)
     save_human(folder / "person.human.safetensors", human)
-    export_for_blender(folder / "human.npz", human)
 
 
 def placed(

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from unittest import mock
 
 import bpy
 import numpy as np
 
-from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene import states
+from blender_primdiffusion.scene.build import build_prepared
+from blender_primdiffusion.scene.pending import pending_of, write_pending
+from blender_primdiffusion.scene.states import prepare_now
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = os.environ.get("PRIMDIFFUSION_PYTHON", sys.executable)
@@ -40,14 +45,8 @@ class Oracle:
         assert self._process.stdout.readline().strip() == "{}"
 
     def make(self, folder: Path, seed: int = 1, betas: Sequence[float] = (0.0,) * 10) -> Path:
-        """Write the files of a human to a folder; few.npz has few primitives, so that building is quick."""
+        """Write a human to a folder."""
         self.ask({"make": str(folder), "seed": seed, "betas": list(betas)})
-        with np.load(folder / "human.npz") as archive:
-            arrays = {name: archive[name] for name in archive.files}
-        count = len(arrays["position"])
-        for name in (name for name, array in arrays.items() if array.ndim and len(array) == count):
-            arrays[name] = arrays[name][:PRIMITIVES_IN_BLENDER]
-        np.savez(folder / "few.npz", **arrays)
         return folder
 
     def picture(
@@ -65,8 +64,16 @@ class Oracle:
 
 
 def add_human(folder: Path) -> bpy.types.Collection:
-    """Build the human of `Oracle.make`, with few of its volumes."""
-    return build_human(bpy.context, folder / "few.npz", keep=[folder / "person.human.safetensors"])
+    """Build the human of `Oracle.make`, with few of its volumes, so that it is quick."""
+    with mock.patch.object(states, "volumes_may_wait", return_value=True):
+        prepared = prepare_now(folder / "person.human.safetensors")
+    whole, few = prepared.human, slice(PRIMITIVES_IN_BLENDER)
+    fields = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")
+    model = dataclasses.replace(whole.model, **{name: getattr(whole.model, name)[few] for name in fields})
+    human = dataclasses.replace(whole, model=model, rest=model.rest(whole.payload.betas))
+    person = build_prepared(bpy.context, dataclasses.replace(prepared, human=human))
+    list(write_pending(pending_of(person)))
+    return person
 
 
 def set_up_render(

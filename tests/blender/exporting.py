@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import bpy
 import numpy as np
 import synthetic
+from support import tensor_files
 
 from blender_primdiffusion.scene.build import build_human
 
 
 def write_store(folder: Path) -> None:
-    """human.npz, proxy.npz, proxy.png and person.human.safetensors of one person."""
-    synthetic.write(folder / "human.npz", 8)
+    """person.human.safetensors, body.safetensors, proxy.npz and proxy.png of one person."""
+    synthetic.write(folder, 8)
     arrays = synthetic.arrays(8)
     parts = {name: arrays[name] for name in ("joints", "vertices", "faces", "uv_corner", "skin_weights")}
     np.savez(folder / "proxy.npz", format_version=1, joint_names=np.array(synthetic.NAMES), **parts)
@@ -25,21 +25,20 @@ def write_store(folder: Path) -> None:
     picture.filepath_raw, picture.file_format = str(folder / "proxy.png"), "PNG"
     picture.save()
     bpy.data.images.remove(picture)
-    write_person(folder / "person.human.safetensors")
 
 
 def write_person(path: Path, betas: np.ndarray | None = None, **metadata: str) -> None:
-    """A small safetensors file with a person's metadata, on a body of the user's files: the child opens it."""
-    raw = np.asarray(synthetic.arrays(8)["betas"] if betas is None else betas, "<f4").tobytes()
-    about = {"format": "primdiffusion.human", "format_version": "2", "body": "{}"}
-    about |= {"provenance": json.dumps({"seed": 5}), **metadata}
-    header = {"__metadata__": about, "betas": {"dtype": "F32", "shape": [10], "data_offsets": [0, len(raw)]}}
-    text = json.dumps(header).encode()
-    path.write_bytes(len(text).to_bytes(8, "little") + text + raw)
+    """A small person's file, on a body of the user's files that is not beside it: the child opens it."""
+    arrays = synthetic.arrays(8)
+    arrays["betas"] = arrays["betas"] if betas is None else betas
+    tensor_files.write_human(path, arrays, {"seed": 5})
+    path.with_name(tensor_files.BODY).unlink()
+    tensors, about = tensor_files.read_tensors(path)
+    tensor_files.write_tensors(path, tensors, {**about, **metadata})
 
 
 def add_person(store: Path, name: str = "Anna") -> bpy.types.Collection:
     """Built in the scene, with the backend's file beside the volumes; the armature is active."""
-    person = build_human(bpy.context, store / "human.npz", name, [store / "person.human.safetensors"])
+    person = build_human(bpy.context, store / "person.human.safetensors", name)
     bpy.context.view_layer.objects.active = person.objects[0]
     return person

@@ -19,7 +19,7 @@ COUNT = 6
 
 def build_posed(source, name="Anna"):
     """A human in the scene in a pose, with its armature active; from the folder of its files."""
-    person = build_human(bpy.context, source / "human.npz", name, [source / "person.human.safetensors"])
+    person = build_human(bpy.context, source / "person.human.safetensors", name)
     rotations = synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3)))
     pose_from_joint_rotations(armature_of(person), rotations)
     bpy.context.view_layer.objects.active = armature_of(person)

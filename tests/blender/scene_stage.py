@@ -7,12 +7,12 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from blender_primdiffusion.scene.edit import Replaced, edit_destination, replace_person
-from blender_primdiffusion.scene.human_npz import write_now
+from blender_primdiffusion.scene.edit import Replaced, replace_person
+from blender_primdiffusion.scene.states import prepare_now
 
 
-def replace(collection: bpy.types.Collection, human_npz: Path, person: Path) -> Replaced:
-    return replace_person(collection, write_now(human_npz, edit_destination(collection)), person)
+def replace(collection: bpy.types.Collection, person: Path) -> Replaced:
+    return replace_person(collection, prepare_now(person, replaced=collection))
 
 
 def render(path: Path) -> np.ndarray:

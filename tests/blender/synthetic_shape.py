@@ -1,4 +1,4 @@
-"""A synthetic person of format version 2: one who has a shape model, with frames as the paper defines them."""
+"""A synthetic person whose body follows its shape."""
 
 from __future__ import annotations
 
@@ -7,30 +7,12 @@ from pathlib import Path
 import numpy as np
 import synthetic
 
-STENCIL = 5
-
-
-def frames(vertices: np.ndarray, model: dict) -> tuple[np.ndarray, np.ndarray]:
-    """Centres [K, 3] and axes [K, 3, 3] of primitives, one after the other by definition."""
-    position, rotation = [], []
-    for k, face in enumerate(model["face"]):
-        position.append(model["barycentric"][k].astype(np.float64) @ vertices[model["faces"][face]])
-        du, dv = (
-            model[name][k].astype(np.float64) @ vertices[model["stencil_vertex"][k]]
-            for name in ("stencil_du", "stencil_dv")
-        )
-        t = du / np.linalg.norm(du)
-        n = np.cross(t, dv)
-        n /= np.linalg.norm(n)
-        rotation.append(np.stack([t, np.cross(n, t), n], -1))
-    return np.array(position), np.array(rotation)
-
 
 def at(person: dict, betas: np.ndarray) -> dict:
     """The person's arrays at other betas, and how much larger boxes are there: `growth` [K, 3]."""
     vertices = person["template"] + np.einsum("vcb,b->vc", person["shape_basis"].astype(np.float64), betas)
     joints = person["joint_template"] + np.einsum("jcb,b->jc", person["joint_basis"].astype(np.float64), betas)
-    position, rotation = frames(vertices, person)
+    position, rotation = synthetic.frames(vertices, person)
     growth = (sides(vertices, person) / sides(person["vertices"], person)) ** 0.5
     return {
         **person,
@@ -57,7 +39,7 @@ def sides(vertices: np.ndarray, model: dict) -> np.ndarray:
 
 
 def arrays(count: int = 12, seed: int = 0) -> dict[str, np.ndarray]:
-    """The fields of a human.npz: bodies taller by the first beta, wider by the second, anyhow by others."""
+    """The fields of a human and its body: bodies taller by the first beta, wider by the second, anyhow by others."""
     person = synthetic.arrays(count, seed)
     rng = np.random.default_rng(seed + 1)
     surface, rest = person["vertices"], person["joints"]
@@ -65,34 +47,29 @@ def arrays(count: int = 12, seed: int = 0) -> dict[str, np.ndarray]:
     for points, change in ((surface, basis), (rest, joint_basis)):
         change[..., 0] = points * [0.0, 0.04, 0.0]
         change[..., 1] = points * [0.05, 0.0, 0.05]
-    faces = person["faces"].astype(np.int32)
-    face = rng.integers(0, len(faces), count).astype(np.int32)
-    barycentric = rng.dirichlet([1.0, 1.0, 1.0], count)
-    others = rng.integers(0, len(surface), (count, STENCIL - 3))
+    face = rng.integers(0, len(person["faces"]), count).astype(np.int32)
+    others = rng.integers(0, len(surface), (count, synthetic.STENCIL - 3))
     model = {
-        "template": surface.astype(np.float32),
         "shape_basis": basis.astype(np.float32),
-        "joint_template": rest.astype(np.float32),
         "joint_basis": joint_basis.astype(np.float32),
-        "faces": faces,
         "face": face,
-        "barycentric": barycentric.astype(np.float32),
-        "stencil_vertex": np.concatenate([faces[face], others], 1).astype(np.int32),
+        "barycentric": rng.dirichlet([1.0, 1.0, 1.0], count).astype(np.float32),
+        "stencil_vertex": np.concatenate([person["faces"][face], others], 1).astype(np.int32),
         "stencil_du": _differences(rng, count),
         "stencil_dv": _differences(rng, count),
     }
-    generated = at({**person, **model, "format_version": np.array(2)}, person["betas"] * 0.5)
+    person |= model
+    generated = at({**person, "primitive_weights": synthetic.weights_of(person)}, person["betas"] * 0.5)
     del generated["growth"]
     return generated
 
 
 def _differences(rng: np.random.Generator, count: int) -> np.ndarray:
     """Weights of stencils [count, STENCIL] that sum to zero, as a derivative's do, wherever the body is."""
-    weights = rng.normal(0, 1, (count, STENCIL))
+    weights = rng.normal(0, 1, (count, synthetic.STENCIL))
     return (weights - weights.mean(1, keepdims=True)).astype(np.float32)
 
 
-def write(path: Path, count: int = 12, seed: int = 0, **changes: np.ndarray) -> Path:
-    """Save a synthetic human.npz, with fields replaced by `changes`."""
-    np.savez(path, **{**arrays(count, seed), **changes})
-    return path
+def write(folder: Path, count: int = 12, seed: int = 0, **changes: np.ndarray) -> Path:
+    """Save a synthetic human in a folder, with fields replaced by `changes`; returns its file."""
+    return synthetic.save(folder, {**arrays(count, seed), **changes})

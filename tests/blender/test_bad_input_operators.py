@@ -14,9 +14,7 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
-import synthetic
 import synthetic_shape
-from exporting import write_person
 from jobs_driven import drive
 from scene_state import state
 from shown_words import ways
@@ -154,7 +152,7 @@ def files_missing(_person) -> None:
 
 def never_saved(person) -> None:
     bpy.ops.wm.read_homefile(use_empty=True)
-    build_human(bpy.context, SOURCE["npz"], "Anna", [SOURCE["file"]])
+    build_human(bpy.context, SOURCE["file"], "Anna")
 
 
 def backend_missing(_person) -> None:
@@ -168,7 +166,7 @@ def backend_missing(_person) -> None:
 
 
 def two_people(_person) -> None:
-    build_human(bpy.context, SOURCE["npz"], "Berta", [SOURCE["file"]])
+    build_human(bpy.context, SOURCE["file"], "Berta")
     nothing_active(None)
 
 
@@ -195,12 +193,9 @@ def anna(addon, tmp_path, monkeypatch):
     from blender_primdiffusion.backend import environment
 
     monkeypatch.setattr(environment, "search", environment.search)  # after `backend_missing`
-    npz = synthetic_shape.write(tmp_path / "human.npz", 8)
-    monkeypatch.setenv("FAKE_HUMAN", str(npz))
-    (tmp_path / "first").mkdir()
-    write_person(tmp_path / "first" / "person.human.safetensors", synthetic.arrays(8)["betas"])
-    SOURCE.update(npz=npz, file=tmp_path / "first" / "person.human.safetensors")
-    person = build_human(addon, npz, "Anna", [SOURCE["file"]])
+    SOURCE.update(file=synthetic_shape.write(tmp_path / "human", 8))
+    monkeypatch.setenv("FAKE_HUMAN", str(SOURCE["file"]))
+    person = build_human(addon, SOURCE["file"], "Anna")
     bpy.context.view_layer.objects.active = armature_of(person)
     bpy.context.scene.frame_end = 2
     bpy.ops.wm.save_mainfile()

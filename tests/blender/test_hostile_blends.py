@@ -12,24 +12,22 @@ from support.errors import refused
 
 from blender_primdiffusion.backend import environment
 from blender_primdiffusion.backend.environment import BackendNotFound, candidates
-from blender_primdiffusion.jobs.late_volumes import late_volumes, write_before_rendering
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_before_rendering
 from blender_primdiffusion.jobs.queue import chosen_checkpoint, queue
 from blender_primdiffusion.places import EXTENSION, preference
 from blender_primdiffusion.scene import collect, merged
-from blender_primdiffusion.scene.body_file import BODY_FILE
-from blender_primdiffusion.scene.edit import edit_destination, replace_person
+from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import (
-    PERSON,
     VolumeWriteError,
     armature_of,
     folder_of,
     humans_folder,
     person_file,
-    unwritten_in,
     volume_path,
     volumes_of,
 )
-from blender_primdiffusion.scene.human_npz import unwritten_name, write_now
+from blender_primdiffusion.scene.pending import pending_of
+from blender_primdiffusion.scene.states import prepare_now
 from blender_primdiffusion.ui.setup import known
 
 
@@ -50,40 +48,29 @@ def test_no_value_of_a_property_leaves_the_folder_or_raises(pristine, tmp_path, 
     assert pristine.users.read_bytes() == SECRET
 
 
-def test_saving_replaces_nothing_that_a_body_files_name_leads_to(pristine, capsys):
-    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
-    person()[BODY_FILE] = "../../../.bashrc"
-    bpy.ops.wm.save_mainfile()
-    assert pristine.users.read_bytes() == SECRET
-    assert "the custom property 'primdiffusion_body_file' of 'Anna' is ignored" in capsys.readouterr().out
-
-
 def test_a_strangers_human_is_collected_where_its_names_are_right(pristine):
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     bpy.ops.wm.save_mainfile()
-    folder = pristine.humans / "Anna"
-    assert {volume_path(volume).parent for volume in bpy.data.volumes} == {folder}
+    folder = pristine.humans / "Anna" / "0001"
+    primitives = [volume_path(obj.data) for objects in volumes_of(person()).values() for obj in objects]
+    assert {path.parent for path in primitives} == {folder}
     assert person_file(person()) == folder / "person.human.safetensors"
-    assert len(list(pristine.humans.glob("body_*.npz"))) == 1
+    assert (folder / "body.safetensors").is_file()
 
 
 @pytest.mark.parametrize("size", ["same", "other"])
-def test_saving_replaces_no_file_of_another_content(pristine, capsys, size):
-    (pristine.humans / "Anna").mkdir(parents=True)
-    names = [f"Anna/{path.name}" for path in pristine.shipped.iterdir() if not path.is_symlink()]
-    names += [path.name for path in pristine.shipped.parent.glob("body_*.npz")]
-    for name in names:
-        length = (pristine.shipped.parent / name).stat().st_size
-        (pristine.humans / name).write_bytes(b"x" * (length if size == "same" else 3))
+def test_saving_replaces_no_file_of_another_content(pristine, size):
+    there = pristine.humans / "Anna" / "0001"
+    there.mkdir(parents=True)
+    for path in pristine.shipped.iterdir():
+        if not path.is_symlink():
+            (there / path.name).write_bytes(b"x" * (path.stat().st_size if size == "same" else 3))
     before = {path: path.read_bytes() for path in pristine.humans.rglob("*") if path.is_file()}
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     bpy.ops.wm.save_mainfile()
     assert {path: path.read_bytes() for path in before} == before
-    shown = capsys.readouterr().out
-    assert ("is not replaced: move it away" in shown) == (size == "other")
-    if size == "same":
-        assert person()[PERSON] != "person.human.safetensors"
-        assert person_file(person()).read_bytes() == (pristine.shipped / "person.human.safetensors").read_bytes()
+    assert person_file(person()).parent == pristine.humans / "Anna" / "0002"
+    assert person_file(person()).read_bytes() == (pristine.shipped / "person.human.safetensors").read_bytes()
 
 
 def test_an_edit_writes_nothing_through_a_link_in_place_of_the_humans_folder(pristine, tmp_path):
@@ -92,11 +79,7 @@ def test_an_edit_writes_nothing_through_a_link_in_place_of_the_humans_folder(pri
     pristine.humans.mkdir()
     folder_of(person()).symlink_to(tmp_path / "outside")
     with refused(VolumeWriteError):
-        replace_person(
-            person(),
-            write_now(pristine.source / "human.npz", edit_destination(person())),
-            pristine.source / "person.human.safetensors",
-        )
+        replace_person(person(), prepare_now(pristine.source / "person.human.safetensors", replaced=person()))
     with refused(VolumeWriteError):
         merged.publish([pristine.source / "grid.vdb"], ["a"], merged.merged_folder(person()))
     assert not list((tmp_path / "outside").iterdir())
@@ -104,19 +87,16 @@ def test_an_edit_writes_nothing_through_a_link_in_place_of_the_humans_folder(pri
 
 def elsewhere(stage: Stage, place: str) -> Path:
     """A .blend whose human is in a folder of the user's, where its volumes are still to be written."""
-    folder = {"temporary": stage.shipped, "named": stage.root / "home" / ".config" / "Anna"}[place]
+    folder = {"temporary": stage.shipped, "named": stage.root / "home" / ".config" / "Anna" / "0001"}[place]
     bpy.ops.wm.open_mainfile(filepath=str(stage.blend))
     if folder != stage.shipped:
-        folder.parent.mkdir()
+        folder.parent.mkdir(parents=True)
         shutil.move(stage.shipped, folder)
-        for body in stage.shipped.parent.glob("body_*.npz"):
-            shutil.move(body, folder.parent)
         for volume in bpy.data.volumes:
             volume.filepath = str(folder / Path(volume.filepath).name)
     names = sorted(path.name for path in folder.glob("prim_*.vdb") if not path.is_symlink())
     for name in names:
         (folder / name).unlink()
-    shutil.copy(stage.source / "human.npz", folder / unwritten_name(names))
     saving = bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]
     bpy.app.handlers.save_pre.clear()  # the stranger has no extension
     bpy.app.handlers.save_post.clear()
@@ -127,7 +107,7 @@ def elsewhere(stage: Stage, place: str) -> Path:
 
 
 def by_timer() -> None:
-    while late_volumes.work(0.0):
+    while deferred_volumes.work(0.0):
         pass
 
 
@@ -154,8 +134,9 @@ def test_no_volume_is_written_in_a_folder_that_a_blend_merely_names(pristine, wr
     assert len(primitives) == COUNT
     assert all(path.is_file() and path.is_relative_to(own) for path in primitives)
     assert not pristine.changed_outside(before)
-    assert unwritten_in(folder), "the stranger's file stays"
-    assert not late_volumes.error
+    assert (folder / "person.human.safetensors").is_file(), "the stranger's file stays"
+    assert pending_of(person()) is None
+    assert not deferred_volumes.error
 
 
 @pytest.mark.parametrize("link", [False, True])
@@ -177,10 +158,10 @@ def test_no_volume_is_written_beside_a_blend_that_a_human_is_appended_or_linked_
 def test_nothing_is_written_through_a_link_in_place_of_a_folder_of_volumes(pristine, tmp_path):
     folder = elsewhere(pristine, "named")
     pristine.humans.mkdir()
-    (pristine.humans / "Anna").symlink_to(folder)
+    (pristine.humans / "Anna").symlink_to(folder.parent)
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     for volume in bpy.data.volumes:
-        volume.filepath = str(pristine.humans / "Anna" / Path(volume.filepath).name)
+        volume.filepath = str(pristine.humans / "Anna" / "0001" / Path(volume.filepath).name)
     before = pristine.before()
     by_timer()
     assert pristine.before() == before
@@ -198,7 +179,7 @@ def test_a_folder_that_cannot_be_copied_is_told_once(pristine, monkeypatch, caps
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     by_timer()
     by_timer()
-    assert "could not be copied" in late_volumes.error
+    assert "could not be copied" in deferred_volumes.error
     assert capsys.readouterr().out.count("could not be copied") == 1
     assert pristine.before() == before
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-import synthetic
 import synthetic_shape
 from exporting import write_person
 from scene_state import state
@@ -69,7 +68,7 @@ def whole(ending: str, folder: Path) -> bytes:
     """A valid file, to be cut."""
     path = folder / f"whole{ending}"
     if ending == ".npz":
-        synthetic_shape.write(path, 8)
+        np.savez(path, **synthetic_shape.arrays(8))
     elif ending in (".human", ".human.safetensors"):
         write_person(path)
     elif ending == ".npy":
@@ -118,11 +117,8 @@ def fault(name: str, folder: Path, **properties: str) -> str:
 
 @pytest.fixture
 def anna(addon, tmp_path, monkeypatch):
-    npz = synthetic_shape.write(tmp_path / "human.npz", 8)
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "first").mkdir()
-    write_person(tmp_path / "first" / "person.human.safetensors", synthetic.arrays(8)["betas"])
-    person = build_human(addon, npz, "Anna", [tmp_path / "first" / "person.human.safetensors"])
+    person = build_human(addon, synthetic_shape.write(tmp_path / "human", 8), "Anna")
     bpy.context.view_layer.objects.active = armature_of(person)
     bpy.context.scene.frame_end = 2
     bpy.ops.wm.save_mainfile()

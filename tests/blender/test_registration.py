@@ -96,7 +96,7 @@ def test_people_survive_the_extensions_absence(saved_scene, tmp_path):
     from blender_primdiffusion.scene.human import humans
 
     blender_primdiffusion.register()
-    build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 4))
+    build_human(saved_scene, synthetic.write(tmp_path / "human", 4))
     bpy.context.scene.primdiffusion.seed = 41
     bpy.ops.wm.save_mainfile()
     blender_primdiffusion.unregister()

@@ -14,6 +14,7 @@ from pathlib import Path
 import psutil
 from chaos.kills import Tally
 from chaos.results import leftovers
+from support import tensor_files
 from support.fake_child import DIES, FAKE_CHILD
 
 from blender_primdiffusion.backend.client import BackendClient, Silent
@@ -37,8 +38,9 @@ class Deaths:
     def __init__(self, folder: Path, rng: random.Random) -> None:
         self._folder, self._rng = folder, rng
         self._numbers = itertools.count()
-        self._human = folder / "human.npz"
-        self._human.write_bytes(b"a human")
+        self._human = folder / "person.human.safetensors"
+        tensor_files.write_tensors(self._human, {}, {"provenance": "{}"})
+        (folder / tensor_files.BODY).write_bytes(b"a body")
         self._backend = Backend(self._fake)
         self.tally = Tally()
         self.hangs = 0

@@ -239,7 +239,7 @@ def served(given: Inputs) -> list[Program]:
             lambda out: {"capture": given.captures, "subject": "person_000000", "views": 2, "size": 16,
                          "checkpoint": given.encoder, "out_dir": out / "new"},
         ),
-        asked("human_npz", lambda out: {"person": given.human(1), "out_dir": out / "new", "size": 16}),
+        asked("open_human", lambda out: {"person": given.human(1), "out_dir": out / "new", "size": 16}),
         asked(
             "render",
             lambda out: {"human": given.human(1), "out": out / "a.png", "depth": out / "b.png", "width": 32,

@@ -57,7 +57,7 @@ def test_a_request_runs_from_a_cold_start_to_its_files(start):
     assert request.step == request.total == 200
     assert request.fraction == 1.0
     assert request.error is None
-    assert request.result.human.exists()
+    assert request.result.person.exists()
     assert any(eta is not None and eta > 0 for eta in etas)
     assert request.info["device"] in ("cpu", "cuda")
     assert not request.tick(), "a finished request stays as it is"

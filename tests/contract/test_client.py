@@ -59,7 +59,7 @@ def test_a_killed_child_is_one_clear_event(client, slow_checkpoint, tmp_path):
     assert not client.alive
     time.sleep(0.3)
     assert client.poll() == []
-    assert not (out / "human.npz").exists()
+    assert not (out / "person.human.safetensors").exists()
 
 
 def test_a_request_to_a_dead_child_is_no_error_of_its_own(client):

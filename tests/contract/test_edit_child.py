@@ -1,6 +1,5 @@
 """Edits of people with the real child: as the protocol promises them to anyone."""
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from primdiffusion.human_file import load_human, save_human
 from tiny_model import VOCABULARY
 
 CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
-RESULTS = ("human", "person", "preview", "side", "depth")
+RESULTS = ("person", "preview", "side", "depth")
 
 
 @pytest.fixture(scope="module")
@@ -77,8 +76,6 @@ def test_an_edit_reports_its_steps_and_leaves_whole_files(child, people, asked, 
     assert result["seconds"] >= result["seconds_sampling"] > 0
     edits = load_human(result["person"]).provenance["edits"]
     assert edits[0]["edit"].startswith(method)
-    with np.load(result["human"]) as human:
-        assert json.loads(str(human["meta"]))["edits"] == edits
     assert not list(Path(asked["out_dir"]).glob(".*"))
 
 

@@ -13,7 +13,7 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
     ("script", "options", "files"),
     [
         ("generate_pose_render.py", ["--size", "48"], {"yaw_000.png", "yaw_270.png", "person.human.safetensors"}),
-        ("drive_the_child.py", ["--steps", "2"], {"human.npz", "front.png"}),
+        ("drive_the_child.py", ["--steps", "2"], {"person.human.safetensors", "front.png"}),
     ],
 )
 def test_an_example_leaves_its_files(script, options, files, checkpoint, tmp_path):

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 from export_people import person
-from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.human_file import load_human, save_human
 from primdiffusion.reshaping import reshaped as reshape_in_backend
 from support.errors import refused
 
+from blender_primdiffusion.scene.body import default_body
 from blender_primdiffusion.scene.human_file import (
     HumanMotion,
     motion_in,
@@ -16,7 +17,6 @@ from blender_primdiffusion.scene.human_file import (
     with_motion,
     write_tensors,
 )
-from blender_primdiffusion.scene.human_npz import read_human
 
 
 @pytest.fixture
@@ -40,10 +40,7 @@ def test_a_file_taken_apart_and_written_again_is_the_same_person(saved, tmp_path
 
 def test_a_reshaped_person_in_a_file_is_the_backends_reshaped_person(saved, tmp_path):
     betas = np.linspace(-1.5, 1.5, 10).astype(np.float32)
-    export_for_blender(tmp_path / "human.npz", person())
-    model = read_human(tmp_path / "human.npz").shape_model
-    assert model is not None
-    kept = reshaped(read_tensors(saved), betas, model.growth(person().betas.numpy(), betas))
+    kept = reshaped(read_tensors(saved), betas, default_body().growth(person().betas.numpy(), betas))
     write_tensors(tmp_path / "b.human", with_motion(kept, walk()))
     again, wanted = load_human(tmp_path / "b.human"), reshape_in_backend(person(), torch.tensor(betas))
     assert again.betas.equal(wanted.betas)

@@ -47,7 +47,6 @@ ALLOWED = {
         "evaluation/gallery.py",
         "formats/picture_files.py",
         "motion/files.py",
-        "scene/body_file.py",
         "scene/human_file.py",
         "training/run_folder.py",
         "backend/packages.py",

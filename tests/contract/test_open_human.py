@@ -6,12 +6,22 @@ import numpy as np
 import pytest
 import torch
 from export_people import person
-from primdiffusion.human import Human
-from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.body.model import default_body as backend_body
+from primdiffusion.human import Human, place
+from primdiffusion.human_file import load_human, save_body, save_human
+from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 
-from blender_primdiffusion.jobs.open_human import opened, rest_arrays
-from blender_primdiffusion.scene.human_file import compacted, expanded, read_payload, read_tensors, write_tensors
-from blender_primdiffusion.scene.human_npz import read_human
+from blender_primdiffusion.jobs.export import opened
+from blender_primdiffusion.scene.body import default_body
+from blender_primdiffusion.scene.human_file import (
+    body_arrays,
+    compacted,
+    expanded,
+    read_payload,
+    read_tensors,
+    write_tensors,
+)
+from blender_primdiffusion.scene.rest_human import read_human
 
 
 @pytest.fixture(scope="module")
@@ -26,24 +36,30 @@ def human() -> Human:
     return dataclasses.replace(person(), payload=payload, betas=torch.linspace(-2, 2, 10))
 
 
-def test_the_arrays_equal_the_backends(human, tmp_path):
+def test_the_default_body_is_the_backends(tmp_path):
+    save_body(tmp_path / "body.safetensors", backend_body(), default_anchors())
+    wanted = body_arrays(tmp_path / "body.safetensors")
+    model = default_body()
+    assert {name for name in vars(model) if getattr(model, name) is not None} == set(wanted)
+    for name, values in wanted.items():
+        assert getattr(model, name).dtype == values.dtype, name
+        assert np.allclose(getattr(model, name), values, rtol=0, atol=1e-5), name
+
+
+def test_a_human_at_rest_is_the_backends_in_the_t_pose(human, tmp_path):
     save_human(tmp_path / "a.human", human)
-    export_for_blender(tmp_path / "human.npz", human)
-    arrays = rest_arrays(tmp_path / "a.human")
-    with np.load(tmp_path / "human.npz") as wanted:
-        assert set(arrays) == set(wanted)
-        for name in wanted:
-            assert np.asarray(arrays[name]).dtype == wanted[name].dtype, name
-            if wanted[name].dtype.kind == "U":
-                assert np.array_equal(arrays[name], wanted[name]), name
-            else:
-                assert np.allclose(arrays[name], wanted[name], rtol=0, atol=1e-5), name
+    found, wanted = read_human(tmp_path / "a.human"), place(human)
+    assert np.allclose(found.rest.position, wanted.position, atol=1e-5)
+    assert np.allclose(found.rest.rotation, wanted.rotation, atol=1e-4)
+    assert np.allclose(found.grids().half_extent, wanted.half_extent, atol=1e-6)
+    weights = anchor_skin_weights(default_anchors(), backend_body())
+    assert np.allclose(found.model.primitive_weights(), weights, atol=1e-6)
 
 
 def test_what_is_opened_is_a_whole_human(human, tmp_path):
     save_human(tmp_path / "a.human", human, compact=True)
     result = opened(tmp_path / "a.human", tmp_path)
-    assert np.allclose(read_human(result.human).betas, human.betas)
+    assert np.allclose(read_human(result.person).payload.betas, human.betas)
     assert load_human(result.person).betas.equal(human.betas)
 
 

@@ -1,6 +1,5 @@
 """The child as the protocol promises it to anyone: lines in, lines out."""
 
-import json
 import subprocess
 import sys
 
@@ -9,6 +8,7 @@ import pytest
 from conversation import BUSY_STEPS, Conversation
 from PIL import Image
 from primdiffusion import __version__
+from primdiffusion.human_file import load_human
 
 CANCELLED, DOMAIN_ERROR = -32001, -32002
 
@@ -70,10 +70,9 @@ def test_generate_reports_every_step_and_leaves_whole_files(child, checkpoint, t
     assert 0 < result["seconds_sampling"] < result["seconds"]
     assert result["peak_gb"] > 0.1
     assert sorted(path.name for path in out.iterdir()) == [
-        "depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png",
+        "depth.png", "front.png", "person.human.safetensors", "side.png",
     ]  # fmt: skip
-    with np.load(result["human"], allow_pickle=False) as human:
-        assert json.loads(str(human["meta"]))["seed"] == 5
+    assert load_human(result["person"]).provenance["seed"] == 5
     with Image.open(result["preview"]) as picture:
         assert picture.size == (512, 512)
         assert np.asarray(picture).max() > 60
@@ -83,12 +82,11 @@ def test_the_same_seed_gives_the_same_person_and_another_seed_another(child, che
     def rgb(id, seed, name):
         out = tmp_path / name
         child.ask(id, "generate", seed=seed, steps=2, size=32, out_dir=str(out), checkpoint=str(checkpoint))
-        with np.load(out / "human.npz") as human:
-            return human["rgb"]
+        return load_human(out / "person.human.safetensors").payload.rgb
 
     first = rgb(20, 3, "a")
-    assert np.array_equal(first, rgb(21, 3, "b"))
-    assert not np.array_equal(first, rgb(22, 4, "c"))
+    assert first.equal(rgb(21, 3, "b"))
+    assert not first.equal(rgb(22, 4, "c"))
 
 
 @pytest.mark.parametrize(
@@ -158,12 +156,12 @@ def test_a_second_generate_is_rejected_while_one_runs_and_cancel_stops_the_first
 
 
 def test_cancelling_in_a_folder_that_was_there_keeps_what_was_in_it(child, slow_checkpoint, tmp_path):
-    (tmp_path / "human.npz").write_bytes(b"an older person")
+    (tmp_path / "person.human.safetensors").write_bytes(b"an older person")
     child.busy(80, tmp_path, slow_checkpoint)
     child.ask(81, "cancel", id=80)
     child.answer(80)
-    assert [path.name for path in tmp_path.iterdir()] == ["human.npz"]
-    assert (tmp_path / "human.npz").read_bytes() == b"an older person"
+    assert [path.name for path in tmp_path.iterdir()] == ["person.human.safetensors"]
+    assert (tmp_path / "person.human.safetensors").read_bytes() == b"an older person"
 
 
 def test_render_draws_a_saved_person_in_a_pose(child, checkpoint, tmp_path):

@@ -38,13 +38,14 @@ def make_compact(folder: Path) -> Path:
 
 def read_human(path: Path) -> None:
     """What Import Human File, the engine and a drop from the file browser do with it."""
-    from blender_primdiffusion.jobs.open_human import rest_arrays
     from blender_primdiffusion.scene.human_file import motion_in, read_tensors
+    from blender_primdiffusion.scene.rest_human import read_human
 
     motion = motion_in(read_tensors(path), path.name)
     if motion is not None:
         finite_members(motion)
-    finite(*(values for values in rest_arrays(path).values() if isinstance(values, np.ndarray)))
+    human = read_human(path)
+    finite_members(human.payload, human.rest, human.grids())
 
 
 def make_checkpoint(folder: Path) -> Path:
@@ -59,18 +60,38 @@ def read_vocabulary(path: Path) -> None:
     finite(*read_vocabulary(path).scalars.values())
 
 
-def make_body_file(folder: Path) -> Path:
-    from blender_primdiffusion.jobs.open_human import default_body
+def make_small(folder: Path) -> Path:
+    """On a body of the user's files, of which Blender reads the file beside it."""
+    import synthetic
 
-    np.savez(folder / "body_0123456789ab.npz", **default_body()[0].arrays())
-    return folder / "body_0123456789ab.npz"
+    return synthetic.write(folder, count=6)
+
+
+def make_body_file(folder: Path) -> Path:
+    return make_small(folder).with_name("body.safetensors")
 
 
 def read_body_file(path: Path) -> None:
-    from blender_primdiffusion.scene.body_file import read_body_file
+    from blender_primdiffusion.scene.body import _read_body
+    from blender_primdiffusion.scene.human_file import file_version
 
-    read_body_file.cache_clear()
-    finite_members(read_body_file(path))
+    _read_body.cache_clear()
+    finite_members(_read_body(file_version(path)))
+
+
+def make_earlier_body(folder: Path) -> Path:
+    import synthetic
+    from support import tensor_files
+
+    arrays, _ = tensor_files.read_tensors(synthetic.write(folder, count=6).with_name(tensor_files.BODY))
+    np.savez(folder / "body_0123456789ab.npz", **arrays)
+    return folder / "body_0123456789ab.npz"
+
+
+def read_earlier_body(path: Path) -> None:
+    from blender_primdiffusion.scene.earlier_files import read_earlier_body
+
+    finite(*read_earlier_body(path).values())
 
 
 def make_proxy(folder: Path) -> Path:
@@ -115,8 +136,7 @@ def read_cameras(path: Path) -> None:
 
 def make_body(folder: Path) -> Path:
     from blender_primdiffusion.formats.arrays import read_arrays
-
-    from blender_primdiffusion.places import body_data
+    from blender_primdiffusion.formats.body_layout import body_data
 
     names = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "f", "kintree_table")
     np.savez(folder / "body.npz", **read_arrays(body_data("body.npz"), names))
@@ -176,7 +196,9 @@ TARGETS = (
     Target("moving human in Blender", make_moving, mutations.SAFETENSORS, read_human),
     Target("compact human in Blender", make_compact, mutations.SAFETENSORS, read_human),
     Target("vocabulary", make_checkpoint, mutations.SAFETENSORS, read_vocabulary),
-    Target("body file", make_body_file, mutations.NPZ, read_body_file),
+    Target("small human in Blender", make_small, mutations.SAFETENSORS, read_human),
+    Target("body file", make_body_file, mutations.SAFETENSORS, read_body_file),
+    Target("earlier body file", make_earlier_body, mutations.NPZ, read_earlier_body),
     Target("proxy", make_proxy, mutations.NPZ, read_proxy),
     Target("motion .npy", as_npy, NPY, read_motion),
     Target("motion .json", as_json, mutations.JSON, read_motion),

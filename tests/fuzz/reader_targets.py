@@ -44,15 +44,14 @@ def read_by_both(path: Path) -> None:
     """By the extension, which leaves humans on a body of the user's to the backend, and by the backend."""
     from primdiffusion.human_file import load_human
 
-    from blender_primdiffusion.jobs.open_human import arrays_in
     from blender_primdiffusion.scene.human_file import read_tensors
+    from blender_primdiffusion.scene.rest_human import read_human
 
     in_extension = in_backend = None
     try:
-        human = read_tensors(path)
-        if "body" in human.metadata:
+        if "body" in read_tensors(path).metadata:
             return
-        arrays_in(human, path.name)
+        read_human(path)
     except ValueError as error:
         in_extension = error
     try:
@@ -78,10 +77,10 @@ def make_requests(folder: Path) -> Path:
 
 
 RESULTS: dict[str, dict[str, Any]] = {
-    "generate": {"human": "a.npz", "person": "a.human", "seconds": 0.5},
-    "reconstruct": {"human": "a.npz", "person": "a.human", "seconds": 0.5, "warnings": ["few views"]},
+    "generate": {"person": "a.human", "seconds": 0.5},
+    "reconstruct": {"person": "a.human", "seconds": 0.5, "warnings": ["few views"]},
     "variations": {
-        "people": [{"seed": 3, "human": "a.npz", "person": "a.human", "picture": "a.png"}], "seconds": 0.1,
+        "people": [{"seed": 3, "person": "a.human", "picture": "a.png"}], "seconds": 0.1,
     },
     "merge_frames": {"files": ["a.npz"], "seconds": 1},
     "proxy": {"proxy": "a.npz", "texture": "a.png", "betas": [0.5] * 10, "triangles": 500, "seconds": 2.5},

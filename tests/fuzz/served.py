@@ -92,7 +92,7 @@ CALLS: dict[str, dict[str, Any]] = {
     "gaussians": {
         **PERSON, "out": "made/x.ply", "object": STILL, "joints": [STILL] * 24, "betas": [0.5] * 10, "limit": 50,
     },
-    "human_npz": {**PERSON, "out_dir": "made", "size": 16},
+    "open_human": {**PERSON, "out_dir": "made", "size": 16},
     "hello": {},
     "cancel": {"id": 1},
     "shutdown": {},

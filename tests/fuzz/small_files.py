@@ -312,28 +312,6 @@ def read_body(path: Path) -> object:
     return load_body(path)
 
 
-def small_human(folder: Path) -> Path:
-    from fuzz.targets import make_synthetic_npz
-
-    return make_synthetic_npz(folder)
-
-
-def many_boxes(kind: str, boxes: int, noise: int = 0) -> Callable[[Path], Path]:
-    return lambda folder: _many_boxes(folder, kind, boxes, noise)
-
-
-def _many_boxes(folder: Path, kind: str, boxes: int, noise: int) -> Path:
-    """A human for Blender of so many boxes, whose numbers are zero."""
-    path = small_human(folder)
-    with np.load(path) as archive:
-        kept = {name: archive[name] for name in archive.files}
-    count = len(kept["position"])
-    large = {
-        name: (kind, (boxes, *array.shape[1:])) for name, array in kept.items() if array.ndim and len(array) == count
-    }
-    return zeros(path, large, noise=noise, **{name: array for name, array in kept.items() if name not in large})
-
-
 def weights(count: int, noise: int = 0) -> Callable[[Path], Path]:
     return lambda folder: zeros(folder / "a.npz", {"weights": ("i1", (count,))}, noise=noise)
 
@@ -342,9 +320,3 @@ def read_weights(path: Path) -> object:
     from primdiffusion.editing.regions import read_weights
 
     return read_weights(path)
-
-
-def read_human(path: Path) -> object:
-    from blender_primdiffusion.scene.human_npz import read_human
-
-    return read_human(path)

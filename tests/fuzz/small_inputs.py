@@ -24,7 +24,6 @@ from fuzz.small_files import (
     bvh,
     captured_poses,
     glb,
-    many_boxes,
     many_corners,
     many_faces,
     matrices,
@@ -37,7 +36,6 @@ from fuzz.small_files import (
     read_capture,
     read_captured_poses,
     read_glb,
-    read_human,
     read_motion,
     read_payload,
     read_pose,
@@ -50,7 +48,6 @@ from fuzz.small_files import (
     shared_lists,
     small_body,
     small_glb,
-    small_human,
     small_motion,
     small_pickle,
     small_picture,
@@ -235,9 +232,6 @@ INPUTS: dict[str, SmallInput] = {
     "payload of scales": SmallInput(payload(1, 10_000), read_payload, payload(1, 0), "people"),
     "body of many faces": SmallInput(many_faces, read_body, small_body, "people"),
     "body of shared lists": SmallInput(shared_lists, read_body, small_pickle, "people"),
-    "human of many boxes": SmallInput(many_boxes("f4", 100_000), read_human, small_human, "people"),
-    "human of bytes": SmallInput(many_boxes("i1", 15_000), read_human, small_human, "people"),
-    "human of bytes and noise": SmallInput(many_boxes("i1", 50_000, 700_000), read_human, small_human, "people"),
     "weights of bytes and noise": SmallInput(weights(150_000_000, 4_000_000), read_weights, weights(100), "people"),
 }  # fmt: skip
 if __name__ == "__main__":

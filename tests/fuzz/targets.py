@@ -43,26 +43,6 @@ def read_human(path: Path) -> None:
         raise Garbage("density below zero")
 
 
-def make_npz(folder: Path) -> Path:
-    from primdiffusion.human_file import export_for_blender
-
-    export_for_blender(folder / "human.npz", tiny_human())
-    return folder / "human.npz"
-
-
-def make_synthetic_npz(folder: Path) -> Path:
-    import synthetic
-
-    return synthetic.write(folder / "human.npz", count=6)
-
-
-def read_npz(path: Path) -> None:
-    from blender_primdiffusion.scene.human_npz import read_human as read
-
-    found = read(path)
-    finite_members(found)
-
-
 def make_checkpoint(folder: Path) -> Path:
     from primdiffusion.diffusion.checkpoint import save_checkpoint
     from tiny_model import tiny_model
@@ -367,8 +347,6 @@ def read_merged(path: Path) -> None:
 TARGETS = (
     Target("human", make_human, mutations.SAFETENSORS, read_human),
     Target("compact human", make_compact, mutations.SAFETENSORS, read_human),
-    Target("human.npz", make_npz, mutations.NPZ, read_npz),
-    Target("small human.npz", make_synthetic_npz, mutations.NPZ, read_npz),
     Target("checkpoint", make_checkpoint, mutations.SAFETENSORS, read_checkpoint),
     Target("released checkpoint", make_released, mutations.TORCH, read_released),
     Target("SMPL .npz", make_smpl_npz, mutations.NPZ, read_body),

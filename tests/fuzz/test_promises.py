@@ -56,9 +56,10 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             f"{BLENDS}test_a_python_beside_the_file_is_not_run_and_the_preferences_say_why",
         ),
     ),
-    "humans `.human`, `.human.safetensors`": (
+    "humans `.human`, `.human.safetensors`, their `body.safetensors`": (
         (
             "human", "compact human", "human in Blender", "compact human in Blender", "moving human in Blender",
+            "small human in Blender", "body file",
         ),
         ("tests/backend/test_human_file.py::test_a_damaged_file_is_rejected_by_name_with_its_damage",),
     ),
@@ -92,11 +93,11 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("UV .obj",),
         ("tests/backend/body/test_smpl_files.py::test_wrong_paths_and_texture_files_are_named",),
     ),
-    "arrays `.npz`: motion, AMASS, captures, payloads, humans for Blender": (
+    "arrays `.npz`: motion, AMASS, captures, payloads, bodies of earlier `.blend` files": (
         (
             "AMASS", "poses .npz", "pose .npz", "parameters of a scan", "captures: poses", "captures: pickled poses",
-            "captures: joints", "payload", "payload of a gallery", "painted weights", "solids", "human.npz",
-            "small human.npz", "body file", "body of captures", "proxy", "merged grid",
+            "captures: joints", "payload", "payload of a gallery", "painted weights", "solids",
+            "earlier body file", "body of captures", "proxy", "merged grid",
         ),
         (
             "tests/backend/formats/test_arrays.py::test_arrays_of_one_call_share_the_limit",

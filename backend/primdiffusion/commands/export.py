@@ -1,4 +1,4 @@
-"""Export humans: `primdiffusion export`, and `proxy`, `gaussians` and `human_npz` of JSON-RPC."""
+"""Export humans: `primdiffusion export`, and `proxy`, `gaussians` and `open_human` of JSON-RPC."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from primdiffusion.commands.session import Session
 from primdiffusion.export.gaussians import gaussians_of, write_gaussians
 from primdiffusion.export.proxy import ARRAYS, TEXTURE, mesh_proxy, write_proxy_arrays, write_proxy_glb, write_proxy_obj
 from primdiffusion.formats.answers import GaussiansAnswer, HumanAnswer, ProxyAnswer
-from primdiffusion.formats.requests import GaussiansRequest, HumanNpzRequest, ProxyRequest
+from primdiffusion.formats.requests import GaussiansRequest, OpenHumanRequest, ProxyRequest
 from primdiffusion.formats.whole_files import staged
 from primdiffusion.human import Human, place, place_skinned
 from primdiffusion.human_file import load_human
@@ -62,7 +62,7 @@ def gaussians(request: GaussiansRequest, session: Session, report: ReportProgres
     return GaussiansAnswer(out=request.out, gaussians=len(splats.opacity), seconds=seconds)
 
 
-def human_npz(request: HumanNpzRequest, session: Session, report: ReportProgress) -> HumanAnswer:
+def open_human(request: OpenHumanRequest, session: Session, report: ReportProgress) -> HumanAnswer:
     """Write the files of `generate` for a saved human, all or none. Raises OSError, and as load_human."""
     began = time.perf_counter()
     with staged(request.out_dir) as folder:

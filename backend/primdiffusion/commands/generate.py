@@ -17,6 +17,7 @@ from primdiffusion.commands.output import (
     PreviewFiles,
     draw_front_and_back,
     step_previews,
+    write_files,
     write_human,
 )
 from primdiffusion.commands.progress import Pace, ReportProgress, progress_bar, step_reporter
@@ -30,7 +31,7 @@ from primdiffusion.formats.removing import check_unlinked
 from primdiffusion.formats.requests import GenerateRequest, VariationsRequest
 from primdiffusion.formats.whole_files import staged, staged_together
 from primdiffusion.human import Human, generate_batch, people_of
-from primdiffusion.human_file import export_for_blender, load_human, save_human
+from primdiffusion.human_file import load_human
 from primdiffusion.machine import peak_memory_gb
 
 
@@ -112,8 +113,7 @@ def variations(request: VariationsRequest, session: Session, report: ReportProgr
         report("sample", 0, request.steps, None)
         for index, human in enumerate(_sample_variations(model, request, folder, report)):
             files = _files(folder, request.seeds[index])
-            export_for_blender(files.human, human)
-            save_human(files.person, human)
+            write_files(files.person, human)
             draw_front_and_back(files.picture, human, request.size)
             report("write", index + 1, len(request.seeds), None, picture=files.picture, index=index)
     return VariationsAnswer(
@@ -126,7 +126,6 @@ def variations(request: VariationsRequest, session: Session, report: ReportProgr
 def _files(folder: Path, seed: int) -> VariationFiles:
     return VariationFiles(
         seed=seed,
-        human=folder / f"{seed}.human.npz",
         person=folder / f"{seed}.human.safetensors",
         picture=folder / f"{seed}.png",
     )

@@ -36,7 +36,7 @@ from primdiffusion.formats.schema import Ending, FieldError, Length, Option, Ran
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GenerateCommand(GenerateRequest):
-    """Generate humans: human.npz for Blender, person.human.safetensors, and previews."""
+    """Generate humans: person.human.safetensors and previews."""
 
     out_dir: OutDir
     """Output folder; with --count above 1, of a folder for each human."""
@@ -166,7 +166,7 @@ class ViewCommand:
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class RefineCommand:
-    """Optimise a human to match captures: human.npz for Blender, person.human.safetensors, and previews.
+    """Optimise a human to match captures: person.human.safetensors and previews.
 
     Captures are those of `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's
     layout, in several poses and from many sides: with few views the result overfits to them. Some cameras are held out

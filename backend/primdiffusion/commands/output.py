@@ -18,7 +18,7 @@ from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.removing import remove_file
 from primdiffusion.human import Human, framing, place
-from primdiffusion.human_file import export_for_blender, save_human
+from primdiffusion.human_file import save_body, save_human
 from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
 from primdiffusion.render.march import march
 
@@ -39,33 +39,40 @@ Decode = Callable[[Tensor], Human | None]
 class OutputFiles:
     """File names in an output folder."""
 
-    blender: str = "human.npz"
     human: str = "person.human.safetensors"
+    body: str = "body.safetensors"
+    """Only for a human on a body of the user's files."""
     front: str = "front.png"
     side: str = "side.png"
     depth: str = "depth.png"
 
     def in_folder(self, folder: Path) -> dict[str, Any]:
         """Return the paths by their names in answers."""
-        names = {"human": self.blender, "person": self.human, "preview": self.front, "side": self.side}
-        return {name: folder / file for name, file in {**names, "depth": self.depth}.items()}
+        names = {"person": self.human, "preview": self.front, "side": self.side, "depth": self.depth}
+        return {name: folder / file for name, file in names.items()}
 
 
 FILES = OutputFiles()
 
 
 def write_human(folder: Path, human: Human, size: int, *, compact: bool = False) -> None:
-    """Write all FILES: the human for Blender and for this program, and previews of size x size pixels in the T pose.
+    """Write all FILES: the human, and previews of size x size pixels in the T pose.
 
     The first preview on a machine takes some seconds longer: the marcher is compiled, and cached. Raises OSError.
     """
-    export_for_blender(folder / FILES.blender, human)
-    save_human(folder / FILES.human, human, compact=compact)
+    write_files(folder / FILES.human, human, compact=compact)
     primitives = place(human)
     front = march(primitives, framing(primitives, 0.0, size, size))
     to_png(folder / FILES.front, front)
     depth_to_png(folder / FILES.depth, front)
     to_png(folder / FILES.side, march(primitives, framing(primitives, math.pi / 2, size, size)))
+
+
+def write_files(path: Path, human: Human, *, compact: bool = False) -> None:
+    """Write the human's file to `path`, and for a body of the user's files that body beside it. Raises OSError."""
+    save_human(path, human, compact=compact)
+    if human.body_setup is not None:
+        save_body(path.with_name(FILES.body), human.body_setup.body, human.body_setup.anchors)
 
 
 class PreviewBudget:

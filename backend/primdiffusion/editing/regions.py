@@ -97,7 +97,7 @@ def region_from_weights(
 ) -> Bool[Tensor, "k"]:
     """Return the primitives whose mean painted weight is at least `threshold`.
 
-    `weights` holds a number from 0 to 1 for each vertex of the body, in the order of `human.npz` (a vertex group in
+    `weights` holds a number from 0 to 1 for each vertex of the body, in its order (a vertex group in
     Blender). The mean is over the primitive's 8 x 8 texels; on a body other than the default one, at its anchor.
 
     Raises ValueError for a wrong number of vertices, values that are not finite, a threshold outside (0, 1], and a

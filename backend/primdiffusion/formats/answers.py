@@ -19,10 +19,8 @@ Seconds = Annotated[float, Range(0, 2**63)]
 class HumanAnswer(Open):
     """The files of a human."""
 
-    human: Path
-    """human.npz, for Blender."""
     person: Path
-    """The .human.safetensors file."""
+    """The .human.safetensors file; beside it body.safetensors, for a human on a body of the user's files."""
     seconds: Seconds
     preview: Path | None = None
     """The human from the front, PNG."""
@@ -54,7 +52,6 @@ class VariationFiles(Open):
     """One of several humans."""
 
     seed: Count
-    human: Path
     person: Path
     picture: Path
 
@@ -227,7 +224,7 @@ class Message(Open):
 
 ANSWERS: dict[str, type] = {
     "hello": HelloAnswer,
-    **dict.fromkeys(("generate", "vary", "interpolate", "inpaint", "transfer", "human_npz"), HumanAnswer),
+    **dict.fromkeys(("generate", "vary", "interpolate", "inpaint", "transfer", "open_human"), HumanAnswer),
     "variations": VariationsAnswer,
     "attributes": AttributesAnswer,
     "reconstruct": ReconstructAnswer,

@@ -41,6 +41,14 @@ LARGEST_STRETCH = 1.6
 groin of a raised leg, stretch further."""
 
 
+def body_data(name: str) -> Path:
+    """body.npz or layout.npz of the default body, which every build has. Raises FileNotFoundError."""
+    path = Path(__file__).resolve().parents[1] / "body" / "data" / name
+    if not path.is_file():
+        raise FileNotFoundError(f"{name} of the default body is missing: install the program again")
+    return path
+
+
 def read_layout(path: Path) -> dict[str, NDArray]:
     """cell_face [K], cell_barycentric [K, 3], cell_chart [K], texel_face [H, W] and texel_barycentric [H, W, 3].
 

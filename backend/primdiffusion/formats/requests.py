@@ -96,7 +96,8 @@ class Previews:
     """Fields of requests that write the files of a human."""
 
     out_dir: OutDir
-    """Output folder, created if missing: human.npz for Blender, person.human.safetensors, and previews."""
+    """Output folder, created if missing: person.human.safetensors and previews; for a body of the user's files
+    also body.safetensors, for Blender."""
     size: Pixels = 512
     """Width and height of the previews, pixels."""
 
@@ -111,7 +112,7 @@ class StepPreviews(Sampling, Previews):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GenerateRequest(StepPreviews, Conditioning):
-    """Generate a human: human.npz for Blender, person.human.safetensors, and previews."""
+    """Generate a human: person.human.safetensors and previews."""
 
     seed: Seed
     """Another seed gives another human; the same seed gives the same human."""
@@ -126,7 +127,7 @@ class VariationsRequest(Sampling, Conditioning):
     seeds: Annotated[list[Seed], Length(1, 64)]
     """Different seeds. They are sampled as one batch: memory grows with their number."""
     out_dir: Path
-    """Output folder, created if missing, for SEED.human.npz, SEED.human.safetensors and SEED.png of each."""
+    """Output folder, created if missing, for SEED.human.safetensors and SEED.png of each."""
     sampler: Sampler = "ddim"
     size: Annotated[int, Range(2, 1024)] = 256
     """Width and height of the previews, pixels."""
@@ -189,7 +190,7 @@ class RegionRequest(EditRequest):
     region: list[Text] = dataclasses.field(default_factory=list)
     """Body parts by name, such as top, bottom, shoes, hair, left_hand (docs/design/diffusion_edits.md)."""
     weights: Path | None = None
-    """Instead of region: an .npz with `weights`, a number from 0 to 1 for each vertex of human.npz's body."""
+    """Instead of region: an .npz with `weights`, a number from 0 to 1 for each vertex of the body."""
     seed: Seed = 0
     """Another seed gives another result; the same seed gives the same result."""
 
@@ -222,7 +223,7 @@ class TransferRequest(RegionRequest):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ReconstructRequest(Previews):
-    """Reconstruct a human from captures: human.npz for Blender, person.human.safetensors, and previews.
+    """Reconstruct a human from captures: person.human.safetensors and previews.
 
     Views are those of one frame; nothing is trained for a subject. Captures are those of
     `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's layout.
@@ -402,7 +403,7 @@ class GaussiansRequest:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class HumanNpzRequest(Previews):
+class OpenHumanRequest(Previews):
     """Write the files of `generate` for a saved human."""
 
     person: Path
@@ -438,7 +439,7 @@ REQUESTS: dict[str, type] = {
     "merge_frames": MergeFramesRequest,
     "proxy": ProxyRequest,
     "gaussians": GaussiansRequest,
-    "human_npz": HumanNpzRequest,
+    "open_human": OpenHumanRequest,
     "cancel": CancelRequest,
     "shutdown": NoParameters,
 }

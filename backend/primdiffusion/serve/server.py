@@ -66,7 +66,7 @@ FUNCTIONS = {
     "merge_frames": "merge:merge_frames",
     "proxy": "export:proxy",
     "gaussians": "export:gaussians",
-    "human_npz": "export:human_npz",
+    "open_human": "export:open_human",
 }
 """Module of `commands` and function by method; the functions run on the main thread, one at a time."""
 GRACE_S = 3.0

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ...scene.human import BODY_MARK
 from ...scene.human_file import file_version
 from ...scene.proxy import PROXY_MARK
-from ..boxes import Boxes, EarlierVersionError
+from ..boxes import Boxes
 from ..picture import PosedHuman, human_armatures, pose_of
 from ..solids import visible_instances
 from ..who_draws import Drawer, who_draws
@@ -22,10 +22,6 @@ from .march import GpuPayload
 
 READING_S = 0.1
 """Time for reading the files of new humans in one go."""
-_EARLIER = (
-    "the human {!r} was made by an earlier version and its volumes are hidden: show these (in the Outliner, or "
-    "Advanced > Attachment > Volumes in Viewport), edit the human, or generate it again"
-)
 _UNRELATED = (
     bpy.types.Mesh,
     bpy.types.Curve,
@@ -114,7 +110,7 @@ class SceneReader:
                 placed = self._placed.get(key) or gpu_humans().placed(pose)
             except (ValueError, OSError) as error:
                 if "volume" not in shown:  # Blender's fog shows where the human is
-                    errors.append(_EARLIER.format(owner.name) if isinstance(error, EarlierVersionError) else str(error))
+                    errors.append(str(error))
                 continue
             humans[key] = ShownHuman(obj.session_uid, pose, placed)
             if not known and number < len(candidates) and time.monotonic() > end:
@@ -134,7 +130,7 @@ def concerns_humans(changed: bpy.types.ID) -> bool:
 
 def _key(pose: PosedHuman) -> object:
     betas = None if pose.betas is None else tuple(pose.betas)
-    return file_version(pose.file), pose.body, pose.object_to_world.tobytes(), pose.joints.tobytes(), betas
+    return file_version(pose.file), pose.object_to_world.tobytes(), pose.joints.tobytes(), betas
 
 
 def _noting(

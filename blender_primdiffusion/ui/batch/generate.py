@@ -1,7 +1,7 @@
 """`blender -c primdiffusion generate`: humans in folders, without a window.
 
 OUT/settings.json, report.json
-OUT/person_000007/person.human.safetensors, human.npz, front.png, side.png, depth.png
+OUT/person_000007/person.human.safetensors, front.png, side.png, depth.png
 OUT/person_000007/person.blend, person_humans/      where asked for
 """
 
@@ -18,7 +18,7 @@ from ...console import Stop, duration
 from ...formats.regular_files import real_path
 from ...formats.removing import check_unlinked
 from ...jobs.queue import chosen_checkpoint
-from ...scene.human import NPZ_FILE, PERSON_FILE
+from ...scene.human import PERSON_FILE
 from ..attributes import Attributes, parsed
 from .people import Movement, movement_of, person_blend
 from .running import Clock, NoBackend, Say, Stopped, ask, backend_of, begun, publish, reason, run, staging
@@ -97,9 +97,8 @@ class _Person:
                 ask(backend, "generate", {**self._params, "out_dir": str(made)}, self._stop, self._print_progress)
                 publish(made, self._folder, last=PERSON_FILE)
         if self._blend is not None:
-            npz, person = self._folder / NPZ_FILE, self._folder / PERSON_FILE
             with staging(self._folder) as made:
-                person_blend(npz, person, made / self._blend, self.name, self._movement)
+                person_blend(self._folder / PERSON_FILE, made / self._blend, self.name, self._movement)
                 publish(made, self._folder, last=self._blend)
 
     def _print_progress(self, request: ChildRequest) -> None:

@@ -49,14 +49,14 @@ def movement_of(options: argparse.Namespace) -> Movement | None:
     return None if path is None else Movement(read_motion(path), options.pose is not None)
 
 
-def person_blend(npz: Path, person: Path, blend: Path, name: str, movement: Movement | None) -> None:
+def person_blend(person: Path, blend: Path, name: str, movement: Movement | None) -> None:
     """Save a .blend with one human, ready to render. Replaces the open file.
 
-    Raises HumanNpzError, VolumeWriteError, OSError.
+    Raises as `build_human`, OSError.
     """
     new_file()
     _save(blend)  # where the volumes go
-    build_person(bpy.context, npz, person, name, movement)
+    build_person(bpy.context, person, name, movement)
     _save(blend)
     remove_file(blend.with_name(f"{blend.name}1"), blend.parent)  # Blender's backup
 
@@ -67,10 +67,10 @@ def new_file() -> None:
 
 
 def build_person(
-    context: bpy.types.Context, npz: Path, person: Path, name: str, movement: Movement | None
+    context: bpy.types.Context, person: Path, name: str, movement: Movement | None
 ) -> bpy.types.Collection:
-    """Build the human of two files in the open file, moved, with a camera and a transparent background."""
-    collection = build_human(context, npz, name, [person])
+    """Build the human of a file in the open file, moved, with a camera and a transparent background."""
+    collection = build_human(context, person, name)
     if movement is not None:
         movement.apply(context, collection)
     scene = context.scene

@@ -24,11 +24,10 @@ from ...engine.engine import ENGINE
 from ...formats.regular_files import check_regular, exists_in_its_folder, real_path
 from ...formats.removing import remove_file, remove_folder
 from ...formats.whole_files import replacing
-from ...jobs.open_human import opened
-from ...scene.collect import collect_unwritten
+from ...jobs.deferred_volumes import deferred_volumes
+from ...jobs.export import opened
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
-from ...scene.human import NPZ_FILE, PERSON_FILE, humans, humans_folder, volume_path
-from ...scene.unwritten import write_all_unwritten
+from ...scene.human import PERSON_FILE, humans, humans_folder, volume_path
 from .people import (
     Movement,
     build_person,
@@ -68,11 +67,6 @@ class RenderSource:
     def is_blend(self) -> bool:
         """Whether it is a .blend; else a human's file."""
         return self.path.suffix == ".blend"
-
-    @property
-    def has_npz(self) -> bool:
-        """Whether the human's folder may hold what Blender needs of it."""
-        return self.path.name == PERSON_FILE
 
 
 def sources(path: Path) -> list[RenderSource]:
@@ -240,12 +234,9 @@ class _Drawing:
         new_file()
         remove_folder(humans_folder(""), humans_folder("").parent)
         with tempfile.TemporaryDirectory(dir=bpy.app.tempdir or None) as folder:
-            npz, person = source.path.with_name(NPZ_FILE), source.path
-            if not (source.has_npz and npz.is_file()):
-                asked = {"person": str(source.path), "out_dir": folder, "size": 16}
-                made = opened(source.path, Path(folder)) or ask(self._backend, "human_npz", asked, self._stop)
-                npz, person = made.human, made.person
-            build_person(bpy.context, npz, person, source.name, self._movement)
+            asked = {"person": str(source.path), "out_dir": folder, "size": 16}
+            made = opened(source.path, Path(folder)) or ask(self._backend, "open_human", asked, self._stop)
+            build_person(bpy.context, made.person, source.name, self._movement)
         render = bpy.context.scene.render
         render.resolution_x, render.resolution_y = self._options.size or _PICTURE
         look_from(bpy.context.scene, self._options.yaw or 0.0, moving_extent(bpy.context.scene))
@@ -274,8 +265,7 @@ class _Drawing:
 
 
 def _check_volumes(scene: bpy.types.Scene) -> None:
-    collect_unwritten()
-    write_all_unwritten()
+    deferred_volumes.finish()
     volumes = {obj.data for person in humans(scene) for obj in person.all_objects if obj.type == "VOLUME"}
     paths = [path for path in map(volume_path, volumes) if path is not None]
     missing = [path for path in paths if not exists_in_its_folder(path)]

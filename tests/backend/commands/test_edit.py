@@ -13,7 +13,7 @@ from primdiffusion.editing.regions import region_from_weights, region_of
 from primdiffusion.human_file import load_human, save_human
 from tiny_model import save_tiny_checkpoint, tiny_model
 
-FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 
 
 @pytest.fixture(scope="module")
@@ -99,7 +99,7 @@ def test_transfer_of_a_garment_copies_shape_too_and_harmonising_changes_it_withi
 def test_a_transfer_needs_no_checkpoint(line, tmp_path):
     take = ["transfer", "--source", "bob.human.safetensors", "--region", "top"]
     cli.main(line(*take, "--checkpoint", "nowhere"))
-    assert (tmp_path / "out" / "human.npz").exists()
+    assert (tmp_path / "out" / "person.human.safetensors").exists()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`primdiffusion export` and the child's jobs proxy, gaussians and human_npz."""
+"""`primdiffusion export` and the child's jobs proxy, gaussians and open_human."""
 
 import numpy as np
 import pytest
@@ -7,12 +7,12 @@ import torch
 import trimesh
 from export_people import person
 from primdiffusion import cli
-from primdiffusion.commands.export import gaussians, human_npz, proxy
+from primdiffusion.commands.export import gaussians, open_human, proxy
 from primdiffusion.commands.session import Session
-from primdiffusion.formats.requests import GaussiansRequest, HumanNpzRequest, ProxyRequest
+from primdiffusion.formats.requests import GaussiansRequest, OpenHumanRequest, ProxyRequest
 from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.human import place, pose_body
-from primdiffusion.human_file import save_human
+from primdiffusion.human_file import load_human, save_human
 
 COARSE = ["--triangles", "800", "--texture", "64"]
 
@@ -80,9 +80,8 @@ def test_the_childs_gaussians_stand_where_the_armature_does(saved, tmp_path):
 
 
 def test_a_person_who_exists_gets_the_files_of_generate(saved, tmp_path):
-    result = human_npz(HumanNpzRequest(person=saved, out_dir=tmp_path / "out", size=32), Session(), silent)
-    with np.load(result.human) as arrays:
-        assert torch.equal(torch.from_numpy(arrays["betas"]), person().betas)
+    result = open_human(OpenHumanRequest(person=saved, out_dir=tmp_path / "out", size=32), Session(), silent)
+    assert torch.equal(load_human(result.person).betas, person().betas)
     assert all(path.is_file() for path in (result.person, result.preview, result.side, result.depth))
 
 
@@ -104,7 +103,7 @@ def test_a_cancelled_proxy_leaves_nothing(saved, tmp_path):
         (ProxyRequest, {"person": "p", "out_dir": "x", "betas": ["tall"]}),
         (GaussiansRequest, {"person": "p", "out": "x", "object": [[1, 0, 0, 0]] * 3}),
         (GaussiansRequest, {"person": "p", "out": "x", "limit": 0}),
-        (HumanNpzRequest, {"person": "p", "out_dir": "x", "size": 0}),
+        (OpenHumanRequest, {"person": "p", "out_dir": "x", "size": 0}),
     ],
 )
 def test_impossible_parameters_are_rejected(kind, wrong):

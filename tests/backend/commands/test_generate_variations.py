@@ -3,7 +3,6 @@
 import itertools
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -48,15 +47,13 @@ def test_each_person_is_the_one_that_generate_makes_of_the_seed(checkpoint, mode
         VariationsRequest(seeds=[5, 2**63 - 1, 6], out_dir=tmp_path / "out", **how), Session(), listener
     )
     assert [person.seed for person in result.people] == [5, 2**63 - 1, 6]
-    assert len(list((tmp_path / "out").iterdir())) == 9
+    assert len(list((tmp_path / "out").iterdir())) == 6
     for person in result.people:
         kept = load_human(person.person)
         alone = generate(model, person.seed, 3, "dpmpp_2m", None, **asked)
         assert dict(kept.provenance) == dict(alone.provenance)
         assert torch.allclose(kept.payload.rgb, alone.payload.rgb, atol=1e-4)
         assert torch.allclose(kept.betas, alone.betas, atol=1e-4)
-        with np.load(person.human, allow_pickle=False) as human:
-            assert np.allclose(human["betas"], kept.betas)
         assert Path(person.picture).is_file()
     written = [more for stage, *_, more in listener.reports if stage == "write"]
     assert [(more["index"], more["size"]) for more in written] == [(0, (32, 32)), (1, (32, 32)), (2, (32, 32))]
@@ -89,7 +86,7 @@ def test_variants_of_a_person_are_those_that_vary_makes(checkpoint, model, tmp_p
         assert torch.equal(kept.betas, alone.betas)
         assert kept.provenance["edits"][0]["seed"] == made.seed
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        f"{seed}.{ending}" for seed in (8, 9) for ending in ("human.npz", "human.safetensors", "png")
+        f"{seed}.{ending}" for seed in (8, 9) for ending in ("human.safetensors", "png")
     ]
 
 

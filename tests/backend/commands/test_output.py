@@ -22,7 +22,7 @@ from primdiffusion.formats.requests import (
 from primdiffusion.formats.schema import FieldError, read
 from tiny_model import save_tiny_checkpoint
 
-FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 
 
 class Clock:
@@ -123,7 +123,7 @@ def test_generate_shows_what_the_person_will_look_like_and_leaves_no_pictures_be
     assert {(picture.size, picture.mode) for _, picture in listener.pictures} == {((24, 24), "RGBA")}
     assert all(picture.getchannel("A").getextrema() == (0, 255) for _, picture in listener.pictures)
     assert sorted(path.name for path in shown.iterdir()) == FILES
-    for name in ("human.npz", "front.png"):
+    for name in ("person.human.safetensors", "front.png"):
         assert (plain / name).read_bytes() == (shown / name).read_bytes(), "looking changes nothing"
 
 

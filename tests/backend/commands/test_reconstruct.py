@@ -29,7 +29,7 @@ from primdiffusion.reconstruction import reconstruct
 from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
-FILES = ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 FIRST, SECOND = "person_000000", "person_000001"
 
 
@@ -67,8 +67,7 @@ def failure(capsys, line, *more) -> str:
 def test_the_command_writes_what_generate_writes_and_says_where_it_comes_from(dataset, line, tmp_path, capsys):
     cli.main([*line, "--capture", str(dataset), "--subject", FIRST, "--frame", "1", "--views", "3"])
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == FILES
-    with np.load(tmp_path / "out" / "human.npz") as human:
-        meta = json.loads(str(human["meta"]))
+    meta = load_human(tmp_path / "out" / "person.human.safetensors").provenance
     chosen = captured_person(dataset, FIRST, 1, 3).cameras
     assert (meta["reconstructed_from"], meta["frame"], meta["views"]) == (FIRST, 1, list(chosen))
     assert (meta["checkpoint"], meta["full_density"]) == ("tiny encoder", 100.0)
@@ -126,7 +125,7 @@ def test_one_view_works_with_a_warning_that_the_rest_is_guessed(dataset, line, t
     cli.main([*line, "--capture", str(dataset / FIRST), "--views", "1"])
     warning = "primdiffusion: warning: only one view: the sides that it does not show are guessed\n"
     assert capsys.readouterr().err == warning
-    assert (tmp_path / "out" / "human.npz").exists()
+    assert (tmp_path / "out" / "person.human.safetensors").exists()
 
 
 def test_the_prior_fits_the_person_to_a_single_view(dataset, line, tmp_path):

@@ -10,7 +10,7 @@ import pytest
 import safetensors
 import safetensors.torch
 import torch
-from primdiffusion import cli
+from primdiffusion import cli, tensor_file
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import load_checkpoint, read_card
@@ -81,14 +81,14 @@ def test_the_imported_denoiser_gives_what_the_source_weights_give(folder):
 
 def test_generate_makes_people_on_the_users_body(person, folder):
     files = sorted(path.name for path in person.iterdir())
-    assert files == ["depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"]
+    assert files == ["body.safetensors", "depth.png", "front.png", "person.human.safetensors", "side.png"]
     body = load_body(folder / "SMPL_NEUTRAL.pkl", uv=folder / "smpl_uv.obj")
-    with np.load(person / "human.npz") as human:
-        np.testing.assert_allclose(human["vertices"], body.template, atol=1e-6)
-        np.testing.assert_array_equal(human["faces"], body.faces)
-        np.testing.assert_allclose(np.linalg.det(human["rotation"]), 1, atol=1e-4)
-        assert human["primitive_weights"].shape == (K, 24)
-        assert json.loads(str(human["meta"]))["seed"] == 3
+    tensors, metadata = tensor_file.read(person / "body.safetensors")
+    np.testing.assert_allclose(tensors["template"], body.template, atol=1e-6)
+    np.testing.assert_array_equal(tensors["faces"], body.faces)
+    assert tensors["rest_half_extent"].shape == (K, 3)
+    assert metadata["format"] == "primdiffusion.body"
+    assert load_human(person / "person.human.safetensors").provenance["seed"] == 3
 
 
 def test_a_saved_person_comes_back_on_the_same_body(person, folder):

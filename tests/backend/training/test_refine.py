@@ -216,7 +216,7 @@ def line(captures, tmp_path):
 def test_the_command_leaves_a_person_and_says_how_good_it_is(line, tmp_path, capsys):
     cli.main(line)
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
-        "depth.png", "front.png", "human.npz", "person.human.safetensors", "side.png"
+        "depth.png", "front.png", "person.human.safetensors", "side.png"
     ]  # fmt: skip
     human = load_human(tmp_path / "out" / "person.human.safetensors")
     assert human.provenance["refined_from"] == "person_000001"

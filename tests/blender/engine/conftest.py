@@ -24,7 +24,7 @@ def oracle(tmp_path_factory) -> Iterator[Oracle]:
 
 @pytest.fixture(scope="module")
 def folder(oracle, tmp_path_factory) -> Path:
-    """The files of a human: `human.npz`, `few.npz` with few primitives, `person.human.safetensors`."""
+    """The folder of a human's file."""
     return oracle.make(tmp_path_factory.mktemp("human"))
 
 

@@ -14,12 +14,11 @@ import pytest
 from engine_stage import PYTHON, ROOT
 from support.errors import refused
 
-from blender_primdiffusion.engine.boxes import EarlierVersionError, boxes_of
+from blender_primdiffusion.engine.boxes import BoxRig, boxes_of
 from blender_primdiffusion.engine.picture import PosedHuman
-from blender_primdiffusion.scene.body_file import read_body_file, saved_body_file
+from blender_primdiffusion.scene.body import default_body
 from blender_primdiffusion.scene.human_file import HumanTensors, file_version, read_payload, read_sizes, read_tensors
 from blender_primdiffusion.scene.human_file import write_tensors as write
-from blender_primdiffusion.scene.human_npz import read_human
 
 pytestmark = pytest.mark.any_blender
 CASES = 20
@@ -29,11 +28,8 @@ def made(folder: Path, kind: str) -> SimpleNamespace:
     folder.mkdir()
     command = [PYTHON, str(ROOT / "tests/blender/boxes_oracle.py"), str(folder), str(CASES), kind]
     subprocess.run(command, env={**os.environ, "PYTHONPATH": str(ROOT / "backend")}, check=True)
-    model = read_human(folder / "human.npz").shape_model
-    with saved_body_file(model, folder) as name, np.load(folder / "cases.npz") as cases:
-        return SimpleNamespace(
-            file=folder / "person.human.safetensors", body=folder / name, model=model, cases=dict(cases)
-        )
+    with np.load(folder / "cases.npz") as cases:
+        return SimpleNamespace(file=folder / "person.human.safetensors", kind=kind, cases=dict(cases))
 
 
 @pytest.fixture(scope="module", params=["default", "own"])
@@ -54,7 +50,6 @@ def posed(person, case: int = 0, **changes) -> PosedHuman:
         joints=cases["joints"][case].astype(np.float64),
         betas=None if case % 3 == 0 else cases["betas"][case].tolist(),
         pelvis=np.zeros(3),
-        body=person.body,
     )
     return dataclasses.replace(human, **changes)
 
@@ -72,26 +67,12 @@ def test_boxes_are_where_the_backend_places_them(person, case):
     assert (np.linalg.det(boxes.rotation) < 0).all() == mirrored
 
 
-def test_the_bodys_file_gives_the_model_back(person):
-    back = read_body_file(person.body)
-    assert (back.pose_basis is None) == (person.model.pose_basis is None)
-    for name, values in person.model.arrays().items():
-        np.testing.assert_array_equal(getattr(back, name), values)
-
-
-def test_a_body_of_an_earlier_version_is_rejected_in_a_sentence(plain, tmp_path):
-    early = dataclasses.replace(plain.model, skin_weights=None, rest_half_extent=None)
-    with saved_body_file(early, tmp_path) as name, refused(ValueError, "version"):
-        boxes_of(posed(plain, body=tmp_path / name))
-    with pytest.raises(EarlierVersionError):
-        boxes_of(posed(plain, body=None))
-
-
-def test_a_body_with_another_number_of_boxes_is_rejected(plain, tmp_path):
+def test_a_body_with_another_number_of_boxes_is_rejected(plain):
+    model = default_body()
     per_box = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")
-    fewer = dataclasses.replace(plain.model, **{name: getattr(plain.model, name)[:4] for name in per_box})
-    with saved_body_file(fewer, tmp_path) as name, pytest.raises(ValueError, match="does not fit"):
-        boxes_of(posed(plain, body=tmp_path / name))
+    fewer = dataclasses.replace(model, **{name: getattr(model, name)[:4] for name in per_box})
+    with refused(ValueError, plain.file.name):
+        BoxRig(fewer).place(posed(plain), read_sizes(file_version(plain.file)))
 
 
 def test_what_is_scaled_to_zero_is_rejected_by_name(plain):
@@ -110,7 +91,7 @@ def test_a_payload_is_read_as_the_backend_wrote_it(person):
         dtype, shape, raw = read_tensors(person.file).arrays[name]
         assert dtype == "F32"
         np.testing.assert_array_equal(getattr(payload, name), np.frombuffer(raw, "<f4").reshape(shape))
-    assert (payload.rest_half_extent is None) == (person.model.pose_basis is None)
+    assert (payload.rest_half_extent is None) == (person.kind == "default")
 
 
 def test_sizes_are_read_once_until_the_file_changes(plain, tmp_path):

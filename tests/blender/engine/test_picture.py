@@ -29,6 +29,7 @@ from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.human import armature_of, remove_human
+from blender_primdiffusion.scene.rest_human import read_human
 
 SIZE = (120, 90)
 REST = np.tile(np.eye(3), (24, 1, 1))
@@ -55,8 +56,7 @@ def stage(extension, saved_scene, backend, tmp_path):
 
 def placed(matrix, folder) -> np.ndarray:
     """The world from the body model's space [4, 4], for an armature at `matrix` with the rest body of a folder."""
-    with np.load(folder / "human.npz") as archive:
-        return np.array(matrix) @ raised(archive["vertices"])
+    return np.array(matrix) @ raised(read_human(folder / "person.human.safetensors").rest.vertices)
 
 
 def as_asked(folder, armature, rotations=REST, translation=(0, 0, 0)) -> dict:

@@ -22,10 +22,7 @@ BETAS = np.array([1.5, -2.0, 1.0, 0, 0, 1.0, 0, 0, 0, 0])
 @pytest.mark.parametrize("earlier", [False, True], ids=["now", "earlier version"])
 @pytest.mark.parametrize("shaped", [False, True], ids=["generated", "reshaped"])
 def test_joints_and_place_are_those_of_smpls_own_space(saved_scene, tmp_path, earlier, shaped):
-    (tmp_path / "first").mkdir()
-    keep = tmp_path / "first" / "person.human.safetensors"
-    keep.write_bytes(b"first")
-    person = build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"), keep=[keep])
+    person = build_human(saved_scene, synthetic_shape.write(tmp_path / "human"))
     armature, body = armature_of(person), synthetic_shape.arrays()
     rng = np.random.default_rng(0)
     rotations, translation = synthetic.axis_angle(rng.normal(0, 0.6, (24, 3))), rng.normal(0, 0.5, 3)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import pytest
 import synthetic_shape
-from late_volumes_stage import COUNT, STATES, advance, generated
+from deferred_volumes_stage import COUNT, STATES, advance, generated
 
 from blender_primdiffusion.scene import attachment
 
@@ -13,11 +13,11 @@ from blender_primdiffusion.scene import attachment
 @pytest.fixture
 def hidden(addon, tmp_path, monkeypatch):
     """Volumes are written as with a window."""
-    monkeypatch.setattr("blender_primdiffusion.jobs.queue.volumes_may_wait", lambda: True)
     monkeypatch.setattr(
-        "blender_primdiffusion.scene.edit.volumes_may_wait", lambda person: not attachment.in_viewport(person)
+        "blender_primdiffusion.scene.states.volumes_may_wait",
+        lambda person: person is None or not attachment.in_viewport(person),
     )
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
     return addon
 
 

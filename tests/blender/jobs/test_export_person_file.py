@@ -29,9 +29,7 @@ from blender_primdiffusion.scene.human import person_file
 
 @pytest.fixture
 def person(addon, tmp_path):
-    file = tmp_path / "person.human.safetensors"
-    file.write_bytes(b"a person")
-    return build_human(addon, synthetic_shape.write(tmp_path / "human.npz", 6), "Änne", [file])
+    return build_human(addon, synthetic_shape.write(tmp_path / "human", 6), "Änne")
 
 
 def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Job]:

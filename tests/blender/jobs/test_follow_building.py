@@ -17,8 +17,8 @@ from blender_primdiffusion.jobs.follow import building, follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.body_file import shape_model_of
-from blender_primdiffusion.scene.human import folder_of, humans, person_file, volume_path
+from blender_primdiffusion.scene.body import shape_model_of
+from blender_primdiffusion.scene.human import folder_of, humans, person_file, state_folder, volume_path
 
 """A seed that the fake child takes as an order."""
 COUNT = 12
@@ -28,7 +28,7 @@ COUNT = 12
 @pytest.fixture
 def on_their_way(addon, tmp_path, monkeypatch):
     """A person of whose volumes some are written."""
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
     monkeypatch.setattr("blender_primdiffusion.jobs.follow.SLICE_S", 0.0)
     bpy.ops.ed.undo_push(message="before")
     queue.add(addon, GenerateJob(7, {"steps": 1}))
@@ -51,16 +51,16 @@ def files_of_people(folder: Path) -> list[Path]:
 def check_whole(person: bpy.types.Collection) -> None:
     shown = [volume_path(obj.data) for obj in person.all_objects if obj.type == "VOLUME"]
     assert len(shown) == COUNT
-    assert all(path.is_file() and path.parent == folder_of(person) for path in shown)
-    assert person_file(person).parent == folder_of(person)
+    assert all(path.is_file() and path.parent == state_folder(person) for path in shown)
+    assert person_file(person).parent == state_folder(person)
     assert shape_model_of(person).template.shape[1] == 3
-    assert not list(folder_of(person).glob(".*.partial*"))
+    assert not list(state_folder(person).glob(".*.partial*"))
 
 
 def test_no_tick_writes_more_than_its_slice(addon, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.jobs.follow.SLICE_S", 0.0)
-    written, write_file, ticks = [], volumes.write_file, [0]
-    monkeypatch.setattr(volumes, "write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
+    written, write_vdb, ticks = [], volumes.write_vdb, [0]
+    monkeypatch.setattr(volumes, "write_vdb", lambda *args: written.append(ticks[0]) or write_vdb(*args))
     queue.add(addon, GenerateJob(7, {"steps": 1}))
     while follow() is not None:
         ticks[0] += 1
@@ -136,7 +136,7 @@ def test_a_script_that_does_not_wait_for_the_volumes_gets_the_whole_person(addon
     bpy.ops.primdiffusion.take_result()
     assert follow() is None
     (person,) = humans(bpy.context.scene)
-    assert len(list(folder_of(person).glob("*.vdb"))) == 8
+    assert len(list(state_folder(person).glob("*.vdb"))) == 8
 
 
 def test_cancel_adds_nothing_and_leaves_no_files(on_their_way, tmp_path):
@@ -184,7 +184,7 @@ def test_nothing_is_written_while_the_user_holds_something(on_their_way, monkeyp
 def test_a_damaged_answer_is_reported_and_leaves_no_files(addon, tmp_path):
     queue.add(addon, GenerateJob(GIVES_GARBAGE, {"steps": 1}))
     drive()
-    assert "is damaged" in error_of("generate")
+    assert "person.human.safetensors" in error_of("generate")
     assert not (tmp_path / "shot_humans").exists()
 
 
@@ -201,6 +201,6 @@ def test_queued_humans_do_not_disturb_each_other(addon):
         queue.add(addon, GenerateJob(seed, {"steps": 1}))
     drive()
     people = humans(bpy.context.scene)
-    assert len({folder_of(person) for person in people}) == 3
+    assert len({state_folder(person) for person in people}) == 3
     for person in people:
-        assert len(list(folder_of(person).glob("*.vdb"))) == 8
+        assert len(list(state_folder(person).glob("*.vdb"))) == 8

@@ -1,5 +1,4 @@
-"""A person in the scene on their way to become another, or to have lost volumes back, and all that can happen
-meanwhile."""
+"""A person in the scene on their way to become another, and all that can happen meanwhile."""
 
 from __future__ import annotations
 
@@ -14,13 +13,20 @@ from jobs_driven import drive, error_of, notice_of
 from support.fake_child import GIVES_GARBAGE
 
 import blender_primdiffusion
-from blender_primdiffusion.jobs.edit import RedressJob, RegenerateJob, RestoreJob, VaryJob, made_from_seed
+from blender_primdiffusion.jobs.edit import RegenerateJob, VaryJob, made_from_seed
 from blender_primdiffusion.jobs.follow import building, follow
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.human import MARK, folder_of, humans, person_file, remove_human, volume_path
-from blender_primdiffusion.scene.missing import missing_files
+from blender_primdiffusion.scene.human import (
+    MARK,
+    folder_of,
+    humans,
+    person_file,
+    remove_human,
+    state_folder,
+    volume_path,
+)
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
@@ -28,14 +34,12 @@ FINE = 8
 """Seeds that the fake child takes as orders, and one that it does not."""
 COUNT = 12
 """Primitives of the synthetic person."""
-OF_THE_REGION = 2
-"""Primitives that the fake child changes where a region is given."""
 SLICE_SECONDS = "blender_primdiffusion.jobs.follow.SLICE_S"
 
 
 @pytest.fixture
 def person(addon, tmp_path, monkeypatch):
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
     bpy.ops.primdiffusion.generate(seed=7, steps=1)
     bpy.ops.ed.undo_push(message="a person")
     return humans(addon.scene)[0]
@@ -57,7 +61,7 @@ def vary(person, seed: int = FINE) -> None:
 def until_written(seconds: float = 30.0) -> None:
     """Until the volumes are written, which the scene does not show yet."""
     end = time.monotonic() + seconds
-    while building._writing is None or not building._writing.over:
+    while building._preparing is None or not building._preparing.over:
         assert time.monotonic() < end
         assert follow() is not None
         time.sleep(0.005)
@@ -90,28 +94,17 @@ def check_drawn(person) -> None:
 
 def test_an_edit_writes_its_volumes_in_slices(person, monkeypatch):
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
-    written, write_file, ticks = [], volumes.write_file, [0]
-    monkeypatch.setattr(volumes, "write_file", lambda *args: written.append(ticks[0]) or write_file(*args))
+    written, write_vdb, ticks = [], volumes.write_vdb, [0]
+    monkeypatch.setattr(volumes, "write_vdb", lambda *args: written.append(ticks[0]) or write_vdb(*args))
     vary(person)
     while follow() is not None:
         ticks[0] += 1
     assert len(written) == len(set(written)) == COUNT
 
 
-def test_only_what_the_edit_changes_is_written(person, monkeypatch):
-    monkeypatch.setattr(SLICE_SECONDS, 0.0)
-    before = set(shown(person).values())
-    queue.add(bpy.context, RedressJob.of(person, {"steps": 2, "region": ["top"], "seed": FINE}))
-    until_written()
-    assert len(building._writing.result.made) == OF_THE_REGION
-    drive()
-    assert len(set(shown(person).values()) - before) == OF_THE_REGION
-    check_whole(person)
-
-
 def test_nothing_is_shown_until_all_is_in_one_undo_step(varied):
     before = shown(varied)
-    assert len(list(folder_of(varied).glob("*.vdb"))) == 2 * COUNT
+    assert len(list(folder_of(varied).glob("*/*.vdb"))) == 2 * COUNT
     drive()
     person = humans(bpy.context.scene)[0]
     after = shown(person)
@@ -123,22 +116,12 @@ def test_nothing_is_shown_until_all_is_in_one_undo_step(varied):
     check_whole(humans(bpy.context.scene)[0])
 
 
-def test_an_edit_that_changes_nothing_has_nothing_to_read(person):
-    vary(person)
-    drive()
-    before = shown(person)
-    vary(person)
-    drive()
-    assert shown(person) == before
-    assert "0 of 12 volumes of Human changed" in notice_of("vary")
-
-
 def test_a_human_removed_meanwhile_is_reported_and_no_file_stays(varied, tmp_path):
-    before = {path.name for path in shown(varied).values()}
+    before = set(shown(varied).values())
     remove_human(varied)
     drive()
     assert "was removed during the edit" in error_of("vary")
-    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+    assert set((tmp_path / "shot_humans").rglob("*.vdb")) == before
 
 
 def test_a_person_renamed_meanwhile_is_edited(varied):
@@ -173,7 +156,7 @@ def test_volumes_deleted_and_brought_back_meanwhile_show_what_they_should(person
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     vary(person)
     until_written()
-    assert len(building._writing.result.files) == COUNT - 1
+    assert len(list(building._preparing.result.folder.glob("prim_*.vdb"))) == COUNT - 1
     bpy.ops.ed.undo()
     drive()
     person = humans(bpy.context.scene)[0]
@@ -184,7 +167,7 @@ def test_volumes_deleted_and_brought_back_meanwhile_show_what_they_should(person
 def test_a_volume_deleted_meanwhile_stays_so(varied):
     bpy.data.objects.remove(next(obj for obj in varied.all_objects if obj.type == "VOLUME"))
     drive()
-    assert "11 of 11 volumes of Human changed" in notice_of("vary")
+    assert "11 volumes of Human changed" in notice_of("vary")
     check_whole(varied, COUNT - 1)
 
 
@@ -197,18 +180,18 @@ def test_a_person_reshaped_meanwhile_keeps_that_shape(varied):
 
 
 def test_saved_elsewhere_meanwhile_all_of_the_person_goes_along(varied, tmp_path):
-    before = {path.name for path in shown(varied).values()}
+    before = set(shown(varied).values())
     (tmp_path / "film").mkdir()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film" / "other.blend"))
     drive()
     person = humans(bpy.context.scene)[0]
     check_whole(person)
-    assert person_file(person).parent == tmp_path / "film" / "other_humans" / "Human"
-    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+    assert person_file(person).parent == tmp_path / "film" / "other_humans" / "Human" / "0002"
+    assert set((tmp_path / "shot_humans").rglob("*.vdb")) == before
 
 
 def test_a_first_save_meanwhile_takes_the_edited_person_along(addon, tmp_path, monkeypatch):
-    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared.npz", COUNT)))
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
     bpy.ops.wm.read_homefile(use_empty=True)
     bpy.ops.primdiffusion.generate(seed=7, steps=1)
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
@@ -218,7 +201,9 @@ def test_a_first_save_meanwhile_takes_the_edited_person_along(addon, tmp_path, m
     drive()
     person = humans(bpy.context.scene)[0]
     check_whole(person)
-    assert person_file(person).parent == tmp_path / "late_humans" / "Human"
+    bpy.ops.wm.save_mainfile()
+    check_whole(person)
+    assert person_file(person).parent.parent == folder_of(person) == tmp_path / "late_humans" / "Human"
 
 
 def test_files_removed_meanwhile_are_written_again(varied):
@@ -252,16 +237,16 @@ def test_cancel_leaves_files_that_undo_and_redo_need(person, monkeypatch):
 
 
 def test_another_file_loaded_meanwhile_leaves_no_files(varied, tmp_path):
-    before = {path.name for path in shown(varied).values()}
+    before = set(shown(varied).values())
     bpy.ops.wm.read_homefile(use_empty=True)
     drive()
-    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+    assert set((tmp_path / "shot_humans").rglob("*.vdb")) == before
 
 
 def test_disabling_the_extension_leaves_no_files(varied, tmp_path):
-    before = {path.name for path in shown(varied).values()}
+    before = set(shown(varied).values())
     blender_primdiffusion.unregister()
-    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+    assert set((tmp_path / "shot_humans").rglob("*.vdb")) == before
     blender_primdiffusion.register()
 
 
@@ -270,7 +255,7 @@ def test_a_full_disk_is_reported_and_leaves_scene_and_disk_as_they_were(person, 
         raise OSError("no space left on device")
 
     before, files = shown(person), on_disk(tmp_path)
-    monkeypatch.setattr(volumes, "write_file", full)
+    monkeypatch.setattr(volumes, "write_vdb", full)
     vary(person)
     drive()
     assert "no space left" in error_of("vary")
@@ -282,17 +267,17 @@ def test_a_damaged_answer_is_reported_and_leaves_scene_and_disk_as_they_were(per
     before, files = shown(person), on_disk(tmp_path)
     vary(person, GIVES_GARBAGE)
     drive()
-    assert "is damaged" in error_of("vary")
+    assert "person.human.safetensors" in error_of("vary")
     assert shown(person) == before
     assert on_disk(tmp_path) == files
 
 
 def test_a_failure_in_the_scene_leaves_no_files(varied, tmp_path, monkeypatch):
-    before = {path.name for path in shown(varied).values()}
-    monkeypatch.setattr("blender_primdiffusion.scene.edit.content_name", lambda _: 1 / 0)
+    before = set(shown(varied).values())
+    monkeypatch.setattr("blender_primdiffusion.scene.edit.check_editable", lambda _: 1 / 0)
     drive()
     assert error_of("vary")
-    assert {path.name for path in (tmp_path / "shot_humans").rglob("*.vdb")} == before
+    assert set((tmp_path / "shot_humans").rglob("*.vdb")) == before
 
 
 def test_a_script_that_does_not_wait_for_the_volumes_gets_the_whole_edit(person):
@@ -307,50 +292,11 @@ def test_a_script_that_does_not_wait_for_the_volumes_gets_the_whole_edit(person)
     check_whole(person)
 
 
-@pytest.fixture
-def lost(person, monkeypatch):
-    """The person after five volumes were lost while Blender was closed, and were asked for; about to be read."""
-    monkeypatch.setattr(SLICE_SECONDS, 0.0)
-    bpy.ops.wm.save_mainfile()
-    for path in sorted(folder_of(person).glob("*.vdb"))[:5]:
-        path.unlink()
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    (person,) = humans(bpy.context.scene)
-    bpy.context.view_layer.update()
-    assert not all(obj.data.grids.load() for obj in person.all_objects if obj.type == "VOLUME")  # seen by Blender
-    queue.add(bpy.context, RestoreJob(HumanTarget.of(person), str(person_file(person))))
-    until_written()
-    return person
-
-
-def test_lost_volumes_are_written_in_the_thread_and_counted_and_read(lost):
-    assert len(building._writing.result.files) == 5
-    drive()
-    assert "5 volumes of Human restored" in notice_of("restore_volumes")
-    check_drawn(lost)
-    check_whole(lost)
-    assert not missing_files()
-
-
-def test_lost_volumes_that_are_cancelled_stay_lost(lost):
-    bpy.ops.primdiffusion.cancel()
-    drive()
-    assert len(missing_files()[0].volumes) == 5
-
-
-def test_lost_volumes_of_a_file_saved_elsewhere_meanwhile_are_restored(lost, tmp_path):
-    (tmp_path / "film").mkdir()
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film" / "other.blend"))
-    drive()
-    assert not missing_files()
-    check_drawn(lost)
-
-
 def test_a_person_generated_again_is_written_in_the_thread(person, monkeypatch):
     monkeypatch.setattr(SLICE_SECONDS, 0.0)
     bpy.ops.wm.save_mainfile()
     made = made_from_seed(person)
-    for path in folder_of(person).iterdir():
+    for path in state_folder(person).iterdir():
         path.unlink()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     (person,) = humans(bpy.context.scene)

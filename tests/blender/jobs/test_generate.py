@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -12,7 +11,7 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
-from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG
+from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
 
 import blender_primdiffusion
 from blender_primdiffusion.jobs import generate
@@ -20,7 +19,7 @@ from blender_primdiffusion.jobs import queue as queue_module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import armature_of, folder_of, humans
+from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_OT_generate, PRIMDIFFUSION_PT_generate
 
 """Seeds that the fake child takes as orders."""
@@ -38,7 +37,7 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
     assert bpy.ops.primdiffusion.generate(seed=7, steps=3) == {"FINISHED"}
     (person,) = humans(addon.scene)
     assert sum(o.type == "VOLUME" for o in person.all_objects) == 8
-    sent = json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
+    sent = request_of(person_file(person))
     assert Path(sent.pop("out_dir")).name.startswith("generate_")
     assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "size": 16, "picture_px": 256}
     assert not queue.busy

@@ -7,16 +7,15 @@ import shutil
 from pathlib import Path
 
 import bpy
-import numpy as np
 import pytest
 import synthetic_shape
-from exporting import write_person
 from jobs_driven import shown
 from support.errors import refused
+from support.fake_child import request_of
 
 from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import HOME, MARK, folder_of, humans, person_file, volume_path
+from blender_primdiffusion.scene.human import HOME, MARK, folder_of, humans, person_file, state_folder, volume_path
 from blender_primdiffusion.scene.missing import missing_files
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human
 
@@ -28,17 +27,13 @@ COUNT = 8
 def store(tmp_path, monkeypatch, addon):
     folder = tmp_path / "store"
     folder.mkdir()
-    npz = synthetic_shape.write(folder / "human.npz", COUNT)
-    monkeypatch.setenv("FAKE_HUMAN", str(npz))
-    with np.load(npz) as archive:
-        betas = archive["betas"]
-    write_person(folder / "person.human.safetensors", betas)
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(folder, COUNT)))
     return folder
 
 
 @pytest.fixture
 def person(store, addon):
-    made = build_human(addon, store / "human.npz", "Anna", [store / "person.human.safetensors"])
+    made = build_human(addon, store / "person.human.safetensors", "Anna")
     bpy.ops.wm.save_mainfile()
     return made
 
@@ -64,12 +59,12 @@ def test_the_panel_is_empty_when_no_file_is_missing(person, addon):
 def test_a_folder_that_was_renamed_is_found_in_one_click(person, tmp_path):
     shutil.move(tmp_path / "shot_humans", tmp_path / "backup_humans")
     anna = reopened()
-    assert state.summary == f"{COUNT} volumes, person.human.safetensors, {anna['primdiffusion_body_file']} of 'Anna'"
+    assert state.summary == "person.human.safetensors of 'Anna'"
     assert "primdiffusion.find_missing_volumes" in shown(PRIMDIFFUSION_PT_human, bpy.context)
     assert ops.find_missing_volumes() == {"FINISHED"}
     assert whole(anna)
     assert state.summary == ""
-    assert all(volume.filepath.startswith("//backup_humans/Anna/") for volume in bpy.data.volumes)
+    assert all(volume.filepath.startswith("//backup_humans/Anna/0001/") for volume in bpy.data.volumes)
 
 
 def test_a_blend_moved_alone_finds_people_where_they_were_when_it_was_saved(person, tmp_path):
@@ -80,7 +75,7 @@ def test_a_blend_moved_alone_finds_people_where_they_were_when_it_was_saved(pers
     assert state.summary
     assert ops.find_missing_volumes() == {"FINISHED"}
     assert whole(anna)
-    assert volume_path(bpy.data.volumes[0]).resolve().parent == tmp_path / "shot_humans" / "Anna"
+    assert volume_path(bpy.data.volumes[0]).resolve().parent == tmp_path / "shot_humans" / "Anna" / "0001"
 
 
 def test_a_folder_may_be_named_and_undo_goes_back(person, tmp_path):
@@ -101,13 +96,12 @@ def test_a_folder_may_be_named_and_undo_goes_back(person, tmp_path):
     assert state.summary
 
 
-def test_volumes_that_are_nowhere_are_made_again_from_the_persons_file(person):
+def test_volumes_that_are_nowhere_are_not_missing_but_written_again(person):
     before = {volume.name: volume.filepath for volume in bpy.data.volumes}
-    for path in list(folder_of(person).glob("prim_*"))[:3]:
+    for path in list(state_folder(person).glob("prim_*"))[:3]:
         path.unlink()
-    next(folder_of(person).parent.glob("body_*")).unlink()
     anna = reopened()
-    assert state.summary.startswith("3 volumes, body_")
+    assert state.summary == ""
     assert ops.find_missing_volumes() == {"FINISHED"}
     assert whole(anna)
     assert {volume.name: volume.filepath for volume in bpy.data.volumes} == before
@@ -115,23 +109,30 @@ def test_volumes_that_are_nowhere_are_made_again_from_the_persons_file(person):
 
 def test_files_that_vanish_while_the_person_is_shown_come_back(person):
     assert all(volume.grids.load() for volume in bpy.data.volumes)
-    for path in folder_of(person).glob("prim_*"):
+    for path in state_folder(person).glob("prim_*"):
         path.unlink()
     assert ops.find_missing_volumes() == {"FINISHED"}
     assert whole(person)
 
 
+def test_a_lost_body_is_found_with_a_copy_of_the_human(person, store):
+    (state_folder(person) / "body.safetensors").unlink()
+    anna = reopened()
+    assert state.summary == "body.safetensors of 'Anna'"
+    assert ops.find_missing_volumes(directory=str(store)) == {"FINISHED"}
+    assert whole(anna)
+
+
 def test_all_of_a_person_lost_but_their_file_elsewhere(person, store, tmp_path):
     shutil.rmtree(tmp_path / "shot_humans")
     anna = reopened()
-    kept = tmp_path / "mail"
-    kept.mkdir()
-    write_person(kept / "person.human.safetensors", np.zeros(10))  # somebody else
+    other, kept = synthetic_shape.write(tmp_path / "other", COUNT, seed=3).parent, tmp_path / "mail"
     with pytest.raises(RuntimeError, match="cannot be found"):
-        ops.find_missing_volumes(directory=str(kept))
-    shutil.copy(store / "person.human.safetensors", kept)
+        ops.find_missing_volumes(directory=str(other))
+    shutil.copytree(store, kept)
     assert ops.find_missing_volumes(directory=str(kept)) == {"FINISHED"}
     assert whole(anna)
+    assert not list(kept.glob("prim_*")), "nothing is written in a folder that is not the file's own"
 
 
 def test_a_human_without_any_file_left_is_generated_again(person, tmp_path):
@@ -142,7 +143,7 @@ def test_a_human_without_any_file_left_is_generated_again(person, tmp_path):
         ops.find_missing_volumes()
     assert ops.generate_again() == {"FINISHED"}
     assert whole(anna)
-    assert json.loads(person_file(anna).read_bytes())["seed"] == 0
+    assert request_of(person_file(anna))["seed"] == 0
     with pytest.raises(RuntimeError, match="is there"):
         ops.generate_again()
 
@@ -175,10 +176,10 @@ def test_a_person_in_a_lost_folder_of_a_linked_blend_is_reported(person, tmp_pat
 def test_missing_files_of_a_thousand_volumes_are_one_entry(person):
     for number in range(1024):
         copy = bpy.data.volumes.new(f"more_{number}")
-        copy.filepath = f"//shot_humans/Anna/prim_{number:04d}_0123456789ab.vdb"
+        copy.filepath = f"//nowhere/Anna/0001/prim_{number:04d}.vdb"
         person.objects.link(bpy.data.objects.new(copy.name, copy))
     (lost,) = missing_files()
-    assert len(lost.volumes) == 1024
+    assert len(lost.volumes) == 1024 + COUNT
 
 
 def test_a_missing_file_offers_the_button_where_a_job_fails(person):
@@ -194,7 +195,7 @@ def test_a_merged_volume_that_is_lost_asks_to_merge_again(person, tmp_path):
     from blender_primdiffusion.scene.merged import MergedState, show_merged
 
     lost = folder_of(person) / "merged_0123456789ab.vdb"
-    shutil.copy(next(folder_of(person).glob("prim_*")), lost)
+    shutil.copy(next(state_folder(person).glob("prim_*")), lost)
     show_merged(person, [lost], MergedState(("x",), 0.01))
     assert not missing_files()
     moved = tmp_path / "elsewhere"

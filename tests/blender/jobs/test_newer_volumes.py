@@ -10,16 +10,16 @@ import pytest
 import synthetic_shape
 from support.errors import refused
 
-from blender_primdiffusion.jobs import late_volumes as module
-from blender_primdiffusion.jobs.late_volumes import late_volumes
+from blender_primdiffusion.jobs import deferred_volumes as module
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
-from blender_primdiffusion.scene import newer_volumes
+from blender_primdiffusion.scene import pending
 from blender_primdiffusion.scene.attachment import show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import humans, person_file, volume_path
-from blender_primdiffusion.scene.human_file import HumanTensors, write_tensors
-from blender_primdiffusion.scene.volumes import format_of, openvdb, readable_format
+from blender_primdiffusion.scene.vdb import openvdb, readable_format
+from blender_primdiffusion.scene.volumes import format_of
 
 COUNT = 5
 ops = bpy.ops.primdiffusion
@@ -31,21 +31,6 @@ def as_if_newer(path) -> None:
     newer = content[:8] + struct.pack("<I", readable_format() + 1) + content[12:].replace(b"Tree_", b"Trex_")
     path.unlink()
     path.write_bytes(newer)
-
-
-def write_own_file(path, arrays, *, with_sizes=True) -> None:
-    """The human of a human.npz as its own file."""
-    stored = {
-        "rgb": np.moveaxis(arrays["rgb"], -1, 1),
-        "density": arrays["density"],
-        "betas": arrays["betas"],
-        "delta_scale": np.full_like(arrays["half_extent"], 0.5),
-    }
-    if with_sizes:
-        stored["rest_half_extent"] = arrays["half_extent"] * 2
-    raw = {name: np.ascontiguousarray(values, "<f4") for name, values in stored.items()}
-    about = {"format": "primdiffusion.human", "format_version": "3", "provenance": "{}", "body": "{}"}
-    write_tensors(path, HumanTensors(about, {name: ("F32", a.shape, a.tobytes()) for name, a in raw.items()}))
 
 
 def grids(path) -> list[np.ndarray]:
@@ -69,17 +54,9 @@ def unreadable() -> list:
 
 
 @pytest.fixture
-def arrays():
-    return {**synthetic_shape.arrays(COUNT), "rest_half_extent": synthetic_shape.arrays(COUNT)["half_extent"] * 2}
-
-
-@pytest.fixture(params=["sizes in the own file", "sizes in the body's file"])
-def saved(addon, tmp_path, arrays, request):
+def saved(addon, tmp_path):
     """The grids, by file, of a human in a saved .blend whose files a newer Blender has written."""
-    np.savez(tmp_path / "human.npz", **{**arrays, "rgb": arrays["rgb"].astype(np.float16)})
-    own = tmp_path / "person.human.safetensors"
-    write_own_file(own, arrays, with_sizes=request.param == "sizes in the own file")
-    build_human(bpy.context, tmp_path / "human.npz", "Anna", [own])
+    build_human(bpy.context, synthetic_shape.write(tmp_path / "human", COUNT), "Anna")
     bpy.ops.wm.save_mainfile()
     before = {path: grids(path) for path in files()}
     assert len(before) == COUNT
@@ -118,10 +95,10 @@ def test_a_render_writes_them_again_and_it_is_said_once(saved, capsys):
     paths = {volume.name: volume.filepath for volume in bpy.data.volumes}
     said = reopened(capsys)
     assert said.count("newer Blender") == 1
-    assert f"{COUNT} volumes of 'Anna' are in a format of a newer Blender ({readable_format() + 1}" in said
-    assert "newer Blender" in late_volumes.notice
+    assert f"Volumes of 'Anna' are in a format of a newer Blender ({readable_format() + 1}" in said
+    assert "newer Blender" in deferred_volumes.notice
     module.write_before_rendering(bpy.context.scene)
-    assert late_volumes.notice == ""
+    assert deferred_volumes.notice == ""
     assert "newer Blender" not in capsys.readouterr().out
     assert {volume.name: volume.filepath for volume in bpy.data.volumes} == paths
     check_written(saved)
@@ -131,21 +108,21 @@ def test_a_render_writes_them_again_and_it_is_said_once(saved, capsys):
 def test_the_timer_writes_them_again(saved, capsys):
     reopened(capsys)
     steps = 0
-    while late_volumes.work(0.0):
+    while deferred_volumes.work(0.0):
         steps += 1
     assert steps > COUNT
-    assert late_volumes.notice == ""
+    assert deferred_volumes.notice == ""
     check_written(saved)
 
 
 def test_only_what_cannot_be_read_is_written(saved, capsys):
     reopened(capsys)
-    late_volumes.finish()
+    deferred_volumes.finish()
     first, *others = files()
     as_if_newer(first)
     inodes = [path.stat().st_ino for path in others]
-    assert "1 volumes of" in reopened(capsys)
-    late_volumes.finish()
+    assert "Volumes of" in reopened(capsys)
+    deferred_volumes.finish()
     assert [path.stat().st_ino for path in others] == inodes
     check_written(saved)
 
@@ -158,7 +135,7 @@ def test_appended_or_linked_they_are_written_in_copies(saved, capsys, how):
     operator = bpy.ops.wm.append if how == "append" else bpy.ops.wm.link
     operator(directory=f"{blend}/Collection/", filename="Anna", instance_collections=how == "instance")
     assert capsys.readouterr().out.count("newer Blender") == 1
-    late_volumes.finish()
+    deferred_volumes.finish()
     values = {path.name: held for path, held in saved.items()}
     assert not set(files()) & set(saved)
     check_written({path: values[path.name] for path in files()})
@@ -171,7 +148,7 @@ def test_two_humans_with_the_same_files_are_one_line(saved, capsys):
     said = reopened(capsys)
     assert said.count("newer Blender") == 1
     assert "'Anna', 'Anna.001'" in said
-    while late_volumes.work(0.0):
+    while deferred_volumes.work(0.0):
         pass
     check_written(saved)
 
@@ -192,13 +169,13 @@ def test_volumes_that_viewports_show_are_seen_at_once(saved, capsys):
     check_written(saved)
 
 
-def test_an_own_file_of_an_earlier_version_is_reported(saved, capsys, arrays):
-    own = person_file(humans(bpy.context.scene)[0])
-    write_own_file(own, {**arrays, "half_extent": arrays["half_extent"][:3], "rgb": arrays["rgb"][:3],
-                         "density": arrays["density"][:3]})  # fmt: skip
+def test_the_file_of_another_human_is_reported(saved, capsys, tmp_path):
+    own, other = person_file(humans(bpy.context.scene)[0]), synthetic_shape.write(tmp_path / "other", 3)
+    for path in (own, own.with_name("body.safetensors")):
+        path.write_bytes(other.with_name(path.name).read_bytes())
     reopened(capsys)
-    late_volumes.finish()
-    assert "cannot be written again" in late_volumes.error
+    deferred_volumes.finish()
+    assert "cannot be written" in deferred_volumes.error
     assert len(unreadable()) == COUNT
 
 
@@ -207,25 +184,13 @@ def test_a_full_disk_is_reported_and_the_files_stay(saved, capsys, monkeypatch):
         raise OSError(28, "No space left on device")
 
     reopened(capsys)
-    monkeypatch.setattr(newer_volumes, "write_one", full)
-    while late_volumes.work(0.0):
+    monkeypatch.setattr(pending, "write_volume", full)
+    while deferred_volumes.work(0.0):
         pass
-    assert "free space" in late_volumes.error
+    assert "free space" in deferred_volumes.error
     assert capsys.readouterr().out.count("free space") == 1
     assert len(unreadable()) == COUNT
     monkeypatch.undo()
-    late_volumes.finish()
-    assert late_volumes.error == ""
+    deferred_volumes.finish()
+    assert deferred_volumes.error == ""
     check_written(saved)
-
-
-def test_an_edit_writes_unchanged_volumes_that_cannot_be_read(saved, tmp_path, arrays):
-    from scene_stage import replace
-
-    person = humans(bpy.context.scene)[0]
-    changed = arrays["rgb"].copy()
-    changed[0] *= 0.5
-    np.savez(tmp_path / "edited.npz", **{**arrays, "rgb": changed.astype(np.float16)})
-    replace(person, tmp_path / "edited.npz", tmp_path / "person.human.safetensors")
-    assert len(files()) == COUNT
-    assert not unreadable()

@@ -127,7 +127,7 @@ def test_a_picture_is_uploaded_once_and_drawn_where_the_human_will_stand(denoisi
     np.testing.assert_allclose(drawn[1].mean(0)[:2], [5, 4], atol=1e-6)
     assert uploaded == [(8, 8, 4)]
     assert prepared == [0, 1], "the human's shaders are compiled meanwhile"
-    build_human(bpy.context, synthetic.write(tmp_path / "one.npz", 4))
+    build_human(bpy.context, synthetic.write(tmp_path / "one", 4))
     bpy.context.scene.cursor.location = (0.5, 0, 0)
     picture_in_view.draw(context())
     assert drawn[2].mean(0)[0] > 1.5, "beside the human there"

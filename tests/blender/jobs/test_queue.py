@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import time
@@ -12,7 +11,7 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
-from support.fake_child import DIES, FAILS, IGNORES_CANCEL, NO_MEMORY, TAKES_LONG
+from support.fake_child import DIES, FAILS, IGNORES_CANCEL, NO_MEMORY, TAKES_LONG, request_of
 
 from blender_primdiffusion.jobs import follow as follow_module
 from blender_primdiffusion.jobs.follow import follow, watch
@@ -34,7 +33,7 @@ def ask(seed: int, steps: int = 1) -> int:
 
 def seeds() -> list[int]:
     """Of the people, in the order in which they came."""
-    return [json.loads(person_file(person).read_bytes())["seed"] for person in humans(bpy.context.scene)]
+    return [request_of(person_file(person))["seed"] for person in humans(bpy.context.scene)]
 
 
 def test_jobs_run_one_at_a_time_in_the_order_queued(addon):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import bpy
@@ -10,7 +9,7 @@ import pytest
 from blender_primdiffusion.formats.answers import VariationFiles
 from jobs_driven import drive, error_of, shown, until_running
 from support.errors import refused
-from support.fake_child import FAILS, TAKES_LONG
+from support.fake_child import FAILS, TAKES_LONG, request_of
 
 from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
@@ -42,7 +41,7 @@ def seeds() -> list[int]:
 
 
 def sent(file: Path) -> dict:
-    return json.loads(file.read_bytes())
+    return request_of(file)
 
 
 def files_left() -> list[Path]:
@@ -53,7 +52,6 @@ def test_variations_are_files_and_nothing_enters_the_scene(addon, shown_people):
     assert seeds() == [11, 12, 13, 14]
     assert not humans(addon.scene)
     for variation in sheet.variations:
-        assert variation.human.is_file()
         assert variation.picture.is_file()
         assert sent(variation.person)["seed"] == variation.seed
     assert [path.name.split("_")[1] for path in files_left()] == ["sheet"], "the child's folder is gone"
@@ -102,7 +100,7 @@ def test_build_all_builds_all_in_edit_mode_too(addon, shown_people):
 
 
 def test_whom_files_are_missing_of_is_not_built_and_those_before_stay(addon, shown_people):
-    sheet.variations[1].human.unlink()
+    sheet.variations[1].person.unlink()
     with refused(RuntimeError, "1 of 4"):
         ops.build_variation(build_all=True)
     assert len(humans(addon.scene)) == 1
@@ -149,7 +147,7 @@ def test_a_failure_leaves_the_sheet_that_was_there(addon, shown_people):
     with refused(RuntimeError, "checkpoint"):
         ops.variations(seed=FAILS, count=2, steps=1)
     assert seeds() == [11, 12, 13, 14]
-    assert all(variation.human.is_file() for variation in sheet.variations)
+    assert all(variation.person.is_file() for variation in sheet.variations)
     assert "damaged" in error_of("variations")
 
 
@@ -244,8 +242,8 @@ def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
     mine = tmp_path / "outside" / "mine"
     mine.parent.mkdir()
     mine.write_text("mine")
-    person = VariationFiles(seed=7, **{name: tmp_path / name for name in ("human", "person", "picture")})
-    for link in (person.human, person.person, person.picture):
+    person = VariationFiles(seed=7, **{name: tmp_path / name for name in ("person", "picture")})
+    for link in (person.person, person.picture):
         link.symlink_to(mine)
     own = Sheet()
     own.fill([person], "")
@@ -253,7 +251,7 @@ def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
     folder = own.variations[0].folder.parent
     own.clear()
     assert not folder.exists()
-    person.human.write_text("")
-    with refused(OSError, "person"):
+    person.person.write_text("")
+    with refused(OSError, "picture"):
         own.fill([person], "")
     assert mine.read_text() == "mine"

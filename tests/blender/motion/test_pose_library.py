@@ -37,7 +37,7 @@ REST = np.tile(np.eye(3), (24, 1, 1))
 @pytest.fixture
 def armature(addon, tmp_path, monkeypatch):
     monkeypatch.setattr(pose_panel, "own_folder", lambda: tmp_path / "eigene Dateien")
-    return armature_of(build_human(addon, synthetic.write(tmp_path / "p.npz", 8), "Ann"))
+    return armature_of(build_human(addon, synthetic.write(tmp_path / "p", 8), "Ann"))
 
 
 def test_every_built_in_pose_is_finite_and_has_a_picture(addon):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import bpy
 import pytest
 import synthetic_shape
-from exporting import write_person
 from human_stage import COUNT, build_posed
 
 
@@ -13,9 +12,7 @@ from human_stage import COUNT, build_posed
 def source(addon, tmp_path, monkeypatch):
     folder = tmp_path / "source"
     folder.mkdir()
-    npz = synthetic_shape.write(folder / "human.npz", COUNT)
-    monkeypatch.setenv("FAKE_HUMAN", str(npz))
-    write_person(folder / "person.human.safetensors", synthetic_shape.arrays(COUNT)["betas"])
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(folder, COUNT)))
     return folder
 
 

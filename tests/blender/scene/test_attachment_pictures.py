@@ -24,10 +24,8 @@ SIZE = 64
 
 @pytest.fixture
 def person(saved_scene, tmp_path):
-    """A synthetic person of format version 2 in shot.blend."""
-    kept = tmp_path / "person.human.safetensors"
-    kept.write_bytes(b"kept")
-    return build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz", COUNT), keep=[kept])
+    """A synthetic person in shot.blend."""
+    return build_human(saved_scene, synthetic_shape.write(tmp_path / "human", COUNT))
 
 
 def box_grid(voxel: float, low: tuple, high: tuple, density: float, colour: tuple) -> MergedGrid:

@@ -32,7 +32,9 @@ from blender_primdiffusion.scene.blend_values import (
     stored_record,
     stored_text,
 )
-from blender_primdiffusion.scene.human import HOME, PERSON, PERSON_FILES
+from blender_primdiffusion.scene.earlier_files import _PERSON as PERSON
+from blender_primdiffusion.scene.earlier_files import _PERSON_FILE as PERSON_FILES
+from blender_primdiffusion.scene.human import HOME
 
 pytestmark = pytest.mark.any_blender
 ROOT = Path(blender_primdiffusion.__file__).parent

@@ -29,7 +29,6 @@ from blender_primdiffusion.scene.human import (
     humans,
     remove_human,
 )
-from blender_primdiffusion.scene.human_npz import HumanNpzError
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
@@ -47,7 +46,7 @@ def volume_files() -> list[str]:
 @pytest.fixture
 def person(saved_scene, tmp_path):
     """The synthetic person in shot.blend, as (collection, arrays)."""
-    return build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 48)), synthetic.arrays(48)
+    return build_human(saved_scene, synthetic.write(tmp_path / "human", 48)), synthetic.arrays(48)
 
 
 def strong_pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -77,9 +76,9 @@ def test_volumes_follow_linear_blend_skinning_to_a_hundredth_of_a_millimetre(per
 
 def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
     arrays = synthetic.arrays(1024)
-    collection = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 1024))
+    collection = build_human(saved_scene, synthetic.write(tmp_path / "human", 1024))
     assert sum(o.type == "VOLUME" for o in collection.all_objects) == 1024
-    assert len(list(folder_of(collection).glob("prim_*.vdb"))) == 1024
+    assert len(list(folder_of(collection).glob("0001/prim_*.vdb"))) == 1024
     frames = np.arange(1, 9)
     swing = np.zeros((8, 24, 3))
     swing[:, 1, 0], swing[:, 2, 0] = 0.5 * np.sin(frames), -0.5 * np.sin(frames)
@@ -121,7 +120,7 @@ def test_a_volume_covers_its_box_in_the_world(person):
 
 
 def test_one_material_serves_all_people(person, saved_scene, tmp_path):
-    build_human(saved_scene, synthetic.write(tmp_path / "second.npz", 8, seed=1))
+    build_human(saved_scene, synthetic.write(tmp_path / "second", 8, seed=1))
     assert len(bpy.data.materials) == 1
     assert {volume.materials[0].name for volume in bpy.data.volumes} == {"PrimDiffusion Volume"}
     assert len(humans(bpy.context.scene)) == 2
@@ -151,7 +150,7 @@ def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_pa
     collection, arrays = person
     rotations, translation = strong_pose(1)
     pose_from_joint_rotations(armature_of(collection), rotations, translation)
-    assert all(v.filepath.startswith("//shot_humans/Human/prim_") for v in bpy.data.volumes)
+    assert all(v.filepath.startswith("//shot_humans/Human/0001/prim_") for v in bpy.data.volumes)
     bpy.ops.wm.save_mainfile()
     moved = tmp_path / "elsewhere"
     moved.mkdir()
@@ -167,9 +166,8 @@ def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_pa
 
 
 def test_a_person_built_before_the_first_save_is_collected_beside_the_blend(empty_scene, tmp_path):
-    keep = tmp_path / "person.human.safetensors"
-    keep.write_bytes(b"kept")
-    build_human(empty_scene, synthetic.write(tmp_path / "human.npz", 8), keep=[keep])
+    source = synthetic.write(tmp_path / "human", 8)
+    build_human(empty_scene, source)
     assert all(path.startswith(bpy.app.tempdir) for path in volume_files())
     bpy.app.handlers.save_pre.append(collect_before_saving)
     try:
@@ -177,9 +175,10 @@ def test_a_person_built_before_the_first_save_is_collected_beside_the_blend(empt
     finally:
         bpy.app.handlers.save_pre.remove(collect_before_saving)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
-    assert all(volume.filepath.startswith("//shot_humans/Human/prim_") for volume in bpy.data.volumes)
+    assert all(volume.filepath.startswith("//shot_humans/Human/") for volume in bpy.data.volumes)
     assert all(volume.grids.load() for volume in bpy.data.volumes)
-    assert (tmp_path / "shot_humans" / "Human" / keep.name).read_bytes() == b"kept"
+    (copied,) = (tmp_path / "shot_humans" / "Human").glob(f"*/{source.name}")
+    assert copied.read_bytes() == source.read_bytes()
     assert not list(tmp_path.rglob("*.part"))
 
 
@@ -196,13 +195,13 @@ def test_removal_takes_everything_but_the_files(person):
 
 @pytest.mark.parametrize("damage", ["truncated", "NaN"])
 def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_path, damage):
-    path = synthetic.write(tmp_path / "human.npz", 8)
+    path = synthetic.write(tmp_path / "human", 8)
     if damage == "truncated":
         path.write_bytes(path.read_bytes()[:5000])
     else:
-        synthetic.write(path, 8, position=np.full((8, 3), np.nan))
+        synthetic.write(path.parent, 8, density=np.full((8, 8, 8, 8), np.nan, np.float32))
     files = sorted(tmp_path.rglob("*"))
-    with pytest.raises(HumanNpzError):
+    with refused(ValueError, path.name):
         build_human(saved_scene, path)
     assert not any(datablocks().values())
     assert sorted(tmp_path.rglob("*")) == files
@@ -211,7 +210,7 @@ def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_pa
 def test_an_unwritable_folder_leaves_the_scene_as_it_was(saved_scene, tmp_path):
     (tmp_path / "shot_humans").write_text("in the way")
     with refused(VolumeWriteError):
-        build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
+        build_human(saved_scene, synthetic.write(tmp_path / "human", 8))
     assert not any(datablocks().values())
 
 
@@ -226,7 +225,7 @@ def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(
 
     monkeypatch.setattr(build, "attach_volumes", failing)
     with pytest.raises(MemoryError):
-        build_human(saved_scene, synthetic.write(tmp_path / "second.npz", 8, seed=3))
+        build_human(saved_scene, synthetic.write(tmp_path / "second", 8, seed=3))
     assert datablocks() == before
     assert sorted(str(path) for path in tmp_path.rglob("*.vdb")) == files
     assert [path.name for path in (tmp_path / "shot_humans").iterdir()] == ["Human"]
@@ -237,5 +236,5 @@ def test_building_from_edit_mode_works(saved_scene, tmp_path):
     saved_scene.scene.collection.objects.link(mesh)
     saved_scene.view_layer.objects.active = mesh
     bpy.ops.object.mode_set(mode="EDIT")
-    collection = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
+    collection = build_human(saved_scene, synthetic.write(tmp_path / "human", 8))
     assert armature_of(collection).mode == "OBJECT"

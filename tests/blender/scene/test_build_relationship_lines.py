@@ -20,5 +20,5 @@ def default_scene(tmp_path):
 def test_a_new_person_is_not_hidden_behind_lines_to_bones(default_scene, tmp_path):
     spaces = [s for screen in bpy.data.screens for area in screen.areas for s in area.spaces if s.type == "VIEW_3D"]
     assert any(space.overlay.show_relationship_lines for space in spaces)
-    build_human(default_scene, synthetic.write(tmp_path / "human.npz", 4))
+    build_human(default_scene, synthetic.write(tmp_path / "human", 4))
     assert not any(space.overlay.show_relationship_lines for space in spaces)

@@ -13,10 +13,9 @@ from blender_primdiffusion.scene import cycles
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import current_overlap, max_overlap, overlap_warning
 from blender_primdiffusion.scene.human import MARK
-from blender_primdiffusion.scene.human_npz import read_human
 from blender_primdiffusion.scene.reshape import reshape
+from blender_primdiffusion.scene.rest_human import read_human
 from blender_primdiffusion.scene.shape import generated_betas
-from blender_primdiffusion.scene.volumes import bake
 from blender_primdiffusion.ui.advanced_panel import details
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
@@ -28,7 +27,7 @@ SMALL = (-4.0, -4.0, -4.0)
 
 @pytest.fixture
 def source(tmp_path):
-    return synthetic_shape.write(tmp_path / "human.npz", COUNT)
+    return synthetic_shape.write(tmp_path / "human", COUNT)
 
 
 @pytest.fixture
@@ -43,8 +42,8 @@ def small(person) -> np.ndarray:
 def counted(source, betas) -> int:
     """From the file alone."""
     human = read_human(source)
-    rest, growth = human.shape_model.rest(betas), human.shape_model.growth(human.betas, betas)
-    offset, half = bake(human.density, human.rgb, human.half_extent).drawn_box()
+    rest, growth = human.model.rest(betas), human.model.growth(human.payload.betas, betas)
+    offset, half = human.grids().drawn_box()
     return max_overlap(
         rest.position + np.einsum("kij,kj->ki", rest.rotation, growth * offset), rest.rotation, growth * half
     )
@@ -90,7 +89,7 @@ def test_volumes_whose_files_are_missing_are_not_counted(person):
     noted = json.loads(person[MARK])["most_overlapping"]
     reshape(person, small(person))
     volume = next(obj.data for obj in person.all_objects if obj.type == "VOLUME")
-    volume.filepath = "//nowhere/prim_0000_0123456789ab.vdb"
+    volume.filepath = "//nowhere/prim_0000.vdb"
     bpy.context.view_layer.update()
     assert current_overlap(person) == noted
 

@@ -25,16 +25,23 @@ def lone_box(saved_scene, tmp_path):
     """A person of one box along the axes at chest height, red, denser in its left half (the person's left, +x)."""
     density = np.full((1, 8, 8, 8), DENSITY, np.float32)
     density[..., :4] *= 0.25  # the last axis, W, runs along T = +x: the person's right half
-    person = synthetic.write(
-        tmp_path / "human.npz",
-        1,
-        position=np.array([[0.0, 0.3, 0.0]]),
-        rotation=np.eye(3)[None],
-        half_extent=HALF[None],
-        primitive_weights=np.eye(24)[[9]],
-        rgb=np.broadcast_to(np.float16(RED), (1, 8, 8, 8, 3)),
-        density=density,
-    )
+    arrays = synthetic.arrays(1)
+    model = {
+        "face": np.array([0]),
+        "faces": np.array([[0, 1, 2]]),
+        "barycentric": np.full((1, 3), 1 / 3),
+        "stencil_vertex": np.array([[0, 1, 2, 0, 0]]),
+        "stencil_du": np.array([[-1.0, 1, 0, 0, 0]]),
+        "stencil_dv": np.array([[-1.0, 0, 1, 0, 0]]),
+        "template": np.array([[-0.1, 0.2, 0], [0.2, 0.2, 0], [-0.1, 0.5, 0], *arrays["template"][3:]]),
+        "skin_weights": np.tile(np.eye(24)[9], (len(arrays["template"]), 1)),
+        "uv_corner": np.zeros((1, 3, 2)),
+        "half_extent": HALF[None],
+        "rest_half_extent": HALF[None],
+        "rgb": np.broadcast_to(np.float16(RED), (1, 8, 8, 8, 3)),
+        "density": density,
+    }
+    person = synthetic.save(tmp_path / "human", {**arrays, **model})
     return build_human(saved_scene, person)
 
 
@@ -70,7 +77,7 @@ def test_a_box_has_its_colour_opacity_size_and_place_in_cycles(lone_box, tmp_pat
 
 
 def test_the_camera_frames_a_posed_person_from_every_side(saved_scene, tmp_path):
-    person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 8))
+    person = build_human(saved_scene, synthetic.write(tmp_path / "human", 8))
     pose_from_joint_rotations(armature_of(person), synthetic.random_rotations(np.random.default_rng(0), 24), np.ones(3))
     armature_of(person).location.x += 5
     from bpy_extras.object_utils import world_to_camera_view

@@ -9,10 +9,13 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+import synthetic_shape
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
 from scene_stage import replace
+from support import tensor_files
 from support.errors import refused
 
+from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
@@ -27,44 +30,41 @@ from blender_primdiffusion.scene.human import (
     human_of,
     humans,
     person_file,
+    state_folder,
+    state_of,
 )
-from blender_primdiffusion.scene.human_npz import HumanNpzError
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
 COUNT = 12
-TALLER = 1.1
 
 
-def person_bytes(folder: Path, contents: bytes) -> Path:
-    folder.mkdir(exist_ok=True)
-    (folder / "person.human.safetensors").write_bytes(contents)
-    return folder / "person.human.safetensors"
-
-
-def redyed(tmp_path, *which: int, seed: int = 0, **changes) -> tuple[Path, Path]:
-    """The file of a person of whom some primitives have another colour, and the backend's own."""
-    rgb = synthetic.arrays(COUNT, seed)["rgb"].copy()
+def redyed(tmp_path, *which: int, seed: int = 0, **changes) -> Path:
+    """The file of a person of whom some primitives have another colour."""
+    rgb = synthetic_shape.arrays(COUNT, seed)["rgb"].copy()
     rgb[list(which)] = 1 - rgb[list(which)]
     meta = np.array(json.dumps({"seed": seed, "edited": list(which), "steps": 5}))
-    path = synthetic.write(tmp_path / "edited.npz", COUNT, seed, rgb=rgb, meta=meta, **changes)
-    return path, person_bytes(tmp_path / "edited", f"edited {which} {sorted(changes)}".encode())
+    return synthetic_shape.write(tmp_path / "edited", COUNT, seed, rgb=rgb, meta=meta, **changes)
 
 
-def reshaped(tmp_path, *which: int) -> tuple[Path, Path]:
-    before = synthetic.arrays(COUNT)
-    taller = {name: before[name] * TALLER for name in ("vertices", "position")}
-    joints = before["joints"] * TALLER + np.random.default_rng(5).normal(0, 0.01, (24, 3))
-    return redyed(tmp_path, *which, betas=before["betas"] + 1, joints=joints, **taller)
+def edited_shape() -> dict[str, np.ndarray]:
+    before = synthetic_shape.arrays(COUNT)
+    arrays = synthetic_shape.at(before, before["betas"] + 1)
+    del arrays["growth"]  # boxes of a generated shape have their own sizes
+    return arrays
+
+
+def reshaped(tmp_path, *which: int) -> Path:
+    return redyed(tmp_path, *which, betas=edited_shape()["betas"])
+
+
+def first(person) -> bool:
+    """Whether the human's file is that of the person before the edit."""
+    return "edited" not in tensor_files.read_tensors(person_file(person))[1]["provenance"]
 
 
 def paths(collection) -> dict[str, str]:
     return {o.name: o.data.filepath for o in collection.all_objects if o.type == "VOLUME"}
-
-
-def changed(before: dict[str, str], after: dict[str, str]) -> set[int]:
-    assert before.keys() == after.keys()
-    return {int(name[-4:]) for name in before if before[name] != after[name]}
 
 
 def transforms(collection) -> dict[str, list]:
@@ -74,8 +74,7 @@ def transforms(collection) -> dict[str, list]:
 
 @pytest.fixture
 def person(saved_scene, tmp_path):
-    npz = synthetic.write(tmp_path / "human.npz", COUNT)
-    collection = build_human(saved_scene, npz, keep=[person_bytes(tmp_path / "first", b"first")])
+    collection = build_human(saved_scene, synthetic_shape.write(tmp_path / "human", COUNT))
     pose_from_joint_rotations(
         armature_of(collection), synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3)))
     )
@@ -83,45 +82,44 @@ def person(saved_scene, tmp_path):
     return collection
 
 
-def test_only_volumes_of_changed_primitives_get_new_files(person, saved_scene, tmp_path):
-    before, places = paths(person), transforms(person)
-    files = {path: path.stat().st_mtime_ns for path in folder_of(person).iterdir()}
-    done = replace(person, *redyed(tmp_path, 3, 7))
-    assert changed(before, paths(person)) == {3, 7}
-    assert (done.volumes, done.of, done.reshaped, done.warning) == (2, COUNT, False, "")
+def test_an_edit_is_a_new_folder_and_leaves_the_files_of_the_state_before(person, saved_scene, tmp_path):
+    places = transforms(person)
+    files = {path: path.stat().st_mtime_ns for path in state_folder(person).iterdir()}
+    done = replace(person, redyed(tmp_path, 3, 7))
+    assert state_folder(person) == folder_of(person) / "0002"
+    assert (done.volumes, done.reshaped, done.warning) == (COUNT, False, "")
     assert transforms(person) == places
     assert {path: path.stat().st_mtime_ns for path in files} == files
-    assert len(list(folder_of(person).iterdir())) == len(files) + 3  # two volumes, the person
+    assert {path.name for path in files} == {path.name for path in state_folder(person).iterdir()}
     assert all(volume.grids.load() for volume in bpy.data.volumes)
-    assert person_file(person).read_bytes().startswith(b"edited (3, 7)")
+    assert not first(person)
     assert json.loads(person[MARK])["edited"] == [3, 7]
+
+
+def test_the_state_is_told_apart_by_what_it_holds_not_by_its_folder(person, saved_scene, tmp_path):
+    before = state_of(person)
+    replace(person, redyed(tmp_path, 3))
+    edited = state_of(person)
+    assert edited != before
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
+    assert state_of(person) == edited
 
 
 def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_scene, tmp_path):
     bpy.ops.ed.undo_push(message="before")
     before = paths(person)
-    replace(person, *redyed(tmp_path, 3))
+    replace(person, redyed(tmp_path, 3))
     after = paths(person)
     bpy.ops.ed.undo_push(message="edit")
     bpy.ops.ed.undo()
     (person,) = humans(bpy.context.scene)
     assert paths(person) == before
-    assert person_file(person).read_bytes() == b"first"
+    assert first(person)
     assert all(volume.grids.load() for volume in bpy.data.volumes)
     bpy.ops.ed.redo()
     (person,) = humans(bpy.context.scene)
     assert paths(person) == after
-    assert person_file(person).read_bytes().startswith(b"edited")
-
-
-def test_an_edit_and_its_reverse_meet_in_the_same_files(person, saved_scene, tmp_path):
-    before = paths(person)
-    replace(person, *redyed(tmp_path, 3))
-    files = len(list(folder_of(person).iterdir()))
-    replace(person, tmp_path / "human.npz", tmp_path / "first" / "person.human.safetensors")
-    assert paths(person) == before
-    assert len(list(folder_of(person).iterdir())) == files + 1  # the first person under an edit's name
-    assert person_file(person).read_bytes() == b"first"
+    assert not first(person)
 
 
 def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved_scene, tmp_path):
@@ -129,14 +127,13 @@ def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved
     before = [list(bone.rotation_quaternion) for bone in armature_of(person).pose.bones]
     objects = {o.name for o in bpy.data.objects}
     saved_scene.view_layer.objects.active = body_of(person)
-    done = replace(person, *reshaped(tmp_path, 3))
+    done = replace(person, reshaped(tmp_path, 3))
     assert done.reshaped
     assert {o.name for o in bpy.data.objects} == objects
     assert saved_scene.view_layer.objects.active == body_of(person)
     armature = armature_of(person)
     np.testing.assert_allclose([list(bone.rotation_quaternion) for bone in armature.pose.bones], before, atol=1e-6)
-    with np.load(tmp_path / "edited.npz") as archive:
-        arrays = dict(archive)
+    arrays = edited_shape()
     body_of(person).hide_viewport = False  # hidden things are not evaluated
     bpy.context.view_layer.update()
     expected = world_from_model(armature, arrays["vertices"]) @ blended_frames(arrays, rotations, np.zeros(3))
@@ -145,13 +142,13 @@ def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved
     body = body_of(person).evaluated_get(bpy.context.evaluated_depsgraph_get())
     vertices = np.array([vertex.co for vertex in body.data.vertices]) - raised(arrays["vertices"])[:3, 3]
     np.testing.assert_allclose(vertices, blended_vertices(arrays, rotations, np.zeros(3)), atol=2e-5)
-    np.testing.assert_allclose(list(armature[BETAS]), arrays["betas"])
+    np.testing.assert_allclose(list(armature[BETAS]), arrays["betas"], atol=1e-6)
 
 
 def test_undo_takes_another_shape_back(person, saved_scene, tmp_path):
     bpy.ops.ed.undo_push(message="before")
     places = transforms(person)
-    replace(person, *reshaped(tmp_path))
+    replace(person, reshaped(tmp_path))
     assert transforms(person) != places
     bpy.ops.ed.undo_push(message="edit")
     bpy.ops.ed.undo()
@@ -160,13 +157,13 @@ def test_undo_takes_another_shape_back(person, saved_scene, tmp_path):
 
 def test_a_shape_the_user_chose_stays_while_the_betas_do(person, saved_scene, tmp_path):
     armature_of(person)[BETAS] = [2.0] * 10
-    replace(person, *redyed(tmp_path, 3))
+    replace(person, redyed(tmp_path, 3))
     assert list(armature_of(person)[BETAS]) == [2.0] * 10
 
 
 def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person, saved_scene, tmp_path):
     body_of(person).shape_key_add(name="Basis")
-    assert "changed by hand" in replace(person, *reshaped(tmp_path)).warning
+    assert "changed by hand" in replace(person, reshaped(tmp_path)).warning
 
 
 def test_what_was_renamed_moved_or_deleted_by_hand_stays_so(person, saved_scene, tmp_path):
@@ -175,8 +172,8 @@ def test_what_was_renamed_moved_or_deleted_by_hand_stays_so(person, saved_scene,
     objects[4].location.z += 1
     height = objects[4].location.z
     bpy.data.objects.remove(objects[5])
-    done = replace(person, *redyed(tmp_path, 3, 4, 5))
-    assert (done.volumes, done.of) == (2, COUNT - 1)
+    done = replace(person, redyed(tmp_path, 3, 4, 5))
+    assert done.volumes == COUNT - 1
     assert bpy.data.objects["Human_prim_0004"].location.z == height
     assert "Human_prim_0005" not in bpy.data.objects
 
@@ -189,52 +186,49 @@ def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person,
         twin.objects.link(obj.copy())
     before = {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"}
     bones = [list(bone.head_local) for bone in armature_of(twin).data.bones]
-    replace(person, *reshaped(tmp_path, 3))
+    replace(person, reshaped(tmp_path, 3))
     assert {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"} == before
     assert [list(bone.head_local) for bone in armature_of(twin).data.bones] == bones
-    assert person_file(twin).read_bytes() == b"first"
+    assert first(twin)
 
 
 def test_a_damaged_result_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp_path):
+    bad = tmp_path / "bad.human"
+    bad.write_bytes(b"PK no more")
     before, files = paths(person), sorted(tmp_path.rglob("*.*"))
-    (tmp_path / "bad.npz").write_bytes(b"PK no more")
-    with pytest.raises(HumanNpzError):
-        replace(person, tmp_path / "bad.npz", tmp_path / "first" / "person.human.safetensors")
-    (tmp_path / "bad.npz").unlink()
+    with refused(ValueError, "bad.human"):
+        replace(person, bad)
     assert paths(person) == before
     assert sorted(tmp_path.rglob("*.*")) == files
 
 
 def test_a_full_disk_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp_path, monkeypatch):
-    from blender_primdiffusion.scene import volumes
-
     def full(*_):
         raise OSError("no space left on device")
 
-    before, files = paths(person), sorted(folder_of(person).iterdir())
     edited = redyed(tmp_path, 3)
-    monkeypatch.setattr(volumes, "write_file", full)
+    before, files = paths(person), sorted(tmp_path.rglob("*"))
+    monkeypatch.setattr(volumes, "write_vdb", full)
     with refused(VolumeWriteError):
-        replace(person, *edited)
+        replace(person, edited)
     assert paths(person) == before
-    assert sorted(folder_of(person).iterdir()) == files
+    assert sorted(tmp_path.rglob("*")) == files
 
 
-def test_after_saving_under_another_name_an_edit_brings_all_of_the_person_along(person, saved_scene, tmp_path):
-    first = folder_of(person)
-    files = sorted(first.iterdir())
+def test_after_saving_under_another_name_an_edit_goes_to_the_new_folder(person, saved_scene, tmp_path):
+    before = state_folder(person)
+    files = sorted(before.parent.rglob("*"))
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
-    replace(person, *redyed(tmp_path, 3))
-    assert sorted(first.iterdir()) == files
+    replace(person, redyed(tmp_path, 3))
+    assert sorted(before.parent.rglob("*")) == files
     assert all(path.startswith("//second_humans/Human/") for path in paths(person).values())
-    assert person_file(person).parent == tmp_path / "second_humans" / "Human"
+    assert person_file(person).is_relative_to(tmp_path / "second_humans" / "Human")
     assert all(volume.grids.load() for volume in bpy.data.volumes)
 
 
 def test_an_edit_before_the_first_save_is_collected_without_the_states_before_it(empty_scene, tmp_path):
-    npz = synthetic.write(tmp_path / "human.npz", COUNT)
-    person = build_human(empty_scene, npz, keep=[person_bytes(tmp_path / "first", b"first")])
-    replace(person, *redyed(tmp_path, 3))
+    person = build_human(empty_scene, synthetic_shape.write(tmp_path / "human", COUNT))
+    replace(person, redyed(tmp_path, 3))
     bpy.app.handlers.save_pre.append(collect_before_saving)
     try:
         bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
@@ -242,8 +236,9 @@ def test_an_edit_before_the_first_save_is_collected_without_the_states_before_it
         bpy.app.handlers.save_pre.remove(collect_before_saving)
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
     (person,) = humans(bpy.context.scene)
-    assert person_file(person).read_bytes().startswith(b"edited")
-    assert len(list((tmp_path / "shot_humans" / "Human").iterdir())) == COUNT + 1
+    assert not first(person)
+    assert list((tmp_path / "shot_humans" / "Human").iterdir()) == [state_folder(person)]
+    assert len(list(state_folder(person).iterdir())) == COUNT + 2
     assert all(volume.grids.load() for volume in bpy.data.volumes)
 
 
@@ -258,13 +253,11 @@ def test_a_linked_person_is_rejected_with_what_to_do(person, tmp_path):
 
 
 def test_files_of_earlier_states_are_unused_and_those_shown_are_not(person, saved_scene, tmp_path):
-    humans_folder = tmp_path / "shot_humans"
-    first = paths(person)["Human_prim_0003"]
+    humans_folder, before = tmp_path / "shot_humans", state_folder(person)
     assert unused(humans_folder) == []
-    (folder_of(person) / "notes.txt").write_text("mine")
-    replace(person, *redyed(tmp_path, 3))
-    names = [path.name for path in unused(humans_folder)]
-    assert names == ["person.human.safetensors", Path(first).name]
+    (before / "notes.txt").write_text("mine")
+    replace(person, redyed(tmp_path, 3))
+    assert unused(humans_folder) == sorted(path for path in before.iterdir() if path.name != "notes.txt")
     assert unused(tmp_path / "nowhere") == []
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 
@@ -13,6 +12,7 @@ import pytest
 import synthetic_shape
 from human_stage import COUNT, named, places, whole
 from support.errors import refused
+from support.fake_child import request_of
 
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file
@@ -44,7 +44,7 @@ def test_undo_and_redo_across_generate_edit_reshape_and_delete(source, addon):
     bpy.ops.ed.undo()
     person = humans(bpy.context.scene)[0]
     assert whole(person, generated)
-    assert json.loads(person_file(person).read_bytes())["seed"] == 7
+    assert request_of(person_file(person))["seed"] == 7
     bpy.ops.ed.undo()
     assert not humans(bpy.context.scene)
     for _ in range(3):
@@ -58,12 +58,12 @@ def test_a_human_generated_after_a_deletion_leaves_the_file_of_the_deleted(sourc
     ops.delete_human()
     step("delete")
     ops.generate(seed=9)
-    assert json.loads(person_file(humans(bpy.context.scene)[0]).read_bytes())["seed"] == 9
+    assert request_of(person_file(humans(bpy.context.scene)[0]))["seed"] == 9
     bpy.ops.ed.undo()
     bpy.ops.ed.undo()
     person = humans(bpy.context.scene)[0]
     assert whole(person)
-    assert json.loads(person_file(person).read_bytes())["seed"] == 7
+    assert request_of(person_file(person))["seed"] == 7
 
 
 def test_appended_people_are_whole_and_can_be_edited_and_collected(person, tmp_path):
@@ -216,9 +216,9 @@ def test_memory_of_deleted_people_is_given_back_and_undo_shows_them_again(person
 
 
 def test_edits_do_not_pile_up_grids(source, monkeypatch):
-    npz = synthetic_shape.write(source / "large.npz", 64)
+    npz = synthetic_shape.write(source / "large", 64)
     monkeypatch.setenv("FAKE_HUMAN", str(npz))
-    build_human(bpy.context, npz, "Anna", [source / "person.human.safetensors"])
+    build_human(bpy.context, npz, "Anna")
     bpy.context.view_layer.update()
     ops.vary(seed=11)
     before = psutil.Process().memory_info().rss

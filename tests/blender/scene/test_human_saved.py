@@ -89,7 +89,8 @@ def test_files_of_a_blender_that_crashed_before_the_first_save_come_along(source
     crashed = tmp_path / "blender_a1b2c3" / "primdiffusion_humans"
     shutil.move(humans_folder(""), crashed)
     for volume in bpy.data.volumes:
-        volume.filepath = str(crashed / "Anna" / volume_path(volume).name)
+        path = volume_path(volume)
+        volume.filepath = str(crashed / "Anna" / path.parent.name / path.name)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "recovered.blend"))
     assert whole(anna)
     assert person_file(anna).is_relative_to(tmp_path / "recovered_humans")

@@ -16,7 +16,7 @@ from blender_primdiffusion.scene.attachment import attachment_before_merge, atta
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.duplicate import duplicate_human
-from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, sequence_files, volume_path
+from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, sequence_files, state_folder, volume_path
 from blender_primdiffusion.scene.material import (
     density_gain,
     person_material,
@@ -56,7 +56,7 @@ def grid(seed: int = 0) -> MergedGrid:
 
 @pytest.fixture
 def person(saved_scene, tmp_path):
-    return build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 6))
+    return build_human(saved_scene, synthetic.write(tmp_path / "human", 6))
 
 
 def merge(person, tmp_path, seeds=(0,), start=0) -> bpy.types.Object:
@@ -159,7 +159,7 @@ def test_the_state_survives_on_the_object(person, tmp_path):
 
 
 def test_a_sequence_made_before_the_first_save_is_collected_whole(empty_scene, tmp_path):
-    person = build_human(empty_scene, synthetic.write(tmp_path / "human.npz", 3))
+    person = build_human(empty_scene, synthetic.write(tmp_path / "human", 3))
     volume = merge(person, tmp_path, (0, 1, 2)).data
     (tmp_path / "new").mkdir()
     collect_before_saving(str(tmp_path / "new" / "shot.blend"))
@@ -198,7 +198,7 @@ def test_a_grid_is_read_as_the_child_wrote_it(tmp_path):
 
 
 def test_a_gain_of_one_s_own_is_a_material_of_one_s_own(person, tmp_path):
-    other = build_human(bpy.context, synthetic.write(tmp_path / "second.npz", 3, seed=1), "Second")
+    other = build_human(bpy.context, synthetic.write(tmp_path / "second", 3, seed=1), "Second")
     merged = merge(person, tmp_path)
     set_density_gain(person, 2.0)
     assert density_gain(person) == pytest.approx(2.0)
@@ -216,7 +216,7 @@ def test_a_duplicate_s_gain_is_its_own(person):
     set_density_gain(twin, 1.9)
     assert density_gain(person) == pytest.approx(2.0)
     assert density_gain(twin) == pytest.approx(1.9)
-    assert {volume_path(data) for data in bpy.data.volumes} == set(folder_of(person).glob("prim_*.vdb"))
+    assert {volume_path(data) for data in bpy.data.volumes} == set(state_folder(person).glob("prim_*.vdb"))
 
 
 def test_a_material_without_the_factor_is_rejected(person):
@@ -230,18 +230,15 @@ def test_a_material_without_the_factor_is_rejected(person):
 
 
 def test_memory_is_what_openvdb_reports_for_the_loaded_grids(person):
-    files = sorted(folder_of(person).glob("prim_*.vdb"))
+    files = sorted(state_folder(person).glob("prim_*.vdb"))
     memory = person_memory(person)
     assert memory.files == sum(path.stat().st_size for path in files)
     assert memory.grids == sum(one.memUsage() for path in files for one in openvdb.readAll(str(path))[0])
 
 
 def test_missing_files_take_no_memory(person):
-    for path in folder_of(person).glob("prim_*.vdb"):
+    for path in state_folder(person).glob("prim_*.vdb"):
         path.rename(path.with_suffix(".gone"))
-    from blender_primdiffusion.scene import volumes
-
-    volumes._memory_of.cache_clear()
     assert person_memory(person).files == 0
 
 

@@ -45,7 +45,7 @@ def test_after_save_as_either_file_may_be_deleted(person, tmp_path, disk, delete
     files = {"shot": tmp_path / "shot.blend", "second": tmp_path / place / "second.blend"}
     bpy.ops.wm.save_as_mainfile(filepath=str(files["second"]))
     assert whole(person, where)
-    assert folders() == {tmp_path / place / "second_humans" / "Anna"}
+    assert folders() == {tmp_path / place / "second_humans" / "Anna" / "0001"}
     delete(files.pop(deleted))
     (kept,) = files.values()
     assert whole(opened(kept), where)
@@ -124,13 +124,13 @@ def test_a_human_without_volumes_keeps_its_own_file(person, tmp_path):
     bpy.data.orphans_purge()
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
     delete(tmp_path / "shot.blend")
-    assert person_file(opened(tmp_path / "second.blend")).parent == tmp_path / "second_humans" / "Anna"
+    assert person_file(opened(tmp_path / "second.blend")).parent == tmp_path / "second_humans" / "Anna" / "0001"
 
 
 def test_a_save_of_unchanged_humans_writes_no_file(person, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.scene.collect.copy_file", lambda *_, **__: pytest.fail("copied"))
     bpy.ops.wm.save_mainfile()
-    assert len(list(folder_of(person).glob("prim_*"))) == COUNT
+    assert len(list(folder_of(person).glob("*/prim_*"))) == COUNT
 
 
 def test_undo_to_before_save_as_and_saved_again(source, person, tmp_path):

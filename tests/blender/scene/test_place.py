@@ -27,7 +27,7 @@ FRONT, BACK = Vector((8.0, -16.0, 9.0)), Vector((8.0, 16.0, 9.0))
 
 @pytest.fixture
 def source(saved_scene, tmp_path):
-    return synthetic.write(tmp_path / "human.npz", 4)
+    return synthetic.write(tmp_path / "human", 4)
 
 
 def standing(source, eye=None) -> bpy.types.Object:

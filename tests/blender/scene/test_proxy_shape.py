@@ -6,6 +6,7 @@ import bpy
 import exporting
 import numpy as np
 import pytest
+import synthetic
 import synthetic_shape
 from blender_primdiffusion.formats.answers import ProxyAnswer
 from human_stage import make_earlier
@@ -27,7 +28,7 @@ TALLER, WIDER = np.eye(10)[0] * 2.0, np.eye(10)[1] * 2.0
 def person(saved_scene, tmp_path):
     """Somebody whose proxy has the vertices of their body."""
     exporting.write_store(tmp_path)
-    person = build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"))
+    person = build_human(saved_scene, synthetic_shape.write(tmp_path / "human"))
     arrays = dict(np.load(tmp_path / "proxy.npz"))
     arrays["vertices"] = synthetic_shape.arrays()["vertices"]
     np.savez(tmp_path / "proxy.npz", **arrays)
@@ -77,8 +78,7 @@ def test_the_proxy_of_a_human_of_an_earlier_version_follows_about_its_own_origin
 def test_an_edit_that_changes_the_body_takes_the_proxy_along(person, tmp_path):
     after = betas_of(person) + TALLER
     edited = {**synthetic_shape.at(synthetic_shape.arrays(), after), "meta": np.array('{"seed": 9}')}
-    np.savez(tmp_path / "edited.npz", **edited)
-    assert replace(person, tmp_path / "edited.npz", tmp_path / "person.human.safetensors").reshaped
+    assert replace(person, synthetic.save(tmp_path / "edited", edited)).reshaped
     proxy = proxy_of(person)
     assert np.linalg.norm(places(proxy) - surface(after), axis=-1).mean() < 0.02
     assert np.allclose(shown_betas(proxy), after)

@@ -32,10 +32,7 @@ SHAPE = np.array([2.0, -1.5, 1, 0, 0.5, 0, 0, -2, 0, 1])
 
 @pytest.fixture
 def person(saved_scene, tmp_path):
-    keep = tmp_path / "first" / "person.human.safetensors"
-    keep.parent.mkdir()
-    keep.write_bytes(b"first")
-    return build_human(saved_scene, synthetic_shape.write(tmp_path / "human.npz"), keep=[keep])
+    return build_human(saved_scene, synthetic_shape.write(tmp_path / "human"))
 
 
 def at(betas: np.ndarray) -> dict:
@@ -195,14 +192,9 @@ def with_renamed_bone(_context, person):
     armature_of(person).data.bones["left_knee"].name = "knee.L"
 
 
-def of_an_earlier_version(_context, person):
-    del person["primdiffusion_body_file"]
-
-
 REFUSED = {
     r"'Human' is in Edit Mode: leave it": (in_edit_mode, SHAPE),
     r"no bone 'left_knee'.*name again": (with_renamed_bone, SHAPE),
-    r"earlier version": (of_an_earlier_version, SHAPE),
     r"a shape is 10 numbers from -5 to 5, not": (lambda *_: None, SHAPE * 4),
     r"a shape is 10 numbers .*, not \[1.0\]": (lambda *_: None, [1.0]),
 }
@@ -255,14 +247,12 @@ def test_without_body_mesh_the_rest_still_follows(person):
 
 
 def edited_file(tmp_path, betas):
-    arrays = at(betas)
-    np.savez(tmp_path / "edited.npz", **{**arrays, "meta": np.array(json.dumps({"seed": 9}))})
-    return tmp_path / "edited.npz", tmp_path / "first" / "person.human.safetensors"
+    return synthetic.save(tmp_path / "edited", {**at(betas), "meta": np.array(json.dumps({"seed": 9}))})
 
 
 def test_a_custom_shape_survives_an_edit_that_changes_the_shape(person, tmp_path):
     reshape(person, SHAPE)
-    done = replace(person, *edited_file(tmp_path, np.ones(10)))
+    done = replace(person, edited_file(tmp_path, np.ones(10)))
     assert not done.reshaped
     np.testing.assert_allclose(betas_of(person), SHAPE)
     np.testing.assert_allclose(heads(person), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
@@ -273,22 +263,10 @@ def test_a_custom_shape_survives_an_edit_that_changes_the_shape(person, tmp_path
 
 
 def test_a_shape_that_was_not_chosen_follows_the_edit(person, tmp_path):
-    assert replace(person, *edited_file(tmp_path, SHAPE)).reshaped
+    assert replace(person, edited_file(tmp_path, SHAPE)).reshaped
     np.testing.assert_allclose(betas_of(person), SHAPE)
     np.testing.assert_allclose(heads(person), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
     assert not has_custom_shape(person)
-
-
-def test_an_edit_gives_people_of_an_earlier_version_a_shape_to_change(saved_scene, tmp_path):
-    keep = tmp_path / "first" / "person.human.safetensors"
-    keep.parent.mkdir()
-    keep.write_bytes(b"first")
-    old = build_human(saved_scene, synthetic_shape.write(tmp_path / "old.npz", format_version=np.array(1)), keep=[keep])
-    with refused(ValueError, "version"):
-        reshape(old, SHAPE)
-    replace(old, *edited_file(tmp_path, generated_betas(old)))
-    reshape(old, SHAPE)
-    np.testing.assert_allclose(heads(old), standing(at(SHAPE)["joints"], at(SHAPE)), atol=TOLERANCE_M)
 
 
 def shown_on_the_surface() -> dict[str, np.ndarray]:
@@ -352,7 +330,7 @@ def test_volumes_grow_with_half_of_the_surface_s_stretch_in_either_attachment(pe
 
 def test_volumes_of_an_edited_person_grow_from_the_edited_one_s_body(person, saved_scene, tmp_path):
     reshape(person, SHAPE)
-    replace(person, *edited_file(tmp_path, np.ones(10)))
+    replace(person, edited_file(tmp_path, np.ones(10)))
     saved_scene.view_layer.update()
     edited = at(np.ones(10))
     wanted = at(SHAPE)["growth"] / edited["growth"]

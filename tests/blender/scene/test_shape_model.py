@@ -14,13 +14,10 @@ import torch
 from primdiffusion.body.measures import betas_of_measures as backend_betas_of_measures
 from primdiffusion.body.measures import measure as backend_measure
 from primdiffusion.body.model import default_body
-from primdiffusion.human import Human
-from primdiffusion.human_file import export_for_blender
 from primdiffusion.primitives.anchors import attach, default_anchors
-from primdiffusion.primitives.primitives import K, Payload
 from primdiffusion.reshaping import box_growth
 
-from blender_primdiffusion.scene.human_npz import read_human
+from blender_primdiffusion.scene.body import default_body as default_body_here
 from blender_primdiffusion.scene.shape import betas_of_measures, measure, slider_names
 
 pytestmark = pytest.mark.any_blender
@@ -29,11 +26,8 @@ SHAPES = np.random.default_rng(4).normal(0, 1.2, (4, 10))
 
 
 @pytest.fixture(scope="module")
-def model(tmp_path_factory):
-    path = tmp_path_factory.mktemp("person") / "human.npz"
-    payload = Payload(torch.rand(K, 3, 8, 8, 8), torch.rand(K, 8, 8, 8), torch.ones(K, 3))
-    export_for_blender(path, Human(payload, torch.zeros(10), {"seed": 1}))
-    return read_human(path).shape_model
+def model():
+    return default_body_here()
 
 
 @pytest.mark.parametrize("betas", SHAPES)

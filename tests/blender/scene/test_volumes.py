@@ -1,29 +1,29 @@
-"""VDB files: their content, where it lies, their names, and that a failed write leaves nothing."""
+"""VDB files: their content, where it lies, and that a failed write leaves nothing."""
 
 from __future__ import annotations
 
-import os
-from contextlib import contextmanager
+from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
 import synthetic
-from support.errors import refused
 
+from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.cycles import max_overlap
-from blender_primdiffusion.scene.human import VolumeWriteError
-from blender_primdiffusion.scene.volumes import FAINTEST, bake, file_name, index_to_local, staged, window
+from blender_primdiffusion.scene.human import volume_name
+from blender_primdiffusion.scene.volumes import FAINTEST, bake, index_to_local, window, write_volume
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
 
 
-@contextmanager
-def written(grids, folder):
-    with staged(folder) as staging:
-        list(staging.write(grids, range(len(grids.density))))
-        yield staging.paths
+def written(grids, folder) -> list[Path]:
+    folder.mkdir()
+    paths = [folder / volume_name(k) for k in range(len(grids.density))]
+    for k, path in enumerate(paths):
+        write_volume(grids, k, bpy.app.version, path)
+    return paths
 
 
 @pytest.fixture
@@ -43,8 +43,7 @@ def test_the_window_is_the_marchers():
 
 
 def test_files_hold_the_windowed_payload_at_half_precision_with_x_along_t(human, grids, tmp_path):
-    with written(grids, tmp_path / "h") as files:
-        pass
+    files = written(grids, tmp_path / "h")
     for k, path in enumerate(files):
         read, _ = openvdb.readAll(str(path))
         density, colour = sorted(read, key=lambda grid: grid.name, reverse=True)
@@ -70,8 +69,7 @@ def test_one_empty_voxel_surrounds_the_dense_ones_and_no_more_is_stored(human, t
     density[0, 3:5, 2, 1:6] = 50  # D, H, W
     density[1] = 1e4  # the window ends before the rim at any density
     grids = bake(density, human["rgb"][:3], human["half_extent"][:3])
-    with written(grids, tmp_path / "h") as files:
-        pass
+    files = written(grids, tmp_path / "h")
     boxes = [openvdb.read(str(path), "density").evalActiveVoxelBoundingBox() for path in files]
     assert boxes[0] == ((0, 1, 2), (6, 3, 5))
     assert boxes[1] == ((0, 0, 0), (7, 7, 7))
@@ -83,8 +81,7 @@ def test_one_empty_voxel_surrounds_the_dense_ones_and_no_more_is_stored(human, t
 
 
 def test_voxels_lie_corner_aligned_in_the_box(human, grids, tmp_path):
-    with written(grids, tmp_path / "h") as files:
-        pass
+    files = written(grids, tmp_path / "h")
     for k, path in enumerate(files):
         transform = openvdb.read(str(path), "density").transform
         half = human["half_extent"][k]
@@ -100,55 +97,25 @@ def test_blender_before_5_gets_grids_half_a_voxel_lower():
     np.testing.assert_allclose(shift, half / 7, atol=1e-15)
 
 
-def test_other_content_or_size_has_another_name(human, grids):
-    name = file_name(grids, 2, bpy.app.version)
-    assert name == file_name(bake(human["density"], human["rgb"], human["half_extent"]), 2, bpy.app.version)
-    changed = human["density"].copy()
-    changed[2, 4, 4, 4] += 1
-    assert name != file_name(bake(changed, human["rgb"], human["half_extent"]), 2, bpy.app.version)
-    assert name != file_name(bake(human["density"], human["rgb"] * 0.5, human["half_extent"]), 2, bpy.app.version)
-    assert name != file_name(bake(human["density"], human["rgb"], human["half_extent"] * 1.01), 2, bpy.app.version)
-
-
 def test_density_beyond_half_precision_is_clamped_not_infinite(human):
     baked = bake(human["density"] * 1e6, human["rgb"], human["half_extent"])
     assert np.isfinite(baked.density).all()
 
 
-def test_a_failure_inside_the_block_leaves_no_files_and_no_folders(grids, tmp_path):
-    with pytest.raises(KeyError), written(grids, tmp_path / "shot_humans" / "Human"):
-        raise KeyError
-    assert list(tmp_path.iterdir()) == []
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), RuntimeError("disk full")])
+def test_a_volume_appears_whole_or_not_at_all(grids, tmp_path, monkeypatch, error):
+    (path, *_), before = written(grids, tmp_path / "h"), sorted((tmp_path / "h").iterdir())
+    content = path.read_bytes()
 
+    def half(path, *_):
+        path.write_bytes(content[:100])
+        raise error
 
-def test_a_folder_that_cannot_be_made_is_named_and_nothing_is_left(grids, tmp_path):
-    (tmp_path / "shot_humans").write_text("a file where the folder should be")
-    with (
-        refused(VolumeWriteError, "shot_humans"),
-        written(grids, tmp_path / "shot_humans" / "H"),
-    ):
-        pass
-    assert [path.name for path in tmp_path.iterdir()] == ["shot_humans"]
-
-
-def test_a_full_disk_half_way_keeps_earlier_files_and_drops_the_new(human, grids, tmp_path, monkeypatch):
-    folder = tmp_path / "Human"
-    with written(grids, folder):
-        pass
-    before = sorted(folder.iterdir())
-    other = bake(human["density"] * 0.5, human["rgb"], human["half_extent"])
-    replace, calls = os.replace, []
-
-    def failing(source, target):
-        calls.append(target)
-        if len(calls) == 4:
-            raise OSError(28, "No space left on device")
-        replace(source, target)
-
-    monkeypatch.setattr(os, "replace", failing)
-    with refused(VolumeWriteError), written(other, folder):
-        pass
-    assert sorted(folder.iterdir()) == before
+    monkeypatch.setattr(volumes, "write_vdb", half)
+    with pytest.raises(type(error)):
+        write_volume(grids, 0, bpy.app.version, path)
+    assert path.read_bytes() == content
+    assert sorted(path.parent.iterdir()) == before
 
 
 def test_overlaps_are_counted():

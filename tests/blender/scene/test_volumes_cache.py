@@ -19,12 +19,12 @@ def _resident_mb() -> float:
 
 
 def test_grids_of_deleted_volumes_are_given_back_and_shown_ones_stay(saved_scene, tmp_path):
-    human = synthetic.write(tmp_path / "human.npz", 64)
+    human = synthetic.write(tmp_path / "human", 64)
     kept = build_human(saved_scene, human, "Kept")
     saved_scene.view_layer.update()
     free_unused_grids()  # of earlier tests: what the process keeps of them would do for new ones
     before = _resident_mb()
-    gone = build_human(saved_scene, synthetic.write(tmp_path / "other.npz", 64, seed=3), "Gone")
+    gone = build_human(saved_scene, synthetic.write(tmp_path / "other", 64, seed=3), "Gone")
     saved_scene.view_layer.update()
     grown = _resident_mb()
     for obj in list(gone.all_objects):
@@ -37,7 +37,7 @@ def test_grids_of_deleted_volumes_are_given_back_and_shown_ones_stay(saved_scene
 
 
 def test_grids_of_people_who_are_shown_are_given_back_and_read_again(saved_scene, tmp_path):
-    person = build_human(saved_scene, synthetic.write(tmp_path / "human.npz", 64), "Shown")
+    person = build_human(saved_scene, synthetic.write(tmp_path / "human", 64), "Shown")
     free_unused_grids()
     before = _resident_mb()
     saved_scene.view_layer.update()

@@ -13,4 +13,4 @@ from blender_primdiffusion.scene.human import armature_of
 @pytest.fixture
 def armature(addon, tmp_path) -> bpy.types.Object:
     """Of a human with the name Ann."""
-    return armature_of(build_human(addon, synthetic.write(tmp_path / "p.npz", 8), "Ann"))
+    return armature_of(build_human(addon, synthetic.write(tmp_path / "p", 8), "Ann"))

@@ -12,6 +12,7 @@ import bpy
 import pytest
 from blender_primdiffusion.formats.requests import PARTS
 from support.errors import refused
+from support.fake_child import request_of
 
 from blender_primdiffusion.scene.human import humans, person_file
 from blender_primdiffusion.ui import attributes, edit_panel
@@ -40,7 +41,7 @@ def known(addon, tmp_path, monkeypatch):
 
 
 def sent(context) -> dict:
-    return json.loads(person_file(humans(context.scene)[-1]).read_bytes())
+    return request_of(person_file(humans(context.scene)[-1]))
 
 
 def test_menus_hold_what_the_checkpoint_knows_and_any(known):

@@ -20,7 +20,7 @@ import sidebar
 from blender_primdiffusion.jobs.queue import JobOutcome, queue
 from blender_primdiffusion.jobs.variations import Variation, sheet
 from blender_primdiffusion.scene import shape
-from blender_primdiffusion.scene.body_file import shape_model_of
+from blender_primdiffusion.scene.body import shape_model_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.ui import drawing, generate_panel
 from blender_primdiffusion.ui.captures_session import captures
@@ -34,7 +34,7 @@ MOST_PANELS, MOST_OPERATORS = 20, 55
 @pytest.fixture
 def human(addon, tmp_path, monkeypatch):
     """One human, whose sliders have names, after Generate Human."""
-    human = build_human(addon, synthetic_shape.write(tmp_path / "human.npz"))
+    human = build_human(addon, synthetic_shape.write(tmp_path / "human"))
     vertices = len(shape_model_of(human).template)
     monkeypatch.setattr(shape, "DEFAULT_BODY_VERTICES", vertices)
     monkeypatch.setattr(generate_panel, "draw_set_up", lambda _layout: True)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
-from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG
+from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.follow import follow
@@ -41,7 +41,7 @@ def paths(person) -> list[str]:
 
 def sent(person) -> dict:
     """What the child was asked, but for the folder of the job."""
-    asked = json.loads(person_file(person).read_bytes())
+    asked = request_of(person_file(person))
     del asked["out_dir"], asked["size"], asked["picture_px"]
     return asked
 

@@ -36,7 +36,7 @@ def store(saved_scene, tmp_path, monkeypatch):
     folder = tmp_path / "store"
     folder.mkdir()
     exporting.write_store(folder)
-    monkeypatch.setenv("FAKE_HUMAN", str(folder / "human.npz"))
+    monkeypatch.setenv("FAKE_HUMAN", str(folder / "person.human.safetensors"))
     use_this_python(monkeypatch, FAKE_CHILD)
     blender_primdiffusion.register()
     yield folder

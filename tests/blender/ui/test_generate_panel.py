@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import random
 import re
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 from jobs_driven import drive, notice_of, shown
 from support.errors import refused
-from support.fake_child import FAILS
+from support.fake_child import FAILS, request_of
 
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
@@ -50,7 +49,7 @@ def presets_folder(tmp_path, monkeypatch):
 
 
 def seeds(context) -> list[int]:
-    return [json.loads(person_file(person).read_bytes())["seed"] for person in humans(context.scene)]
+    return [request_of(person_file(person))["seed"] for person in humans(context.scene)]
 
 
 def test_an_unlocked_seed_is_another_one_after_each_result_and_a_locked_one_stays(addon, panel_settings, monkeypatch):

@@ -18,9 +18,18 @@ from support.errors import refused
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.attachment import set_attachment
-from blender_primdiffusion.scene.body_file import shape_model_of
+from blender_primdiffusion.scene.body import shape_model_of
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, folder_of, humans, person_file
+from blender_primdiffusion.scene.human import (
+    BETAS,
+    MARK,
+    armature_of,
+    body_of,
+    folder_of,
+    humans,
+    person_file,
+    state_folder,
+)
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
 from blender_primdiffusion.scene.surface import node_inputs
@@ -39,15 +48,12 @@ TALL = [2.0] + [0.0] * 9
 
 @pytest.fixture
 def person(addon, tmp_path):
-    keep = tmp_path / "first" / "person.human.safetensors"
-    keep.parent.mkdir()
-    keep.write_bytes(b"first")
-    return build_human(addon, synthetic_shape.write(tmp_path / "human.npz"), keep=[keep])
+    return build_human(addon, synthetic_shape.write(tmp_path / "human"))
 
 
 @pytest.fixture
 def other(person, addon, tmp_path):
-    return build_human(addon, synthetic_shape.write(tmp_path / "other.npz", seed=3), "Ötzi")
+    return build_human(addon, synthetic_shape.write(tmp_path / "other", seed=3), "Ötzi")
 
 
 def settings(person):
@@ -121,13 +127,6 @@ def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_wh
     bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def test_humans_of_earlier_versions_have_to_be_generated_again(addon, tmp_path):
-    build_human(addon, synthetic.write(tmp_path / "old.npz", 8))
-    assert "generate the human again" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
-    with refused(RuntimeError, "human"):
-        ops.reshape(to="RANDOM")
-
-
 def test_an_animated_shape_is_reported(person, addon):
     armature_of(person).keyframe_insert(f'["{BETAS}"]', frame=1)
     assert "animated" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
@@ -192,7 +191,7 @@ def test_a_script_gives_betas_and_measures(person):
 def test_a_new_name_is_the_collections_and_its_parts_but_not_of_those_renamed_by_hand(person):
     hat = body_of(person)
     hat.name = "Skin"
-    files = sorted(folder_of(person).iterdir())
+    files = sorted(state_folder(person).iterdir())
     settings(person).person = "Jürgen  "
     assert person.name == settings(person).person == "Jürgen"
     assert armature_of(person).name == armature_of(person).data.name == "Jürgen"
@@ -362,7 +361,7 @@ def test_a_scaled_human_shows_its_height_in_the_scene(person, addon):
     armature_of(person).scale = (2, 2, 2)
     addon.view_layer.update()
     tall = 2 * measure(shape_model_of(person), betas_of(person)).height
-    assert f"In the scene: {tall:.1f} m" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
+    assert f"In the scene: {f'{tall:.2f}'.rstrip('0')} m" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
 
 
 def test_other_bodies_have_sliders_with_numbers(person):

@@ -100,7 +100,7 @@ def test_bad_files_are_rejected_in_a_sentence_and_leave_nothing(addon, armature,
 
 def test_an_npz_that_is_something_else_is_rejected(addon, armature, tmp_path):
     with refused(RuntimeError, "poses"):
-        ops.import_motion(filepath=str(synthetic.write(tmp_path / "human.npz", 4)))
+        ops.import_motion(filepath=str(synthetic.write(tmp_path / "human", 4)))
     with refused(RuntimeError, "chosen"):
         ops.import_motion()
 
@@ -140,7 +140,7 @@ def test_a_scene_without_humans_is_reported(addon, tmp_path):
 
 
 def test_of_two_people_the_named_one_moves(addon, armature, tmp_path):
-    other = build_human(addon, synthetic.write(tmp_path / "q.npz", 8), "Bob")
+    other = build_human(addon, synthetic.write(tmp_path / "q", 8), "Bob")
     ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Bob")
     assert armature.animation_data is None or armature.animation_data.action is None
     assert armature_of(other).animation_data.action is not None

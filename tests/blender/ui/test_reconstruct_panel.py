@@ -11,10 +11,11 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
+from support.fake_child import request_of
 
 from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import folder_of, humans
+from blender_primdiffusion.scene.human import humans, person_file
 from blender_primdiffusion.ui import reconstruct_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
@@ -29,7 +30,7 @@ def captures(tmp_path) -> Path:
 
 
 def asked_of_the_child(person: bpy.types.Collection) -> dict:
-    return json.loads((folder_of(person) / "person.human.safetensors").read_bytes())
+    return request_of(person_file(person))
 
 
 def test_the_operator_builds_a_human_from_the_chosen_captures(addon, captures):

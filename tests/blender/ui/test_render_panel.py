@@ -36,9 +36,7 @@ ops = bpy.ops.primdiffusion
 @pytest.fixture
 def person(addon, tmp_path, monkeypatch):
     """Somebody in shot.blend whom there is to merge."""
-    kept = tmp_path / "person.human.safetensors"
-    kept.write_bytes(b"kept")
-    person = build_human(addon, synthetic_shape.write(tmp_path / "human.npz", 6), keep=[kept])
+    person = build_human(addon, synthetic_shape.write(tmp_path / "human", 6))
     bpy.ops.ed.undo_push(message="a person")
     return person
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import time
 from types import SimpleNamespace
@@ -14,18 +13,15 @@ import synthetic_shape
 from engine_stage import cube
 from mathutils import Matrix
 
-from blender_primdiffusion.engine.boxes import Boxes, boxes_of
+from blender_primdiffusion.engine.boxes import Boxes
 from blender_primdiffusion.engine.gpu import overlay as module
 from blender_primdiffusion.engine.gpu import scene_reading
 from blender_primdiffusion.engine.gpu.overlay import Overlay
 from blender_primdiffusion.engine.gpu.start import GpuStart
 from blender_primdiffusion.engine.view import NO_SURFACE_M
-from blender_primdiffusion.scene.attachment import show_in_viewport
-from blender_primdiffusion.scene.body_file import BODY_FILE, body_file, saved_body_file, shape_model_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import armature_of, body_of, person_file
-from blender_primdiffusion.scene.shape import OPTIONAL_FIELDS
 from blender_primdiffusion.ui import viewport_humans
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
@@ -57,12 +53,9 @@ def people(addon, tmp_path, monkeypatch):
     """Two humans whose volumes viewports hide, and the scene's overlay."""
     uploads = Uploads()
     monkeypatch.setattr(scene_reading, "gpu_humans", lambda: uploads)
-    source = synthetic_shape.write(tmp_path / "human.npz", 12)
     found = []
-    for name, x in (("Anna", 0.0), ("Bert", 1.0)):
-        file = tmp_path / f"{name}.human.safetensors"
-        file.write_text(name)
-        human = build_human(addon, source, name, [file.rename(tmp_path / "person.human.safetensors")])
+    for seed, (name, x) in enumerate((("Anna", 0.0), ("Bert", 1.0))):
+        human = build_human(addon, synthetic_shape.write(tmp_path / name, 12, seed), name)
         armature_of(human).location.x = x
         volumes_of(human).hide_viewport = True
         found.append(human)
@@ -151,25 +144,6 @@ def test_a_human_without_its_file_is_named_and_the_others_are_drawn(people):
     volumes_of(people.anna).hide_viewport = False
     assert names(read(people.overlay)) == ["Bert"]
     assert people.overlay.error == "", "the fog shows her"
-
-
-def test_the_view_says_how_to_see_a_human_of_an_earlier_version(people, monkeypatch):
-    def placed(pose):
-        return None, boxes_of(pose)
-
-    monkeypatch.setattr(scene_reading.gpu_humans(), "placed", placed)
-    early = dataclasses.replace(shape_model_of(people.anna), **dict.fromkeys(OPTIONAL_FIELDS))
-    with saved_body_file(early, body_file(people.anna).parent) as name:
-        people.anna[BODY_FILE] = name
-    volumes_of(people.bert).hide_viewport = False
-    read(people.overlay)
-    assert people.overlay.error == (
-        "the human 'Anna' was made by an earlier version and its volumes are hidden: show these (in the Outliner, or "
-        "Advanced > Attachment > Volumes in Viewport), edit the human, or generate it again"
-    )
-    show_in_viewport(people.anna, True)
-    assert names(read(people.overlay)) == []
-    assert people.overlay.error == ""
 
 
 def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 from pathlib import Path
 
 import bpy
@@ -114,20 +115,28 @@ def test_cycles_draws_the_volumes(people, out):
 
 
 def test_one_who_fails_is_named_and_does_not_stop_the_others(people, out, capfd):
-    (people / "person_000007" / "human.npz").write_bytes(b"PK\x03\x04 no more")
+    (people / "person_000007" / "body.safetensors").write_bytes(b"PK\x03\x04 no more")
     assert render(people, out, *SMALL) == FAILED
     assert pictures(out) == ["person_000008.png"]
     (failed,) = report(out)["failed"]
     assert failed["subject"] == "person_000007"
-    assert "'human.npz' is damaged" in failed["why"]
+    assert "body.safetensors" in failed["why"]
     assert not list(out.rglob(".*"))
 
 
-def test_missing_volumes_are_reported_before_cycles_renders(people, out):
+def test_volumes_that_are_gone_are_written_before_cycles_renders(people, out):
     folder = people / "person_000007"
-    next((folder / "person_humans").rglob("*.vdb")).unlink()
+    gone = next((folder / "person_humans").rglob("*.vdb"))
+    gone.unlink()
+    assert render(folder / "person.blend", out, *SMALL, "--engine", "cycles") == DONE
+    assert gone.is_file()
+
+
+def test_missing_humans_are_reported_before_cycles_renders(people, out):
+    folder = people / "person_000007"
+    shutil.rmtree(folder / "person_humans")
     assert render(folder / "person.blend", out, *SMALL, "--engine", "cycles") == FAILED
-    assert "1 of 8 volumes have lost their files" in report(out)["failed"][0]["why"]
+    assert "8 of 8 volumes have lost their files" in report(out)["failed"][0]["why"]
 
 
 def test_a_missing_backend_is_reported_at_once(people, out, monkeypatch, capfd):

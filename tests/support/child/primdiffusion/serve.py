@@ -13,16 +13,20 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+sys.path.append(str(Path(__file__).parents[2]))
 try:
     import numpy as np
+    import tensor_files
 except ModuleNotFoundError:  # an environment of tests/contract/tiny_packages.py
     import tiny
 
+    tensor_files = None
     PROBLEM = tiny.PROBLEM
 else:
     PROBLEM = None
 
 HERE = Path(__file__).parent
+PERSON = "person.human.safetensors"
 HUMAN = Path(os.environ.get("FAKE_HUMAN", os.devnull))
 ORDER, STEP_S = os.environ.get("FAKE_ORDER", ""), float(os.environ.get("FAKE_STEP_S", "0.02"))
 ORDERS = {seed: order for order, seed in json.loads((HERE / "seeds.json").read_text()).items()}
@@ -92,56 +96,57 @@ def bands(params: dict) -> Steps:
 
 
 def human(params: dict) -> dict:
-    """The prepared human, or an edit of it, beside what was asked for."""
+    """The prepared human, or an edit of it; its file says what was asked for."""
     out = Path(params["out_dir"])
     out.mkdir(parents=True, exist_ok=True)
-    npz, person = out / "human.npz", out / "person.human.safetensors"
-    if order_of(params) == "gives garbage":
-        npz.write_bytes(GARBAGE)
-    elif "person" in params:
-        write_edited(npz, params)
-    else:
-        shutil.copyfile(HUMAN, npz)
-    person.write_bytes(json.dumps(params).encode())
-    files = {"human": str(npz), "person": str(person)}
+    person = write_person(out / PERSON, params)
     warnings = ["only one view"] if params.get("views") == 1 else []
-    return {**files, "seed": params.get("seed"), "steps": params.get("steps"), "warnings": warnings}
+    return {"person": str(person), "seed": params.get("seed"), "steps": params.get("steps"), "warnings": warnings}
 
 
-def write_edited(path: Path, params: dict) -> None:
-    """Another colour for primitives 1 and 2, for all where no region is given; another body for a blend."""
-    with np.load(HUMAN) as archive:
-        arrays = dict(archive)
-    arrays["rgb"] = arrays["rgb"].copy()
-    region = [1, 2] if "region" in params else slice(None)
-    arrays["rgb"][region] = arrays["rgb"][region] * 0.5 + 0.1 * (params.get("seed", 0) % 5)
+def write_person(path: Path, params: dict) -> Path:
+    """Another colour for primitives 1 and 2, for all where no region is given; another shape for a blend."""
+    if order_of(params) == "gives garbage":
+        path.write_bytes(GARBAGE)
+        return path
+    if tensor_files is None or not HUMAN.is_file():
+        shutil.copyfile(HUMAN, path)
+        return path
+    arrays, metadata = tensor_files.read_tensors(HUMAN)
+    if "person" in params:
+        region = [1, 2] if "region" in params else slice(None)
+        arrays["rgb"] = arrays["rgb"].copy()
+        arrays["rgb"][region] = arrays["rgb"][region] * 0.5 + 0.1 * (params.get("seed", 0) % 5)
+        metadata["provenance"] = json.dumps(
+            {**json.loads(metadata["provenance"]), "edits": [{"edit": "fake", "seed": params.get("seed")}]}
+        )
     if "fraction" in params:
         arrays["betas"] = arrays["betas"] + 1
-        for name in ("joints", "vertices", "position"):
-            arrays[name] = arrays[name] * 1.1
     if "weights" in params:
         with np.load(params["weights"]) as weights:
-            arrays["meta"] = np.array(json.dumps({"painted": weights["weights"].tolist()}))
-    np.savez(path, **arrays)
+            metadata["provenance"] = json.dumps({"painted": weights["weights"].tolist()})
+    tensor_files.write_tensors(path, arrays, {**metadata, "asked": json.dumps(params)})
+    shutil.copyfile(HUMAN.with_name(tensor_files.BODY), path.with_name(tensor_files.BODY))
+    return path
 
 
 def sheet(params: dict) -> dict:
     people = []
     for seed in params["seeds"]:
-        files = {"human": f"{seed}.human.npz", "person": f"{seed}.human.safetensors", "picture": f"{seed}.png"}
-        files = {name: Path(params["out_dir"]) / file for name, file in files.items()}
-        shutil.copyfile(HUMAN, files["human"])
-        files["person"].write_bytes(json.dumps({**params, "seed": seed}).encode())
+        files = {
+            name: Path(params["out_dir"]) / f"{seed}{end}" for name, end in (("person", ".human"), ("picture", ".png"))
+        }
+        write_person(files["person"], {**params, "seed": seed})
         people.append({"seed": seed, **{name: str(path) for name, path in files.items()}})
     return {"people": people}
 
 
-def human_npz(params: dict) -> dict:
+def open_human(params: dict) -> dict:
     """Whoever is asked for, they are FAKE_HUMAN's."""
-    npz, person = (Path(params["out_dir"]) / name for name in ("human.npz", "person.human.safetensors"))
-    shutil.copyfile(HUMAN, npz)
-    shutil.copyfile(params["person"], person)
-    return {"human": str(npz), "person": str(person)}
+    person = Path(params["out_dir"]) / PERSON
+    for source, copy in ((HUMAN, person), (HUMAN.with_name(tensor_files.BODY), person.with_name(tensor_files.BODY))):
+        shutil.copyfile(source, copy)
+    return {"person": str(person)}
 
 
 def picture(params: dict) -> dict:
@@ -203,7 +208,7 @@ ANSWERS: dict[str, tuple[Callable[[dict], Steps], Callable[[dict], dict]]] = {
     **dict.fromkeys(("generate", "vary", "interpolate", "inpaint", "transfer"), edit),
     "variations": (sheet_steps, sheet),
     "reconstruct": (steps("encode", lambda _: 4), human),
-    "human_npz": (at_once, human_npz),
+    "open_human": (at_once, open_human),
     "render": (at_once, picture),
     "draw": (bands, nothing),
     "merge": (merging, merged),

@@ -1,4 +1,4 @@
-"""A human whose volumes are written later: made, written by halves, and whole."""
+"""A human whose volumes are deferred: made, written by halves, and whole."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ from pathlib import Path
 import bpy
 from jobs_driven import drive
 
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.generate import GenerateJob
-from blender_primdiffusion.jobs.late_volumes import late_volumes
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import (
     humans,
     humans_folder,
-    unwritten_in,
     volume_path,
     volumes_of,
 )
+from blender_primdiffusion.scene.pending import pending_of
 
 COUNT = 12
 """Primitives of the synthetic person."""
-STATES = ("unwritten", "half", "written")
+STATES = ("absent", "half", "written")
 
 
 def generated(seed: int = 7) -> bpy.types.Collection:
@@ -33,9 +33,9 @@ def advance(state_wanted: str) -> None:
     """Write no volumes, about half of them, or all."""
     if state_wanted == "half":
         while len(on_disk()) < COUNT // 2:
-            assert late_volumes.work(0.0)
+            assert deferred_volumes.work(0.0)
     elif state_wanted == "written":
-        while late_volumes.work(0.0):
+        while deferred_volumes.work(0.0):
             pass
 
 
@@ -52,5 +52,5 @@ def check_complete(person: bpy.types.Collection) -> None:
     paths = paths_of(person)
     assert len(paths) == COUNT
     assert all(path.is_file() for path in paths)
-    assert not unwritten_in(paths[0].parent)
+    assert pending_of(person) is None
     assert not list(paths[0].parent.glob(".*.partial*"))

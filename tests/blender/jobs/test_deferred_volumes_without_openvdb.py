@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import bpy
 import pytest
-from late_volumes_stage import COUNT, on_disk
+from deferred_volumes_stage import COUNT, on_disk
 from support.errors import refused
 
-from blender_primdiffusion.jobs.late_volumes import late_volumes, write_after_loading
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_after_loading
 from blender_primdiffusion.scene import vdb
 from blender_primdiffusion.scene.human import humans, person_file, volumes_of
 from blender_primdiffusion.scene.volumes import Memory, person_memory
@@ -33,17 +33,17 @@ def test_a_human_is_generated_with_the_file_that_the_engine_draws(person):
 
 
 def test_the_panel_says_why_no_volume_is_written_and_writing_stops(person):
-    while late_volumes.work(0.0):
+    while deferred_volumes.work(0.0):
         pass
-    assert "python3-openvdb" in late_volumes.error
+    assert "python3-openvdb" in deferred_volumes.error
     assert not on_disk()
     assert person_memory(person) == Memory(0, 0)
 
 
 def test_loading_and_rendering_report_it_without_an_exception(person):
     write_after_loading()
-    late_volumes.finish()
-    assert "python3-openvdb" in late_volumes.error
+    deferred_volumes.finish()
+    assert "python3-openvdb" in deferred_volumes.error
 
 
 def test_what_cannot_wait_is_refused_and_adds_no_human(without_openvdb, addon):

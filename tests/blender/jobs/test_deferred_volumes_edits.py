@@ -1,4 +1,4 @@
-"""A human with unwritten volumes is undone, saved, moved, appended, edited and duplicated."""
+"""A human whose volumes are deferred is undone, saved, moved, appended, edited and duplicated."""
 
 from __future__ import annotations
 
@@ -6,10 +6,10 @@ import shutil
 
 import bpy
 import pytest
+from deferred_volumes_stage import COUNT, STATES, advance, check_complete, generated, on_disk, paths_of
 from jobs_driven import drive
-from late_volumes_stage import COUNT, STATES, advance, check_complete, generated, on_disk, paths_of
 
-from blender_primdiffusion.jobs.late_volumes import late_volumes
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.collect import unused
@@ -17,10 +17,10 @@ from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import (
     armature_of,
     folder_of,
-    folders_of,
     humans,
     humans_folder,
-    unwritten_in,
+    person_file,
+    state_folder,
     volumes_of,
 )
 
@@ -30,7 +30,7 @@ ops = bpy.ops.primdiffusion
 def test_undo_redo_and_work_again(in_each_state):
     bpy.ops.ed.undo()
     assert not humans(bpy.context.scene)
-    assert not late_volumes.work(0.0), "no human is left to write"
+    assert not deferred_volumes.work(0.0), "no human is left to write"
     bpy.ops.ed.redo()
     (person,) = humans(bpy.context.scene)
     advance("written")
@@ -42,7 +42,7 @@ def test_a_deleted_human_is_not_written_on_and_comes_back_with_undo(in_each_stat
     bpy.ops.ed.undo_push(message="stands")
     ops.delete_human(human=in_each_state.name)
     bpy.ops.ed.undo_push(message="deleted")
-    assert not late_volumes.work(0.0)
+    assert not deferred_volumes.work(0.0)
     assert on_disk() == before
     bpy.ops.ed.undo()
     advance("written")
@@ -51,7 +51,7 @@ def test_a_deleted_human_is_not_written_on_and_comes_back_with_undo(in_each_stat
 
 def test_saved_and_opened_again_the_rest_is_written(in_each_state):
     bpy.ops.wm.save_mainfile()
-    late_volumes.stop()
+    deferred_volumes.stop()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     (person,) = humans(bpy.context.scene)
     look()
@@ -65,10 +65,10 @@ def test_the_first_save_takes_the_volumes_along_however_many_are_written(hidden,
     bpy.ops.wm.read_homefile(use_empty=True)
     person = generated()
     temporary = folder_of(person)
-    while reached != "unwritten" and len(on_disk(temporary)) < (COUNT if reached == "written" else COUNT // 2):
-        assert late_volumes.work(0.0)
+    while reached != "absent" and len(on_disk(temporary)) < (COUNT if reached == "written" else COUNT // 2):
+        assert deferred_volumes.work(0.0)
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
-    assert folders_of(person)[0] == tmp_path / "film_humans" / "Human"
+    assert state_folder(person).parent == tmp_path / "film_humans" / "Human"
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "film.blend"))
     shutil.rmtree(temporary, ignore_errors=True)
     advance("written")
@@ -143,14 +143,14 @@ def test_collected_files_include_what_is_still_to_be_written(in_each_state, tmp_
     shutil.rmtree(tmp_path / "shot_humans")
     advance("written")
     check_complete(in_each_state)
-    assert paths_of(in_each_state)[0].parent == tmp_path / "other_humans" / "Human"
+    assert state_folder(in_each_state) == tmp_path / "other_humans" / "Human" / "0001"
 
 
-def test_the_source_of_unwritten_volumes_is_unused_once_no_human_needs_it(person):
-    source = unwritten_in(folder_of(person))
+def test_the_file_that_volumes_are_written_from_is_unused_once_no_human_needs_it(person):
+    source = person_file(person)
     assert not unused(humans_folder())
     ops.delete_human(human=person.name)
-    assert set(source) <= set(unused(humans_folder()))
+    assert source in unused(humans_folder())
 
 
 def test_what_failed_is_tried_again_when_the_file_is_opened(person, monkeypatch):
@@ -158,12 +158,12 @@ def test_what_failed_is_tried_again_when_the_file_is_opened(person, monkeypatch)
         raise OSError(28, "No space left on device")
 
     bpy.ops.wm.save_mainfile()
-    monkeypatch.setattr(volumes, "write_file", full)
-    while late_volumes.work(0.0):
+    monkeypatch.setattr(volumes, "write_vdb", full)
+    while deferred_volumes.work(0.0):
         pass
     monkeypatch.undo()
-    assert not late_volumes.work(0.0)
+    assert not deferred_volumes.work(0.0)
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    assert late_volumes.error == ""
+    assert deferred_volumes.error == ""
     advance("written")
     check_complete(*humans(bpy.context.scene))

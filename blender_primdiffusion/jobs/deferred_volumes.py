@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import bpy
 from bpy.app.handlers import persistent
 
 from ..backend.requests import sentence
 from ..engine.engine import ENGINE
+from ..engine.gpu.overlay import overlay
 from ..places import EXTENSION
+from ..scene.collect import collect_pending
+from ..scene.earlier_files import convert_earlier
 from ..scene.human import any_humans
+from ..scene.pending import (
+    PendingVolumes,
+    is_wanted,
+    newer_text,
+    pending_volumes,
+    show_written,
+    write_all_pending,
+    write_pending,
+)
 from .windows import in_the_way, redraw
-
-if TYPE_CHECKING:
-    from ..scene.newer_volumes import NewerVolumes
 
 ALWAYS, WHEN_RENDERING = "ALWAYS", "WHEN_RENDERING"
 """Values of the preference `volumes`."""
@@ -30,56 +38,61 @@ FIRST_S = 1.0
 """After a human has entered, until writing begins: views draw the human first."""
 
 
-class LateVolumes:
-    """The one that is being written, in slices. All methods but `finish` are for Blender's main thread."""
+class DeferredVolumes:
+    """Writes the volumes of one human after the other, in slices. All methods but `finish` are for the main thread."""
 
     def __init__(self) -> None:
         self.error = ""
         """Why volumes could not be written; empty when they could."""
         self.notice = ""
         """Which volumes are written again, and why; empty when none are."""
-        self._source: Path | NewerVolumes | None = None
+        self._left: list[PendingVolumes] = []
+        """The humans whose volumes are left to write; looked up when it is empty."""
         self._steps: Generator[None, None, None] | None = None
-        self._newer: list[NewerVolumes] = []
-        self._failed: set[Path | NewerVolumes] = set()
+        self._failed: set[Path] = set()
+        """Folders whose volumes could not be written."""
         self._ended = 0.0
 
     def work(self, seconds: float) -> bool:
         """Write for about `seconds`, one step at least; whether more is left."""
-        # needs numpy
-        from ..scene.newer_volumes import write_again
-        from ..scene.unwritten import unwritten, write_unwritten
-
-        self.bring_here()
-        sources = {**dict.fromkeys(unwritten(), write_unwritten), **dict.fromkeys(self._newer, write_again)}
-        left = [source for source in sources if source not in self._failed]
-        if self._source not in left:  # written by a render, or the human is gone
+        if self._left and not is_wanted(self._left[0]):  # the human was removed, or is in another state
             self.stop()
-        if not left:
+        if not self._left:
+            self.bring_here()
+            self._left = [one for one in pending_volumes() if one.folder not in self._failed]
+        if not self._left:
             return False
-        source = left[0] if self._source is None else self._source
-        steps = sources[source](source) if self._steps is None else self._steps
-        self._source, self._steps = source, steps
+        pending = self._left[0]
+        self._steps = write_pending(pending) if self._steps is None else self._steps
         end = time.monotonic() + seconds
         try:
-            next(steps)
+            next(self._steps)
             while time.monotonic() < end:
-                next(steps)
+                next(self._steps)
         except StopIteration:
-            self._newer = [newer for newer in self._newer if newer != source]
-            self.notice = self.notice if self._newer else ""
-            self.stop()
+            self._steps = None
+            self._left = self._left[1:]
+            self.notice = self.notice if any(one.newer for one in self._left) else ""
+            show_written()
         except (OSError, ValueError) as error:
-            self._fail(source, error)
+            self.stop()
+            self._failed.add(pending.folder)
+            self._report(error)
+            redraw()
         return True
 
     def bring_here(self) -> None:
         """Have humans elsewhere, whose volumes are still to be written, in this .blend's own folders (see
-        `collect_unwritten`)."""
-        from ..scene.collect import collect_unwritten  # needs numpy
+        `collect_pending`)."""
+        self._try(collect_pending)
 
+    def convert(self) -> None:
+        """Have humans of the earlier layout in folders of states."""
+        self._try(convert_earlier)
+
+    def _try(self, change: Callable[[], object]) -> None:
         try:
-            collect_unwritten()
+            change()
         except OSError as error:
             if self.error != str(error):
                 print(f"PrimDiffusion: {error}")
@@ -87,47 +100,41 @@ class LateVolumes:
 
     def finish(self) -> None:
         """Write all that is left, with steps of its own: renders call it from another thread."""
-        from ..scene.unwritten import write_all_unwritten  # needs numpy
-
         self.forget_failures()
         if bpy.app.background:  # in the main thread
             self.bring_here()
         try:
-            write_all_unwritten()
+            write_all_pending()
         except (OSError, ValueError) as error:
-            self.error = str(error)
-            print(f"PrimDiffusion: {error}")
-        self._newer, self.notice = [], ""
+            self._report(error)
+        if bpy.app.background:
+            show_written()
 
     def look_for_newer(self) -> None:
         """Find volumes that only a newer Blender can read, say so once, and write at once those that viewports read."""
-        from ..scene.newer_volumes import in_a_sentence, newer_volumes, write_again  # needs numpy
-
-        known, self._newer = self._newer, newer_volumes()
-        if not self._newer:
+        newer = [one for one in pending_volumes() if one.newer]
+        if not newer:
             self.notice = ""
             return
-        if self._newer != known:
-            self.notice = sentence(in_a_sentence(self._newer))
-            print(f"PrimDiffusion: {self.notice}")
+        notice = sentence(newer_text(newer))
+        if self.notice != notice:
+            self.notice = notice
+            print(f"PrimDiffusion: {notice}")
         try:
-            for newer in (newer for newer in self._newer if newer.in_views):
-                for _ in write_again(newer):
-                    pass
+            for one in newer:
+                if one.in_views:
+                    for _ in write_pending(one):
+                        pass
         except (OSError, ValueError) as error:
-            self.error, self.notice = str(error), ""
-            print(f"PrimDiffusion: {error}")
-        self._newer = newer_volumes()
+            self._report(error)
 
     def forget_failures(self) -> None:
-        """Try again what could not be written."""
+        """Try again what could not be written, and say again what is written again."""
         self._failed.clear()
-        self.error = ""
+        self.error = self.notice = ""
 
     def tick(self) -> float | None:
         """The timer: a slice of writing, until all is written. Views that humans are drawn in come first."""
-        from ..engine.gpu.overlay import overlay  # needs numpy
-
         if in_the_way() or not overlay.resting:
             return BLOCKED_S
         drawing = time.monotonic() - self._ended - PAUSE_S
@@ -136,20 +143,17 @@ class LateVolumes:
         return PAUSE_S if more else None
 
     def stop(self) -> None:
-        """Stop writing; what is written stays, and the rest can be written later."""
+        """Stop writing; what is written stays, and the rest is looked up again."""
         if self._steps is not None:
             self._steps.close()
-        self._source = self._steps = None
+        self._left, self._steps = [], None
 
-    def _fail(self, source: Path | NewerVolumes, error: Exception) -> None:
-        self.stop()
-        self._failed.add(source)
+    def _report(self, error: Exception) -> None:
         self.error, self.notice = str(error), ""
         print(f"PrimDiffusion: {error}")
-        redraw()
 
 
-late_volumes = LateVolumes()
+deferred_volumes = DeferredVolumes()
 """One for all humans."""
 
 
@@ -161,6 +165,7 @@ def preferred() -> str:
 
 def keep_writing() -> None:
     """Have Blender write what is not written yet, unless the preference is to wait for a render."""
+    deferred_volumes.stop()  # other volumes may be wanted now
     if bpy.app.background or preferred() != ALWAYS or not any_humans():
         return
     if not bpy.app.timers.is_registered(_tick):
@@ -169,7 +174,7 @@ def keep_writing() -> None:
 
 def _bring_here() -> None:
     if any_humans():
-        late_volumes.bring_here()
+        deferred_volumes.bring_here()
 
 
 def _bring_here_soon() -> float | None:
@@ -181,7 +186,7 @@ def _bring_here_soon() -> float | None:
 
 
 def _tick() -> float | None:
-    return late_volumes.tick()
+    return deferred_volumes.tick()
 
 
 @persistent
@@ -197,30 +202,31 @@ def write_soon(*_: object) -> None:
 @persistent
 def write_after_loading(*_: object) -> None:
     """Handler of load_post."""
-    late_volumes.forget_failures()
+    deferred_volumes.forget_failures()
     write_after_importing()
 
 
 @persistent
 def write_after_importing(*_: object) -> None:
     """Handler of blend_import_post: humans were appended or linked."""
-    _bring_here()
     if any_humans():
-        late_volumes.look_for_newer()
+        deferred_volumes.convert()
+        deferred_volumes.bring_here()
+        deferred_volumes.look_for_newer()
     keep_writing()
 
 
 @persistent
 def stop_writing(*_: object) -> None:
     """Handler of save_pre, which may copy the files elsewhere."""
-    late_volumes.stop()
+    deferred_volumes.stop()
 
 
 @persistent
 def write_before_rendering(scene: bpy.types.Scene, *_: object) -> None:
     """Handler of render_init: every engine but PrimDiffusion draws the volumes."""
     if scene.render.engine != ENGINE and any_humans():
-        late_volumes.finish()
+        deferred_volumes.finish()
 
 
 HANDLERS = (
@@ -239,4 +245,4 @@ def unregister() -> None:
     for timer in (_tick, _bring_here_soon):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)
-    late_volumes.stop()
+    deferred_volumes.stop()

@@ -7,26 +7,25 @@ import time
 
 import bpy
 import pytest
-from late_volumes_stage import COUNT, advance, check_complete, generated, on_disk, paths_of
+from deferred_volumes_stage import COUNT, advance, check_complete, generated, on_disk, paths_of
 
 import blender_primdiffusion
 from blender_primdiffusion.engine.gpu.overlay import overlay
-from blender_primdiffusion.jobs import late_volumes as module
+from blender_primdiffusion.jobs import deferred_volumes as module
 from blender_primdiffusion.jobs import windows
-from blender_primdiffusion.jobs.late_volumes import late_volumes
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import (
     armature_of,
-    folder_of,
     humans,
     person_file,
-    unwritten_in,
+    state_folder,
     volumes_of,
 )
-from blender_primdiffusion.scene.unwritten import write_all_unwritten, write_unwritten
+from blender_primdiffusion.scene.pending import pending_of, pending_volumes, write_all_pending, write_pending
 from blender_primdiffusion.scene.volumes import person_memory
 
 ops = bpy.ops.primdiffusion
@@ -34,7 +33,7 @@ ops = bpy.ops.primdiffusion
 
 def test_the_human_stands_before_any_volume_is_written(person):
     assert not on_disk()
-    assert len(unwritten_in(folder_of(person))) == 1
+    assert pending_of(person).primitives == tuple(range(COUNT))
     assert len(volumes_of(person)) == COUNT
     assert person_file(person).is_file()
     assert armature_of(person).visible_get()
@@ -43,10 +42,11 @@ def test_the_human_stands_before_any_volume_is_written(person):
 
 
 def test_the_files_written_later_are_those_that_would_be_written_at_once(person, tmp_path):
-    write_all_unwritten()
+    write_all_pending()
     check_complete(person)
-    at_once = build_human(bpy.context, tmp_path / "prepared.npz", "Anna")
+    at_once = build_human(bpy.context, tmp_path / "prepared" / "person.human.safetensors", "Anna")
     later = {path.name: path for path in paths_of(person)}
+    write_all_pending()
     for path in paths_of(at_once):
         assert later[path.name].stat().st_size == path.stat().st_size
 
@@ -65,26 +65,26 @@ def test_a_slice_is_as_long_as_the_drawing_before_it_within_limits(person, monke
     given, now = [], [100.0]
     monkeypatch.setattr(windows, "_last_undo", -math.inf)  # an undo of another test lies in this clock's future
     monkeypatch.setattr(module.time, "monotonic", lambda: now[0])
-    monkeypatch.setattr(late_volumes, "work", lambda seconds: given.append(round(seconds, 3)) or True)
+    monkeypatch.setattr(deferred_volumes, "work", lambda seconds: given.append(round(seconds, 3)) or True)
     for drawing in (0.0, 0.07, 3.0):
-        late_volumes._ended = now[0]
+        deferred_volumes._ended = now[0]
         now[0] += module.PAUSE_S + drawing
-        assert late_volumes.tick() == module.PAUSE_S
+        assert deferred_volumes.tick() == module.PAUSE_S
     assert given == [module.SHORTEST_S, 0.07, module.LONGEST_S]
 
 
 def test_views_that_show_the_human_come_before_its_volumes(person, monkeypatch):
     monkeypatch.setattr(overlay, "undrawn", True)
-    assert late_volumes.tick() == module.BLOCKED_S
+    assert deferred_volumes.tick() == module.BLOCKED_S
     assert not on_disk()
 
 
 def test_the_timer_waits_for_what_the_user_holds_and_ends_with_the_work(person, monkeypatch):
     monkeypatch.setattr(module, "in_the_way", lambda: "Move")
-    assert late_volumes.tick() == module.BLOCKED_S
+    assert deferred_volumes.tick() == module.BLOCKED_S
     assert not on_disk()
     monkeypatch.undo()
-    while late_volumes.tick() is not None:
+    while deferred_volumes.tick() is not None:
         pass
     check_complete(person)
 
@@ -133,44 +133,44 @@ def test_hidden_volumes_stay_hidden_when_the_attachment_changes(person, mode):
 
 
 def test_both_a_render_and_the_timer_may_write_the_same(person):
-    (source,) = unwritten_in(folder_of(person))
+    (pending,) = pending_volumes()
     advance("half")
-    for _ in write_unwritten(source):
+    for _ in write_pending(pending):
         pass
     check_complete(person)
-    assert not late_volumes.work(60.0)
-    assert not list(folder_of(person).glob(".*.partial*"))
+    while deferred_volumes.work(60.0):
+        pass
+    assert not list(state_folder(person).glob(".*.partial*"))
 
 
 def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypatch, capsys):
     def full(*_: object) -> str:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(volumes, "write_file", full)
-    while late_volumes.work(0.0):
+    monkeypatch.setattr(volumes, "write_vdb", full)
+    while deferred_volumes.work(0.0):
         pass
-    assert "could not be written" in late_volumes.error
+    assert "could not be written" in deferred_volumes.error
     assert capsys.readouterr().out.count("could not be written") == 1
-    assert not list(folder_of(person).glob(".*.partial*"))
+    assert not list(state_folder(person).glob(".*.partial*"))
     monkeypatch.undo()
-    late_volumes.finish()
-    assert late_volumes.error == ""
+    deferred_volumes.finish()
+    assert deferred_volumes.error == ""
     check_complete(person)
 
 
-def test_a_changed_source_is_reported(person):
-    (source,) = unwritten_in(folder_of(person))
-    source.write_bytes(b"no human")
-    while late_volumes.work(0.0):
+def test_a_damaged_file_of_the_human_is_reported(person):
+    person_file(person).write_bytes(b"no human")
+    while deferred_volumes.work(0.0):
         pass
-    assert "is damaged" in late_volumes.error
+    assert person_file(person).name in deferred_volumes.error
 
 
 def test_disabling_the_extension_leaves_no_unfinished_files(person):
     advance("half")
     blender_primdiffusion.unregister()
-    assert not list(folder_of(person).glob(".*.partial*"))
-    assert len(unwritten_in(folder_of(person))) == 1
+    assert not list(state_folder(person).glob(".*.partial*"))
+    assert pending_of(person) is not None
     blender_primdiffusion.register()
 
 
@@ -183,7 +183,7 @@ def test_background_mode_writes_at_once(addon):
 
 def test_the_memory_of_volumes_is_told_when_they_are_written(in_each_state):
     person_memory(in_each_state)
-    write_all_unwritten()
+    write_all_pending()
     memory = person_memory(in_each_state)
     assert memory.files == sum(path.stat().st_size for path in paths_of(in_each_state))
     assert memory.grids > 0
@@ -192,7 +192,7 @@ def test_the_memory_of_volumes_is_told_when_they_are_written(in_each_state):
 def test_several_humans_are_written_one_after_another(hidden):
     people = [generated(seed) for seed in (11, 12)]
     began = time.monotonic()
-    while late_volumes.work(0.0):
+    while deferred_volumes.work(0.0):
         assert time.monotonic() - began < 60
     for person in people:
         check_complete(person)
@@ -200,7 +200,7 @@ def test_several_humans_are_written_one_after_another(hidden):
 
 def test_paths_change_after_undo_only_once_it_rests(person, monkeypatch):
     brought = []
-    monkeypatch.setattr(late_volumes, "bring_here", lambda: brought.append(True))
+    monkeypatch.setattr(deferred_volumes, "bring_here", lambda: brought.append(True))
     monkeypatch.setattr(windows, "_last_undo", time.monotonic())
     monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
     assert module._bring_here_soon() == module.BLOCKED_S
