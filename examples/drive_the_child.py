@@ -38,7 +38,7 @@ def main() -> None:
         child.stdin.close()  # ends the child
     if "error" in message:
         sys.exit(message["error"]["message"])
-    print(message["result"]["human"])
+    print(message["result"]["person"])
 
 
 if __name__ == "__main__":

@@ -77,7 +77,7 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
     frame: not_given(ReconstructRequest, "frame", default=-1, min=-1, description="-1: the panel's")
     views: not_given(ReconstructRequest, "views", default=0, min=0, description="0: the panel's")
     by: bpy.props.EnumProperty(
-        name="By", description=_BY_DESCRIPTION, items=[("PANEL", "The panel's", PANELS), *_BY], options=SKIP
+        name="By", description=_BY_DESCRIPTION, items=[("PANEL", "As in the Panel", PANELS), *_BY], options=SKIP
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 

@@ -8,7 +8,8 @@ from synthetic import skinning
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Blender from backend, written out by hand: forward +z becomes -y, up +y becomes +z."""
-TOLERANCE_M = 1e-5
+TOLERANCE_M = 2e-5
+"""Of points on posed bodies, whose files hold float32."""
 
 
 def blended_frames(human: dict, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:

@@ -5,11 +5,11 @@ import signal
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from capture_scenes import captured
 from child_requests import reconstruct_request, this_pythons_backend
 from conversation import Conversation
+from primdiffusion.human_file import load_human
 from tiny_encoder import save_tiny_encoder
 
 from blender_primdiffusion.backend.requests import ChildRequest
@@ -51,11 +51,10 @@ def test_reconstruct_reports_its_stages_and_leaves_whole_files(child, asked):
     result = message["result"]
     assert (result["subject"], result["frame"], len(result["views"])) == (FIRST, 1, 2)
     assert result["seconds"] >= result["seconds_encoding"] > 0
-    for name in ("human", "person", "preview", "side", "depth"):
+    for name in ("person", "preview", "side", "depth"):
         assert Path(result[name]).parent == Path(asked["out_dir"])
         assert Path(result[name]).stat().st_size > 0
-    with np.load(result["human"]) as human:
-        assert human["betas"].shape == (10,)
+    assert load_human(result["person"]).betas.shape == (10,)
     assert not list(Path(asked["out_dir"]).glob(".*"))
 
 
@@ -122,7 +121,7 @@ def test_the_panels_job_runs_from_a_cold_start_to_its_files(start):
     assert messages[0] == "Starting the backend"
     assert {"Reading the pictures", "Reconstructing", "Writing the human"} <= set(messages)
     assert request.fraction == 1.0
-    assert request.result.human.exists()
+    assert request.result.person.exists()
     assert request.result.warnings[0] == "only one view: the sides that it does not show are guessed"
 
 

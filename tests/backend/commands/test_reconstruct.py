@@ -15,8 +15,8 @@ from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person, choose_subject, conditioning_views
 from primdiffusion.capture.render import render
 from primdiffusion.commands import reconstruct as commands
+from primdiffusion.commands import session as session_module
 from primdiffusion.commands.session import Session
-from primdiffusion.encoder import model as encoder_model
 from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
@@ -186,7 +186,7 @@ def test_a_missing_folder_picture_or_dataset_is_named(dataset, line, tmp_path, c
 def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, tmp_path, capsys):
     cut, other = tmp_path / "cut.safetensors", save_tiny_checkpoint(tmp_path / "diffusion.safetensors")
     cut.write_bytes(checkpoint.read_bytes()[:-100])
-    for path, fault in ((cut, "is damaged"), (other, "of format"), (tmp_path / "none", "there is no encoder at")):
+    for path, fault in ((cut, "is damaged"), (other, "has the format"), (tmp_path / "none", "there is no encoder at")):
         line = ["reconstruct", "--capture", dataset / FIRST, "--checkpoint", path, "--out", tmp_path / "out"]
         sentence = failure(capsys, [str(word) for word in line])
         assert fault in sentence
@@ -198,7 +198,7 @@ def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint
     load = load_encoder
     monkeypatch.setattr(commands, "write_human", lambda *_: None)
     counted = lambda path, device: loaded.append(path) or load(path, device)  # noqa: E731
-    monkeypatch.setattr(encoder_model, "load_encoder", counted)
+    monkeypatch.setattr(session_module, "load_encoder", counted)
     other = save_tiny_encoder(tmp_path / "other.safetensors")
     session = Session()
     for path in (checkpoint, checkpoint, other):

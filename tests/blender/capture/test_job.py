@@ -54,7 +54,7 @@ def capture(context, settings: CaptureSettings, people=PEOPLE, load=load_painted
 def start_child(out: Path) -> subprocess.Popen:
     command = [sys.executable, str(Path(__file__).parents[1] / "capture_child.py"), str(out)]
     here = Path(__file__).parents[1]
-    path = [str(here), str(here.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
+    path = [str(here), str(here.parent), str(here.parents[1]), *filter(None, [os.environ.get("PYTHONPATH")])]
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path)}
     return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env=environment)
 

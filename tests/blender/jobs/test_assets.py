@@ -44,7 +44,7 @@ def preview(asset: bpy.types.ID) -> np.ndarray:
 
 
 def rendered(tmp_path) -> dict:
-    return json.loads((tmp_path / "rendered.json").read_text())
+    return json.loads((tmp_path / "prepared" / "rendered.json").read_text())
 
 
 def test_a_human_becomes_an_asset_with_tags_and_a_preview(person, tmp_path):
@@ -62,7 +62,7 @@ def test_a_human_becomes_an_asset_with_tags_and_a_preview(person, tmp_path):
 def test_a_given_preview_needs_no_backend(person, tmp_path):
     assert ops.mark_as_asset(picture=str(PICTURE)) == {"FINISHED"}
     assert preview(person).max() > 0
-    assert not (tmp_path / "rendered.json").exists()
+    assert not (tmp_path / "prepared" / "rendered.json").exists()
 
 
 def test_one_undo_makes_it_an_ordinary_collection_again(person):

@@ -92,7 +92,7 @@ def test_an_animation_turns_the_joints_as_before(person, saved_scene):
     saved_scene.scene.frame_set(5)
     world = world_from_model(armature_of(person), at(SHAPE)["vertices"])
     expected = world @ blended_frames(at(SHAPE), rotations[1], np.zeros(3))
-    np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2e-5)
+    np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2 * TOLERANCE_M)
 
 
 def test_changing_the_shape_and_back_is_no_change(person, saved_scene):
@@ -143,7 +143,7 @@ def test_a_human_of_an_earlier_version_is_reshaped_about_its_own_origin(person, 
     np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
     saved_scene.view_layer.update()
     expected = np.array(armature_of(person).matrix_world) @ blended_frames(at(SHAPE), rotations, np.zeros(3))
-    np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2e-5)
+    np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2 * TOLERANCE_M)
     assert ORIGIN not in armature_of(person).data
 
 
