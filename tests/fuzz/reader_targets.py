@@ -132,7 +132,7 @@ def read_answers(path: Path) -> None:
         if isinstance(event, Response) and event.id == list(RESULTS).index("variations") + 1:
             for files in event.result.people:
                 int(files.seed)
-                [path.exists() for path in (files.human, files.person, files.picture)]
+                [path.exists() for path in (files.person, files.picture)]
     answered = [event.id for event in events if isinstance(event, Response)]
     if len(answered) != len(set(answered)):
         raise Garbage("an answer was taken twice")
