@@ -14,6 +14,7 @@ from .proxy import follow_shape, proxy_of
 from .reshape import apply_growth, apply_rest, check_shapeable
 from .shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
 from .states import PreparedHuman
+from .volumes import reload_volume
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +65,10 @@ def _replace(collection: bpy.types.Collection, prepared: PreparedHuman) -> Repla
     folder = stored_path(prepared.folder)
     for k, objects in shown.items():
         for obj in objects:
-            own_data(obj, collection).filepath = os.path.join(folder, volume_name(k))
+            volume = own_data(obj, collection)
+            volume.filepath = os.path.join(folder, volume_name(k))
+            if volume.grids.error_message:  # its file was missing
+                reload_volume(volume)
     collection[MARK] = prepared.provenance
     collection[HOME] = str(prepared.folder)
     armature_of(collection).update_tag()

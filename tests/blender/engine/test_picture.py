@@ -28,7 +28,7 @@ from oracle import raised
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of, remove_human
+from blender_primdiffusion.scene.human import armature_of, person_file, remove_human
 from blender_primdiffusion.scene.rest_human import read_human
 
 SIZE = (120, 90)
@@ -362,7 +362,7 @@ def test_a_renamed_collection_and_a_blend_saved_elsewhere_keep_their_person(stag
 
 
 def test_a_missing_file_is_one_error_that_names_person_and_file(stage):
-    folder = next(stage.out.parent.glob("shot_humans/Human"))
+    folder = person_file(stage.person).parent
     shutil.move(folder / "person.human.safetensors", stage.out.parent)
     with refused(RuntimeError, "Human", "person.human.safetensors") as caught:
         render_png(stage.out)

@@ -8,25 +8,32 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+import synthetic
+import synthetic_shape
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
+from support.tensor_files import read_tensors
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import painted_weights
-from blender_primdiffusion.scene.human import armature_of, body_of, humans, person_file, remove_human
+from blender_primdiffusion.scene.human import armature_of, body_of, humans, humans_folder, person_file, remove_human
 from blender_primdiffusion.ui import edit_panel
 
 """Seeds that the fake child takes as orders."""
 FINE = 8
+COUNT = 8
+"""Primitives of the synthetic people."""
 ops = bpy.ops.primdiffusion
 
 
 @pytest.fixture
-def person(addon):
+def person(addon, tmp_path, monkeypatch):
     """Somebody at work on whom there is to edit, and somebody else, in a saved file."""
+    monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
     for _ in range(2):
         ops.generate(seed=7, steps=1)
     first, _ = humans(addon.scene)
@@ -64,7 +71,7 @@ def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):
     assert sent(person) == {"person": str(first), "amount": 0.25, "seed": FINE, "steps": 3}
     assert not set(before) & set(paths(person))
     assert armature_of(person).location.x == 3.0
-    assert "8 of 8 volumes of Human changed" in notice_of("vary")
+    assert "8 volumes of Human changed" in notice_of("vary")
     after = paths(person)
     bpy.ops.ed.undo()
     person = humans(bpy.context.scene)[0]
@@ -76,13 +83,14 @@ def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):
     assert not list(Path(bpy.app.tempdir).glob("vary_*"))
 
 
-def test_redress_changes_the_volumes_of_the_region_alone(person):
-    before, other = paths(person), paths(humans(bpy.context.scene)[1])
+def test_redress_changes_the_primitives_of_the_region_alone(person):
+    before, other = read_tensors(person_file(person))[0], paths(humans(bpy.context.scene)[1])
     assert ops.redress(parts={"top", "left_foot"}, seed=FINE, steps=2, attributes="outfit=dress") == {"FINISHED"}
     asked = sent(person)
     assert asked["region"] == ["left_foot", "top"]
     assert (asked["attributes"], asked["guidance"]) == ({"outfit": "dress"}, 1.5)
-    assert [k for k in range(8) if paths(person)[k] != before[k]] == [1, 2]
+    after = read_tensors(person_file(person))[0]
+    assert [k for k in range(COUNT) if (after["rgb"][k] != before["rgb"][k]).any()] == [1, 2]
     assert paths(humans(bpy.context.scene)[1]) == other
 
 
@@ -100,12 +108,13 @@ def test_what_a_script_does_not_give_is_the_panels(person):
 
 
 def test_a_blend_moves_the_body_where_the_betas_differ(person):
-    joints = [list(bone.head_local) for bone in armature_of(person).data.bones]
+    betas = read_tensors(person_file(person))[0]["betas"].astype(np.float64)
     assert ops.blend(other="Human.001", fraction=0.75, steps=1) == {"FINISHED"}
     asked = sent(person)
     assert (asked["other"], asked["fraction"]) == (str(person_file(humans(bpy.context.scene)[1])), 0.75)
-    moved = [list(bone.head_local) for bone in armature_of(person).data.bones]
-    np.testing.assert_allclose(moved, np.array(joints) * 1.1, atol=1e-5)
+    heads = np.array([armature_of(person).data.bones[name].head_local for name in synthetic.NAMES])
+    wanted = points_to_blender(synthetic_shape.at(synthetic_shape.arrays(COUNT), betas + 1)["joints"])
+    np.testing.assert_allclose(heads - heads[0], wanted - wanted[0], atol=1e-5)
     assert "the body's shape too" in notice_of("interpolate")
 
 
@@ -160,7 +169,8 @@ def test_a_vertex_group_that_is_not_there_is_named(person):
 
 
 @pytest.mark.parametrize(
-    ("seed", "sentence"), [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "is damaged")]
+    ("seed", "sentence"),
+    [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "contains no human")],
 )
 def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, seed, sentence):
     before, file, files = paths(person), person_file(person), sorted(person_file(person).parent.iterdir())
@@ -228,7 +238,7 @@ def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(add
     drive()
     assert error_of("vary") == ""
     assert all(path.startswith("//late_humans/Human/") for path in paths(person))
-    assert person_file(person).parent == tmp_path / "late_humans" / "Human"
+    assert person_file(person).parent == tmp_path / "late_humans" / "Human" / "0002"
     assert sent(person)["seed"] == FINE
 
 
@@ -324,6 +334,6 @@ def test_unused_files_are_removed_and_those_in_use_stay(person):
     ops.vary(seed=FINE, steps=1)
     shown = {bpy.path.abspath(path) for human in humans(bpy.context.scene) for path in paths(human)}
     assert ops.remove_unused_files() == {"FINISHED"}
-    left = {str(path) for path in person_file(person).parent.parent.rglob("*.vdb")}
+    left = {str(path) for path in humans_folder().rglob("*.vdb")}
     assert left == shown
     assert person_file(person).is_file()

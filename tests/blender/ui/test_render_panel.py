@@ -23,6 +23,7 @@ from blender_primdiffusion.scene.human import (
     armature_of,
     folder_of,
     humans,
+    person_file,
     remove_human,
     sequence_files,
     volume_path,
@@ -186,7 +187,7 @@ def test_a_renamed_bone_is_rejected_with_what_to_do(person):
 
 
 def test_a_missing_file_of_the_person_is_named(person):
-    (folder_of(person) / "person.human.safetensors").unlink()
+    person_file(person).unlink()
     with refused(RuntimeError, "person.human.safetensors"):
         ops.merge()
 
