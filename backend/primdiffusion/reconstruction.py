@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float32
-from numpy import ndarray
+from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion import __version__
@@ -31,7 +30,7 @@ from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.human import Human, frames_of, made_by
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.render.cpu_linear import apply_to_codes
-from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, encoding_slope, fit_payload
+from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
 
 STEPS = 4
 """Gauss-Newton steps for person coefficients."""
@@ -40,8 +39,6 @@ OBSERVATIONS = 150.0
 pixels; more would fit them to noise, fewer would ignore the view."""
 PIXEL_STD = 0.08
 """Standard deviation of such a pixel from what the best coefficients draw, in encoded colour."""
-CLAMPED = 0.05
-"""Relative densities farther than this beyond their range count as clamped."""
 COARSE_SIDE, FINE_SIDE = 176, 512
 """Largest sides of the pictures for coefficients and for voxels, pixels."""
 
@@ -87,14 +84,14 @@ def reconstruct_by_prior(
         if on_step is not None:
             on_step(done, STEPS + 1)
 
-    coefficients = prior.posterior_mean(torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis)))
+    coefficients = torch.zeros(len(prior.basis))
     human = Human(payload_of(coefficients), person.betas, {**_origin(person), **made_by(model)})
     frames = frames_of(human, person.views.pose)
-    targets = _targets(person, frames, COARSE_SIDE)
+    targets = targets_of(person, frames, COARSE_SIDE)
     for step in range(STEPS):
-        coefficients = _gauss_newton(coefficients, prior, codec, payload_of(coefficients), model.full_density, targets)
+        coefficients = _gauss_newton(coefficients, prior, codec, model.full_density, targets)
         report(step + 1)
-    payload = fit_payload(payload_of(coefficients), _targets(person, frames, FINE_SIDE), model.full_density)
+    payload = fit_payload(payload_of(coefficients), targets_of(person, frames, FINE_SIDE), model.full_density)
     report(STEPS + 1)
     return dataclasses.replace(human, payload=payload).validate()
 
@@ -103,19 +100,22 @@ def _gauss_newton(
     coefficients: Float[Tensor, "r"],
     prior: PersonPrior,
     codec: LinearCodec,
-    payload: Payload,
     full_density: float,
     targets: Sequence[TargetImage],
 ) -> Float[Tensor, "r"]:
-    """The posterior mean of person coefficients, for pictures linearised at `coefficients`, whose payload is given."""
-    cells = codec.decode(prior.mean + prior.picture(coefficients[None]))[0]
-    slope, region = _slopes(cells, codec, full_density), codec.region.numpy()
+    """The posterior mean of person coefficients, for pictures linearised at `coefficients`."""
+    cells = codec.decode(prior.mean + prior.picture(coefficients[None]))[0].requires_grad_()
+    payload = payload_from_cells(cells, full_density, codec.zone)
+    # Each colour and density depends on its own value of the cells, so the gradient of their sum has all derivatives.
+    (by_cell,) = torch.autograd.grad(payload.rgb.sum() + payload.density.sum(), cells)
+    slope = by_cell[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1).numpy()
+    payload, region = payload.map(Tensor.detach), codec.region.numpy()
     basis = codec.voxel_basis(prior.basis.shape[1] // K).contiguous().numpy()
     codes = prior.basis.unflatten(1, (-1, K)).permute(2, 1, 0).contiguous().numpy()
     precision, vector = torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis))
     for target in targets:
         view = LinearisedView.of(target, payload, InverseSettings())
-        seen = view.weight.any(1) & (np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0)
+        seen = np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0
         matrix = apply_to_codes(view.jacobian, slope, basis, region, codes, view.alpha_free)[seen]
         matrix = torch.from_numpy(matrix).flatten(0, 1)
         weight = torch.from_numpy(view.weight[seen]).flatten() * (OBSERVATIONS / PIXEL_STD**2)
@@ -125,18 +125,8 @@ def _gauss_newton(
     return prior.posterior_mean(precision, vector)
 
 
-def _slopes(cells: Float[Tensor, "k v"], codec: LinearCodec, full_density: float) -> Float32[ndarray, "v 4"]:
-    """d(linear colour, density) / d(encoded colour, relative density) of every voxel; 0 where it stays clamped."""
-    values = cells[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1)
-    linear = decode_srgb(values[:, :3].clamp(0, 1)).numpy()
-    start, width = codec.zone
-    relative = (values[:, 3:] - start) / width
-    density = torch.where((relative > -CLAMPED) & (relative < 1 + CLAMPED), full_density / width, 0.0)
-    return np.concatenate([1 / encoding_slope(linear, 0.0), density.numpy()], axis=1).astype(np.float32)
-
-
-def _targets(person: CapturedPerson, frames: Frames, largest: int) -> list[TargetImage]:
-    """Linear pictures with sides of at most `largest` pixels, averaged over blocks."""
+def targets_of(person: CapturedPerson, frames: Frames, largest: int) -> list[TargetImage]:
+    """The views as linear pictures with sides of at most `largest` pixels, averaged over blocks."""
     targets = []
     for number, rgba in enumerate(person.views.rgba.cpu()):
         camera = person.views.camera.to("cpu").map(lambda values, number=number: values[number])

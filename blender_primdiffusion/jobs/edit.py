@@ -36,7 +36,7 @@ def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, resu
     prepared = building.take(result.person) or prepare_now(result.person, replaced=person)
     done = replace_person(person, prepared)
     if in_viewport(person):
-        if (pending := pending_of(person)) is not None:  # of volumes that undo has brought back meanwhile
+        if (pending := pending_of(person)) is not None:  # of volumes that undo has brought back since
             for _ in write_pending(pending):
                 pass
         context.view_layer.update()  # evaluated data holds the old grids

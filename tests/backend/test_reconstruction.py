@@ -9,8 +9,8 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.geometry.srgb import encode_srgb
-from primdiffusion.human import Human, framing, place
-from primdiffusion.reconstruction import reconstruct_by_prior
+from primdiffusion.human import Human, frames_of, framing, place
+from primdiffusion.reconstruction import reconstruct_by_prior, targets_of
 from primdiffusion.render.march import march
 from support.errors import refused
 from tiny_model import tiny_model
@@ -48,6 +48,17 @@ def test_what_no_view_shows_has_the_most_probable_colours_given_what_they_show(y
     assert (got - wanted).abs().flatten(1).mean(1).max() < 0.02
     assert torch.equal(found.betas, BETAS)
     assert (found.provenance["reconstructed_from"], found.provenance["views"]) == ("anna", list(range(len(yaws))))
+
+
+def test_smaller_pictures_are_what_their_cameras_see():
+    human = human_of(COLOURS)
+    person = captured(human, BodyPose.rest(), [0.3])
+    for largest, size in ((128, (128, 96)), (64, (64, 48)), (50, (42, 32))):
+        (target,) = targets_of(person, frames_of(human), largest)
+        seen = march(place(human), target.camera)
+        drawn = torch.cat([seen.rgb, seen.alpha[..., None]], -1)
+        assert (target.camera.height, target.camera.width) == drawn.shape[:2] == size
+        assert (drawn - torch.from_numpy(target.rgba)).abs().mean() < 0.012
 
 
 def test_steps_are_reported_and_an_exception_cancels():

@@ -24,7 +24,7 @@ from primdiffusion.commands.output import FILES, write_human
 from primdiffusion.commands.progress import ReportProgress, progress_bar
 from primdiffusion.commands.session import Session
 from primdiffusion.device import best_device
-from primdiffusion.encoder.model import load_encoder
+from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.formats.answers import ReconstructAnswer
 from primdiffusion.formats.requests import ReconstructRequest
 from primdiffusion.formats.whole_files import staged
@@ -50,17 +50,15 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
     began = time.perf_counter()
     with staged(request.out_dir) as folder:
         report("load", 0, STAGES, None)
-        encoder = session.encoder(request.checkpoint) if request.by == "encoder" else None
-        model = session.model(request.checkpoint) if request.by == "prior" else None
+        model = session.encoder(request.checkpoint) if request.by == "encoder" else session.model(request.checkpoint)
         report("read", 1, STAGES, None)
-        body = None if encoder is None else encoder.body
+        body = model.body if isinstance(model, EncoderModel) else None
         person = captured_person(request.capture, request.subject, request.frame, request.views, body)
         report("encode", 2, STAGES, None)
         loaded = time.perf_counter()
-        if encoder is not None:
-            human = reconstruct_human(encoder, person)
+        if isinstance(model, EncoderModel):
+            human = reconstruct_human(model, person)
         else:
-            assert model is not None
             human = reconstruct_by_prior(model, person, lambda done, total: report("fit", done, total, None))
         encoded = time.perf_counter()
         report("write", 3, STAGES, None)

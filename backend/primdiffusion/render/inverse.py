@@ -190,7 +190,7 @@ class LinearisedView:
         wanted, wanted_alpha = _over_background(target)
         residual = np.concatenate([wanted - (rgb + (1 - alpha) * BACKGROUND), wanted_alpha - alpha], axis=1)
         weight = np.concatenate(
-            [encoding_slope(wanted, settings.darkest) ** 2, np.full_like(alpha, settings.opacity_weight)], axis=1
+            [_encoding_slope(wanted, settings.darkest) ** 2, np.full_like(alpha, settings.opacity_weight)], axis=1
         )
         weight *= target.weight / max(1.0, float(wanted_alpha.sum()))
         return cls(
@@ -226,7 +226,7 @@ class _ColourView:
         matrix, alpha = ColourMatrix.of(jacobian), rendering.alpha.numpy().reshape(-1, 1)
         drawn = matrix.apply(z) + (1 - alpha) * BACKGROUND
         wanted = np.concatenate([_over_background(one)[0] for one in targets], axis=1)
-        weight = encoding_slope(wanted, settings.darkest) ** 2
+        weight = _encoding_slope(wanted, settings.darkest) ** 2
         weight *= target.weight / max(1.0, float(target.rgba[..., 3].sum()))
         return cls(matrix, (wanted - drawn).astype(np.float32), weight.astype(np.float32))
 
@@ -298,7 +298,7 @@ def _over_background(target: TargetImage) -> tuple[ndarray, ndarray]:
     return rgba[:, :3] + (1 - rgba[:, 3:]) * BACKGROUND, rgba[:, 3:]
 
 
-def encoding_slope(linear: ndarray, darkest: float) -> ndarray:
+def _encoding_slope(linear: ndarray, darkest: float) -> ndarray:
     """d(sRGB-encoded) / d(linear)."""
     linear = np.maximum(linear, darkest)
     power = 1.055 / 2.4 * np.maximum(linear, 0.0031308) ** (1 / 2.4 - 1)
@@ -307,7 +307,7 @@ def encoding_slope(linear: ndarray, darkest: float) -> ndarray:
 
 def _linear_unit(colours: ndarray, settings: InverseSettings) -> ndarray:
     """Change of linear colour per unit of encoded colour, at these colours."""
-    return 1 / encoding_slope(colours.clip(0, 1), settings.darkest)
+    return 1 / _encoding_slope(colours.clip(0, 1), settings.darkest)
 
 
 def _mean_diagonal(diagonal: ndarray) -> ndarray:

@@ -54,6 +54,14 @@ def test_each_region_of_the_body_has_a_basis_that_its_mirror_image_shares(codec)
     assert torch.equal(codec.region.unflatten(0, (GRID, GRID)).flip(1).flatten(), codec.region)
 
 
+def test_the_voxel_basis_is_what_decoding_adds(codec):
+    latents = torch.randn(16, GRID, GRID, generator=torch.Generator().manual_seed(4))
+    latents[5:] = 0
+    added = (codec.decode(latents) - codec.decode(torch.zeros_like(latents)))[:, : 4 * S**3].unflatten(1, (4, -1)).mT
+    basis = codec.voxel_basis(5)[codec.region]
+    assert torch.allclose(torch.einsum("kvxc,ck->kvx", basis, latents[:5].flatten(1)), added, atol=1e-4)
+
+
 def test_what_the_basis_spans_survives_the_round_trip(codec):
     latents = torch.randn(2, 16, GRID, GRID, generator=torch.Generator().manual_seed(3))
     assert torch.allclose(codec.encode(codec.decode(latents)), latents, atol=1e-4)

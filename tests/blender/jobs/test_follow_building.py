@@ -1,4 +1,4 @@
-"""A person on their way into the scene, and all that can happen meanwhile."""
+"""A human that enters the scene a slice of time at a time, and all that can happen before it is there."""
 
 from __future__ import annotations
 
