@@ -111,9 +111,9 @@ def make_hub(name: str) -> Callable[[Path], Path]:
 
 
 def read_hub(path: Path) -> None:
-    from primdiffusion.diffusion.pretrained import load_pretrained
+    from primdiffusion.diffusion.checkpoint import load_checkpoint
 
-    load_pretrained(next(parent for parent in path.parents if parent.name == "hub"))
+    load_checkpoint(next(parent for parent in path.parents if parent.name == "hub"))
 
 
 def make_run(name: str) -> Callable[[Path], Path]:

@@ -6,6 +6,7 @@ import contextlib
 import dataclasses
 import hashlib
 import json
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
@@ -27,7 +28,7 @@ from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import JsonError, parse_json
-from primdiffusion.formats.regular_files import FileError, TooLargeError, open_regular
+from primdiffusion.formats.regular_files import FileError, TooLargeError, open_regular, read_regular
 from primdiffusion.formats.schema import FieldError, Open, Range, read
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
@@ -44,6 +45,9 @@ FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
 _HALVED = ("codec.mean", "codec.basis", "denoiser.")
 _WHOLE = ("prior_variance", "prior_log_weight")
+WEIGHTS = "model.safetensors"
+"""The checkpoint in a folder of `save_pretrained` or of the Hugging Face hub."""
+_COMMIT = re.compile(r"[0-9a-zA-Z_-]{1,64}", re.ASCII)
 SYMMETRIC = 1e-4
 """Largest difference between an entry of a person component and its mirror image; entries are up to 1."""
 
@@ -80,6 +84,39 @@ class ModelConfig(Open):
 def default_checkpoint() -> Path:
     """Path of the weights that ship with the package."""
     return Path(str(resources.files("primdiffusion.weights") / "default.safetensors"))
+
+
+def checkpoint_file(path: Path | str | None = None) -> Path:
+    """Find the checkpoint that a path stands for: a file, or the one in a folder; None: the default checkpoint.
+
+    Folders are those of `save_pretrained`, and repositories in a local hub cache (`models--OWNER--NAME`), of which the
+    commit of the main branch counts, or else the only snapshot. Nothing is downloaded. Raises FileError for a folder
+    without a model, or with several snapshots and no main branch; OSError.
+    """
+    if path is None:
+        return default_checkpoint()
+    folder = Path(path)
+    if not folder.is_dir():
+        return folder
+    if (folder / WEIGHTS).is_file():
+        return folder / WEIGHTS
+    main = folder / "refs" / "main"
+    if main.is_file():
+        commit = read_regular(main, 1024).decode("ascii", errors="replace").strip()
+        found = [folder / "snapshots" / commit / WEIGHTS] if _COMMIT.fullmatch(commit) else []
+    else:
+        found = sorted((folder / "snapshots").glob(f"*/{WEIGHTS}"))
+    found = [path for path in found if path.is_file()]
+    if len(found) > 1:
+        names = ", ".join(path.parent.name for path in found)
+        raise FileError(folder, f"holds several snapshots ({names})", "give the folder of one of them")
+    if not found:
+        raise FileError(
+            folder,
+            f"holds no {WEIGHTS}, nor a hub snapshot with one",
+            "give a folder of save_pretrained or hf download",
+        )
+    return found[0]
 
 
 def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
@@ -162,7 +199,7 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
 
     A checkpoint's card lists under "attributes" what its model can be conditioned on (`AttributeVocabulary.to_json`).
     """
-    path = default_checkpoint() if path is None else Path(path)
+    path = checkpoint_file(path)
     metadata = read_metadata(path, (FORMAT, ENCODER_FORMAT))
     with mismatches_named(path, AttributeError):
         known = parse_json(metadata.get("architecture", "{}")).get("vocabulary")
@@ -170,13 +207,13 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
 
 
 def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:
-    """Load a model in float32 (without a path: the default checkpoint), trained here or imported (`released`).
+    """Load a model in float32, trained here or imported (`released`), from the file that `checkpoint_file` finds.
 
     Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
-    format or version, does not match its own architecture or holds values that are not finite. An imported one raises
-    BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
+    format or version, does not match its own architecture or holds values that are not finite; as `checkpoint_file`;
+    and for an imported one BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
     """
-    path = default_checkpoint() if path is None else Path(path)
+    path = checkpoint_file(path)
     tensors, config, card = read_checkpoint(path)
     if config.kind == RELEASED:
         with mismatches_named(path):
@@ -305,7 +342,8 @@ def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
 def _check_there(path: Path) -> None:
     if not path.is_file():
         raise FileNotFoundError(
-            f"there is no checkpoint at {path}: give the path of a .safetensors file, or reinstall the package"
+            f"there is no checkpoint at {path}: give a .safetensors file on this disk, or the folder of a model; "
+            "models are not downloaded, so run hf download first"
         )
 
 

@@ -8,7 +8,7 @@ import torch
 from primdiffusion.diffusion.checkpoint import load_checkpoint, read_card
 from primdiffusion.diffusion.model import sample
 from primdiffusion.diffusion.model_card import model_card
-from primdiffusion.diffusion.pretrained import load_pretrained, save_pretrained
+from primdiffusion.diffusion.pretrained import save_pretrained
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
@@ -38,7 +38,7 @@ def test_a_saved_folder_loads_as_the_same_model(tmp_path):
     loaded = load_checkpoint(save_tiny_checkpoint(tmp_path / "tiny.safetensors"))
     folder = save_pretrained(loaded, tmp_path / "folder")
     assert sorted(path.name for path in folder.iterdir()) == ["README.md", "config.json", "model.safetensors"]
-    again = load_pretrained(folder)
+    again = load_checkpoint(folder)
     assert torch.equal(drawn(again), drawn(loaded))
     assert again.vocabulary == loaded.vocabulary
     config = json.loads((folder / "config.json").read_text())
@@ -57,20 +57,20 @@ def test_the_readme_is_the_card_of_the_default_checkpoint(tmp_path):
 
 @pytest.mark.parametrize(("commits", "main"), [((COMMIT, "other"), COMMIT + "\n"), ((COMMIT,), None)])
 def test_a_repository_of_a_hub_cache_loads_its_main_or_only_snapshot(tmp_path, commits, main):
-    model = load_pretrained(hub(tmp_path / "models--us--tiny", *commits, main=main))
+    model = load_checkpoint(hub(tmp_path / "models--us--tiny", *commits, main=main))
     assert model.card["name"] == "tiny"
-    assert load_pretrained(tmp_path / "models--us--tiny" / "snapshots" / COMMIT).card == model.card
+    assert load_checkpoint(tmp_path / "models--us--tiny" / "snapshots" / COMMIT).card == model.card
 
 
 @pytest.mark.parametrize(("commits", "main"), [(("a", "b"), None), ((), None), (("a",), "../snapshots/a")])
 def test_a_folder_without_one_model_is_refused(tmp_path, commits, main):
     with refused(FileError):
-        load_pretrained(hub(tmp_path / "models--us--tiny", *commits, main=main))
+        load_checkpoint(hub(tmp_path / "models--us--tiny", *commits, main=main))
 
 
 def test_a_name_on_the_hub_is_not_downloaded():
     with refused(FileNotFoundError, "download"):
-        load_pretrained("owner/name")
+        load_checkpoint("owner/name")
 
 
 def test_models_that_a_folder_cannot_hold_are_refused_and_leave_nothing(tmp_path):
