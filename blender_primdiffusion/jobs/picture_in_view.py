@@ -20,7 +20,7 @@ from .views import eye
 from .windows import redraw_views
 
 _LEAST_SHARE = 0.5
-"""Of the picture in view: less would be a piece of an arm before everything, of a human that stands beside the camera."""
+"""Of the picture in view: less is a piece of an arm in front of everything, of who stands beside the camera."""
 
 
 class PictureInView:
