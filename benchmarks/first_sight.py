@@ -153,10 +153,9 @@ def one_human(person: Path) -> dict[str, float]:
     trim()
     memory = resident_mb()
     steps: list[float] = []
-    prepared = prepared_in_slices(person, steps)
+    prepared = [prepared_in_slices(person, steps)]
     found: list[bpy.types.Collection] = []
-    steps.append(seconds(lambda: found.append(enter(prepared))))
-    del prepared
+    steps.append(seconds(lambda: found.append(enter(prepared.pop()))))
     figures = {"stand_seconds": sum(steps), "longest_step_seconds": max(steps)}
     trim()
     figures["person_memory_mb"] = resident_mb() - memory

@@ -66,7 +66,9 @@ def _without_hidden(place: NDArray, tint: NDArray) -> Relief:
     cells = visible[:, :-1, :-1] | visible[:, :-1, 1:] | visible[:, 1:, :-1] | visible[:, 1:, 1:]
     box, b, t = np.nonzero(cells)
     corners = (((box * VOXELS + b) * VOXELS + t)[:, None, None] + _CELL).reshape(-1, 3)
-    used, triangles = np.unique(corners, return_inverse=True)
+    seen = np.zeros(tint[..., 3].size, np.bool_)
+    seen[corners] = True
+    used, triangles = np.flatnonzero(seen), (np.cumsum(seen) - 1)[corners]
     return Relief(
         place.reshape(-1, 3)[used].astype(np.float32),
         tint.reshape(-1, 4)[used].astype(np.float32),

@@ -25,6 +25,7 @@ from ..scene.body import body_of_file, shape_model_of
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import BODY_FILE, PERSON_FILE, armature_of, person_file
 from ..scene.human_file import (
+    CHOOSE_ANOTHER,
     HumanMotion,
     compacted,
     expanded,
@@ -305,7 +306,7 @@ class ImportHumanJob(Job):
         return opened(Path(self.path), folder)
 
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
-        motion = motion_in(read_tensors(Path(self.path)), Path(self.path).name)
+        motion = motion_in(read_tensors(Path(self.path), CHOOSE_ANOTHER), Path(self.path).name)
         person, notice = build_person(context, result, "Imported", name_of(self.path))
         armature = armature_of(person)
         if motion is not None:
@@ -330,7 +331,7 @@ def opened(source: Path, folder: Path) -> HumanAnswer | None:
     body = source.with_name(BODY_FILE)
     if "body" in human.metadata and (not exists_in_its_folder(body) or body_of_file(source).uv_corner is None):
         return None
-    read_human(source)
+    read_human(source, CHOOSE_ANOTHER)
     write_tensors(folder / PERSON_FILE, with_motion(human, None))
     if "body" in human.metadata:
         shutil.copyfile(body, folder / BODY_FILE)

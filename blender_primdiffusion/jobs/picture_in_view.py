@@ -11,13 +11,16 @@ from numpy.typing import NDArray
 
 from ..engine import by_engine
 from ..engine.gpu import billboard
-from ..engine.gpu.billboard import corners, figure_of
+from ..engine.gpu.billboard import corners, figure_of, share_in_view
 from ..engine.gpu.overlay import overlay
 from ..scene.place import next_place
 from .pictures import so_far
 from .queue import queue
 from .views import eye
 from .windows import redraw_views
+
+_LEAST_SHARE = 0.5
+"""Of the picture in view: less is a piece of an arm in front of everything, of who stands beside the camera."""
 
 
 class PictureInView:
@@ -63,15 +66,19 @@ class PictureInView:
         return corners(self._place, to_view, figure_of(self._pixels[..., 3]))
 
     def draw(self, context: bpy.types.Context) -> None:
-        """Draw the picture into the region that Blender draws now, if it belongs there; uploads it once.
+        """Draw the picture into the region that Blender draws now, if it belongs there and most of it is in view;
+        uploads it once.
 
         The human's own shaders are compiled meanwhile.
         """
         if not self.drawn_in(context):
             return
         overlay.prepare()
+        places = self.corners(context)
+        if share_in_view(places, np.array(context.region_data.perspective_matrix, np.float64)) < _LEAST_SHARE:
+            return
         self._texture = self._texture or billboard.texture_of(self._pixels)
-        billboard.draw(self._texture, self.corners(context))
+        billboard.draw(self._texture, places)
 
 
 picture_in_view = PictureInView()

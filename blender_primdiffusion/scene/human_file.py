@@ -35,7 +35,10 @@ _PAYLOAD: dict[str, tuple[int | str, ...]] = {
     "rgb": ("K", 3, 8, 8, 8), "density": ("K", 8, 8, 8), "delta_scale": ("K", 3), "betas": (BETA_COUNT,),
     "rest_half_extent": ("K", 3),
 }  # fmt: skip
-_REMEDY = "choose a .human file, or export the human again"
+GENERATE_AGAIN = "generate the human again"
+"""What to do about a damaged file of a human in the scene, or of one that the backend has just written."""
+CHOOSE_ANOTHER = "choose a .human file, or export the human again"
+"""What to do about one that the user has chosen."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,16 +63,16 @@ class HumanTensors:
     """Safetensors' dtype, shape and bytes by name; those of a file that was read are views of its content."""
 
 
-def read_tensors(path: Path) -> HumanTensors:
-    """Read a .human file. Raises ValueError for a file of another kind or a damaged one, OSError."""
+def read_tensors(path: Path, remedy: str = GENERATE_AGAIN) -> HumanTensors:
+    """Read a .human file. Raises ValueError, with this remedy, for a file of another kind or a damaged one, OSError."""
     data = read_regular(path, LARGEST_PERSON)
     try:
         layout = read_layout(io.BytesIO(data))
         check_limits(layout)
     except ValueError as error:
-        raise ValueError(f"{path.name!r} contains no human ({error!s:.120}); {_REMEDY}") from error
+        raise ValueError(f"{path.name!r} contains no human ({error!s:.120}); {remedy}") from error
     if layout.metadata.get("format") != "primdiffusion.human":
-        raise ValueError(f"{path.name!r} contains no human but something else; {_REMEDY}")
+        raise ValueError(f"{path.name!r} contains no human but something else; {remedy}")
     arrays = {name: (one.dtype, one.shape, layout.raw(data, name)) for name, one in layout.tensors.items()}
     return HumanTensors(layout.metadata, arrays)
 
@@ -120,7 +123,7 @@ def read_payload(path: Path) -> HumanPayload:
     return payload_in(read_tensors(path), path.name)
 
 
-def payload_in(human: HumanTensors, name: str) -> HumanPayload:
+def payload_in(human: HumanTensors, name: str, remedy: str = GENERATE_AGAIN) -> HumanPayload:
     """As `read_payload`, of a file of this name that was read."""
     if fault := version_fault(human.metadata):
         raise ValueError(f"{name!r} {fault}")
@@ -138,7 +141,7 @@ def payload_in(human: HumanTensors, name: str) -> HumanPayload:
         if arrays["density"].min(initial=0) < 0:
             raise ValueError("'density' holds impossible values")
     except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{name!r} is damaged ({error!s:.120}); {_REMEDY}") from error
+        raise ValueError(f"{name!r} is damaged ({error!s:.120}); {remedy}") from error
     return HumanPayload(**{"rest_half_extent": None, **arrays})
 
 
@@ -167,7 +170,7 @@ def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> Hum
         dtype, shape, raw = human.arrays.get("delta_scale", ("", (), b""))
         if dtype != "F32" or shape != growth.shape:
             given, expected = f"{dtype}{list(shape)}", f"F32{list(growth.shape)}"
-            raise ValueError(f"the human's file holds sizes of boxes as {given}, not {expected}; {_REMEDY}")
+            raise ValueError(f"the human's file holds sizes of boxes as {given}, not {expected}; {GENERATE_AGAIN}")
         arrays["delta_scale"] = _stored((_loaded(dtype, shape, raw) * growth).astype(np.float32))
     return HumanTensors(human.metadata, arrays)
 
@@ -179,7 +182,7 @@ def compacted(human: HumanTensors) -> HumanTensors:
     try:
         rgb, density, scales = compact_human.compact(*(_loaded(*human.arrays[name]) for name in _EIGHT_BIT))
     except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"the human's file is damaged ({error!s:.160}); {_REMEDY}") from error
+        raise ValueError(f"the human's file is damaged ({error!s:.160}); {GENERATE_AGAIN}") from error
     arrays = {
         name: ("U8", array.shape, array.tobytes()) for name, array in zip(_EIGHT_BIT, (rgb, density), strict=True)
     }
@@ -218,17 +221,17 @@ def motion_in(human: HumanTensors, name: str) -> HumanMotion | None:
         fps = float(parse_json(human.metadata["motion"])["fps"])
         arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
     except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ValueError(f"the motion in {name!r} is damaged ({error!s:.80}); {_REMEDY}") from error
+        raise ValueError(f"the motion in {name!r} is damaged ({error!s:.80}); {CHOOSE_ANOTHER}") from error
     frames = len(arrays[0]) if arrays[0].ndim else 0
     for array, shape in zip(arrays, _MOTION.values(), strict=True):
         if array.shape != tuple(frames if s == "F" else s for s in shape) or not all_finite(array):
-            raise ValueError(f"the motion in {name!r} is damaged; {_REMEDY}")
+            raise ValueError(f"the motion in {name!r} is damaged; {CHOOSE_ANOTHER}")
     if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
-        raise ValueError(f"the motion in {name!r} has frames out of order; {_REMEDY}")
+        raise ValueError(f"the motion in {name!r} has frames out of order; {CHOOSE_ANOTHER}")
     improper = first_improper(arrays[1])
     if improper is not None:
         frame = f"{arrays[0][improper[0]]:g}"
-        raise ValueError(f"the motion in {name!r} holds {improper_text(frame, improper[1])}; {_REMEDY}")
+        raise ValueError(f"the motion in {name!r} holds {improper_text(frame, improper[1])}; {CHOOSE_ANOTHER}")
     return HumanMotion(*arrays, fps)
 
 

@@ -14,7 +14,7 @@ from ..formats.human_metadata import provenance_of
 from .body import body_of_file
 from .cycles import max_overlap
 from .human import LARGEST_BETA
-from .human_file import HumanPayload, payload_in, read_tensors
+from .human_file import GENERATE_AGAIN, HumanPayload, payload_in, read_tensors
 from .shape import Rest, ShapeModel
 from .volumes import Grids, bake
 
@@ -50,18 +50,18 @@ class RestHuman:
         return json.dumps({**self.made, "betas": betas, "most_overlapping": most})
 
 
-def read_human(person: Path) -> RestHuman:
-    """Read a human and its body.
+def read_human(person: Path, remedy: str = GENERATE_AGAIN) -> RestHuman:
+    """Read a human and its body; `remedy` says what to do about a damaged file.
 
     Raises FileNotFoundError where a file is missing, ValueError for a damaged one, a newer one and one on another body,
     OSError.
     """
     if not person.is_file():
         raise FileNotFoundError(f"there is no human file at {str(person)!r}; generate the human again")
-    tensors = read_tensors(person)
-    payload = payload_in(tensors, person.name)
+    tensors = read_tensors(person, remedy)
+    payload = payload_in(tensors, person.name, remedy)
     if np.abs(payload.betas).max() > LARGEST_BETA:
-        raise ValueError(f"{person.name!r} is damaged (betas above {LARGEST_BETA}); generate the human again")
+        raise ValueError(f"{person.name!r} is damaged (betas above {LARGEST_BETA}); {remedy}")
     try:
         made = provenance_of(tensors.metadata)
     except ValueError as error:
@@ -69,7 +69,6 @@ def read_human(person: Path) -> RestHuman:
     model = body_of_file(person)
     if len(payload.density) != len(model.face):
         raise ValueError(
-            f"{person.name!r} holds {len(payload.density)} primitives instead of its body's {len(model.face)}; "
-            "generate the human again"
+            f"{person.name!r} holds {len(payload.density)} primitives instead of its body's {len(model.face)}; {remedy}"
         )
     return RestHuman(made, payload, model, model.rest(payload.betas.astype(np.float64)))

@@ -26,7 +26,7 @@ from ..jobs.queue import Job
 from ..jobs.target import HumanTarget
 from ..scene.export_model import check_ready
 from ..scene.human import armature_of
-from ..scene.human_file import motion_in, read_tensors
+from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
 from ..scene.proxy import proxy_of, remove_proxy
 from .declared import PANELS, SKIP, declared, not_given
 from .drawing import property_columns
@@ -306,7 +306,7 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
         path = Path(bpy.path.abspath(self.filepath))
         if not self.filepath or not path.is_file():
             raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
-        motion_in(read_tensors(path), path.name)
+        motion_in(read_tensors(path, CHOOSE_ANOTHER), path.name)
         at = tuple(self.location) if self.properties.is_property_set("location") else None
         return submit(self, context, ImportHumanJob(str(path), at))
 

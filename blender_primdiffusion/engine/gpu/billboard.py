@@ -37,6 +37,20 @@ def corners(place: NDArray, to_view: NDArray, figure: tuple[float, float], aspec
     return np.array([bottom - side, bottom + side, bottom - side + up, bottom + side + up])
 
 
+def share_in_view(places: NDArray, to_window: NDArray) -> float:
+    """How much of a picture with these corners [4, 3] a region shows, 0 to 1; 0 where it reaches behind the camera.
+
+    `to_window` [4, 4] is the region's perspective matrix.
+    """
+    clip = np.concatenate([places, np.ones((len(places), 1))], 1) @ to_window.T
+    if (clip[:, 3] <= 0).any():
+        return 0.0
+    points = clip[:, :2] / clip[:, 3:]
+    low, high = points.min(0), points.max(0)
+    within = np.clip(high, -1, 1) - np.clip(low, -1, 1)
+    return float(np.prod(within / np.maximum(high - low, 1e-9)))
+
+
 def figure_of(alpha: NDArray) -> tuple[float, float]:
     """Lower and upper end of the figure in a picture's alpha [h, w], bottom row first, as fractions of its height; the
     whole picture where little is opaque."""

@@ -17,6 +17,7 @@ common one near the boxes. Records and lists are textures: Python gets storage b
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator, Sequence
 
 import bpy
@@ -53,7 +54,10 @@ _EDGES = np.array([[i, i | 1 << axis] for axis in range(3) for i in range(8) if 
 
 
 class GpuPayload:
-    """Colour and density of a human's boxes on the GPU, 4 MB for 1024 boxes; freed with the object."""
+    """Colour and density of a human's boxes on the GPU, 4 MB for 1024 boxes; freed with the object.
+
+    They are uploaded when they are first marched: the relief, by which a human is seen at once, does not wait for it.
+    """
 
     def __init__(self, rgb: NDArray, density: NDArray, thickness: NDArray | None = None):
         """`rgb` [K, 3, 8, 8, 8] is linear, `density` [K, 8, 8, 8] in 1/m; voxel axes N, B, T as in the backend.
@@ -62,13 +66,30 @@ class GpuPayload:
         """
         self.count = len(density)
         self.rows = max(-(-self.count // ACROSS), 1)
+        self._voxels: tuple[NDArray, NDArray] | None = (rgb, density)
+        """Until they are uploaded."""
+        self.relief = None if thickness is None else GpuRelief(relief_of(rgb, density, thickness))
+
+    @property
+    def texture(self) -> gpu.types.GPUTexture:
+        """A brick for each box."""
+        return self._uploaded[0]
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Of the content of each box, as `_content`."""
+        return self._uploaded[1]
+
+    @functools.cached_property
+    def _uploaded(self) -> tuple[gpu.types.GPUTexture, NDArray[np.float64]]:
+        rgb, density = self._voxels
         values = np.zeros((self.rows * ACROSS, 4, VOXELS, VOXELS, VOXELS), np.float32)
         values[: self.count, :3] = rgb
         values[: self.count, 3] = np.minimum(density, _LARGEST_HALF)
         parts = values.reshape(self.rows, ACROSS, 4, VOXELS, VOXELS, VOXELS)
-        self.texture = _texture(parts.transpose(3, 0, 4, 1, 5, 2).reshape(VOXELS, self.rows * VOXELS, -1, 4), "RGBA16F")
-        self.bounds = _content(values[: self.count, 3] > 0)
-        self.relief = None if thickness is None else GpuRelief(relief_of(rgb, density, thickness))
+        texture = _texture(parts.transpose(3, 0, 4, 1, 5, 2).reshape(VOXELS, self.rows * VOXELS, -1, 4), "RGBA16F")
+        self._voxels = None
+        return texture, _content(values[: self.count, 3] > 0)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..boxes import Boxes
 from ..view import PinholeView
-from .march import GpuMarcher, GpuPayload
+from .march import GpuMarcher, GpuPayload, gpu_marcher
 
 
 class GpuStart:

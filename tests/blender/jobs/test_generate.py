@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import time
 from pathlib import Path
@@ -75,7 +76,11 @@ def test_generate_cannot_be_redone_with_a_slider():
 
 @pytest.mark.parametrize(
     ("seed", "sentence"),
-    [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "contains no human")],
+    [
+        (DIES, "ended by itself"),
+        (FAILS, "checkpoint is damaged"),
+        (GIVES_GARBAGE, r"contains no human \([^)]*\); generate the human again"),
+    ],
 )
 def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed, sentence):
     objects = len(bpy.data.objects)
@@ -85,7 +90,7 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed,
     assert len(bpy.data.objects) == objects
     assert not (tmp_path / "shot_humans").exists()
     assert not list(Path(bpy.app.tempdir).glob("generate_*"))
-    assert any(sentence in text for text in (" ".join(panel_texts(addon)),))
+    assert re.search(sentence, " ".join(panel_texts(addon)))
 
 
 def test_after_a_death_the_next_generation_works(addon):

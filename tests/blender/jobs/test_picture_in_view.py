@@ -26,9 +26,11 @@ pytestmark = pytest.mark.any_blender
 """Seeds that the fake child takes as orders."""
 LEVEL = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """A view along +y."""
+WIDE = np.diag([0.01, 0.01, 0.01, 1.0]) @ LEVEL
+"""Shows 200 m, in parallel."""
 
 
-def context(shading="SOLID", overlays=True, local_view=None) -> SimpleNamespace:
+def context(shading="SOLID", overlays=True, local_view=None, to_window=WIDE) -> SimpleNamespace:
     """As in the draw handler of a region."""
     space = SimpleNamespace(
         local_view=local_view,
@@ -38,7 +40,7 @@ def context(shading="SOLID", overlays=True, local_view=None) -> SimpleNamespace:
     return SimpleNamespace(
         scene=bpy.context.scene,
         space_data=space,
-        region_data=SimpleNamespace(view_matrix=LEVEL),
+        region_data=SimpleNamespace(view_matrix=LEVEL, perspective_matrix=to_window),
         evaluated_depsgraph_get=bpy.context.evaluated_depsgraph_get,
     )
 
@@ -135,6 +137,23 @@ def test_a_picture_is_uploaded_once_and_drawn_where_the_human_will_stand(denoisi
     bpy.context.scene.cursor.location = (0.501, 0, 0)
     picture_in_view.draw(context())
     assert drawn[3].mean(0)[1] < -1, "in front of the cube there"
+
+
+def test_a_view_that_shows_less_than_half_of_the_picture_does_without(denoising, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(billboard, "texture_of", lambda pixels: "texture")
+    monkeypatch.setattr(billboard, "draw", lambda texture, corners: drawn.append(corners))
+    monkeypatch.setattr(overlay, "prepare", lambda: None)
+    narrow = np.diag([1.0, 1.0, 0.01, 1.0]) @ LEVEL  # 2 m around the world's origin
+    for x, count in ((0.0, 1), (0.9, 2), (1.1, 2), (30.0, 2)):
+        bpy.context.scene.cursor.location = (x, 0, -0.9)
+        picture_in_view.draw(context(to_window=narrow))
+        assert len(drawn) == count, x
+    behind = np.diag([1.0, 1.0, 1.0, 1.0])
+    behind[3] = [0, 1.0, 0, 0]  # a camera at the origin that looks along +y
+    bpy.context.scene.cursor.location = (0, -5, -0.9)
+    picture_in_view.draw(context(to_window=behind))
+    assert len(drawn) == 2
 
 
 def test_edits_show_no_picture_in_the_views(denoising, monkeypatch):
