@@ -5,8 +5,10 @@ import os
 import pytest
 from jaxtyping import install_import_hook
 from primdiffusion.machine import share_processors
+from support import kernels
 
 share_processors()
+kernels.share()
 
 CHECKED = [
     f"primdiffusion.{module}"

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from support import kernels
 
 _PREFIX, _DAY_S = "primdiffusion_blender_", 24 * 3600
 _OWN = Path(tempfile.mkdtemp(prefix=_PREFIX))
@@ -18,8 +19,7 @@ for _name in ("user", "tmp"):
     (_OWN / _name).mkdir()
 os.environ.setdefault("BLENDER_USER_RESOURCES", str(_OWN / "user"))
 os.environ["TMPDIR"] = str(_OWN / "tmp")
-_TESTS = Path(__file__).parents[1]
-os.environ.setdefault("PRIMDIFFUSION_CACHE", str(_TESTS.parent / ".pytest_cache" / "children"))  # compile once
+kernels.share()
 
 bpy = pytest.importorskip("bpy", reason="bpy is not installed: pip install -e .[blender]")
 

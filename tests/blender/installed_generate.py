@@ -1,7 +1,7 @@
-"""Run by test_addon_zip in a Blender of its own: install the zip, generate a person through the operator, report as
-JSON.
+"""Run by test_addon_zip in a Blender of its own: install the zip, generate a human through the operator, render it with
+the engine beside a cube, report as JSON.
 
-python installed_generate.py ZIP CHECKPOINT_OR_EMPTY BLEND SEED STEPS
+python installed_generate.py ZIP CHECKPOINT_OR_EMPTY BLEND SEED STEPS PICTURE
 """
 
 import json
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import bpy
 
-archive, checkpoint, blend, seed, steps = sys.argv[1:]
+archive, checkpoint, blend, seed, steps, picture = sys.argv[1:]
 bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
 (module,) = [name for name in bpy.context.preferences.addons.keys() if name.endswith(".primdiffusion")]  # noqa: SIM118
 addon = bpy.context.preferences.addons[module].preferences
@@ -27,6 +27,18 @@ bpy.ops.wm.save_mainfile()
 bpy.ops.wm.open_mainfile(filepath=blend)
 volumes = [o for o in bpy.context.scene.objects if o.type == "VOLUME"]
 armature = next(o for o in bpy.context.scene.objects if o.type == "ARMATURE")
+
+scene = bpy.context.scene
+scene.render.engine = "PRIMDIFFUSION"
+scene.render.resolution_x = scene.render.resolution_y = 32
+scene.render.film_transparent = True
+scene.render.filepath = picture
+scene.render.image_settings.color_mode = "RGBA"
+bpy.ops.mesh.primitive_cube_add(size=1.0, location=(1.5, 0.0, 1.0))
+bpy.ops.object.camera_add(location=(0.0, -6.0, 1.0), rotation=(1.5708, 0.0, 0.0))
+scene.camera = bpy.context.object
+bpy.ops.render.render(write_still=True)
+
 installed = Path(sys.modules[module].__file__).parent
 report = {
     "outcome": sorted(outcome),
@@ -40,5 +52,4 @@ report = {
     "backend_in_zip": (installed / "bundled" / "primdiffusion" / "human.py").is_file(),
     "seconds": seconds,
 }
-bpy.ops.preferences.addon_disable(module=module)
 print("REPORT " + json.dumps(report), flush=True)

@@ -10,7 +10,10 @@ import sys
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
+from engine_stage import pixels
+from support import kernels
 from support.errors import refused
 
 import build_addon
@@ -71,11 +74,13 @@ def test_an_index_makes_the_folder_a_repository_that_offers_the_zip(archive, tmp
     assert {"website", "copyright", "permissions"} <= set(offered)
 
 
-def test_the_installed_zip_generates_a_person_through_its_operator(archive, checkpoint, tmp_path):
+def test_the_installed_zip_generates_and_renders_a_human_and_blender_exits(archive, checkpoint, tmp_path):
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path / "user")}
     (tmp_path / "user").mkdir()
+    kernels.share_with_installed(tmp_path / "user")
     program = Path(__file__).parent / "installed_generate.py"
-    command = [sys.executable, str(program), str(archive), checkpoint, str(tmp_path / "shot.blend"), "7", "3"]
+    blend, picture = tmp_path / "shot.blend", tmp_path / "picture.png"
+    command = [sys.executable, *map(str, (program, archive, checkpoint, blend, 7, 3, picture))]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=tmp_path)
     reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
     assert reports, done.stdout[-3000:] + done.stderr[-3000:]
@@ -85,3 +90,11 @@ def test_the_installed_zip_generates_a_person_through_its_operator(archive, chec
     assert (report["volumes"], report["loaded"], report["bones"], report["files"]) == (1024, 1024, 24, 1024)
     assert report["backend_in_zip"]
     assert report["written_into_the_addon"] == []
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
+    red, green, blue, alpha = pixels(picture).transpose(2, 0, 1)
+    assert alpha[0, 0] == 0.0
+    human, cube = (slice(10, 20), 15), (16, 24)
+    assert alpha[human].min() > 0.9
+    assert alpha[cube] == 1.0
+    assert red[cube] == green[cube] == blue[cube]
+    assert np.ptp([red[human], green[human], blue[human]], axis=0).max() > 0.05

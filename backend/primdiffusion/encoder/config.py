@@ -8,6 +8,9 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 from primdiffusion.primitives.primitives import GRID, S
 
+MOST_BLOCKS = 16
+"""Consecutive blocks of attention; the paper has 2."""
+
 
 @dataclasses.dataclass(frozen=True)
 class EncoderConfig:
@@ -105,6 +108,8 @@ class EncoderConfig:
                 raise ValueError(f"{name} is {value!r}: choose one of {', '.join(map(repr, get_args(hint)))}")
         if not 1 <= len(self.grid) <= GRID.bit_length():
             raise ValueError(f"grid has {len(self.grid)} levels: give 1 to {GRID.bit_length()}, down to one texel")
+        if not 1 <= self.attention_blocks <= MOST_BLOCKS:
+            raise ValueError(f"attention_blocks is {self.attention_blocks}: give 1 to {MOST_BLOCKS}")
         if self.attention_width % self.attention_heads:
             raise ValueError(
                 f"attention_width {self.attention_width} is not a multiple of attention_heads {self.attention_heads}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import hashlib
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -35,7 +36,7 @@ def kernel(function: Function) -> Any:
     """Compile a kernel for `on_all_threads`, cached on disk.
 
     numba 0.68 invalidates a cached kernel when its own file changes, but not when functions or constants from other
-    files do. Here the cache stamp covers all of those files.
+    files do. Here the cache stamp covers the content of all of those files.
     """
     dispatcher = _njit(nogil=True, cache=True, fastmath=set(FASTMATH), error_model="numpy")(function)
     dispatcher._cache._cache_file._source_stamp = _stamp()
@@ -98,10 +99,13 @@ def take(typingctx, taken):
     return types.int64(taken), generate
 
 
-def _stamp() -> tuple[tuple[str, int, int], ...]:
-    folder = Path(__file__).parent
-    files = sorted(path for pattern in _SOURCES for path in folder.glob(pattern))
-    return tuple((path.name, path.stat().st_mtime_ns, path.stat().st_size) for path in files)
+@functools.cache
+def _stamp() -> str:
+    """Digest of the sources, so that a copy of the package, or an update that leaves them alone, compiles nothing."""
+    digest = hashlib.sha256()
+    for path in sorted(path for pattern in _SOURCES for path in Path(__file__).parent.glob(pattern)):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
 TILE = 8

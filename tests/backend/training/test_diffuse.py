@@ -258,10 +258,11 @@ def test_other_people_or_settings_in_the_same_folder_are_rejected(people, few, r
 def test_a_damaged_file_of_the_run_is_named(people, whole, tmp_path, name):
     shutil.copytree(whole, tmp_path / "run")
     path = tmp_path / "run" / name
-    path.write_bytes(path.read_bytes()[:30])
+    path.write_bytes(damaged := path.read_bytes()[:30])
     with refused(ValueError, "damaged") as error:
         train(settings(people, tmp_path / "run"))
     assert str(tmp_path / "run") in sentence(error.value)
+    assert path.read_bytes() == damaged
 
 
 def test_a_loss_that_is_not_finite_stops_the_run_with_a_sentence(people, run, monkeypatch):
@@ -380,11 +381,3 @@ def test_settings_that_cannot_be_are_rejected(settings_of, changes, word):
     given = {"steps": 1, "batch": 1} if settings_of is PhaseConfig else {"data": Path("a"), "run": Path("b")}
     with pytest.raises(ValueError, match=word):
         settings_of(**{**given, **changes})
-
-
-def test_more_steps_go_on_from_a_finished_run(people, whole, tmp_path):
-    shutil.copytree(whole, tmp_path / "run")
-    config = settings(people, tmp_path / "run")
-    longer = dataclasses.replace(config, local=dataclasses.replace(config.local, steps=5))
-    assert train(longer).card["steps"] == {"person": 6, "local": 5}
-    assert logged(tmp_path / "run")[-1] == ("local", 5)

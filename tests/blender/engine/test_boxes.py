@@ -32,14 +32,14 @@ def made(folder: Path, kind: str) -> SimpleNamespace:
         return SimpleNamespace(file=folder / "person.human.safetensors", kind=kind, cases=dict(cases))
 
 
-@pytest.fixture(scope="module", params=["default", "own"])
-def person(request, tmp_path_factory):
-    return made(tmp_path_factory.mktemp("boxes") / request.param, request.param)
-
-
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory):
-    return made(tmp_path_factory.mktemp("boxes") / "plain", "default")
+    return made(tmp_path_factory.mktemp("boxes") / "default", "default")
+
+
+@pytest.fixture(scope="module", params=["default", "own"])
+def person(request, plain, tmp_path_factory):
+    return plain if request.param == "default" else made(tmp_path_factory.mktemp("boxes") / "own", "own")
 
 
 def posed(person, case: int = 0, **changes) -> PosedHuman:

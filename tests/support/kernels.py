@@ -1,0 +1,35 @@
+"""One cache of compiled kernels for all tests, their child processes and installed copies of the backend.
+
+numba has a cache for each folder of sources, and compiling the marcher takes half a minute.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+BACKEND = ROOT / "backend" / "primdiffusion"
+CACHE = ROOT / ".pytest_cache" / "children"
+INSTALLED = "extensions/user_default/primdiffusion/bundled/primdiffusion"
+"""The backend's path in Blender's user folder."""
+
+
+def share() -> None:
+    """Name the cache in the environment; call before numba is imported."""
+    os.environ.setdefault("PRIMDIFFUSION_CACHE", str(CACHE))
+    os.environ.setdefault("NUMBA_CACHE_DIR", str(CACHE / "numba"))  # where the extension tells children to cache
+
+
+def share_with_installed(user_folder: Path) -> None:
+    """Let a zip that is installed into this user folder of Blender find the kernels of the checkout."""
+    for folder in (path for path in BACKEND.iterdir() if path.is_dir()):
+        own = _cache_of(folder)
+        own.mkdir(parents=True, exist_ok=True)
+        _cache_of(user_folder.resolve() / INSTALLED / folder.name).symlink_to(own)
+
+
+def _cache_of(sources: Path) -> Path:
+    """As numba's `UserProvidedCacheLocator` names it."""
+    return CACHE / "numba" / f"{sources.name}_{hashlib.sha1(str(sources).encode()).hexdigest()}"
