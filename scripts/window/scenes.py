@@ -147,13 +147,14 @@ def edits(module: str, python: str) -> Steps:
     yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
     first, second = armatures()
     select(first)
+    second.location.x = first.location.x - 1.8  # the sidebar is at the right
     settings = bpy.context.scene.primdiffusion_edit
     settings.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit")
     settings.kind = "TRANSFER"
     yield 0.5
     yield "edit_two_people"
-    settings.kind, settings.parts = "REDRESS", {"top"}
+    settings.kind, settings.parts = "REDRESS", {"clothes"}
     settings.attributes.outfit = "suit"
     yield "edit_parts"
     press("primdiffusion.redress")
