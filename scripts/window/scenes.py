@@ -16,7 +16,18 @@ from file_scenes import cancelled_captures, five_humans, handles, other_files, r
 from moving_scenes import opening, playing, turning
 from panels import show, sidebar, view
 from press import Steps, invoke, press, wait
-from start import FIRST_SEED, SECOND_SEED, armatures, begin, cancel_all, people_file, queue_of, select, with_people
+from start import (
+    FIRST_SEED,
+    SECOND_SEED,
+    armatures,
+    begin,
+    cancel_all,
+    clear_of_the_sidebar,
+    people_file,
+    queue_of,
+    select,
+    with_people,
+)
 from view_scenes import denoising_in_view, dragging, redraw, rendered, rendered_view, shadings, stalls
 from visible_scene import visible_humans
 
@@ -147,7 +158,7 @@ def edits(module: str, python: str) -> Steps:
     yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
     first, second = armatures()
     select(first)
-    second.location.x = first.location.x - 1.8  # the sidebar is at the right
+    clear_of_the_sidebar()
     settings = bpy.context.scene.primdiffusion_edit
     settings.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit")

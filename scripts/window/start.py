@@ -40,6 +40,12 @@ def with_people(module: str, python: str, *seeds: int) -> Steps:
     select(armatures()[0])
 
 
+def clear_of_the_sidebar() -> None:
+    """Move the second of two people to the left of the first one, as `wide_view` sees them."""
+    first, second = armatures()
+    second.location.xy = first.location.x - 1.8, first.location.y
+
+
 def people_file(module: str, count: int = 1) -> Path:
     """A file in the installed extension's folder, which is deleted with it."""
     folder = Path(import_module(module).__file__).parents[3]
