@@ -14,7 +14,7 @@ from pathlib import Path
 import bpy
 from file_scenes import cancelled_captures, five_humans, handles, other_files, read_back
 from moving_scenes import opening, playing, turning
-from panels import show, sidebar, view
+from panels import show, sidebar, view, wide_view
 from press import Steps, invoke, press, wait
 from start import (
     FIRST_SEED,
@@ -259,6 +259,8 @@ def captures(module: str, python: str) -> Steps:
 def export(module: str, python: str) -> Steps:
     """A mesh, and the mesh proxy in the scene."""
     yield from with_people(module, python, FIRST_SEED)
+    wide_view()
+    view()[1].spaces.active.shading.type = "SOLID"
     bpy.context.scene.primdiffusion_export.format = "GLB"
     yield from show("PRIMDIFFUSION_PT_export/proxy")
     yield "export_before"
