@@ -98,6 +98,7 @@ def generate(module: str, python: str) -> Steps:
     yield from wait(lambda: not queue_of(module).busy, 60)
     yield "generate_error"
     preferences.checkpoint = ""
+    queue_of(module).outcomes.clear()
     attributes = settings.attributes
     attributes.sex, attributes.outfit, attributes.hair = "female", "blouse and skirt", "braid"
     attributes.use_height = True

@@ -26,6 +26,7 @@ def begin(module: str, python: str) -> Steps:
     around = view()[1].spaces.active.region_3d
     for name, value in _first_view.items():
         setattr(around, name, value)
+    queue_of(module).outcomes.clear()
     yield 1.5
     bpy.context.preferences.addons[module].preferences.backend_python = python
 
