@@ -27,6 +27,7 @@ def shadings(module: str, python: str) -> Steps:
     """Two humans among solids in each shading, turned, clipped and from the camera; clicks select them."""
     yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
     clear_of_the_sidebar()
+    armatures()[1].location.y -= 1.0  # in front of the plane
     bpy.ops.mesh.primitive_cube_add(size=0.4, location=(0.1, -0.4, 0.9))
     bpy.ops.mesh.primitive_plane_add(size=6, location=(0, 0.15, 0), rotation=(1.4, 0, 0.3))
     wide_view()
