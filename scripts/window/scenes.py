@@ -29,7 +29,7 @@ from start import (
     with_people,
 )
 from view_scenes import denoising_in_view, dragging, redraw, rendered, rendered_view, shadings, stalls
-from visible_scene import visible_humans
+from visible_scene import at_rest, visible_humans
 
 
 def set_up(module: str, python: str) -> Steps:
@@ -72,7 +72,7 @@ def first_human(module: str, python: str) -> Steps:
     yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
     yield "first_denoising"
     yield from wait(lambda: not queue.busy, 240)
-    yield 4.0
+    yield from at_rest(module)
     yield "first_solid"
     yield from rendered_view()
     yield "first_person"
