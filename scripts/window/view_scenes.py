@@ -60,6 +60,8 @@ def shadings(module: str, python: str) -> Steps:
         bpy.ops.screen.region_quadview()
     yield 15.0
     yield "shadings_quad"
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.screen.region_quadview()
 
 
 def dragging(module: str, python: str) -> Steps:
