@@ -49,7 +49,7 @@ class EditJob(Job):
     """Base of the edits."""
 
     made: ClassVar[str]
-    """Past participle for the message: Varied."""
+    """Before the human's name in the message: Varied."""
 
     target: HumanTarget
     asked: Mapping[str, Any]
@@ -82,8 +82,8 @@ class EditJob(Job):
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         person = self.target.found()
         done = show_in_place(context, person, result)
-        shape = ", the body's shape too" if done.reshaped else ""
-        message = f"{self.made} in {result.seconds:.1f} s; {done.volumes} volumes of {person.name} changed"
+        shape = "; the body's shape has changed too" if done.reshaped else ""
+        message = f"{self.made} {person.name} in {result.seconds:.1f} s"
         warnings = (done.warning, overlap_warning_in(context.scene, person))
         return " ".join([f"{message}{shape}.", *(sentence(text) for text in warnings if text)])
 
@@ -106,7 +106,7 @@ class TransferJob(EditJob):
     """Transfer a region from another human."""
 
     kind = method = "transfer"
-    undo, made = "Transfer Texture", "Texture transferred"
+    undo, made = "Transfer Texture", "Texture transferred to"
 
 
 class BlendJob(EditJob):

@@ -21,8 +21,6 @@ from .volumes import reload_volume
 class Replaced:
     """What an edit has changed."""
 
-    volumes: int
-    """How many the human has; all show another file."""
     reshaped: bool
     """The body has another shape: bones, body mesh and volumes have moved."""
     warning: str
@@ -72,7 +70,7 @@ def _replace(collection: bpy.types.Collection, prepared: PreparedHuman) -> Repla
     collection[MARK] = prepared.provenance
     collection[HOME] = str(prepared.folder)
     armature_of(collection).update_tag()
-    return Replaced(sum(map(len, shown.values())), reshaped, warning)
+    return Replaced(reshaped, warning)
 
 
 def painted_weights(body: bpy.types.Object, group: str) -> NDArray[np.float32]:

@@ -266,8 +266,9 @@ class PRIMDIFFUSION_PT_edit(HumanPanel, bpy.types.Panel):
         return backend_is_named() and super().poll(context)
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = property_columns(self.layout), context.scene.primdiffusion_edit
-        layout.row().prop(settings, "kind", expand=True)
+        settings = context.scene.primdiffusion_edit
+        self.layout.row(align=True).prop(settings, "kind", expand=True)  # with a label beside it words are cut short
+        layout = property_columns(self.layout)
         _DRAW[settings.kind](layout, settings, context)
 
 

@@ -20,8 +20,8 @@ from primdiffusion.reshaping import reshaped
 
 from .shrink import save_jpeg
 
-SEED = 7
-HEIGHT_M, WEIGHT_KG = 1.74, 108.0
+SEED = 0
+HEIGHT_M, WEIGHT_KG = 1.74, 122.0
 SIZE = 420
 _GREY = (0.35, 0.35, 0.35)
 

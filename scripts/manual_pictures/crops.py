@@ -43,14 +43,15 @@ STACKS = {"set_up_progress": ("set_up_real_0", "set_up_real_1", "set_up_real_2")
 DIALOGS = {"motion_dialog": "motion_dialog"}
 WINDOW_PART = (0, 24, 1320, 1190)
 """Pixels of the main window: without the properties and the timeline."""
-PREFERENCES_PART = (172, 222, 872, 548)
+PREFERENCES_PART = (172, 240, 872, 548)
 """Pixels of the preferences' window: the extension's part, down to a whole row."""
 _STACKED_ROWS = 130
 """Pixels of the preferences' part: down to the end of the backend's box while a set-up runs."""
 _WINDOW_WIDTH = 880
 _PANEL_WIDTH = 262
-_OUTLINE_RGB, _OUTLINE_COLUMN, _RUN = 74, 8, 10
-"""Panels have an outline of this grey at this distance from the sidebar's left edge, over at least so many rows."""
+_PANEL_RGB, _SECTION_RGB, _COLUMN, _RUN = 74, 67, 8, 10
+"""Greys of panels, and of what is in their open sections, at this distance from the sidebar's left edge, over at least
+so many rows."""
 _GAP, _GAP_RGB = 12, (255, 255, 255)
 
 
@@ -81,9 +82,9 @@ def panels_of(shots: Path, shot: str) -> Image.Image:
     """The sidebar down to the end of its last panel."""
     picture, boxes = _read(shots, shot)
     left, top, _, bottom = boxes["sidebar"]
-    column = np.asarray(picture)[top:bottom, left + _OUTLINE_COLUMN].astype(int)
-    outline = (np.abs(column - _OUTLINE_RGB) <= 1).all(1)
-    runs = np.convolve(outline, np.ones(_RUN), "valid") == _RUN
+    column = np.asarray(picture)[top:bottom, left + _COLUMN].astype(int)
+    greys = np.abs(column[..., None] - [_PANEL_RGB, _SECTION_RGB]) <= [1, 0]
+    runs = np.convolve(greys.all(1).any(1), np.ones(_RUN), "valid") == _RUN
     if not runs.any():
         raise ValueError(f"{shot} shows no panel in its sidebar")
     end = int(np.flatnonzero(runs)[-1]) + _RUN + 2

@@ -15,6 +15,8 @@ from start import FIRST_SEED, SECOND_SEED, armatures, begin, people_file, queue_
 from visible_scene import at_rest
 
 _FIVE = (FIRST_SEED, SECOND_SEED, 11, 21, 31)
+_HEIGHT_M = (1.4, 2.4)
+"""With an arm raised."""
 
 
 def five_humans(module: str, python: str) -> Steps:
@@ -88,6 +90,8 @@ def read_back(module: str, python: str) -> Steps:
         meshes = [obj for obj in bpy.data.objects if obj.type == "MESH" and len(obj.data.polygons) > 1000]
         if not meshes or not bones or bones[0] < 24:
             raise RuntimeError(f"{path.name}: {len(meshes)} meshes, bones {bones}")
+        if not _HEIGHT_M[0] < (height := max(obj.dimensions.z for obj in meshes)) < _HEIGHT_M[1]:
+            raise RuntimeError(f"{path.name}: the human is {height:.2f} m tall")
         _, area = view()
         area.spaces.active.shading.type = "MATERIAL"
         press("view3d.view_all", "EXEC_DEFAULT")

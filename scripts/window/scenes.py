@@ -14,11 +14,22 @@ from pathlib import Path
 import bpy
 from file_scenes import cancelled_captures, five_humans, handles, other_files, read_back
 from moving_scenes import opening, playing, turning
-from panels import show, sidebar, view
+from panels import show, sidebar, view, wide_view
 from press import Steps, invoke, press, wait
-from start import FIRST_SEED, SECOND_SEED, armatures, begin, cancel_all, people_file, queue_of, select, with_people
+from start import (
+    FIRST_SEED,
+    SECOND_SEED,
+    armatures,
+    begin,
+    cancel_all,
+    clear_of_the_sidebar,
+    people_file,
+    queue_of,
+    select,
+    with_people,
+)
 from view_scenes import denoising_in_view, dragging, redraw, rendered, rendered_view, shadings, stalls
-from visible_scene import visible_humans
+from visible_scene import at_rest, visible_humans
 
 
 def set_up(module: str, python: str) -> Steps:
@@ -61,7 +72,7 @@ def first_human(module: str, python: str) -> Steps:
     yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
     yield "first_denoising"
     yield from wait(lambda: not queue.busy, 240)
-    yield 4.0
+    yield from at_rest(module)
     yield "first_solid"
     yield from rendered_view()
     yield "first_person"
@@ -87,6 +98,7 @@ def generate(module: str, python: str) -> Steps:
     yield from wait(lambda: not queue_of(module).busy, 60)
     yield "generate_error"
     preferences.checkpoint = ""
+    queue_of(module).outcomes.clear()
     attributes = settings.attributes
     attributes.sex, attributes.outfit, attributes.hair = "female", "blouse and skirt", "braid"
     attributes.use_height = True
@@ -147,13 +159,14 @@ def edits(module: str, python: str) -> Steps:
     yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
     first, second = armatures()
     select(first)
+    clear_of_the_sidebar()
     settings = bpy.context.scene.primdiffusion_edit
     settings.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit")
     settings.kind = "TRANSFER"
     yield 0.5
     yield "edit_two_people"
-    settings.kind, settings.parts = "REDRESS", {"top"}
+    settings.kind, settings.parts = "REDRESS", {"clothes"}
     settings.attributes.outfit = "suit"
     yield "edit_parts"
     press("primdiffusion.redress")
@@ -247,6 +260,8 @@ def captures(module: str, python: str) -> Steps:
 def export(module: str, python: str) -> Steps:
     """A mesh, and the mesh proxy in the scene."""
     yield from with_people(module, python, FIRST_SEED)
+    wide_view()
+    view()[1].spaces.active.shading.type = "SOLID"
     bpy.context.scene.primdiffusion_export.format = "GLB"
     yield from show("PRIMDIFFUSION_PT_export/proxy")
     yield "export_before"

@@ -15,7 +15,7 @@ from mathutils import Quaternion
 from panels import show, view, wide_view
 from press import Steps, press, wait
 from stalls import Stalls, measure_extension
-from start import FIRST_SEED, SECOND_SEED, armatures, begin, queue_of, select, with_people
+from start import FIRST_SEED, SECOND_SEED, armatures, begin, clear_of_the_sidebar, queue_of, select, with_people
 
 REDRAW_ROUNDS, REDRAWS = 5, 6
 """Rounds of all states, and redraws in each."""
@@ -26,6 +26,8 @@ AFTERWARDS_S = 3.0
 def shadings(module: str, python: str) -> Steps:
     """Two humans among solids in each shading, turned, clipped and from the camera; clicks select them."""
     yield from with_people(module, python, FIRST_SEED, SECOND_SEED)
+    clear_of_the_sidebar()
+    armatures()[1].location.y -= 1.0  # in front of the plane
     bpy.ops.mesh.primitive_cube_add(size=0.4, location=(0.1, -0.4, 0.9))
     bpy.ops.mesh.primitive_plane_add(size=6, location=(0, 0.15, 0), rotation=(1.4, 0, 0.3))
     wide_view()
@@ -58,6 +60,8 @@ def shadings(module: str, python: str) -> Steps:
         bpy.ops.screen.region_quadview()
     yield 15.0
     yield "shadings_quad"
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        bpy.ops.screen.region_quadview()
 
 
 def dragging(module: str, python: str) -> Steps:

@@ -71,7 +71,7 @@ def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):
     assert sent(person) == {"person": str(first), "amount": 0.25, "seed": FINE, "steps": 3}
     assert not set(before) & set(paths(person))
     assert armature_of(person).location.x == 3.0
-    assert "8 volumes of Human changed" in notice_of("vary")
+    assert notice_of("vary").startswith("Varied Human in ")
     after = paths(person)
     bpy.ops.ed.undo()
     person = humans(bpy.context.scene)[0]
@@ -115,7 +115,7 @@ def test_a_blend_moves_the_body_where_the_betas_differ(person):
     heads = np.array([armature_of(person).data.bones[name].head_local for name in synthetic.NAMES])
     wanted = points_to_blender(synthetic_shape.at(synthetic_shape.arrays(COUNT), betas + 1)["joints"])
     np.testing.assert_allclose(heads - heads[0], wanted - wanted[0], atol=1e-5)
-    assert "the body's shape too" in notice_of("interpolate")
+    assert "the body's shape has changed too" in notice_of("interpolate")
 
 
 def test_any_part_of_a_person_selects_it_and_a_script_may_name_it(person):
