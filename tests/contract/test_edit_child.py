@@ -179,12 +179,3 @@ def test_an_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, 
 def test_a_missing_parameter_is_named(child, people):
     error = child.ask(11, "interpolate", person=people["ann"], out_dir="x")["error"]
     assert (error["code"], "interpolate.other" in error["message"]) == (INVALID_PARAMS, True)
-
-
-def test_painted_weights_of_another_body_are_rejected(child, asked, tmp_path):
-    np.savez(tmp_path / "smpl.npz", weights=np.ones(6890))
-    error = child.ask(12, "inpaint", **asked, weights=str(tmp_path / "smpl.npz"))["error"]
-    assert "12196 vertices" in error["message"]
-    np.savez(tmp_path / "none.npz", weights=np.zeros(12196))
-    error = child.ask(13, "inpaint", **asked, weights=str(tmp_path / "none.npz"))["error"]
-    assert "covers no primitive" in error["message"]
