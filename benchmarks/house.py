@@ -1,10 +1,10 @@
 """Figures of the source tree: sizes by room, import circles, hidden imports, threads, ambiguous names, tests.
 
-    python benchmarks/house.py
-    python benchmarks/house.py --walk --json docs/results/house.json    # --walk: also run Generate and count the files
+    python benchmarks/house.py --json docs/results/house.json
     python benchmarks/house.py --tests ...    # also run `make test` and time it, on an idle machine
 
-The source is parsed, never imported. The items counted are printed above the figures.
+The source is parsed, never imported; walk.py runs Generate and counts the files that it passes. The items counted are
+printed above the figures.
 """
 
 from __future__ import annotations
@@ -64,7 +64,6 @@ class Module:
 
 def main() -> None:
     parser = record.command_line(__doc__)
-    parser.add_argument("--walk", action="store_true", help="generate in Blender and count the files passed (walk.py)")
     parser.add_argument("--tests", action="store_true", help="time the tests on each Blender; all must pass")
     arguments = parser.parse_args()
     modules = parsed()
@@ -79,7 +78,7 @@ def main() -> None:
         print(f"{name}:", *(found or ["none"]), sep="\n  ", end="\n\n")
     figures: dict[str, float | None] = {**sizes(modules), **{name: len(found) for name, found in findings.items()}}
     figures |= test_sizes() | (test_minutes() if arguments.tests else {"test_minutes": None})
-    figures |= walk() if arguments.walk else {"walk_extension_files": None, "walk_backend_files": None}
+    figures |= walk()
     record.report(figures, arguments.json)
 
 

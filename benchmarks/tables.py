@@ -25,7 +25,7 @@ from primdiffusion.body.model import BodyPose, J
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.evaluation.pose_depth_network import load_pose_depth_network
 from primdiffusion.evaluation.shots import SIDE, Shot, human_shots, mesh_shots, primitive_shots
-from primdiffusion.evaluation.tables import Cell, Judged, Networks, compare_pictures, floor_cells, judge, table
+from primdiffusion.evaluation.tables import Cell, Networks, Scores, compare_pictures, evaluate, floor_cells, table
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, pose_body
 from primdiffusion.people.assets import Assets, open_assets
@@ -163,7 +163,7 @@ def judged(
     seeds: Sequence[int],
     networks: Networks,
     found: Path | None = None,
-) -> Judged:
+) -> Scores:
     """What our network finds in a set, TOGETHER humans at a time; kept in the folder `found`, and read from there."""
     parts = []
     for first in range(0, len(seeds), TOGETHER):
@@ -172,7 +172,7 @@ def judged(
         if path is not None and path.is_file():
             parts.append(json.loads(path.read_text(encoding="utf-8")))
             continue
-        one = judge(shots(some), networks)
+        one = evaluate(shots(some), networks)
         features = {key: values.tolist() for key, values in one.features.items()}
         parts.append({"features": features, "own": one.correct["own"], "depth": one.depth["own"]})
         if path is not None:
@@ -182,7 +182,7 @@ def judged(
         print(name, first + len(some), "of", len(seeds), flush=True)
     features = {key: torch.cat([torch.tensor(part["features"][key]) for part in parts]) for key in parts[0]["features"]}
     correct, depth = ([value for part in parts for value in part[key]] for key in ("own", "depth"))
-    return Judged(len(features["own"]), features, {"own": correct, "pose": []}, {"own": depth, "depth": []})
+    return Scores(len(features["own"]), features, {"own": correct, "pose": []}, {"own": depth, "depth": []})
 
 
 def figures_of(rows: Mapping[str, Mapping[str, Cell]], models: Mapping[str, Model]) -> Figures:

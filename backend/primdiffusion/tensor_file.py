@@ -34,7 +34,7 @@ _KINDS = {
 }  # fmt: skip
 """torch's types of the dtypes in `formats.tensor_layout`."""
 _MAKERS = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
-_ROOM, _SMALL = 2, 100_000
+_COPIES, _SMALL = 2, 100_000
 """Layers with weight normalisation make their weights twice; networks count and place with small tensors."""
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -140,27 +140,27 @@ def save(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = Non
 def load_network(build: Callable[[], Network], tensors: Mapping[str, Tensor]) -> Network:
     """Build a network whose sizes an untrusted file states, and load the file's `tensors` into it.
 
-    Raises RuntimeError where they do not fit, and as `RoomFor`; what `build` raises.
+    Raises RuntimeError where they do not fit, and as `ParameterLimit`; what `build` raises.
     """
-    with RoomFor(tensors):
+    with ParameterLimit(tensors):
         network = build()
     network.load_state_dict(tensors)
     return network
 
 
-class RoomFor(TorchFunctionMode):
-    """While it is entered, no more values are made than a network with these tensors takes: RuntimeError."""
+class ParameterLimit(TorchFunctionMode):
+    """Within it, making more values than a network with these tensors has raises RuntimeError."""
 
     def __init__(self, tensors: Mapping[str, Tensor]) -> None:
         super().__init__()
-        self._room = _ROOM * sum(values.numel() for values in tensors.values()) + _SMALL
+        self._left = _COPIES * sum(values.numel() for values in tensors.values()) + _SMALL
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Count the values of a new tensor before it takes memory."""
         kwargs = kwargs or {}
         if func in _MAKERS:
             size = (args or (kwargs["size"],))[0]
-            self._room -= math.prod(args if isinstance(size, int) else size)
-            if self._room < 0:
+            self._left -= math.prod(args if isinstance(size, int) else size)
+            if self._left < 0:
                 raise RuntimeError("the network has more parameters than the file has values")
         return func(*args, **kwargs)

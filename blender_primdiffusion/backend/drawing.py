@@ -133,7 +133,7 @@ class DrawingChild:
         except IndexError:
             return
         try:
-            self._backend.see_off()
+            self._backend.reap()
             while (drawing := self._next()) is not None:
                 self._follow(drawing)
                 if not drawing.finished:

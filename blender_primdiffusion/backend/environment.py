@@ -51,7 +51,7 @@ class BackendNotFound(RuntimeError):
     """No Python that can run the backend; the message names each that was tried and why it will not do."""
 
     kind = "environment"
-    """Of the error that a request becomes."""
+    """The kind of the error that a request becomes."""
 
 
 class ImportTimedOut(BackendNotFound):
@@ -68,7 +68,7 @@ class BackendPython:
     source: str
     """Who named it, in words for the user."""
     version: str
-    """Of primdiffusion."""
+    """primdiffusion's version."""
     torch: str
     python: str
 
@@ -101,7 +101,7 @@ class SetUpFolder:
 
     @property
     def temporary(self) -> Path:
-        """Of the set-up and the self-test."""
+        """Folder of temporary files of the set-up and the self-test."""
         return self.root / "temporary"
 
     @property

@@ -42,7 +42,7 @@ class Package:
     name: str
     version: str
     bytes: int
-    """Of the file; 0 where the lock does not say."""
+    """Size of the file; 0 where the lock does not say."""
     installed: int
     """Bytes that it unpacks to, or about that."""
 
@@ -60,7 +60,7 @@ class Lock:
 
     @property
     def download_bytes(self) -> int:
-        """Of all wheels."""
+        """Size of all wheels, bytes."""
         return sum(package.bytes for package in self.packages)
 
     @property

@@ -17,7 +17,7 @@ _LONGEST_NAME = 120
 """Characters of a path in a sentence."""
 
 
-def in_words(error: BaseException | str) -> str:
+def error_text(error: BaseException | str) -> str:
     """What an error says: the system's with the file first, whose name is cut if it is very long."""
     if isinstance(error, OSError) and error.strerror and error.filename:
         name = str(error.filename)
@@ -28,9 +28,9 @@ def in_words(error: BaseException | str) -> str:
 
 def sentence(text: BaseException | str) -> str:
     """`text` with a capital and a full stop; the kind of an error that says nothing."""
-    said = in_words(text) or type(text).__name__
-    said = said[:1].upper() + said[1:]
-    return said if said.endswith((".", "!", "?")) else f"{said}."
+    words = error_text(text) or type(text).__name__
+    words = words[:1].upper() + words[1:]
+    return words if words.endswith((".", "!", "?")) else f"{words}."
 
 
 TICK_S = 0.02
@@ -62,12 +62,12 @@ class Backend:
         """`make_client` finds a Python and returns a client not yet started; yields while it looks for one."""
         self._make_client = make_client
         self._client: BackendClient | None = None
-        self._leaving: list[tuple[BackendClient, float, Callable[[], None]]] = []
+        self._ending: list[tuple[BackendClient, float, Callable[[], None]]] = []
         """Children that are ending: the time at which each is killed, and what to do once it has gone."""
         self._closed = False
         self._request: ChildRequest | None = None
 
-    def admit(self, request: ChildRequest) -> bool:
+    def start(self, request: ChildRequest) -> bool:
         """Make `request` the current one; False while another is running."""
         if self._request is not None and not self._request.finished:
             return False
@@ -103,7 +103,7 @@ class Backend:
 
     def listen(self) -> list[Event]:
         """What has happened between requests: the child's end, or its silence."""
-        self.see_off()
+        self.reap()
         return self._client.poll() if self._client is not None else []
 
     def release(self) -> None:
@@ -111,32 +111,32 @@ class Backend:
         client, self._client = self._client, None
         if client is not None:
             client.end()
-            self.part_with(client)
+            self.when_ended(client)
 
-    def part_with(self, client: BackendClient, afterwards: Callable[[], None] = lambda: None) -> None:
+    def when_ended(self, client: BackendClient, afterwards: Callable[[], None] = lambda: None) -> None:
         """Call `afterwards` once a child that was asked to end has gone; kill it if it stays too long."""
-        self._leaving.append((client, time.monotonic() + END_S, afterwards))
+        self._ending.append((client, time.monotonic() + END_S, afterwards))
 
-    def see_off(self) -> None:
+    def reap(self) -> None:
         """Kill children that take too long to end; clean up after those that have gone. Never waits."""
-        leaving, self._leaving = self._leaving, []
-        for client, killed_at, afterwards in leaving:
+        ending, self._ending = self._ending, []
+        for client, killed_at, afterwards in ending:
             if client.gone_within(0.0):
                 afterwards()
                 continue
             if time.monotonic() > killed_at:
                 client.kill(0.0)
-            self._leaving.append((client, killed_at, afterwards))
+            self._ending.append((client, killed_at, afterwards))
 
     def shutdown(self) -> None:
         """End the child for good, also one that is still starting. Waits a few seconds at most."""
         self._closed = True
         if self._client is not None:
             self._client.shutdown()
-        for client, _, afterwards in self._leaving:
+        for client, _, afterwards in self._ending:
             client.shutdown()
             afterwards()
-        self._leaving.clear()
+        self._ending.clear()
 
 
 _SETTINGS = {
@@ -227,7 +227,7 @@ class ChildRequest:
         """The child's answer: a record of `formats.answers`."""
         self.error: RequestError | None = None
         self._connecting = backend.connecting()
-        if not backend.admit(self):
+        if not backend.start(self):
             self._fail(RequestError("the backend is at work already", "wait for it, or cancel it first", "busy"))
 
     @property
@@ -249,7 +249,7 @@ class ChildRequest:
         """Read the child's messages; returns whether something visible changed. Never waits."""
         if self.finished:
             return False
-        self._backend.see_off()
+        self._backend.reap()
         before = (self.state, self.step, self.total, self.eta_s, self.message, self.picture, dict(self.pictures))
         if self._client is None:
             self._tick_start()
@@ -358,7 +358,7 @@ class ChildRequest:
         if client is None or client.kill(_KILL_PATIENCE_S):
             self._clear_leftovers()
         else:
-            self._backend.part_with(client, self._clear_leftovers)
+            self._backend.when_ended(client, self._clear_leftovers)
 
     def _clear_leftovers(self) -> None:
         """Remove the folder of half-written files of a killed child (see formats/whole_files.py)."""

@@ -54,7 +54,7 @@ class Step:
 
     message: str
     fraction: float
-    """Of everything, 0 to 1."""
+    """Share of everything that is done, 0 to 1."""
 
 
 Steps = Generator[Step, None, str]
@@ -197,7 +197,7 @@ def _installing(folder: SetUpFolder, lock: Lock, said: str) -> Step:
 
 
 def _wheel_bytes(folder: Path) -> int:
-    """Of the wheels below a folder, where pip adds and removes some meanwhile."""
+    """Bytes of the wheels below a folder, where pip adds and removes some meanwhile."""
     total = 0
     for parent, _, names in os.walk(folder):
         with contextlib.suppress(OSError):

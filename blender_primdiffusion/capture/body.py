@@ -160,9 +160,9 @@ class ShapeFit:
     betas: NDArray[np.float64]
     """[B]."""
     scale: float
-    """Of the scan: 1 unless only another size fits."""
+    """Factor on the scan: 1 unless only another size fits."""
     shift: NDArray[np.float64]
-    """Of the scan after scaling [3], metres."""
+    """Shift of the scan after scaling [3], metres."""
     residual: float
     """Weighted root mean square distance of the joints, metres."""
 

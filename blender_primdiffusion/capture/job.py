@@ -61,7 +61,7 @@ def _in_place(motion: Motion) -> Motion:
 
 
 _CENTRE_PASSES = frozenset({"depth", "normal", "part"})
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 class CaptureError(ValueError):
@@ -153,7 +153,7 @@ def _try_subject(
         list_subjects(settings.out)
     except OSError as error:
         clock.note(report.fail(scan_file.name, "capture", str(error)))
-        if error.errno in _NO_ROOM:
+        if error.errno in _DISK_FULL:
             raise
     except Exception as error:  # one bad scan must not end a batch of days
         known = isinstance(error, (ValueError, RuntimeError))

@@ -21,9 +21,9 @@ class RigSkeleton:
     """A rig at rest in the world; metres, y up, facing +z."""
 
     names: list[str]
-    """Of the bones, parents first [N]."""
+    """Names of the bones, parents first [N]."""
     parents: list[int]
-    """Of each bone, -1 for a root."""
+    """Parent of each bone, -1 for a root."""
     heads: NDArray[np.float64]
     """[N, 3]."""
     axes: NDArray[np.float64]

@@ -26,7 +26,7 @@ class CaptureSettings:
     out: Path
     """The dataset's folder."""
     seed: int = 0
-    """Of the choice of poses, and of the noise of every view (`capture_layout.view_seed`)."""
+    """Seed of the choice of poses, and of the noise of every view (`capture_layout.view_seed`)."""
     rig: Rig = dataclasses.field(default_factory=Rig)
     """Cameras around each subject; its picture size applies to `cameras` too."""
     cameras: tuple[View, ...] = ()
@@ -46,7 +46,7 @@ class CaptureSettings:
     """Denoise img under a dome or HDRI light; other passes never are."""
     device: Device = "auto"
     threads: int = 0
-    """Of Cycles on the CPU; 0 for all cores."""
+    """Threads of Cycles on the CPU; 0 for all cores."""
     shard: tuple[int, int] = (0, 1)
     """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
     layouts: tuple[str, ...] = LAYOUTS

@@ -8,9 +8,8 @@ import bpy
 
 from ..scene.human import any_humans
 from . import studio, viewport
-from .engine import ENGINE, PRIMDIFFUSION_RenderEngine
+from .engine import ENGINE, PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine
 from .gpu import overlay
-from .settings import PRIMDIFFUSION_PG_render
 from .who_draws import view_engine
 
 CHECK_S = 5.0

@@ -61,7 +61,7 @@ def _height(above: NDArray, wanted: NDArray) -> NDArray:
 
 
 def _without_hidden(place: NDArray, tint: NDArray) -> Relief:
-    """Of grids [K, 8, 8, ..] the cells that are visible somewhere, and their vertices."""
+    """The cells of grids [K, 8, 8, ..] that are visible somewhere, and their vertices."""
     visible = tint[..., 3] >= VISIBLE
     cells = visible[:, :-1, :-1] | visible[:, :-1, 1:] | visible[:, 1:, :-1] | visible[:, 1:, 1:]
     box, b, t = np.nonzero(cells)

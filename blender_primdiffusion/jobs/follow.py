@@ -14,7 +14,7 @@ from typing import Any
 import bpy
 
 from ..backend.environment import NOT_INSTALLED
-from ..backend.requests import in_words, sentence
+from ..backend.requests import error_text, sentence
 from ..formats.answers import HumanAnswer
 from ..places import backend_is_named
 from ..scene.states import Preparation, PreparedHuman
@@ -174,7 +174,7 @@ class Reporting:
         try:
             return self.act(context)
         except (ValueError, OSError) as error:
-            self.report({"ERROR"}, in_words(error))
+            self.report({"ERROR"}, error_text(error))
         return {"CANCELLED"}
 
     def act(self, context: bpy.types.Context) -> set[str]:

@@ -88,7 +88,7 @@ class MergeFramesJob(Job):
     voxel: float
     """Metres."""
     _digests: list[str] = dataclasses.field(default_factory=list, init=False, repr=False)
-    """Of the VDB files written so far."""
+    """Digests of the VDB files written so far."""
     _error: OSError | ValueError | None = dataclasses.field(default=None, init=False, repr=False)
 
     @property

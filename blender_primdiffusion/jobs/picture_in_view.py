@@ -32,7 +32,7 @@ class PictureInView:
         """Linear, premultiplied [h, w, 4], bottom row first."""
         self._texture: gpu.types.GPUTexture | None = None
         self._cursor: tuple[float, ...] | None = None
-        """Of the scene when `_place` was found."""
+        """The scene's cursor when `_place` was found."""
         self._place: NDArray[np.float64] | None = None
 
     def update(self) -> bool:

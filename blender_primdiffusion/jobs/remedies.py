@@ -12,7 +12,7 @@ import bpy
 from ..backend.requests import RequestError, sentence
 from ..places import INSTALLS_BACKEND
 
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
+_DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EACCES, errno.EPERM)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -65,7 +65,7 @@ def error_in_the_scene(error: Exception) -> RequestError:
     cause = error if isinstance(error, OSError) else error.__cause__
     while cause is not None and not getattr(cause, "errno", None):
         cause = cause.__cause__
-    if cause is not None and cause.errno in _NO_ROOM:
+    if cause is not None and cause.errno in _DISK_FULL:
         return RequestError(
             sentence(error),
             "Save the file in a folder with free space and write permission, then try again",

@@ -14,10 +14,10 @@ class HumanTarget:
     """A human as it was when the job was queued. Holds no Blender objects, since undo may replace them."""
 
     uid: int
-    """Of the collection; valid while the file is open."""
+    """The collection's identity while the file is open (`session_uid`)."""
     name: str
     state: str
-    """Of the human, by `state_of`."""
+    """The human's state by `state_of`."""
 
     @classmethod
     def of(cls, person: bpy.types.Collection) -> HumanTarget:

@@ -133,7 +133,7 @@ def _rectangle(perspective: Matrix, obj: bpy.types.Object) -> NDArray[np.float64
 
 
 def _corners(obj: bpy.types.Object) -> NDArray[np.float64]:
-    """Of its bounding box in the world and the flesh around it [8, 3]."""
+    """Corners of its bounding box in the world and the flesh around it [8, 3]."""
     corners = np.array([obj.matrix_world @ Vector(corner) for corner in obj.bound_box])
     return corners + np.sign(corners - corners.mean(0)) * _FLESH_M
 

@@ -47,7 +47,7 @@ class Hierarchy:
     names: list[str]
     """Names of the joints, parents first; an end site is named after its joint with "_end"."""
     parents: list[int]
-    """Of each joint, -1 for the root."""
+    """Parent of each joint, -1 for the root."""
     offsets: NDArray[np.float64]
     """From the parent [n, 3], the file's units."""
     channels: list[list[str]]

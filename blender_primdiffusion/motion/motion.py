@@ -41,7 +41,7 @@ class Motion:
     rotations: NDArray[np.float64]
     """Each joint about the world's rest axes, relative to its parent [F, 24, 3, 3]; the first is the whole body's."""
     translations: NDArray[np.float64]
-    """Of the whole body [F, 3], metres, after the rotations."""
+    """Translations of the whole body [F, 3], metres, after the rotations."""
     fps: float
     """Frames per second; 1 for single poses."""
     name: str

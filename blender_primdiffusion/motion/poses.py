@@ -73,7 +73,7 @@ class Pose:
     trunk: tuple[float, float, float] = (0.0, 0.0, 0.0)
     head: tuple[float, float, float] = (0.0, 0.0, 0.0)
     whole: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of the pelvis, and all with it."""
+    """Rotation of the pelvis, and all with it."""
 
     def rotations(self) -> NDArray[np.float64]:
         """SMPL's joint rotations [24, 3, 3]; [F, 24, 3, 3] where angles are arrays [F]."""

@@ -83,7 +83,7 @@ NEEDED = (
     "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist",
 )  # fmt: skip
 """A rig needs these to be posed, and one bone of spine, neck and head."""
-BY_HAND = "chosen by hand"
+MANUAL = "chosen by hand"
 _TRUNK = ("spine1", "spine2", "spine3", "neck", "head")
 _LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist", "wrist": "hand"}
 """Parts whose direction towards the next part gives their rotation."""
@@ -99,7 +99,7 @@ class BoneMap:
     """Which bone of a rig is which joint."""
 
     rig: str
-    """A key of `RIGS`, or `BY_HAND`."""
+    """A key of `RIGS`, or `MANUAL`."""
     joints: dict[str, str]
     """SMPL's joint -> the bone's name; all of `NEEDED`, and other joints that the rig has."""
     tips: dict[str, str]
@@ -146,7 +146,7 @@ def chosen_bones(names: Iterable[str], joints: Mapping[str, str]) -> BoneMap:
     missing = _missing_joints(chosen)
     if missing:
         raise UnknownBonesError(f"the bone map has no bone for {_listed(missing)}: choose one for each")
-    return BoneMap(BY_HAND, chosen, {})
+    return BoneMap(MANUAL, chosen, {})
 
 
 def expected_names(part: str, rig: str, side: str) -> list[str]:

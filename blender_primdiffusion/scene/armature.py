@@ -204,7 +204,7 @@ def append_poses(armature: bpy.types.Object, frames: NDArray, rotations: NDArray
         raise ValueError(f"the action {action.name!r} is linked from another file: import into a new action")
     end = last_key(armature)
     if end >= frames[0]:
-        raise ValueError(f"the action {action.name!r} goes on until frame {end:g}: start later than that")
+        raise ValueError(f"the action {action.name!r} continues until frame {end:g}: start later than that")
     existing = {(curve.data_path, curve.array_index): curve for curve in curves}
     for bone in JOINT_NAMES:
         path = f'pose.bones["{bone}"].rotation_quaternion'

@@ -53,7 +53,7 @@ class MissingPersonFile(FileNotFoundError):
     """The backend's file of a human is not where it should be."""
 
     kind = "missing_volumes"
-    """By which panels find the remedy."""
+    """The kind of error, by which panels find the remedy."""
 
 
 def humans_folder(blend_path: str | None = None) -> Path:

@@ -195,7 +195,7 @@ def faulty_field(model: ShapeModel) -> str | None:
 
 
 class BodyMeasures(NamedTuple):
-    """Of a bare body at rest."""
+    """Measures of a bare body at rest."""
 
     height: float
     """Metres."""

@@ -47,7 +47,7 @@ class CaptureSession:
         self.lines: collections.deque[str] = collections.deque(maxlen=_MOST_LINES)
         """Lines of the child, newest last."""
         self.exit_code: int | None = None
-        """Of the last run."""
+        """The last run's exit code."""
         self._process: subprocess.Popen[bytes] | None = None
         self._output: Output | None = None
         self._errors: Output | None = None

@@ -143,7 +143,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     )
 
     def elevations(self) -> list[float]:
-        """Of the rings, degrees."""
+        """Elevations of the rings, degrees."""
         lowest, highest = math.degrees(self.lowest), math.degrees(self.highest)
         if self.rings == 1:
             return [round((lowest + highest) / 2, 4)]

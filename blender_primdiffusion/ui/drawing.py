@@ -32,7 +32,7 @@ class SidebarPanel:
     bl_region_type = "UI"
     bl_category = MAIN
     manual_page = ""
-    """Of the manual, opened by a button in the header."""
+    """Page of the manual that a button in the header opens."""
     manual_section = ""
 
     def draw_header_preset(self, _context: bpy.types.Context) -> None:

@@ -100,7 +100,7 @@ SHOWN = (
 
 
 class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
-    """Of a scene."""
+    """Export settings of a scene."""
 
     format: bpy.props.EnumProperty(name="Format", description="What Export writes", items=FORMATS, default="HUMAN")
     animation: bpy.props.BoolProperty(

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import bpy
 
-from ..backend.requests import in_words, sentence
+from ..backend.requests import error_text, sentence
 from ..formats.removing import OutsideFolderError, remove_file
 from ..formats.whole_files import remove_empty
 from ..jobs.deferred_volumes import deferred_volumes, keep_writing
@@ -67,7 +67,7 @@ class PRIMDIFFUSION_OT_find_missing_volumes(bpy.types.Operator):
                 deferred_volumes.finish()
             keep_writing()
         except (OSError, ValueError) as error:
-            self.report({"ERROR"}, in_words(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         finally:
             look()

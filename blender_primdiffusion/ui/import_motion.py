@@ -74,7 +74,7 @@ class FileFacts:
 
     facts: dict[str, str]
     bones: tuple[str, ...]
-    """Of a .bvh."""
+    """Names of the bones in a .bvh."""
     found: dict[str, str]
     """SMPL's joint -> bone, as recognised by name."""
     error: str = ""

@@ -40,7 +40,7 @@ class Placement:
     """The same; 0 is the last there is."""
     stride: int = 1
     scale: float = 1.0
-    """Of the path."""
+    """Factor on the path."""
     fit_stride: bool = True
     """Whether the path is scaled to the armature's legs, before `scale`."""
     root: str = "ORIGIN"

@@ -98,7 +98,7 @@ def free() -> None:
 
 
 class PRIMDIFFUSION_PG_motion(bpy.types.PropertyGroup):
-    """Of a scene."""
+    """Motion settings of a scene."""
 
     pose: bpy.props.EnumProperty(name="Pose", description="The pose to apply", items=pose_items)
     amount: bpy.props.FloatProperty(

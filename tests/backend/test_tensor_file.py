@@ -11,7 +11,7 @@ import safetensors.torch
 import torch
 from primdiffusion.formats.regular_files import TooLargeError
 from primdiffusion.formats.tensor_layout import LARGEST_HEADER
-from primdiffusion.tensor_file import LARGEST_FILE, RoomFor, load_network, opened, read, read_metadata, save
+from primdiffusion.tensor_file import LARGEST_FILE, ParameterLimit, load_network, opened, read, read_metadata, save
 from safetensors import safe_open
 from support.errors import refused
 from torch import nn
@@ -140,5 +140,5 @@ def test_a_network_gets_the_weights_of_a_file():
     ],
 )
 def test_what_is_larger_than_the_file_gets_no_memory(build):
-    with refused(RuntimeError, "parameters"), RoomFor({"a": torch.zeros(10)}):
+    with refused(RuntimeError, "parameters"), ParameterLimit({"a": torch.zeros(10)}):
         build()

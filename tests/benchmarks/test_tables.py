@@ -9,7 +9,7 @@ from diffuse_runs import settings
 from diffusion_people import small_model, write_people
 from latent_baseline import decoded_rest, sample_people
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.evaluation.tables import Cell, Judged, Networks
+from primdiffusion.evaluation.tables import Cell, Networks, Scores
 from support.errors import refused
 from tables import Model, check_equal, figures_of, judged
 from train_baselines import train_model
@@ -91,13 +91,13 @@ def test_figures_name_model_and_measure():
 def test_what_was_seen_is_not_looked_at_again(tmp_path, monkeypatch):
     asked = []
 
-    def judge(shots, networks):
+    def evaluate(shots, networks):
         seeds = list(shots)
         asked.extend(seeds)
         features = {"own": torch.tensor(seeds)[:, None].float(), "detail": torch.zeros(len(seeds), 3)}
-        return Judged(len(seeds), features, {"own": [0.5] * len(seeds)}, {"own": []})
+        return Scores(len(seeds), features, {"own": [0.5] * len(seeds)}, {"own": []})
 
-    monkeypatch.setattr(tables, "judge", judge)
+    monkeypatch.setattr(tables, "evaluate", evaluate)
     first = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
     again = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
     assert asked == list(range(10))

@@ -155,7 +155,7 @@ class Deaths:
             wrong.append(f"the request is {request.state}: {request.message}")
         if request.state == "failed" and (request.error is None or not request.error.message):
             wrong.append("it failed without a message")
-        self._backend.see_off()
+        self._backend.reap()
         wrong += [f"{name} was left over" for name in leftovers(self._folder)]
         self.tally.add(int(died), wrong, where)
 

@@ -32,15 +32,3 @@ def _request(backend: Backend, method: str, out_dir: Path, checkpoint: Path | No
 def generate_request(backend: Backend, *, out_dir: Path, checkpoint: Path | None = None, **params) -> ChildRequest:
     """A person from noise."""
     return _request(backend, "generate", out_dir, checkpoint, size=_PICTURE_PX, **params)
-
-
-def edit_request(
-    backend: Backend, method: str, person: Path, *, out_dir: Path, checkpoint: Path, **params
-) -> ChildRequest:
-    """A person of one that exists."""
-    return _request(backend, method, out_dir, checkpoint, person=str(person), size=_PICTURE_PX, **params)
-
-
-def reconstruct_request(backend: Backend, *, capture: Path, out_dir: Path, checkpoint: Path, **params) -> ChildRequest:
-    """A person from captures."""
-    return _request(backend, "reconstruct", out_dir, checkpoint, capture=str(capture), **params)

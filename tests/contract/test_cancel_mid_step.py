@@ -74,6 +74,6 @@ def test_a_cancel_in_the_middle_of_a_step_does_not_wait_for_the_step_and_leaves_
     assert client.gone_within(10.0)
     end = time.monotonic() + 10.0
     while out.exists():
-        backend.see_off()  # as the timer does, where killing the child takes longer
+        backend.reap()  # as the timer does, where killing the child takes longer
         assert time.monotonic() < end, list(out.iterdir())
         time.sleep(0.05)

@@ -146,24 +146,12 @@ def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, s
         ("vary", {"person": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
         ("vary", {"attributes": {"species": "cat"}}, DOMAIN_ERROR, "bad_input", "knows no attribute 'species'"),
         ("vary", {"attributes": {"outfit": None}}, INVALID_PARAMS, None, "vary.attributes.outfit"),
-        ("vary", {"attributes": ["outfit"]}, INVALID_PARAMS, None, "vary.attributes"),
-        ("vary", {"amount": 1.5}, INVALID_PARAMS, None, "vary.amount"),
-        ("vary", {"seed": "seven"}, INVALID_PARAMS, None, "vary.seed"),
-        ("vary", {"seed": 2**63}, INVALID_PARAMS, None, "vary.seed"),
-        ("vary", {"steps": 0}, INVALID_PARAMS, None, "vary.steps"),
-        ("vary", {"steps": 1001}, INVALID_PARAMS, None, "vary.steps"),
-        ("vary", {"out_dir": ""}, INVALID_PARAMS, None, "vary.out_dir"),
         ("vary", {"checkpoint": "/nowhere.safetensors"}, DOMAIN_ERROR, "missing_file", "no checkpoint at"),
         ("interpolate", {"steps": 1}, INVALID_PARAMS, None, "interpolate.steps"),
-        ("interpolate", {"fraction": -1}, INVALID_PARAMS, None, "interpolate.fraction"),
         ("inpaint", {"region": []}, INVALID_PARAMS, None, "inpaint.region"),
-        ("inpaint", {"region": [1]}, INVALID_PARAMS, None, "inpaint.region[0]"),
-        ("inpaint", {"region": {"vertices": "x"}}, INVALID_PARAMS, None, "inpaint.region"),
-        ("inpaint", {"region": "top"}, INVALID_PARAMS, None, "inpaint.region"),
         ("inpaint", {"region": ["hat"]}, DOMAIN_ERROR, "bad_input", "part of the body 'hat'"),
         ("inpaint", {"region": ["clothes", "skin", "hair"]}, DOMAIN_ERROR, "bad_input", "the whole human"),
         ("inpaint", {"region": [], "weights": "/no.npz"}, DOMAIN_ERROR, "missing_file", "/no.npz"),
-        ("transfer", {"what": "soul"}, INVALID_PARAMS, None, "transfer.what"),
         ("transfer", {"source": "/nobody.human.safetensors"}, DOMAIN_ERROR, "missing_file", "there is no human file"),
     ],
 )
@@ -179,12 +167,3 @@ def test_an_error_names_what_was_wrong_and_leaves_nothing(child, people, asked, 
 def test_a_missing_parameter_is_named(child, people):
     error = child.ask(11, "interpolate", person=people["ann"], out_dir="x")["error"]
     assert (error["code"], "interpolate.other" in error["message"]) == (INVALID_PARAMS, True)
-
-
-def test_painted_weights_of_another_body_are_rejected(child, asked, tmp_path):
-    np.savez(tmp_path / "smpl.npz", weights=np.ones(6890))
-    error = child.ask(12, "inpaint", **asked, weights=str(tmp_path / "smpl.npz"))["error"]
-    assert "12196 vertices" in error["message"]
-    np.savez(tmp_path / "none.npz", weights=np.zeros(12196))
-    error = child.ask(13, "inpaint", **asked, weights=str(tmp_path / "none.npz"))["error"]
-    assert "covers no primitive" in error["message"]

@@ -42,6 +42,7 @@ def provenance(text: str) -> Callable[[Tensors, dict[str, str]], object]:
         (provenance('{"seed": "seven"}'), False),
         (provenance('{"unknown": NaN}'), False),
         (provenance(json.dumps("\0")), False),
+        (lambda _, metadata: metadata.update(compact="{}"), False),
         (lambda tensors, _: tensors.update(rgb=tensors["rgb"].bfloat16()), True),
         (lambda tensors, _: tensors.update(unknown=torch.full((2,), torch.nan)), True),
         (lambda tensors, _: tensors.update(rest_half_extent=torch.ones(3)), False),

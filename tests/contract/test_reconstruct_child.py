@@ -1,18 +1,12 @@
-"""A person from captures, with the real child: as the protocol promises it, and as the panel follows it."""
+"""A human from captures, with the real child."""
 
-import os
-import signal
-import time
 from pathlib import Path
 
 import pytest
 from capture_scenes import captured
-from child_requests import reconstruct_request, this_pythons_backend
 from conversation import Conversation
 from primdiffusion.human_file import load_human
 from tiny_encoder import save_tiny_encoder
-
-from blender_primdiffusion.backend.requests import ChildRequest
 
 CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
 FIRST = "person_000000"
@@ -84,65 +78,3 @@ def test_a_cancel_ends_the_job_and_leaves_nothing(child, asked):
     assert child.answer(4)["result"] == {"cancelled": True}
     assert child.answer(3)["error"]["code"] == CANCELLED
     assert not Path(asked["out_dir"]).parent.exists()
-
-
-def follow(request: ChildRequest, timeout_s: float = 180) -> list[str]:
-    """Ticks as Blender's timer does; returns the messages passed through."""
-    messages, end = [request.message], time.monotonic() + timeout_s
-    while not request.finished:
-        assert time.monotonic() < end, (request.state, request.message)
-        request.tick()
-        if request.message != messages[-1]:
-            messages.append(request.message)
-        time.sleep(0.005)
-    return messages
-
-
-@pytest.fixture(scope="module")
-def backend():
-    backend = this_pythons_backend()
-    yield backend
-    backend.shutdown()
-
-
-@pytest.fixture
-def start(backend, captures, encoder, tmp_path):
-    def start(**more) -> ChildRequest:
-        settings = {"capture": captures, "subject": FIRST, "checkpoint": encoder, "out_dir": tmp_path / "out", **more}
-        return reconstruct_request(backend, **settings)
-
-    return start
-
-
-def test_the_panels_job_runs_from_a_cold_start_to_its_files(start):
-    request = start(views=1)
-    messages = follow(request)
-    assert request.state == "done", request.message
-    assert messages[0] == "Starting the backend"
-    assert {"Reading the pictures", "Reconstructing", "Writing the human"} <= set(messages)
-    assert request.fraction == 1.0
-    assert request.result.person.exists()
-    assert request.result.warnings[0] == "only one view: the sides that it does not show are guessed"
-
-
-def test_an_error_of_the_backend_becomes_the_requests_error(start):
-    request = start(subject="nobody")
-    follow(request)
-    assert (request.state, request.error.kind) == ("failed", "bad_input")
-    assert str(request.error).startswith("There is no subject 'nobody'")
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
-def test_a_killed_child_fails_the_request_leaves_nothing_and_the_next_request_works(start, tmp_path):
-    request = start()
-    while request.step < 1:
-        request.tick()
-        assert not request.finished
-    os.kill(request._client.pid, signal.SIGKILL)
-    follow(request)
-    assert (request.state, request.error.kind) == ("failed", "died")
-    assert not (tmp_path / "out").exists()
-    again = start()
-    follow(again)
-    assert again.state == "done"

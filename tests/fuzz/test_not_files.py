@@ -171,6 +171,7 @@ BACKEND = {
     "pose_file.py": ("pose", "pose .npz"),
     "primitives/body_setup.py": ("SMPL .npz", "SMPL .pkl", "UV .obj"),
     "released/reading.py": ("released checkpoint",),
+    "render/cpu_compiled.py": OWN,
     "tensor_file.py": FORMATS,
     "torch_file.py": FORMATS,
     "training/captured_people.py": ("human's card", "payload"),

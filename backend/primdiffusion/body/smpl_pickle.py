@@ -100,7 +100,7 @@ class _Reconstructed(Inert):
     def __new__(cls, kind: object, *_: object) -> Inert:
         if not (isinstance(kind, type) and issubclass(kind, Inert)):
             raise UnsafePickleError(
-                f"The pickle rebuilds a {type(kind).__name__}, which is no array; take the publisher's file again."
+                f"The pickle rebuilds a {type(kind).__name__}, which is not an array; take the publisher's file again."
             )
         return kind()
 
@@ -206,7 +206,7 @@ def array_of_objects(value: object) -> list[object]:
     match value:
         case _Array(state=(_, tuple(), _NumberType(arguments=("O8" | "O", *_)), _, list() as objects)):
             return objects
-    raise ValueError(f"a {type(value).__name__.strip('_')} stands where an array of objects belongs")
+    raise ValueError(f"a {type(value).__name__.strip('_')} is given instead of an array of objects")
 
 
 def as_array(value: object, nesting: int = 0) -> np.ndarray:
@@ -251,7 +251,7 @@ def _as_array(value: object, nesting: int) -> np.ndarray:
             _check_count(value)
             array = np.asarray(value)
         case _:
-            raise ValueError(f"a {type(value).__name__.strip('_')} stands where an array of numbers belongs")
+            raise ValueError(f"a {type(value).__name__.strip('_')} is given instead of an array of numbers")
     if array.dtype.kind not in "biuf":
         raise ValueError(f"an array holds {array.dtype} where numbers belong")
     return array
@@ -285,7 +285,7 @@ def _raw_bytes(raw: object) -> bytes | bytearray:
         return raw.encode("latin1")
     if isinstance(raw, bytes | bytearray):
         return raw
-    raise ValueError(f"a {type(raw).__name__.strip('_')} stands where an array's bytes belong")
+    raise ValueError(f"a {type(raw).__name__.strip('_')} is given instead of an array's bytes")
 
 
 def _dense(data: np.ndarray, indices: np.ndarray, starts: np.ndarray, shape: np.ndarray) -> np.ndarray:

@@ -46,12 +46,12 @@ from primdiffusion.evaluation.shots import (
 )
 from primdiffusion.evaluation.tables import (
     Cell,
-    Judged,
     Networks,
+    Scores,
     check_counts,
     compare_pictures,
+    evaluate,
     floor_cells,
-    judge,
     table,
 )
 from primdiffusion.human import Human, framing, generate, place
@@ -148,7 +148,7 @@ def measure(options: TableOptions, generated: Generated, assets: Path | None) ->
     else:
         assert options.real is not None
         reals = folder_shots(options.real)
-    fake, real = _judged(fakes, networks, "generated"), _judged(reals, networks, "real")
+    fake, real = _evaluated(fakes, networks, "generated"), _evaluated(reals, networks, "real")
     rows = compare_pictures(fake, real, options.kid_subsets, options.kid_subset_size, options.kid_seed)
     if fps is not None:
         rows["generated"]["fps"] = fps
@@ -193,13 +193,13 @@ def _mesh_shots(assets: Assets, options: TableOptions, count: int, poses: BodyPo
         yield from mesh_shots(make_person(assets, base, seed), poses, yaws, f"{seed:08d}", SIDE)
 
 
-def _judged(shots: Iterator[Shot], networks: Networks, what: str) -> Judged:
+def _evaluated(shots: Iterator[Shot], networks: Networks, what: str) -> Scores:
     with tqdm(unit="picture", desc=what, disable=None) as bar:
 
         def report(done: int) -> None:
             bar.update(done - bar.n)
 
-        return judge(shots, networks, report)
+        return evaluate(shots, networks, report)
 
 
 def frames_per_second(human: Human, settings: MarchSettings) -> Cell:
@@ -231,8 +231,8 @@ def resolution_of(human: Human) -> str:
 def _choices(
     options: TableOptions,
     generated: Generated,
-    fake: Judged,
-    real: Judged,
+    fake: Scores,
+    real: Scores,
     settings: MarchSettings,
 ) -> dict[str, Any]:
     """Every choice on which the figures depend."""

@@ -281,7 +281,7 @@ def _released_model(
 ) -> DiffusionModel:
     """Build an imported model; `folder` is that of its file."""
     weights = under(tensors, "denoiser.")
-    with tensor_file.RoomFor(weights), torch.device("meta"):
+    with tensor_file.ParameterLimit(weights), torch.device("meta"):
         network = SlabUNet(config.unet())
     network.load_state_dict(weights, assign=True)
     network.eval().requires_grad_(False)

@@ -132,8 +132,11 @@ def detail_energies(pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n d"
     energies, finer = [], image
     for sigma in BANDS:
         coarser = _blurred(image, sigma)
-        reach = 2 * round(3 * sigma) + 1
-        inside = -functional.max_pool2d(-alpha[:, None], reach, stride=1, padding=reach // 2) > 0.95
+        reach = round(3 * sigma)
+        outside = -alpha[:, None]
+        for size, padding in (((1, 2 * reach + 1), (0, reach)), ((2 * reach + 1, 1), (reach, 0))):
+            outside = functional.max_pool2d(outside, size, stride=1, padding=padding)
+        inside = outside < -0.95
         energy = ((finer - coarser).square() * inside).sum((1, 2, 3)) / inside.sum((1, 2, 3)).clamp_min(1)
         energies.append((energy + 1e-7).log())
         finer = coarser

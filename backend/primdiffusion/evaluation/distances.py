@@ -59,7 +59,7 @@ class KernelDistances(NamedTuple):
 
     mean: float
     std: float
-    """Of the subsets' distances, biased, as published after +-."""
+    """Standard deviation of the subsets' distances, biased, as published after +-."""
 
 
 def kernel_distance_of_subsets(

@@ -82,10 +82,10 @@ class Source:
     """One geometry in n colourings to make portraits of."""
 
     name: str
-    """Of its file in the cache."""
+    """Name of the file in the cache."""
     draw: Callable[[], UInt8[Tensor, "n v h w 4"]]
     attributes: Callable[[], list[dict[str, Any]]]
-    """Of each colouring."""
+    """Reads the attributes of each colouring."""
 
 
 def payload_sources(paths: Sequence[Path], read: ReadPerson) -> list[Source]:

@@ -77,7 +77,7 @@ class ImageMetrics:
     """Within the bounding box of the target's mask, dB."""
     ssim_box: float | None
     mask_iou: float
-    """Of the masks of pixels that are at least half covered."""
+    """Intersection over union of the masks of pixels that are at least half covered."""
     lpips: float | None = None
 
 

@@ -57,19 +57,19 @@ class Cell(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Judged:
+class Scores:
     """What the networks found in one set of pictures."""
 
     pictures: int
     features: Mapping[str, Float[Tensor, "n d"]]
-    """Of "inception", "clip", "own" and "detail"."""
+    """Features by network: "inception", "clip", "own" and "detail"."""
     correct: Mapping[str, Sequence[float]]
-    """Share of correct joints of each picture with known joints, of "pose" and "own"."""
+    """Share of correct joints of each picture with known joints, by network: "pose" and "own"."""
     depth: Mapping[str, Sequence[float]]
-    """Depth error of each picture with known depth, of "depth" and "own"."""
+    """Depth error of each picture with known depth, by network: "depth" and "own"."""
 
 
-def judge(shots: Iterable[Shot], networks: Networks, report: Callable[[int], None] = lambda done: None) -> Judged:
+def evaluate(shots: Iterable[Shot], networks: Networks, report: Callable[[int], None] = lambda done: None) -> Scores:
     """Look at every picture once. A picture in which a network finds no human has no correct joint.
 
     Raises ValueError for a network that does not fit, and what `shots` raises.
@@ -111,7 +111,7 @@ def judge(shots: Iterable[Shot], networks: Networks, report: Callable[[int], Non
         count += len(batch)
         report(count)
     stacked = {name: torch.cat(parts).clone() for name, parts in features.items() if parts}
-    return Judged(count, stacked, correct, depth)
+    return Scores(count, stacked, correct, depth)
 
 
 def check_counts(fakes: int, reals: int) -> None:
@@ -125,7 +125,7 @@ def check_counts(fakes: int, reals: int) -> None:
 
 
 def compare_pictures(
-    fake: Judged, real: Judged, kid_subsets: int, kid_subset_size: int, seed: int
+    fake: Scores, real: Scores, kid_subsets: int, kid_subset_size: int, seed: int
 ) -> dict[str, dict[str, Cell]]:
     """The cells of the rows "generated" and "real". Raises ValueError for too few pictures, and features with NaN.
 
@@ -153,13 +153,13 @@ def compare_pictures(
     return rows
 
 
-def _frechet(fake: Judged, real: Judged, name: str, option: str) -> Cell:
+def _frechet(fake: Scores, real: Scores, name: str, option: str) -> Cell:
     if name not in fake.features:
         return Cell(None, why=f"no weights file: name one with {option}")
     return Cell(frechet_distance(fake.features[name], real.features[name]))
 
 
-def _kid(fake: Judged, real: Judged, subsets: int, size: int, seed: int) -> Cell:
+def _kid(fake: Scores, real: Scores, subsets: int, size: int, seed: int) -> Cell:
     if "inception" not in fake.features:
         return Cell(None, why="no weights file: name one with --inception")
     if min(fake.pictures, real.pictures) < size:
@@ -184,7 +184,7 @@ def _mean(values: Sequence[float], has_truth: bool, truth: str, option: str | No
     return Cell(float(found.mean()), float(found.std(correction=0)))
 
 
-def _own_distances(fake: Judged, real: Judged) -> tuple[Cell, Cell]:
+def _own_distances(fake: Scores, real: Scores) -> tuple[Cell, Cell]:
     """Frechet distances of generated pictures, and of the first half of the real ones, to the second half.
 
     All three sets have the same size, since the distance falls with it. Pictures of one human follow each other, so

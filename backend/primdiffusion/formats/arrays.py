@@ -43,7 +43,7 @@ _UNREADABLE = (
     zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error, EOFError, OSError, NotImplementedError,
     RuntimeError, ValueError, OverflowError, LookupError,
 )  # fmt: skip
-_NO_ARRAY = (
+_HEADER_ERRORS = (
     ValueError, KeyError, SyntaxError, TypeError, MemoryError, RecursionError, OverflowError, struct.error,
     tokenize.TokenError,
 )  # fmt: skip
@@ -327,7 +327,7 @@ def _head(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype
             shape, fortran, dtype = read(text)
         if len(shape) > 32 or not all(type(side) is int and 0 <= side < 2**62 for side in shape):
             raise ValueError("an impossible shape")
-    except _NO_ARRAY as e:
+    except _HEADER_ERRORS as e:
         raise ArrayFileError(f"{what} is not an array of numpy's format: save it with numpy.save or savez") from e
     if not dtype.hasobject and (dtype.kind not in _KINDS or dtype.itemsize <= 0):  # sizes of long texts wrap
         raise ArrayFileError(f"{what} holds {dtype!s:.60}, not numbers or text: save it as one of these")

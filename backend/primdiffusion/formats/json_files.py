@@ -112,7 +112,7 @@ def _check_strings(values: list[Any]) -> None:
 
 def _parsed(text: str | bytes) -> Any:
     if not isinstance(text, str | bytes):
-        raise JsonError(f"it is no text but {type(text).__name__}")
+        raise JsonError(f"it is not text but {type(text).__name__}")
     try:
         text = text if isinstance(text, str) else text.decode("utf-8")
     except UnicodeDecodeError as e:

@@ -19,6 +19,8 @@ from numba.core import config
 from numba.extending import intrinsic
 from numpy import ndarray
 
+from primdiffusion.formats.regular_files import read_regular
+
 FASTMATH = frozenset({"contract", "arcp", "nsz", "reassoc"})
 """Allows different rounding, but keeps the semantics of NaN and infinity."""
 
@@ -27,6 +29,8 @@ THREADS: int = vars(config)["NUMBA_NUM_THREADS"]
 
 _njit: Any = numba.njit  # the type stubs lack some options
 _compiled_call: Any = intrinsic  # untyped: callers omit the typing context and pass other types
+_LARGEST_SOURCE = 1_000_000
+"""Bytes."""
 _SOURCES = ("cpu_*.py", "merge.py", "lattice.py", "compositing.py")
 
 Function = Callable[..., Any]
@@ -104,7 +108,7 @@ def _stamp() -> str:
     """Digest of the sources, so that a copy of the package, or an update that leaves them alone, compiles nothing."""
     digest = hashlib.sha256()
     for path in sorted(path for pattern in _SOURCES for path in Path(__file__).parent.glob(pattern)):
-        digest.update(path.read_bytes())
+        digest.update(read_regular(path, _LARGEST_SOURCE))
     return digest.hexdigest()
 
 

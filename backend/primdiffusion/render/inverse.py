@@ -178,7 +178,7 @@ class LinearisedView:
     residual: Float32[ndarray, "r 4"]
     """Linear RGB over BACKGROUND, and alpha."""
     weight: Float32[ndarray, "r 4"]
-    """Of squared residuals; the sum with those of a target's pixels is a mean over its figure, of encoded colours."""
+    """Weights of squared residuals; those of a target's pixels sum to a mean over its figure, of encoded colours."""
     alpha_free: Float32[ndarray, "r"]
     """1 where alpha follows density, 0 where the ray is opaque."""
 

@@ -77,7 +77,7 @@ class GpuPayload:
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Of the content of each box, as `_content`."""
+        """Bounds of the content of each box, as `_content`."""
         return self._uploaded[1]
 
     @functools.cached_property

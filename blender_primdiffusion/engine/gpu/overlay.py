@@ -44,7 +44,7 @@ class Overlay:
 
     def __init__(self) -> None:
         self._regions: dict[int, GpuRefinement] = {}
-        """By the region's address; the latest drawn last."""
+        """Refinements by the region's address; the latest drawn last."""
         self._reader = SceneReader()
         self._readings: dict[ViewContent, SceneReading] = {}
         """Since the scene has changed."""
@@ -212,7 +212,7 @@ def _parts(picture: GpuRefinement, seen: Part) -> Iterator[tuple[Part, GpuMarch 
 
 
 def _matrices(context: bpy.types.Context) -> tuple[Matrix, Matrix]:
-    """Of the region: to the window, and to the view."""
+    """The region's matrices: to the window, and to the view."""
     return context.region_data.window_matrix, context.region_data.view_matrix
 
 

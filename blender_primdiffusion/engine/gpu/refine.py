@@ -89,13 +89,13 @@ class GpuRefinement:
     """Sketches the newest request at once, or marches it where that is as quick; then marches it finely."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, samples: int = SAMPLES):
-        """Of `samples` pictures at rest."""
+        """A refinement of `samples` pictures at rest."""
         self._clock, self._samples = clock, samples
         self._request: MarchRequest | None = None
         self._changed_at = self._revealed_at = 0.0
         self._pending: ShownMarch | None = None
         self._seconds, self._pixel_seconds = 0.0, np.inf
-        """Of the pending picture so far, and of a pixel of the last one."""
+        """Seconds for the pending picture so far, and for a pixel of the last one."""
         self._work, self._sketch_side = _FIRST_WORK, 1
         self.shown: ShownMarch | None = None
         self.reveal_s = REVEAL_S

@@ -37,7 +37,7 @@ class ShownHuman:
     """A human whom a 3D view shows."""
 
     object_uid: int
-    """Of the armature, or of the object that instances it; a reference would not outlive undo."""
+    """The armature's `session_uid`, or that of the object that instances it; a reference would not outlive undo."""
     pose: PosedHuman
     placed: tuple[GpuPayload, Boxes]
 
@@ -47,7 +47,7 @@ class SceneReading:
     """What a 3D view shows besides Blender's objects."""
 
     humans: dict[object, ShownHuman]
-    """By what their pictures depend on."""
+    """Humans by what their pictures depend on."""
     bones: NDArray[np.float64]
     """Ends of the bones that are shown in front [N, 2, 3], Blender's world: of armatures that are posed or edited, and
     of those that the user wants in front."""
@@ -68,11 +68,11 @@ class ViewContent:
     by_volumes: bool
     """An engine draws humans by their volumes."""
     types: frozenset[str]
-    """Of "mesh" and "volume" those that the view's Object Types Visibility shows."""
+    """"mesh" and "volume", as far as the view's Object Types Visibility shows them."""
 
     @classmethod
     def of(cls, context: bpy.types.Context) -> ViewContent:
-        """Of the context's space."""
+        """The content of the context's space."""
         space = context.space_data
         by_volumes = who_draws(context.scene.render.engine, space.shading.type, True) is Drawer.VOLUMES
         types = frozenset(kind for kind in ("mesh", "volume") if getattr(space, f"show_object_viewport_{kind}"))

@@ -60,7 +60,7 @@ class RenderSource:
     """A .blend or a human's file."""
 
     name: str
-    """Of the pictures."""
+    """Name of the pictures."""
     path: Path
 
     @property

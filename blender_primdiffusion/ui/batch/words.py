@@ -17,7 +17,7 @@ ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
 """Names of render engines on the command line -> Blender's."""
 DECLARED = {"steps": "--steps", "sampler": "--sampler", "guidance": "--guidance", "size": "--pictures"}
 """Options of `generate` by the field of the request that declares them."""
-_ENDS = (
+_EPILOG = (
     "exit codes: 0 all is done, 1 some failed (report.json says which and why), 2 usage error, 3 no Python runs the "
     "backend, 130 stopped by Ctrl-C; the same command resumes"
 )
@@ -93,7 +93,7 @@ def motion_name(options: argparse.Namespace) -> str | None:
 
 
 def _parser(name: str, description: str) -> argparse.ArgumentParser:
-    made = argparse.ArgumentParser(prog=f"primdiffusion {name}", description=description, epilog=_ENDS)
+    made = argparse.ArgumentParser(prog=f"primdiffusion {name}", description=description, epilog=_EPILOG)
     made.error = _raise_usage_error
     return made
 

@@ -112,10 +112,6 @@ def without(tree: str, key: str) -> str:
     return json.dumps({k: v for k, v in json.loads(tree).items() if k != key})
 
 
-def test_no_temporary_file_is_left(path):
-    assert [p.name for p in path.parent.iterdir()] == ["model.safetensors"]
-
-
 def test_a_slab_network_is_saved_and_loaded(tmp_path):
     torch.manual_seed(0)
     network = SlabUNet(UNetConfig(width=32, multipliers=(1, 1), blocks=1, heads=2))
@@ -242,7 +238,3 @@ def test_the_default_checkpoint_draws_people_that_differ(default):
 def test_the_committed_model_card_is_the_checkpoint_s(request):
     page = request.config.rootpath / "docs" / "model_card.md"
     assert page.read_text() == model_card(read_card())
-
-
-def test_a_card_is_json_all_the_way(default):
-    assert json.loads(json.dumps(default.card)) == default.card

@@ -14,23 +14,23 @@ from primdiffusion.evaluation.shots import JOINTS, SIDE, Shot
 from primdiffusion.evaluation.tables import (
     COLUMNS,
     OF_TABLE,
-    Judged,
     Networks,
+    Scores,
     check_counts,
     compare_pictures,
-    judge,
+    evaluate,
     table,
 )
 from support.errors import refused
 from tiny_model import tiny_model
 
 
-def judged(count: int, seed: int, shift: float = 0.0, **lists: list[float]) -> Judged:
+def judged(count: int, seed: int, shift: float = 0.0, **lists: list[float]) -> Scores:
     generator = torch.Generator().manual_seed(seed)
     widths = {"own": 6, "detail": 3, "inception": 8, "clip": 5}
     features = {name: torch.randn(count, width, generator=generator) + shift for name, width in widths.items()}
     values = {"own": lists.get("own", []), "pose": lists.get("pose", []), "depth": lists.get("depth", [])}
-    return Judged(count, features, values, values)
+    return Scores(count, features, values, values)
 
 
 def shots(count: int, seed: int) -> list[Shot]:
@@ -79,7 +79,7 @@ def test_a_known_share_of_joints_is_the_pckh():
 
 def test_empty_columns_say_why():
     fake = judged(10, 1)
-    bare = Judged(10, {name: fake.features[name] for name in ("own", "detail")}, fake.correct, fake.depth)
+    bare = Scores(10, {name: fake.features[name] for name in ("own", "detail")}, fake.correct, fake.depth)
     cells = compare_pictures(bare, bare, 5, 8, 0)["generated"]
     assert all(cells[column].value is None for column in OF_TABLE[1] if column != "own_distance")
     assert "--inception" in cells["fid"].why
@@ -110,15 +110,15 @@ def test_joints_are_judged_against_the_truth_of_each_picture():
     network = load_pose_depth_network()
     given = shots(3, 0)
     seen = joint_positions(network(torch.stack([shrunk(shot.rgb) for shot in given]).float() / 255).heatmaps)
-    right = judge(
+    right = evaluate(
         [dataclasses.replace(shot, joints=SIDE * own) for shot, own in zip(given, seen, strict=True)], Networks(network)
     )
     assert right.correct["own"] == [1.0] * 3
-    first = judge(given, Networks(network))
+    first = evaluate(given, Networks(network))
     assert first.pictures == len(first.correct["own"]) == len(first.depth["own"]) == 3
     assert (len(first.correct["pose"]), len(first.depth["depth"])) == (0, 0)
     assert first.features["own"].shape == (3, 64)
-    assert torch.equal(judge(given, Networks(network)).features["own"], first.features["own"])
+    assert torch.equal(evaluate(given, Networks(network)).features["own"], first.features["own"])
 
 
 def test_folders_are_compared_twice_with_the_same_bits(tmp_path, capsys):

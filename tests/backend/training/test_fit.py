@@ -1,9 +1,7 @@
 """A run of stage 1: what it leaves, when it stops, and what it says of bad input."""
 
 import json
-import os
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +20,7 @@ from primdiffusion.training.fit import MODEL, EncoderTask, fit, run
 from primdiffusion.training.fit_config import FitConfig, LossConfig
 from primdiffusion.training.fit_data import fit_batches
 from primdiffusion.training.fit_losses import volume_loss
-from primdiffusion.training.loop import Recorder, StepTimer, begin_phase
+from primdiffusion.training.loop import StepTimer, begin_phase
 from primdiffusion.training.run_folder import METRICS, PICTURES, Metrics
 from safetensors.torch import load_file
 from support.errors import refused
@@ -81,17 +79,6 @@ def test_weights_change_and_the_average_is_what_is_kept(captures, tmp_path):
     for key, value in kept.items():
         assert torch.equal(state[f"average.{key}"].half(), value)
     assert any(not torch.equal(state[f"average.{key}"], state[f"network.{key}"]) for key in kept)
-
-
-def test_ctrl_c_stops_after_the_step_and_saves(captures, tmp_path, monkeypatch):
-    def press(self, progress):
-        if self.state.step == 2:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(Recorder, "__call__", press)
-    model = fit(settings(captures, tmp_path / "run"))
-    assert model.card["steps"] == 2
-    assert load_encoder(tmp_path / "run" / MODEL).card["steps"] == 2
 
 
 def test_without_minutes_left_the_encoder_is_that_of_the_last_step(captures, tmp_path, monkeypatch):

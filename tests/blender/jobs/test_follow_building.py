@@ -20,6 +20,8 @@ from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.body import shape_model_of
 from blender_primdiffusion.scene.human import folder_of, humans, person_file, state_folder, volume_path
 
+pytestmark = pytest.mark.any_blender
+
 """A seed that the fake child takes as an order."""
 COUNT = 12
 """Primitives of the synthetic person."""

@@ -21,7 +21,7 @@ from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
-from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_OT_generate, PRIMDIFFUSION_PT_generate
+from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 
 """Seeds that the fake child takes as orders."""
 
@@ -68,10 +68,6 @@ def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_j
     assert len(humans(bpy.context.scene)) == 1
     assert all(volume.grids.load() for volume in bpy.data.volumes)
     assert not queue.busy
-
-
-def test_generate_cannot_be_redone_with_a_slider():
-    assert not {"REGISTER", "UNDO"} & PRIMDIFFUSION_OT_generate.bl_options
 
 
 @pytest.mark.parametrize(

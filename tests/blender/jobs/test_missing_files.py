@@ -19,6 +19,8 @@ from blender_primdiffusion.scene.human import HOME, MARK, folder_of, humans, per
 from blender_primdiffusion.scene.missing import missing_files
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human
 
+pytestmark = pytest.mark.any_blender
+
 ops = bpy.ops.primdiffusion
 COUNT = 8
 

@@ -17,6 +17,8 @@ from blender_primdiffusion.jobs.variations import Sheet, VariationsJob, sheet
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.ui import variations_panel
 
+pytestmark = pytest.mark.any_blender
+
 """Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
@@ -237,7 +239,6 @@ def test_none_can_be_redone_with_a_slider():
     assert not {"REGISTER", "UNDO"} & variations_panel.PRIMDIFFUSION_OT_variations.bl_options
 
 
-@pytest.mark.any_blender
 def test_links_in_place_of_the_sheets_files_lose_nothing_outside(tmp_path):
     mine = tmp_path / "outside" / "mine"
     mine.parent.mkdir()

@@ -25,7 +25,6 @@ from blender_primdiffusion.scene.human import (
     VolumeWriteError,
     armature_of,
     body_of,
-    check_editable,
     folder_of,
     human_of,
     humans,
@@ -240,16 +239,6 @@ def test_an_edit_before_the_first_save_is_collected_without_the_states_before_it
     assert list((tmp_path / "shot_humans" / "Human").iterdir()) == [state_folder(person)]
     assert len(list(state_folder(person).iterdir())) == COUNT + 2
     assert all(volume.grids.load() for volume in bpy.data.volumes)
-
-
-def test_a_linked_person_is_rejected_with_what_to_do(person, tmp_path):
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
-        wanted.collections = ["Human"]
-    bpy.context.scene.collection.children.link(wanted.collections[0])
-    with refused(ValueError, "Human", "shot.blend"):
-        check_editable(wanted.collections[0])
 
 
 def test_files_of_earlier_states_are_unused_and_those_shown_are_not(person, saved_scene, tmp_path):

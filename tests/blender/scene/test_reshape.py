@@ -12,7 +12,6 @@ import synthetic_shape
 from human_stage import make_earlier
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
 from scene_stage import replace
-from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import set_attachment
@@ -210,16 +209,6 @@ def test_what_cannot_be_reshaped_is_rejected_untouched(person, saved_scene, sent
     assert list(armature_of(person)[BETAS]) == before
     if armature_of(person).mode == "EDIT":
         bpy.ops.object.mode_set(mode="OBJECT")
-
-
-def test_a_linked_person_is_rejected_with_what_to_do(person, tmp_path):
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
-        wanted.collections = ["Human"]
-    bpy.context.scene.collection.children.link(wanted.collections[0])
-    with refused(ValueError, "Human", "shot.blend", "Make Local"):
-        reshape(wanted.collections[0], SHAPE)
 
 
 def test_an_appended_person_finds_the_file_of_their_body(person, tmp_path):

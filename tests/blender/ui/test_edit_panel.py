@@ -16,7 +16,6 @@ from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_o
 from support.tensor_files import read_tensors
 
 from blender_primdiffusion.jobs.edit import VaryJob
-from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import painted_weights
@@ -240,16 +239,6 @@ def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(add
     assert all(path.startswith("//late_humans/Human/") for path in paths(person))
     assert person_file(person).parent == tmp_path / "late_humans" / "Human" / "0002"
     assert sent(person)["seed"] == FINE
-
-
-def test_loading_a_file_during_the_job_drops_it(person):
-    start(person, TAKES_LONG)
-    until_running()
-    bpy.ops.wm.save_mainfile()
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    assert not queue.busy
-    assert follow() is None
-    assert len(humans(bpy.context.scene)) == 2
 
 
 @pytest.mark.parametrize("part", ["armature", "body", "cube"])

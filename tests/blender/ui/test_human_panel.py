@@ -320,11 +320,16 @@ def linked(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "given"), [("duplicate_human", {}), ("delete_human", {}), ("reshape", {"to": "GENERATED"})]
+    ("name", "given", "way"),
+    [
+        ("duplicate_human", {}, "Make Local"),
+        ("delete_human", {}, "Unlink"),
+        ("reshape", {"to": "GENERATED"}, "Make Local"),
+    ],
 )
-def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name, given):
+def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name, given, way):
     linked(tmp_path)
-    with refused(RuntimeError, "linked"):
+    with refused(RuntimeError, "Human", "linked", way):
         getattr(ops, name)(**given)
 
 

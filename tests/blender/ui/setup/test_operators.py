@@ -158,13 +158,6 @@ def test_a_folder_that_is_none_is_rejected(wheels, folder):
         press.set_up_backend(choose=True, directory=folder)
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
-def test_a_pipe_among_the_wheels_is_named(wheels):
-    os.mkfifo(wheels / "tensorflow.whl")
-    with refused(RuntimeError, "tensorflow.whl"):
-        press.set_up_backend(choose=True, directory=str(wheels))
-
-
 def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypatch):
     ours = write_lock(tmp_path / "ours.txt", [write_wheel(tmp_path / "elsewhere", "torch", "")])
     monkeypatch.setattr(known, "available", lambda: {"cpu": ours})

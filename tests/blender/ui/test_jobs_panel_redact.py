@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 import pytest
 
-from blender_primdiffusion.backend.redact import redact
+from blender_primdiffusion.ui.jobs_panel import redact
 
 pytestmark = pytest.mark.any_blender
 
