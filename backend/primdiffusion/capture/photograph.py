@@ -182,7 +182,8 @@ def _person_box(path: Path, mask: UInt8[np.ndarray, "H W"]) -> tuple[tuple[int, 
     """Left, top, right, bottom of the person in the mask, and the mask's factor 0 or 1 [H, W] or [1, 1]."""
     block = math.ceil(max(mask.shape) / MASK_SIDE)
     small = mask[::block, ::block] > 127
-    labels, count = ndimage.label(small, np.ones((3, 3)))
+    labels = np.empty(small.shape, np.int32)
+    count = ndimage.label(small, np.ones((3, 3)), output=labels)
     if not count:
         raise FileError(path, "shows nobody: no pixel of the mask is set", "mark the person, white or opaque")
     areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]

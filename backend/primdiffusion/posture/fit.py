@@ -147,7 +147,8 @@ class PostureFit:
         sideways = before[:, :2] * log_depth.exp()[:, None] + SIDEWAYS_STD_M * self._move[:, :2]
         place = torch.cat([sideways, (before[:, 2] * (log_depth + log_focal).exp())[:, None]], 1)
         pelvis = ((place - extrinsics[:, :, 3])[:, None] @ extrinsics[:, :, :3])[:, 0]
-        betas = self._shapes.bias + self._shapes.scale @ self._shape
+        limit = torch.maximum(self._shapes.limit, start.betas.abs())
+        betas = (self._shapes.bias + self._shapes.scale @ self._shape).clamp(-limit, limit)
         rotation = start.pose.joint_rotation @ axis_angle_to_matrix(self._turn * self._joint_std)
         pose = BodyPose(rotation, pelvis - default_body().shape(betas).joints[0])
         focal = start.camera.intrinsics[..., :2] * log_focal.exp()[:, None, None]

@@ -96,6 +96,14 @@ def test_what_pictures_do_not_show_stays_where_it_was():
     assert (joints_px(fit.posture()) - joints_px(true)).norm(dim=-1).max() < 1.0
 
 
+def test_shapes_stay_within_those_of_people():
+    true = a_posture()
+    tall = [dataclasses.replace(target, rgba=np.ones_like(target.rgba)) for target in seen(true)]
+    fit = PostureFit(true, STANDARD_SHAPES)
+    fit.refine(PAYLOAD, tall, Stage(60, 0.1))
+    assert fit.posture().betas.abs().max() <= STANDARD_SHAPES.limit.max()
+
+
 def test_an_exception_cancels():
     true = a_posture()
 
