@@ -17,8 +17,6 @@ from ..scene.human import armature_of, human_of
 from .declared import SKIP
 from .drawing import BackendPanel, draw_job, property_columns
 
-PAGE = "pictures"
-
 
 class PRIMDIFFUSION_PG_picture(bpy.types.PropertyGroup):
     """`scene.primdiffusion_picture`."""
@@ -67,8 +65,7 @@ class PRIMDIFFUSION_OT_choose_picture(Reporting, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
-    """Make the human in the picture of the scene's camera. Its pose is found from the selected human, posed over the
-    picture and hidden then, or from a standing one"""
+    """Make the human in the picture of the scene's camera, in a pose found from the selected human's or from standing"""
 
     bl_idname = "primdiffusion.human_from_picture"
     bl_label = "Human from Picture"
@@ -90,7 +87,7 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
         if properties.only_fit:
             return "Refine pose and shape of the selected human, and the camera, until they match the picture"
-        return " ".join((cls.__doc__ or "").split())
+        return cls.__doc__ or ""
 
     def act(self, context: bpy.types.Context) -> set[str]:
         separate()
@@ -119,7 +116,7 @@ class PRIMDIFFUSION_PT_human_from_picture(BackendPanel, bpy.types.Panel):
     bl_label = "Human from Picture"
     bl_order = 2
     bl_options = {"DEFAULT_CLOSED"}
-    manual_page = PAGE
+    manual_page = "picture"
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, asked = property_columns(self.layout), context.scene.primdiffusion_picture
@@ -130,7 +127,7 @@ class PRIMDIFFUSION_PT_human_from_picture(BackendPanel, bpy.types.Panel):
         column = layout.column()
         column.prop(asked, "mask")
         column.prop(asked, "seed")
-        missing = "" if image is not None else "The scene's camera has no picture."
+        missing = "" if image is not None else "Choose a picture first."
         reason = missing or ("" if person is not None else "Select a human posed over the picture to fit it.")
         fit = draw_job(layout, "fit_picture", "primdiffusion.human_from_picture", "SNAP_ON", reason, text="Fit")
         fit.only_fit = True
