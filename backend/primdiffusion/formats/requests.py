@@ -231,8 +231,8 @@ class Pictures:
     masks: tuple[Path, ...] = ()
     """A mask for each picture, of its size: opaque or white where the person is; pictures with alpha need none."""
     pose: Path | None = None
-    """Pose file: one pose for each picture or one for all (.json, .npz, .npy), or a posture.json; without it, the
-    person is taken to stand upright, facing the camera."""
+    """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl), or a posture.json; without
+    it, the person is taken to stand upright, facing the camera."""
     cameras: Path | None = None
     """Cameras of the pictures, as a cameras.json of captures; without it, the lens is that of the EXIF data or a usual
     one, and the distance follows from the person's size in the picture."""
