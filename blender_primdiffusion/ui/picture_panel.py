@@ -65,7 +65,7 @@ class PRIMDIFFUSION_OT_choose_picture(Reporting, bpy.types.Operator):
 
 
 class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
-    """Make the human in the picture; the search for its pose begins with that of the selected human, or with standing"""
+    """Make the human in the picture; the search for its pose starts from the selected human's, or from standing"""
 
     bl_idname = "primdiffusion.human_from_picture"
     bl_label = "Human from Picture"
