@@ -43,6 +43,10 @@ SOURCES = {
         "From one view, by the person prior",
         "benchmarks/from_pictures.py --assets DIR --json docs/results/from_pictures.json",
     ),
+    "plain_pictures": (
+        "From one plain picture, whose pose and camera are refined",
+        "benchmarks/plain_pictures.py --assets DIR --json docs/results/plain_pictures.json",
+    ),
     "encoder_paper_form": (
         "The paper's Table 3 in the paper's own form",
         "benchmarks/encoder_paper_form.py --train DIR --novel DIR --out DIR "

@@ -32,7 +32,7 @@ COMMANDS = {
     "interpolate": ("commands.edit:run", "Interpolate between two humans"),
     "inpaint": ("commands.edit:run", "Resample a region of a human: other clothes or hair"),
     "transfer": ("commands.edit:run", "Copy the appearance of a region from another human"),
-    "reconstruct": ("commands.reconstruct:run", "Reconstruct a human from captures: images from several sides"),
+    "reconstruct": ("commands.reconstruct:run", "Reconstruct a human from one picture, or from captures"),
     "refine": ("commands.reconstruct:run_refine", "Optimise a captured human to match the images"),
     "render": ("commands.render:run", "Render a human in a pose"),
     "view": ("commands.view:run", "Show a human in a browser, with sliders for the pose"),

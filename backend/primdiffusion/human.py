@@ -185,6 +185,13 @@ def frames_of(
     return _frames(human, pose_body(human.betas, pose, body).vertices, body, anchors)
 
 
+def default_frames(betas: Float[Tensor, "n"], pose: BodyPose) -> Frames:
+    """As `frames_of` for a human of this shape on the default body; differentiable in both."""
+    body, anchors = default_body(), default_anchors()
+    vertices = pose_body(betas, pose).vertices
+    return stretched(attach(anchors, vertices, body.faces), anchors, vertices, body.shape(betas).vertices)
+
+
 def place_skinned(
     human: Human,
     skinning: Float[Tensor, "24 r 4"],

@@ -10,6 +10,7 @@ pictures (`render.inverse`), which keeps the others close to that human.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -21,13 +22,14 @@ from torch import Tensor
 
 from primdiffusion import __version__
 from primdiffusion.capture.conditioning import CapturedPerson
+from primdiffusion.capture.dataset import Views
 from primdiffusion.diffusion.codec import VOXEL_VALUES, CellCodec, LinearCodec, payload_from_cells
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.geometry.srgb import decode_srgb
-from primdiffusion.human import Human, frames_of, made_by
+from primdiffusion.human import Human, default_frames, made_by
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.render.cpu_linear import apply_to_codes
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
@@ -60,83 +62,129 @@ def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
 
 
 def reconstruct_by_prior(
-    model: DiffusionModel, person: CapturedPerson, on_step: Callable[[int, int], None] | None = None
+    model: DiffusionModel,
+    person: CapturedPerson,
+    on_step: Callable[[int, int], None] | None = None,
+    seed: int | None = None,
 ) -> Human:
-    """Reconstruct the subject from one or more views, on the CPU; deterministic for a model and views.
+    """Reconstruct the subject from one or more views, on the CPU; deterministic for a model, views and seed.
 
+    With a seed, what no view shows is drawn from what is probable given the views, instead of the most probable.
     `on_step` is called with the number of completed steps and of all; an exception that it raises cancels.
 
     Raises ValueError if the model has no person components, or is of another body than the default one.
     """
-    if not isinstance(model.denoiser, PersonDenoiser) or not isinstance(model.codec, CellCodec):
-        raise ValueError("the model has no person components: give a checkpoint of the default architecture")
-    if model.body_setup is not None:
-        raise ValueError(
-            f"the model belongs to the body {model.body_setup.files.smpl.path}: give one of the default body"
-        )
-    prior, codec = model.denoiser.prior.to("cpu"), model.codec.codec.to("cpu")
+    components = PersonComponents.of(model)
+    frames = [default_frames(person.betas, person.views.pose)] * len(person.views.rgba)
+    done = itertools.count(1)
 
-    def payload_of(coefficients: Float[Tensor, "r"]) -> Payload:
-        latents = prior.mean + prior.picture(coefficients[None])
-        return payload_from_cells(codec.decode(latents)[0], model.full_density, codec.zone)
-
-    def report(done: int) -> None:
+    def report() -> None:
         if on_step is not None:
-            on_step(done, STEPS + 1)
+            on_step(next(done), STEPS + 1)
 
-    coefficients = torch.zeros(len(prior.basis))
-    human = Human(payload_of(coefficients), person.betas, {**_origin(person), **made_by(model)})
-    frames = frames_of(human, person.views.pose)
-    targets = targets_of(person, frames, COARSE_SIDE)
-    for step in range(STEPS):
-        coefficients = _gauss_newton(coefficients, prior, codec, model.full_density, targets)
-        report(step + 1)
-    payload = fit_payload(payload_of(coefficients), targets_of(person, frames, FINE_SIDE), model.full_density)
-    report(STEPS + 1)
-    return dataclasses.replace(human, payload=payload).validate()
+    generator = None if seed is None else torch.Generator().manual_seed(seed)
+    payload = components.fit(person.views, frames, components.mean, report, generator)
+    drawn = {} if seed is None else {"seed": seed}
+    return Human(payload, person.betas, {**_origin(person), **drawn, **made_by(model)}).validate()
 
 
-def _gauss_newton(
-    coefficients: Float[Tensor, "r"],
-    prior: PersonPrior,
-    codec: LinearCodec,
-    full_density: float,
-    targets: Sequence[TargetImage],
-) -> Float[Tensor, "r"]:
-    """The posterior mean of person coefficients, for pictures linearised at `coefficients`."""
-    cells = codec.decode(prior.mean + prior.picture(coefficients[None]))[0].requires_grad_()
-    payload = payload_from_cells(cells, full_density, codec.zone)
-    # Each colour and density depends on its own value of the cells, so the gradient of their sum has all derivatives.
-    (by_cell,) = torch.autograd.grad(payload.rgb.sum() + payload.density.sum(), cells)
-    slope = by_cell[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1).numpy()
-    payload, region = payload.map(Tensor.detach), codec.region.numpy()
-    basis = codec.voxel_basis(prior.basis.shape[1] // K).contiguous().numpy()
-    codes = prior.basis.unflatten(1, (-1, K)).permute(2, 1, 0).contiguous().numpy()
-    precision, vector = torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis))
-    for target in targets:
-        view = LinearisedView.of(target, payload, InverseSettings())
-        seen = np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0
-        matrix = apply_to_codes(view.jacobian, slope, basis, region, codes, view.alpha_free)[seen]
-        matrix = torch.from_numpy(matrix).flatten(0, 1)
-        weight = torch.from_numpy(view.weight[seen]).flatten() * (OBSERVATIONS / PIXEL_STD**2)
-        weighted = matrix.mT * weight
-        precision += weighted @ matrix
-        vector += weighted @ (torch.from_numpy(view.residual[seen]).flatten() + matrix @ coefficients)
-    return prior.posterior_mean(precision, vector)
+@dataclasses.dataclass(frozen=True)
+class PersonComponents:
+    """The person components of a diffusion model, and their prior."""
+
+    prior: PersonPrior
+    codec: LinearCodec
+    full_density: float
+
+    @classmethod
+    def of(cls, model: DiffusionModel) -> PersonComponents:
+        """Those of a model; ValueError if it has none, or is of another body than the default one."""
+        if not isinstance(model.denoiser, PersonDenoiser) or not isinstance(model.codec, CellCodec):
+            raise ValueError("the model has no person components: give a checkpoint of the default architecture")
+        if model.body_setup is not None:
+            raise ValueError(
+                f"the model belongs to the body {model.body_setup.files.smpl.path}: give one of the default body"
+            )
+        return cls(model.denoiser.prior.to("cpu"), model.codec.codec.to("cpu"), model.full_density)
+
+    @property
+    def mean(self) -> Float[Tensor, "r"]:
+        """Coefficients of the mean human."""
+        return torch.zeros(len(self.prior.basis))
+
+    def payload(self, coefficients: Float[Tensor, "r"]) -> Payload:
+        """Decode."""
+        latents = self.prior.mean + self.prior.picture(coefficients[None])
+        return payload_from_cells(self.codec.decode(latents)[0], self.full_density, self.codec.zone)
+
+    def fit(
+        self,
+        views: Views,
+        frames: Sequence[Frames],
+        coefficients: Float[Tensor, "r"],
+        on_step: Callable[[], None],
+        generator: torch.Generator | None = None,
+    ) -> Payload:
+        """The human in views with these frames: STEPS steps from `coefficients`, then voxels; `on_step` after each.
+
+        With a generator, coefficients are drawn from their distribution given the views, instead of its mean: what no
+        view shows varies with it.
+        """
+        targets = targets_of(views, frames, COARSE_SIDE)
+        for step in range(STEPS):
+            drawn_by = generator if step == STEPS - 1 else None
+            coefficients = self.closer(coefficients, targets, drawn_by)
+            on_step()
+        payload = fit_payload(self.payload(coefficients), targets_of(views, frames, FINE_SIDE), self.full_density)
+        on_step()
+        return payload
+
+    def closer(
+        self,
+        coefficients: Float[Tensor, "r"],
+        targets: Sequence[TargetImage],
+        generator: torch.Generator | None = None,
+    ) -> Float[Tensor, "r"]:
+        """The posterior mean of coefficients, or a draw, for pictures linearised at `coefficients`: a step of
+        Gauss-Newton.
+        """
+        prior, codec = self.prior, self.codec
+        cells = codec.decode(prior.mean + prior.picture(coefficients[None]))[0].requires_grad_()
+        payload = payload_from_cells(cells, self.full_density, codec.zone)
+        # Each colour and density depends on its own value of the cells, so the gradient of their sum has all
+        # derivatives.
+        (by_cell,) = torch.autograd.grad(payload.rgb.sum() + payload.density.sum(), cells)
+        slope = by_cell[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1).numpy()
+        payload, region = payload.map(Tensor.detach), codec.region.numpy()
+        basis = codec.voxel_basis(prior.basis.shape[1] // K).contiguous().numpy()
+        codes = prior.basis.unflatten(1, (-1, K)).permute(2, 1, 0).contiguous().numpy()
+        precision, vector = torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis))
+        for target in targets:
+            view = LinearisedView.of(target, payload, InverseSettings())
+            seen = np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0
+            matrix = apply_to_codes(view.jacobian, slope, basis, region, codes, view.alpha_free)[seen]
+            matrix = torch.from_numpy(matrix).flatten(0, 1)
+            weight = torch.from_numpy(view.weight[seen]).flatten() * (OBSERVATIONS / PIXEL_STD**2)
+            weighted = matrix.mT * weight
+            precision += weighted @ matrix
+            vector += weighted @ (torch.from_numpy(view.residual[seen]).flatten() + matrix @ coefficients)
+        if generator is None:
+            return prior.posterior_mean(precision, vector)
+        return prior.posterior_sample(precision, vector, generator)
 
 
-def targets_of(person: CapturedPerson, frames: Frames, largest: int) -> list[TargetImage]:
+def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[TargetImage]:
     """The views as linear pictures with sides of at most `largest` pixels, averaged over blocks."""
     targets = []
-    for number, rgba in enumerate(person.views.rgba.cpu()):
-        camera = person.views.camera.to("cpu").map(lambda values, number=number: values[number])
+    for number, (rgba, boxes) in enumerate(zip(views.rgba.cpu(), frames, strict=True)):
+        camera = views.camera.to("cpu").map(lambda values, number=number: values[number])
         picture = torch.cat([decode_srgb(rgba[..., :3].float() / 255), rgba[..., 3:].float() / 255], -1)
         block = math.ceil(max(camera.width, camera.height) / largest)
         height, width = camera.height // block, camera.width // block
         picture = picture[: height * block, : width * block].unflatten(1, (width, block)).unflatten(0, (height, block))
         intrinsics = torch.cat([camera.intrinsics[:2] / block, camera.intrinsics[2:]])
         camera = dataclasses.replace(camera, intrinsics=intrinsics, width=width, height=height)
-        targets.append(TargetImage(frames, camera, picture.mean((1, 3)).numpy()))
+        targets.append(TargetImage(boxes, camera, picture.mean((1, 3)).numpy()))
     return targets
 
 

@@ -33,6 +33,7 @@ from . import (
     jobs_panel,
     manual,
     motion_panel,
+    picture_panel,
     pose_panel,
     preferences,
     reconstruct_panel,
@@ -47,9 +48,9 @@ from . import (
 MODULES = (
     *backend_state.MODULES, preferences, windows, follow, jobs_panel, attributes,
     generate_panel, variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, copies,
-    deferred_volumes, import_motion, motion_panel, handle_operators, pose_panel, asset_operators, render_operators,
-    render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings, captures_panel,
-    reconstruct_panel, viewport_humans, picture_in_view, batch, manual, stand_in,
+    deferred_volumes, import_motion, motion_panel, handle_operators, pose_panel, picture_panel, asset_operators,
+    render_operators, render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
+    captures_panel, reconstruct_panel, viewport_humans, picture_in_view, batch, manual, stand_in,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

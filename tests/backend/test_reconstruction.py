@@ -54,7 +54,7 @@ def test_smaller_pictures_are_what_their_cameras_see():
     human = human_of(COLOURS)
     person = captured(human, BodyPose.rest(), [0.3])
     for largest, size in ((128, (128, 96)), (64, (64, 48)), (50, (42, 32))):
-        (target,) = targets_of(person, frames_of(human), largest)
+        (target,) = targets_of(person.views, [frames_of(human)], largest)
         seen = march(place(human), target.camera)
         drawn = torch.cat([seen.rgb, seen.alpha[..., None]], -1)
         assert (target.camera.height, target.camera.width) == drawn.shape[:2] == size

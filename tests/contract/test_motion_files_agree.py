@@ -12,11 +12,13 @@ from primdiffusion.pose_file import read_pose
 from support.errors import refused
 
 from blender_primdiffusion.motion import files
+from blender_primdiffusion.motion.rotation import from_axis_angle
 
 FRAMES = 4
 RNG = np.random.default_rng(1)
 WHOLE = RNG.normal(0, 0.3, (FRAMES, 165))
 MOVE = RNG.normal(0, 1, (FRAMES, 3))
+MATRICES = from_axis_angle(WHOLE[:, :72].reshape(FRAMES, 24, 3))
 
 
 def lying(turn: tuple[float, float, float], numbers: int) -> np.ndarray:
@@ -38,6 +40,9 @@ FILES = {
     "without_root.npz": {"body_pose": WHOLE[:, 3:72]},
     "no_hands.npz": {"poses": WHOLE[:, :66]},
     "whole.npz": {"fullpose": WHOLE, "transl": MOVE[:1]},
+    "matrices.npz": {"poses": MATRICES, "transl": MOVE},
+    "matrices_by_parts.npz": {"global_orient": MATRICES[:, 0], "body_pose": MATRICES[:, 1:]},
+    "matrices_with_a_root_of_one_joint.npz": {"global_orient": MATRICES[:, :1], "body_pose": MATRICES[:, 1:22]},
 }
 
 
@@ -56,11 +61,17 @@ def test_both_programs_read_the_same_motion(tmp_path, name):
 
 def test_matrices_are_not_taken_for_axis_angle_numbers(tmp_path):
     np.savez(tmp_path / "a.npz", poses=np.tile(np.eye(3), (FRAMES, 24, 1, 1)))
-    assert np.allclose(files.read_motion(tmp_path / "a.npz").rotations, np.eye(3))
-    with refused(poses.MotionFileError, "matrices"):
-        poses.read_motion(tmp_path / "a.npz")
     with refused(ValueError, "axis-angle"):
         read_pose(tmp_path / "a.npz")
+
+
+def test_matrices_that_are_no_rotations_are_refused_by_both(tmp_path):
+    stretched = np.array(MATRICES)
+    stretched[1, 16] *= 1.1
+    np.savez(tmp_path / "a.npz", poses=stretched)
+    for reader in (files.read_motion, poses.read_motion):
+        with refused(ValueError, "a.npz", "left_shoulder", "frame 1"):
+            reader(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize("name", ["amass_smplh_without_a_rate.npz", "no_hands.npz", "amass_smpl.npz"])

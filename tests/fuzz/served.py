@@ -77,6 +77,10 @@ CALLS: dict[str, dict[str, Any]] = {
         "capture": "captures", "out_dir": "made", "subject": None, "frame": 0, "views": 2,
         "checkpoint": "encoder.safetensors", "size": 16,
     },
+    "fit_posture": {
+        "pictures": ["anna.png"], "masks": ["mask.png"], "pose": "pose.json", "cameras": "cameras.json",
+        "out_dir": "made", "checkpoint": "tiny.safetensors",
+    },
     "render": {
         "human": "a.human.safetensors", "out": "made/x.png", "width": 16, "height": 16, "yaw": 0.5, "pose": "pose.json",
         "depth": "made/depth.png",

@@ -11,10 +11,13 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyPose, J, default_body
+from primdiffusion.body.smpl_pickle import as_array, load_restricted
 from primdiffusion.formats.arrays import ArrayFileError, all_finite, read_npy, read_numbers
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.motion_size import MotionTooLongError, check_motion_size
-from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.rotations import first_improper, improper_text
+from primdiffusion.geometry.rotation import axis_angle_to_matrix, matrix_to_axis_angle
 from primdiffusion.pose_file import body_theta, reject_matrices
 
 POSES, ROOT, REST = ("poses", "pose", "theta", "fullpose"), ("global_orient", "root_orient"), ("body_pose", "pose_body")
@@ -26,6 +29,8 @@ MOST_CANDIDATES = 2000
 """Frames to choose from; longer motions are subsampled evenly."""
 FRAMES_AT_ONCE = 4096
 """Frames whose rotations are made at once: in float64 that takes several times their memory."""
+LARGEST_PICKLE = 64 * 2**20
+"""Bytes of a .pkl."""
 BUILT_IN = Path(__file__).parent / "data" / "poses.json"
 """The extension's poses, 72 axis-angle values by name; made by scripts/bake_poses."""
 
@@ -44,14 +49,18 @@ def read_motion(path: str | Path) -> BodyPose:
     """Read all frames of a file: rotations [F, 24, 3, 3], translations [F, 3] in metres, y up.
 
     .npz of AMASS, of "poses" or "pose" [F, 72 or more], or of "global_orient" and "body_pose"; .npy or .json of the
-    same. Hands of SMPL-H and SMPL-X are dropped (`pose_file.body_theta`). AMASS files ("trans" with "poses" or
+    same; .pkl, a dictionary of such arrays as estimators of SMPL write it. Numbers of axis-angle, or matrices. Hands of
+    SMPL-H and SMPL-X are dropped (`pose_file.body_theta`). AMASS files ("trans" with "poses" or
     "pose_body") are rotated so that y is up. The extension, which cannot import the backend, has its own reader; a test
     compares both. Raises FileNotFoundError, ArrayFileError or MotionFileError.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"the pose file {path} does not exist: check the path")
-    content = read_numbers(path, (), KEYS) if path.suffix == ".npz" else _read_plain(path)
+    if path.suffix == ".pkl":
+        content = _read_pickle(path)
+    else:
+        content = read_numbers(path, (), KEYS) if path.suffix == ".npz" else _read_plain(path)
     try:
         check_motion_size(path, max((values.size for values in content.values()), default=0))
     except MotionTooLongError as e:
@@ -123,6 +132,17 @@ def _as_pose(turns: NDArray, translation: NDArray) -> BodyPose:
     return BodyPose(rotation, torch.from_numpy(np.array(translation, np.float32)))
 
 
+def _read_pickle(path: Path) -> dict[str, NDArray]:
+    """The arrays of a pickled dictionary, read without executing code from it."""
+    try:
+        content = load_restricted(read_regular(path, LARGEST_PICKLE), str(path))
+        if not isinstance(content, dict):
+            raise ValueError(f"it contains a {type(content).__name__}")
+        return {key: np.asarray(as_array(content[key]), np.float64) for key in KEYS if key in content}
+    except (ValueError, TypeError, OSError) as e:
+        raise MotionFileError(f"{path} is not a pickled dictionary of poses ({e!s:.160}): save it as .npz") from e
+
+
 def _read_plain(path: Path) -> dict[str, NDArray]:
     try:
         if path.suffix == ".npy":
@@ -157,15 +177,22 @@ def _rows(rest: NDArray | None, root: NDArray | None, poses: NDArray | None) -> 
         if poses is None:
             raise ValueError("it has no array with a known name")
         return _frames(poses)
-    body = _frames(rest)
+    body = _frames(rest, joints_before=1)
     turn = np.zeros(3) if root is None else np.asarray(root, np.float64)
+    if turn.ndim > 2 and turn.shape[-2:] == (3, 3):
+        turn = _frames(turn.reshape(-1, 1, 3, 3))
     if turn.size not in (3, 3 * len(body)):
         raise ValueError(f"global_orient of shape {turn.shape} for {len(body)} frames")
     return np.concatenate([np.broadcast_to(turn.reshape(-1, 3), (len(body), 3)), body], axis=1)
 
 
-def _frames(values: NDArray) -> NDArray[np.float64]:
+def _frames(values: NDArray, joints_before: int = 0) -> NDArray[np.float64]:
+    """Axis-angle numbers [F, n] of those, or of matrices. Raises ValueError for matrices that are no rotations."""
     values = np.asarray(values, np.float64)
+    if values.ndim == 4 and values.shape[-2:] == (3, 3):
+        if improper := first_improper(values):
+            raise ValueError(improper_text(improper[0], improper[1] + joints_before))
+        return matrix_to_axis_angle(torch.from_numpy(values)).flatten(1).numpy()
     reject_matrices(values)
     values = values[None] if values.ndim == 1 or (values.ndim == 2 and values.shape[1] == 3) else values
     return values.reshape(len(values), -1)

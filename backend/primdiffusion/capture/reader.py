@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -314,12 +314,23 @@ def _read_views(folder: Path) -> list[View]:
         raise FileNotFoundError(f"{path} is missing: render the subject again") from None
     except (OSError, ValueError) as e:
         raise FileError(path, f"cannot be read ({e!s:.160})", "render the subject again") from e
+    views = views_in(named, path, lambda camera: _size(folder, camera))
+    if not views:
+        raise FileError(path, "contains no camera", "render the subject again")
+    return views
+
+
+def views_in(named: Any, path: Path, size: Callable[[int], tuple[int, int]]) -> list[View]:
+    """The cameras of {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}; `size` gives width and height by number.
+
+    Raises FileError, which names `path`, and what `size` raises.
+    """
     views = []
     try:
         for camera in range(len(named)):
             about = named[f"camera{camera:04d}"]
             k, r, t = (np.asarray(about[key], np.float64) for key in ("K", "R", "T"))
-            width, height = _size(folder, camera, k)
+            width, height = size(camera)
             t = t.reshape(3)
             if k.shape != (3, 3) or r.shape != (3, 3) or not all(map(all_finite, (k, r, t))):
                 raise ValueError(f"camera {camera} is not finite, or its shapes are not K 3x3, R 3x3, T 3")
@@ -330,12 +341,10 @@ def _read_views(folder: Path) -> list[View]:
         if isinstance(e, FileError):
             raise
         raise FileError(path, f"is not a list of cameras ({e!s:.160})", "render the subject again") from e
-    if not views:
-        raise FileError(path, "contains no camera", "render the subject again")
     return views
 
 
-def _size(folder: Path, camera: int, intrinsics: np.ndarray) -> tuple[int, int]:
+def _size(folder: Path, camera: int) -> tuple[int, int]:
     """Width and height of a camera's images, from the header of the first."""
     for kind in ("img", "mask"):
         pictures = sorted((folder / kind / f"camera{camera:04d}").glob(f"[0-9]*{capture_layout.ENDINGS[kind]}"))

@@ -1,4 +1,4 @@
-"""Reconstruct a human from captures, and refine it: `reconstruct` and `refine`, `reconstruct` also of JSON-RPC."""
+"""Reconstruct a human, and refine it on captures: `reconstruct` and `refine`, `reconstruct` also of JSON-RPC."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from primdiffusion.capture.conditioning import (
     default_betas,
 )
 from primdiffusion.capture.reader import Captures
+from primdiffusion.commands.from_pictures import reconstruct_pictures
 from primdiffusion.commands.options import RefineCommand
 from primdiffusion.commands.output import FILES, write_human
 from primdiffusion.commands.progress import ReportProgress, progress_bar
@@ -47,6 +48,9 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
 
     Raises OSError first of all if the folder cannot be written to; raises as captured_person and load_encoder.
     """
+    if request.pictures:
+        return reconstruct_pictures(request, session, report)
+    assert request.capture is not None, "checked by the request"
     began = time.perf_counter()
     with staged(request.out_dir) as folder:
         report("load", 0, STAGES, None)
@@ -59,7 +63,8 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
         if isinstance(model, EncoderModel):
             human = reconstruct_human(model, person)
         else:
-            human = reconstruct_by_prior(model, person, lambda done, total: report("fit", done, total, None))
+            on_step = lambda done, total: report("fit", done, total, None)  # noqa: E731
+            human = reconstruct_by_prior(model, person, on_step, request.seed)
         encoded = time.perf_counter()
         report("write", 3, STAGES, None)
         write_human(folder, human, request.size)
@@ -82,6 +87,9 @@ def run(request: ReconstructRequest) -> None:
         answer = reconstruct(request, Session(), report)
     for warning in answer.warnings:
         print(f"primdiffusion: warning: {warning}", file=sys.stderr)
+    if request.pictures:
+        print(f"{request.out_dir}  {len(request.pictures)} pictures, {answer.seconds:.1f} s")
+        return
     seconds = f"{answer.seconds:.1f} s, of which the {request.by} {answer.seconds_encoding:.1f} s"
     print(f"{request.out_dir}  {answer.subject}, frame {answer.frame}, {len(answer.views or ())} views, {seconds}")
 

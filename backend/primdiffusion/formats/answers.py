@@ -45,6 +45,19 @@ class ReconstructAnswer(HumanAnswer):
     views: list[Count] | None = None
     """Numbers of the cameras."""
     seconds_encoding: Seconds | None = None
+    posture: Path | None = None
+    """posture.json: pose, shape and cameras in pictures; None for captures."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitPostureAnswer(Open):
+    """A refined posture."""
+
+    posture: Path
+    """posture.json."""
+    seconds: Seconds
+    warnings: list[str]
+    """Sentences."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -228,6 +241,7 @@ ANSWERS: dict[str, type] = {
     "variations": VariationsAnswer,
     "attributes": AttributesAnswer,
     "reconstruct": ReconstructAnswer,
+    "fit_posture": FitPostureAnswer,
     "render": RenderAnswer,
     "draw": DrawAnswer,
     "merge": MergeAnswer,

@@ -31,8 +31,9 @@ SIDED_PARTS = (
 PARTS = (*WHOLE_PARTS, *SIDED_PARTS)
 """Body parts that regions consist of."""
 Making = Literal["fitted", "from_mesh"]
-Reconstruction = Literal["encoder", "prior"]
 """How payloads are made: fitted to renders of the mesh, or with the colours of the nearest surface point."""
+Reconstruction = Literal["encoder", "prior"]
+"""How views become a human."""
 PASSES = ("img", "mask", "depth", "normal", "part")
 """Images of a captured view."""
 LAYOUTS = ("nerf", "opencv", "colmap")
@@ -222,14 +223,36 @@ class TransferRequest(RegionRequest):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ReconstructRequest(Previews):
-    """Reconstruct a human from captures: person.human.safetensors and previews.
+class Pictures:
+    """Fields of requests that take plain pictures of one person."""
 
-    Views are those of one frame; nothing is trained for a subject. Captures are those of
-    `primdiffusion captures`, of Blender's Render Captures, or a dataset in the released code's layout.
+    pictures: Annotated[tuple[Path, ...], Option(positional=True)] = ()
+    """PNG or JPEG files of one person, who is marked by alpha or by `masks`."""
+    masks: tuple[Path, ...] = ()
+    """A mask for each picture, of its size: opaque or white where the person is; pictures with alpha need none."""
+    pose: Path | None = None
+    """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl), or a posture.json; without
+    it, the person is taken to stand upright, facing the camera."""
+    cameras: Path | None = None
+    """Cameras of the pictures, as a cameras.json of captures; without it, the lens is that of the EXIF data or a usual
+    one, and the distance follows from the person's size in the picture."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ReconstructRequest(Previews, Pictures):
+    """Reconstruct a human from plain pictures or from captures: person.human.safetensors and previews.
+
+    One picture is enough. Pose, shape and cameras are refined, starting from files or from a standing body, and are
+    written to posture.json; what no picture shows is guessed. From captures, whose poses and cameras are known, views
+    are those of one frame: captures of `primdiffusion captures`, of Blender's Render Captures, or a dataset in the
+    released code's layout. Nothing is trained for a person.
     """
 
-    capture: Path
+    refine: bool = True
+    """Whether pose, shape and cameras of pictures are refined; otherwise a pose file and cameras are needed."""
+    seed: Seed | None = None
+    """Draws what no picture shows; without it, that is the most probable."""
+    capture: Path | None = None
     """Folder of a capture dataset, or of one subject in it."""
     subject: str | None = None
     """Name of the subject; not needed if there is only one."""
@@ -239,9 +262,32 @@ class ReconstructRequest(Previews):
     """Number of cameras, spread around the human; all if there are fewer."""
     by: Reconstruction = "encoder"
     """encoder: a network turns several views into a human within seconds; prior: the human is fitted to the views, and
-    what they do not show is the most probable for the diffusion model, so one view is enough."""
+    what they do not show is the most probable for the diffusion model, so one view is enough, as for pictures."""
     checkpoint: Path | None = None
-    """Trained encoder, or diffusion model for `by` prior (.safetensors); the default is the one in the package."""
+    """Trained encoder, or diffusion model for `by` prior and for pictures (.safetensors); the default is the one in the
+    package."""
+
+    def check(self) -> None:
+        """Raise FieldError unless there is either a capture or at least one picture."""
+        if bool(self.pictures) == (self.capture is not None):
+            raise FieldError(("capture",), "and pictures exclude each other: give a folder of captures, or pictures")
+        if self.seed is not None and not self.pictures and self.by != "prior":
+            raise FieldError(("seed",), "has no effect on the encoder: leave it out, or reconstruct by prior")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FitPostureRequest(Pictures):
+    """Refine pose, shape and cameras of the person in pictures."""
+
+    out_dir: OutDir
+    """Output folder, for posture.json."""
+    checkpoint: Path | None = None
+    """Trained diffusion model (.safetensors); the default is the one in the package."""
+
+    def check(self) -> None:
+        """Raise FieldError without a picture."""
+        if not self.pictures:
+            raise FieldError(("pictures",), "is empty: give at least one")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -433,6 +479,7 @@ REQUESTS: dict[str, type] = {
     "inpaint": InpaintRequest,
     "transfer": TransferRequest,
     "reconstruct": ReconstructRequest,
+    "fit_posture": FitPostureRequest,
     "render": RenderRequest,
     "draw": DrawRequest,
     "merge": MergeRequest,

@@ -60,6 +60,7 @@ FUNCTIONS = {
     "inpaint": "edit:edit",
     "transfer": "edit:edit",
     "reconstruct": "reconstruct:reconstruct",
+    "fit_posture": "from_pictures:fit_posture",
     "render": "render:render",
     "draw": "render:draw",
     "merge": "merge:merge",

@@ -1,6 +1,8 @@
 """Poses to capture people in."""
 
 import json
+import pickle
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -45,6 +47,20 @@ def test_every_form_of_file_is_the_same_motion(tmp_path):
     for path in sorted(tmp_path.iterdir()):
         assert_turns(read_motion(path))
     assert torch.equal(read_motion(tmp_path / "b.npz").translation, torch.ones(5, 3))
+
+
+def test_a_pickled_dictionary_is_the_same_motion_and_nothing_else_is_loaded(tmp_path):
+    theta = np.random.default_rng(2).normal(0, 0.3, (3, 72))
+    parts = {"global_orient": theta[:, :3], "body_pose": theta[:, 3:], "transl": np.ones((3, 3)), "betas": np.ones(10)}
+    (tmp_path / "a.pkl").write_bytes(pickle.dumps(parts))
+    np.savez(tmp_path / "a.npz", **parts)
+    pickled, plain = (read_motion(tmp_path / name) for name in ("a.pkl", "a.npz"))
+    assert torch.equal(pickled.joint_rotation, plain.joint_rotation)
+    assert torch.equal(pickled.translation, plain.translation)
+    for content in (pickle.dumps([1]), pickle.dumps(Path), b"nothing", pickle.dumps({"body_pose": "x"})):
+        (tmp_path / "b.pkl").write_bytes(content)
+        with refused(MotionFileError, "b.pkl"):
+            read_motion(tmp_path / "b.pkl")
 
 
 def test_one_pose_is_a_motion_of_one_frame(tmp_path):

@@ -67,6 +67,18 @@ def test_posterior_mean_of_white_noise_is_what_the_denoiser_gives(prior):
     assert torch.allclose(got, wanted, atol=1e-9)
 
 
+def test_posterior_samples_have_the_posterior_s_mean_and_follow_what_is_observed(prior):
+    precision = torch.diag(torch.tensor([2.0, 0.5, 0.0, 1e6], dtype=F64))
+    vector = torch.tensor([1.0, -0.3, 0.0, 0.7e6], dtype=F64)
+    generator = torch.Generator().manual_seed(5)
+    drawn = torch.stack([prior.posterior_sample(precision, vector, generator) for _ in range(4000)])
+    mean = prior.posterior_mean(precision, vector)
+    assert ((drawn.mean(0) - mean).abs() < 4 * drawn.std(0) / 4000**0.5 + 1e-6).all()
+    assert torch.allclose(drawn[:, 3], torch.tensor(0.7, dtype=F64), atol=0.01)
+    everything = prior.posterior_sample(torch.zeros(4, 4, dtype=F64), torch.zeros(4, dtype=F64), generator)
+    assert everything.shape == (4,)
+
+
 def test_samples_have_the_prior_s_moments(prior):
     z = prior.sample(60_000, torch.Generator().manual_seed(0))
     coefficients, rest = prior.split(z)

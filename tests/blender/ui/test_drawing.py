@@ -128,7 +128,7 @@ def test_no_button_is_grey_without_a_reason_in_the_panel(human, monkeypatch, tmp
             if button.grey:
                 grey.add(button.idname.removeprefix("primdiffusion."))
                 assert any(re.match(r"(Set up|Choose|Select|Wait)", text) for text in layout.texts), cls.__name__
-    always = {"transfer_texture", "blend"}
+    always = {"transfer_texture", "blend", "human_from_picture"}
     more = {
         "no backend": {"generate"},
         "one human": set(),

@@ -149,6 +149,29 @@ def open_human(params: dict) -> dict:
     return {"person": str(person)}
 
 
+def posture(params: dict) -> dict:
+    """What was given, or a T pose, with the left arm down, the pelvis moved, and a lens a tenth longer."""
+    path = Path(params["out_dir"]) / "posture.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if "pose" in params:
+        found = json.loads(Path(params["pose"]).read_text())
+    else:
+        cameras = json.loads(Path(params["cameras"]).read_text())
+        found = {"pose": [[0.0] * 72], "translation": [[0.0] * 3], "betas": [0.0] * 10, "cameras": cameras}
+    found["pose"][0][3 * 16 + 2] -= 0.5
+    found["translation"][0][0] += 0.25
+    found["betas"][1] += 0.5
+    for row in (0, 1):
+        found["cameras"]["camera0000"]["K"][row][row] *= 1.1
+    path.write_text(json.dumps(found))
+    path.with_name("asked.json").write_text(json.dumps(params))
+    return {"posture": str(path), "warnings": ["a guess"]}
+
+
+def reconstructed(params: dict) -> dict:
+    return human(params) | (posture(params) if "pictures" in params else {})
+
+
 def picture(params: dict) -> dict:
     """Always the same; what was asked for is beside FAKE_HUMAN."""
     shutil.copyfile(HERE / "picture.png", params["out"])
@@ -207,7 +230,8 @@ merging = steps("merge", lambda _: 1)
 ANSWERS: dict[str, tuple[Callable[[dict], Steps], Callable[[dict], dict]]] = {
     **dict.fromkeys(("generate", "vary", "interpolate", "inpaint", "transfer"), edit),
     "variations": (sheet_steps, sheet),
-    "reconstruct": (steps("encode", lambda _: 4), human),
+    "reconstruct": (steps("encode", lambda _: 4), reconstructed),
+    "fit_posture": (steps("fit", lambda _: 4), posture),
     "open_human": (at_once, open_human),
     "render": (at_once, picture),
     "draw": (bands, nothing),

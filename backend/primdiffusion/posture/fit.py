@@ -1,0 +1,206 @@
+"""Refine pose, shape and cameras of a human in pictures, by gradients of the marcher.
+
+The human's primitives are drawn on a posture (body -> frames -> `march`), and colours and opacity compared with the
+pictures. Parameters are measured in standard deviations from where they start, so that the penalty |u|^2 / 2 is a
+prior: what a picture does not show, such as how far an arm points at the camera, stays as it was. Differences are
+compared after a blur that shrinks from stage to stage, because a limb beside the true one has no gradient in sharp
+pictures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.diffusion.model import ShapePrior
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import default_frames
+from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.render.inverse import BACKGROUND, TargetImage
+from primdiffusion.render.march import MarchSettings, march
+
+Record = TypeVar("Record", bound=TensorRecord)
+
+_DEGREES = {
+    "pelvis": 12, "hip": 15, "knee": 15, "ankle": 10, "foot": 3, "spine1": 5, "spine2": 5, "spine3": 5, "neck": 8,
+    "head": 10, "collar": 5, "shoulder": 20, "elbow": 20, "wrist": 10, "hand": 3,
+}  # fmt: skip
+JOINT_STD = torch.tensor(
+    [math.radians(_DEGREES[name.removeprefix("left_").removeprefix("right_")]) for name in JOINT_NAMES]
+)
+"""Standard deviation of each joint's rotation from the start, radians; the pelvis turns the whole body."""
+SIDEWAYS_STD_M, DEPTH_STD, FOCAL_STD = 0.05, 0.1, 0.1
+"""Standard deviations of the position across the line of sight, and of the logarithms of distance and focal length."""
+EVIDENCE = 1500.0
+"""Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
+RATE = 0.15
+"""Step of Adam, standard deviations, which falls to a fifth."""
+COARSE = MarchSettings(step=0.008)
+
+
+@dataclasses.dataclass(frozen=True)
+class Posture(TensorRecord):
+    """How one human is posed in each of v pictures, and the cameras that see it."""
+
+    pose: BodyPose
+    """[v]."""
+    betas: Float[Tensor, "10"]
+    """Of the default body."""
+    camera: Camera
+    """[v]."""
+
+    def frames(self) -> list[Frames]:
+        """The boxes in each picture."""
+        return [default_frames(self.betas, pose) for pose in each(self.pose)]
+
+
+@dataclasses.dataclass(frozen=True)
+class Stage:
+    """A part of the fit."""
+
+    steps: int
+    blur: float
+    """Standard deviation of the blur at the start, as a share of the picture's side; it halves to the end."""
+
+
+def each(records: Record) -> Iterator[Record]:
+    """The members of a batch [v] of poses or cameras."""
+    first = next(value for value in vars(records).values() if isinstance(value, Tensor))
+    for number in range(len(first)):
+        yield records.map(lambda values, number=number: values[number])
+
+
+class PostureFit:
+    """A posture on its way from where it started."""
+
+    def __init__(self, start: Posture, shapes: ShapePrior, tightness: float = 1.0) -> None:
+        """`tightness` divides the standard deviations of joints: above 1 where the pose is known well."""
+        self._start, self._shapes = start, shapes
+        self._joint_std = JOINT_STD[:, None] / tightness
+        count = len(start.pose.translation)
+        self._turn = torch.zeros(count, len(JOINT_NAMES), 3)
+        self._move = torch.zeros(count, 3)
+        """Right, down, and the logarithm of the distance."""
+        self._lens = torch.zeros(count)
+        self._shape = torch.linalg.solve_triangular(
+            shapes.scale, (start.betas - shapes.bias)[:, None], upper=False
+        )[:, 0].clone()  # fmt: skip
+
+    @torch.no_grad()
+    def posture(self) -> Posture:
+        """The posture so far."""
+        return self._posture()
+
+    def refine(
+        self,
+        payload: Payload,
+        targets: Sequence[TargetImage],
+        stage: Stage,
+        on_step: Callable[[], None] | None = None,
+    ) -> None:
+        """Move to where the human's primitives look most like the pictures; deterministic on one machine.
+
+        `targets` are of one size, and their cameras those of the posture so far, scaled; their frames do not count.
+        `on_step` is called after each step; an exception that it raises cancels.
+        """
+        unknowns = [self._turn, self._move, self._lens, self._shape]
+        first, cameras = targets[0].camera, self.posture().camera
+        scale = float(first.intrinsics[0, 0] / cameras.intrinsics[0, 0, 0])
+        pictures = [_encoded(*torch.from_numpy(target.rgba).split((3, 1), -1)) for target in targets]
+        for value in unknowns:
+            value.requires_grad_()
+        optimiser = torch.optim.Adam(unknowns, RATE, betas=(0.8, 0.95))
+        schedule = torch.optim.lr_scheduler.LinearLR(optimiser, 1.0, 0.2, stage.steps)
+        for step in range(stage.steps):
+            optimiser.zero_grad()
+            blur = stage.blur * max(first.width, first.height) * 0.5 ** (step / stage.steps)
+            posture = self._posture()
+            seen = zip(posture.frames(), each(resized(posture.camera, scale, first)), pictures, strict=True)
+            errors = [_difference(frames, payload, camera, picture, blur) for frames, camera, picture in seen]
+            prior = torch.cat([value.flatten() for value in unknowns]).square().sum() / 2
+            loss = EVIDENCE * torch.stack(errors).sum() + prior
+            loss.backward()
+            optimiser.step()
+            schedule.step()
+            if on_step is not None:
+                on_step()
+        for value in unknowns:
+            value.requires_grad_(False)
+
+    def _posture(self) -> Posture:
+        start, log_focal, log_depth = self._start, FOCAL_STD * self._lens, DEPTH_STD * self._move[:, 2]
+        extrinsics = start.camera.world_to_camera
+        pelvis = default_body().shape(start.betas).joints[0] + start.pose.translation
+        before = (extrinsics[:, :, :3] @ pelvis[:, :, None])[..., 0] + extrinsics[:, :, 3]
+        # A longer lens from farther away shows the same size, so that focal length and distance are told apart.
+        sideways = before[:, :2] * log_depth.exp()[:, None] + SIDEWAYS_STD_M * self._move[:, :2]
+        place = torch.cat([sideways, (before[:, 2] * (log_depth + log_focal).exp())[:, None]], 1)
+        pelvis = ((place - extrinsics[:, :, 3])[:, None] @ extrinsics[:, :, :3])[:, 0]
+        limit = torch.maximum(self._shapes.limit, start.betas.abs())
+        betas = (self._shapes.bias + self._shapes.scale @ self._shape).clamp(-limit, limit)
+        rotation = start.pose.joint_rotation @ axis_angle_to_matrix(self._turn * self._joint_std)
+        pose = BodyPose(rotation, pelvis - default_body().shape(betas).joints[0])
+        focal = start.camera.intrinsics[..., :2] * log_focal.exp()[:, None, None]
+        camera = dataclasses.replace(start.camera, intrinsics=torch.cat([focal, start.camera.intrinsics[..., 2:]], -1))
+        return Posture(pose, betas, camera)
+
+
+def resized(camera: Camera, scale: float, like: Camera) -> Camera:
+    """Cameras of pictures scaled from their upper left corner, of the size of another's."""
+    intrinsics = torch.cat([scale * camera.intrinsics[..., :2, :], camera.intrinsics[..., 2:, :]], -2)
+    return dataclasses.replace(camera, intrinsics=intrinsics, width=like.width, height=like.height)
+
+
+def _difference(
+    frames: Frames, payload: Payload, camera: Camera, picture: Float[Tensor, "4 H W"], blur: float
+) -> Float[Tensor, ""]:
+    """Squared differences of encoded colour over grey and of opacity, after a blur, per pixel of the figure."""
+    seen = march(Primitives.place(frames, payload), camera, COARSE)
+    return _blurred(_encoded(seen.rgb, seen.alpha[..., None]) - picture, blur).square().sum() / picture[3].sum()
+
+
+def outline_error(payload: Payload, targets: Sequence[TargetImage]) -> float:
+    """Mean squared difference of opacity."""
+    drawn, masks = _outlines(payload, targets)
+    return float((drawn - masks).square().mean())
+
+
+def overlap(payload: Payload, targets: Sequence[TargetImage]) -> float:
+    """Intersection over union of the human and the masks."""
+    drawn, masks = _outlines(payload, targets)
+    return float(torch.minimum(drawn, masks).sum() / torch.maximum(drawn, masks).sum())
+
+
+@torch.no_grad()
+def _outlines(
+    payload: Payload, targets: Sequence[TargetImage]
+) -> tuple[Float[Tensor, "v H W"], Float[Tensor, "v H W"]]:
+    """Opacity of the human, and that of the pictures."""
+    drawn = [march(Primitives.place(target.frames, payload), target.camera, COARSE).alpha for target in targets]
+    return torch.stack(drawn), torch.stack([torch.from_numpy(target.rgba[..., 3]) for target in targets])
+
+
+def _encoded(rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "4 H W"]:
+    """Encoded colour over grey, and opacity."""
+    return torch.cat([encode_srgb((rgb + (1 - alpha) * BACKGROUND).clamp(1e-4, 1)), alpha], -1).movedim(-1, 0)
+
+
+def _blurred(picture: Float[Tensor, "c H W"], std: float) -> Float[Tensor, "c H W"]:
+    """Gaussian blur; beyond the edges there is 0."""
+    reach = max(1, round(2.5 * std))
+    offsets = torch.arange(-reach, reach + 1, dtype=picture.dtype)
+    kernel = torch.exp(-0.5 * (offsets / max(std, 1e-3)) ** 2)
+    kernel = kernel / kernel.sum()
+    across = torch.nn.functional.conv2d(picture[:, None], kernel[None, None, None], padding=(0, reach))
+    return torch.nn.functional.conv2d(across, kernel[None, None, :, None], padding=(reach, 0))[:, 0]

@@ -1,0 +1,113 @@
+"""A picture as a camera's background, and the camera of its size."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import bpy
+import numpy as np
+
+from ..formats.camera_rig import View
+from ..formats.regular_files import open_regular
+from .blender_camera import CameraError, aim, view_of
+
+NAME = "Picture"
+LONG_SIDE_DEGREES = 45.0
+"""Field of view along the picture's longer side before it is fitted, as the backend assumes too."""
+AWAY_M, HEIGHT_M = 4.0, 0.95
+"""Distance of a new camera from the human, and its height."""
+_LARGEST_FILE = 512 * 2**20
+_HEAD = 256 * 2**10
+"""Bytes in which the EXIF data of a picture begins."""
+_ORIENTATION = 0x0112
+
+
+def add_picture_camera(context: bpy.types.Context, path: Path, place: np.ndarray) -> bpy.types.Object:
+    """Add a camera with the picture as its background, facing a human at `place` [3] (Blender's axes), and make it the
+    scene's, whose render size becomes the picture's.
+
+    Raises ValueError for what is not a picture or is stored turned, and then leaves nothing.
+    """
+    if stored_turned(path):
+        raise ValueError(
+            f"{path.name!r} is stored turned, with a note in its EXIF data that Blender ignores: rotate it in another "
+            "program and save it without that note"
+        )
+    try:
+        image = bpy.data.images.load(str(path))
+    except RuntimeError as error:
+        raise ValueError(f"{str(path)!r} is not a picture that Blender can read: choose a PNG or JPEG") from error
+    width, height = image.size
+    if min(width, height) < 1:
+        bpy.data.images.remove(image)
+        raise ValueError(f"{str(path)!r} is not a picture that Blender can read: choose a PNG or JPEG")
+    data = bpy.data.cameras.new(NAME)
+    camera = bpy.data.objects.new(NAME, data)
+    context.scene.collection.objects.link(camera)
+    data.show_background_images = True
+    background = data.background_images.new()
+    background.image, background.alpha, background.frame_method = image, 0.6, "FIT"
+    data.sensor_fit, data.angle = "AUTO", np.radians(LONG_SIDE_DEGREES)
+    camera.rotation_euler = (np.pi / 2, 0, 0)
+    camera.location = (place[0], place[1] - AWAY_M, place[2] + HEIGHT_M)
+    render = context.scene.render
+    render.resolution_x, render.resolution_y, render.resolution_percentage = width, height, 100
+    render.pixel_aspect_x = render.pixel_aspect_y = 1.0
+    context.scene.camera = camera
+    context.view_layer.update()
+    return camera
+
+
+def picture_of(camera: bpy.types.Object | None) -> bpy.types.Image | None:
+    """The picture in a camera's background; None if there is none."""
+    if camera is None or camera.type != "CAMERA":
+        return None
+    backgrounds = camera.data.background_images
+    return next((each.image for each in backgrounds if each.source == "IMAGE" and each.image is not None), None)
+
+
+def picture_view(context: bpy.types.Context, camera: bpy.types.Object, image: bpy.types.Image) -> View:
+    """What the camera sees in the picture. Raises CameraError where its size is not the scene's render size."""
+    render, size = context.scene.render, tuple(image.size)
+    if (render.resolution_x, render.resolution_y) != size:
+        raise CameraError(
+            f"the render size is {render.resolution_x} x {render.resolution_y} pixels, the picture's {size[0]} x "
+            f"{size[1]}: make them equal in the output properties, or choose the picture again"
+        )
+    return view_of(camera, context.evaluated_depsgraph_get(), size)
+
+
+def aim_at_picture(camera: bpy.types.Object, view: View) -> None:
+    """Give the camera the view that was fitted."""
+    aim(camera, view)
+    camera.data.clip_start, camera.data.clip_end = 0.1, 1000.0
+
+
+def stored_turned(path: Path) -> bool:
+    """Whether a picture's EXIF data says that it must be turned or mirrored. Raises OSError."""
+    with open_regular(path, _LARGEST_FILE) as file:
+        head = file.read(_HEAD)
+    for start in (head.find(b"Exif\0\0") + 6, head.find(b"eXIf") + 4):
+        if start > 6 or head[start - 4 : start] == b"eXIf":
+            found = _orientation(head[start:])
+            if found not in (0, 1):
+                return True
+    return False
+
+
+def _orientation(tiff: bytes) -> int:
+    """The orientation in a TIFF header; 0 if not stated."""
+    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
+    if order is None:
+        return 0
+    try:
+        (place,) = struct.unpack_from(f"{order}I", tiff, 4)
+        (count,) = struct.unpack_from(f"{order}H", tiff, place)
+        for entry in range(min(count, 512)):
+            tag, _, _, value = struct.unpack_from(f"{order}HHIH", tiff, place + 2 + 12 * entry)
+            if tag == _ORIENTATION:
+                return value
+    except struct.error:
+        return 0
+    return 0

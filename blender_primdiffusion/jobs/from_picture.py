@@ -1,0 +1,197 @@
+"""Jobs of Human from Picture: fit a human's pose, shape and camera to a picture, and make the human in it."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import bpy
+import numpy as np
+from mathutils import Matrix
+from numpy.typing import NDArray
+
+from ..backend.requests import sentence
+from ..capture.picture_camera import aim_at_picture, picture_of, picture_view
+from ..formats.answers import FitPostureAnswer, ReconstructAnswer
+from ..formats.camera_rig import View
+from ..formats.json_files import read_json
+from ..motion.pose_library import check_posable
+from ..motion.posture import take_world_posture, world_posture
+from ..scene.handles import handles_from_joints, joints_from_handles
+from ..scene.human import BODY_FILE, armature_of, state_folder
+from ..scene.reshape import check_shapeable, reshape
+from ..scene.shape import betas_of
+from .generate import build_person
+from .queue import PREVIEW_PX, Job, chosen_checkpoint
+from .target import HumanTarget
+
+POSTURE_FORMAT = "primdiffusion-posture"
+"""As `posture/file.py` of the backend writes it."""
+
+
+def on_own_body(person: bpy.types.Collection) -> bool:
+    """Whether a human stands on a body of the user's files, whose shape and skeleton the fit does not know."""
+    return (state_folder(person) / BODY_FILE).exists()
+
+
+@dataclasses.dataclass(frozen=True)
+class PictureTask:
+    """A picture, the camera it belongs to, and where the fit starts. Holds no Blender objects."""
+
+    picture: str
+    mask: str
+    """Empty where the picture has alpha."""
+    camera: int
+    """Session uid."""
+    cameras: Mapping[str, Any]
+    """As in cameras.json."""
+    size: tuple[int, int]
+    posed: Mapping[str, Any] | None = None
+    """Pose, translation and betas of the human posed over the picture; None to start from a standing one."""
+
+    @classmethod
+    def of(cls, context: bpy.types.Context, mask: str, person: bpy.types.Collection | None) -> PictureTask:
+        """The scene's camera with its picture, and `person` as it is posed over it. Raises ValueError."""
+        camera = context.scene.camera
+        image = picture_of(camera)
+        if camera is None or image is None:
+            raise ValueError("the scene's camera has no picture: choose one first, with Choose Picture")
+        view = picture_view(context, camera, image)
+        posed = None
+        if person is not None:
+            armature = armature_of(person)
+            if on_own_body(person):
+                raise ValueError(
+                    f"the human {person.name!r} is on a body of your own files: pose one of the default body"
+                )
+            check_posable(armature)
+            joints_from_handles(context, armature)
+            pose, translation = world_posture(armature)
+            posed = {
+                "pose": [pose.ravel().tolist()],
+                "translation": [translation.tolist()],
+                "betas": np.asarray(betas_of(person)).tolist(),
+            }
+        about = {"K": view.intrinsics.tolist(), "R": view.rotation.tolist(), "T": view.translation.tolist()}
+        path = bpy.path.abspath(image.filepath, library=image.library)
+        return cls(path, mask, camera.session_uid, {"camera0000": about}, (view.width, view.height), posed)
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        """Parameters that both requests have; writes their files into `folder`."""
+        params: dict[str, Any] = {"pictures": [self.picture]}
+        if self.mask:
+            params["masks"] = [self.mask]
+        if self.posed is None:
+            (folder / "cameras.json").write_text(json.dumps(self.cameras), encoding="utf-8")
+            params["cameras"] = str(folder / "cameras.json")
+        else:
+            posture = {"format": POSTURE_FORMAT, **self.posed, "cameras": self.cameras}
+            (folder / "start.json").write_text(json.dumps(posture), encoding="utf-8")
+            params["pose"] = str(folder / "start.json")
+        checkpoint = chosen_checkpoint("checkpoint")
+        return {**params, **({"checkpoint": checkpoint} if checkpoint else {}), "out_dir": str(folder / "fitted")}
+
+    def camera_now(self) -> bpy.types.Object | None:
+        """The camera, if it is still there."""
+        return next((obj for obj in bpy.data.objects if obj.session_uid == self.camera and obj.type == "CAMERA"), None)
+
+
+@dataclasses.dataclass(frozen=True)
+class Fitted:
+    """The content of posture.json."""
+
+    pose: NDArray[np.float64]
+    """[24, 3], axis-angle."""
+    translation: NDArray[np.float64]
+    betas: NDArray[np.float64]
+    view: View
+
+
+def read_fitted(path: Path, size: tuple[int, int]) -> Fitted:
+    """Read the posture of one picture of `size`. Raises ValueError and OSError."""
+    content = read_json(path)
+    try:
+        camera = content["cameras"]["camera0000"]
+        k, r, t = (np.asarray(camera[name], np.float64) for name in ("K", "R", "T"))
+        return Fitted(
+            np.asarray(content["pose"][0], np.float64).reshape(24, 3),
+            np.asarray(content["translation"][0], np.float64).reshape(3),
+            np.asarray(content["betas"], np.float64),
+            View(k.reshape(3, 3), r.reshape(3, 3), t.reshape(3), *size),
+        )
+    except (LookupError, TypeError, ValueError) as error:
+        raise ValueError(f"the fitted pose {str(path)!r} cannot be read ({error!s:.120}): fit again") from error
+
+
+@dataclasses.dataclass(frozen=True)
+class FitPictureJob(Job):
+    """Fit to Picture."""
+
+    kind = "fit_picture"
+    method = "fit_posture"
+    undo = "Fit to Picture"
+
+    task: PictureTask
+    target: HumanTarget
+
+    @property
+    def label(self) -> str:
+        return f"Fit to Picture: {self.target.name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        return self.task.params(folder)
+
+    def finish(self, context: bpy.types.Context, result: FitPostureAnswer, _folder: Path) -> str:
+        fitted, person = read_fitted(result.posture, self.task.size), self.target.found()
+        armature = armature_of(person)
+        check_shapeable(person)
+        check_posable(armature)
+        reshape(person, fitted.betas)
+        take_world_posture(armature, fitted.pose, fitted.translation)
+        context.view_layer.update()
+        handles_from_joints(context, armature)
+        if (camera := self.task.camera_now()) is not None:
+            aim_at_picture(camera, fitted.view)
+        return " ".join([f"Fitted in {result.seconds:.1f} s.", *map(sentence, result.warnings)])
+
+
+@dataclasses.dataclass(frozen=True)
+class PictureJob(Job):
+    """Human from Picture."""
+
+    kind = "from_picture"
+    method = "reconstruct"
+    undo = "Human from Picture"
+    new_person = "Human"
+
+    task: PictureTask
+    seed: int = -1
+    """-1 for the most probable unseen sides."""
+    posed_over: int = 0
+    """Session uid of the collection of the human posed over the picture, which is hidden; 0 for none."""
+
+    @property
+    def label(self) -> str:
+        return f"Human from {Path(self.task.picture).name}"
+
+    def params(self, folder: Path) -> dict[str, Any]:
+        drawn = {} if self.seed < 0 else {"seed": self.seed}
+        return {**self.task.params(folder), **drawn, "size": PREVIEW_PX}
+
+    def finish(self, context: bpy.types.Context, result: ReconstructAnswer, _folder: Path) -> str:
+        assert result.posture is not None
+        fitted = read_fitted(result.posture, self.task.size)
+        collection, notice = build_person(context, result, "Made")
+        armature = armature_of(collection)
+        armature.matrix_world = Matrix.Identity(4)
+        context.view_layer.update()
+        take_world_posture(armature, fitted.pose, fitted.translation)
+        if (camera := self.task.camera_now()) is not None:
+            aim_at_picture(camera, fitted.view)
+        for other in context.scene.collection.children_recursive:
+            if other.session_uid == self.posed_over:
+                other.hide_viewport = other.hide_render = True
+        return notice

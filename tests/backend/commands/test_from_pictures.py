@@ -1,0 +1,168 @@
+"""Humans from plain pictures: the command line and the child's requests, without the child."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from primdiffusion import cli, from_pictures
+from primdiffusion.body.model import BodyPose
+from primdiffusion.commands.from_pictures import fit_posture
+from primdiffusion.commands.session import Session
+from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
+from primdiffusion.formats.schema import FieldError, read
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import Human, framing, place
+from primdiffusion.human_file import load_human
+from primdiffusion.posture.start import standing
+from primdiffusion.render.march import march
+from support.errors import refused
+from tiny_model import save_tiny_checkpoint, tiny_model
+
+FILES = ["depth.png", "front.png", "person.human.safetensors", "posture.json", "side.png"]
+COLOURS = torch.tensor([30.0, -20.0, 5.0])
+
+
+@pytest.fixture(autouse=True)
+def short(monkeypatch):
+    """Few steps in small pictures."""
+    rounds = [from_pictures.Round(48, from_pictures.Stage(8, 0.03), 1)]
+    monkeypatch.setattr(from_pictures, "ROUNDS", rounds)
+
+
+@pytest.fixture(scope="module")
+def picture(tmp_path_factory):
+    """A standing person of the tiny model in reddish clothes, cut out."""
+    model = tiny_model()
+    prior = model.denoiser.prior
+    human = Human(model.decode((prior.mean + prior.picture(COLOURS[None]))[0]), torch.zeros(10), {})
+    primitives = place(human, standing(1, 55.0).map(lambda values: values[0]))
+    seen = march(primitives, framing(primitives, 0.0, 96, 128))
+    straight = seen.rgb / seen.alpha[..., None].clamp_min(1e-3)
+    rgba = torch.cat([encode_srgb(straight.clamp(0, 1)), seen.alpha[..., None]], -1)
+    path = tmp_path_factory.mktemp("picture") / "anna.png"
+    Image.fromarray((255 * rgba).round().to(torch.uint8).numpy()).save(path)
+    return path
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    return save_tiny_checkpoint(tmp_path_factory.mktemp("model") / "tiny.safetensors")
+
+
+@pytest.fixture
+def line(picture, checkpoint, tmp_path):
+    return [
+        "reconstruct",
+        str(picture),
+        "--checkpoint",
+        str(checkpoint),
+        "--out",
+        str(tmp_path / "out"),
+        "--size",
+        "32",
+    ]
+
+
+def failure(capsys, line, *more) -> str:
+    """The sentence that a line fails with, having left nothing."""
+    with pytest.raises(SystemExit) as end:
+        cli.main([*line, *(str(word) for word in more)])
+    assert end.value.code == 1
+    assert not Path(line[line.index("--out") + 1]).exists()
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[-1].startswith("primdiffusion: ")
+    return lines[-1]
+
+
+def test_a_picture_becomes_a_human_and_its_posture(line, tmp_path, capsys):
+    cli.main(line)
+    out = tmp_path / "out"
+    assert sorted(path.name for path in out.iterdir()) == FILES
+    human = load_human(out / "person.human.safetensors")
+    assert human.provenance["reconstructed_from"] == ["anna.png"]
+    red, green, _ = human.payload.rgb.transpose(0, 1).flatten(1).mean(1)
+    assert red > green
+    posture = json.loads((out / "posture.json").read_text())
+    assert posture["betas"] == pytest.approx(human.betas.tolist(), abs=1e-4)
+    warnings = capsys.readouterr().err
+    assert "only one picture" in warnings
+    assert "no pose was given" in warnings
+
+
+def test_the_posture_can_be_used_again_without_refining(line, tmp_path):
+    cli.main(line)
+    first = shutil.copytree(tmp_path / "out", tmp_path / "first")
+    cli.main([*line, "--pose", str(first / "posture.json"), "--no-refine"])
+    before, after = (json.loads((folder / "posture.json").read_text()) for folder in (first, tmp_path / "out"))
+    for key in ("pose", "translation", "betas"):
+        assert np.allclose(before[key], after[key], atol=2e-5)
+    assert np.allclose(before["cameras"]["camera0000"]["K"], after["cameras"]["camera0000"]["K"], atol=0.05)
+
+
+def test_seeds_vary_the_human_and_repeat(line, tmp_path):
+    payloads = []
+    for seed in ("1", "2", "1"):
+        cli.main([*line, "--seed", seed])
+        human = load_human(tmp_path / "out" / "person.human.safetensors")
+        assert human.provenance["seed"] == int(seed)
+        payloads.append(human.payload.rgb)
+    assert not torch.equal(payloads[0], payloads[1])
+    assert torch.equal(payloads[0], payloads[2])
+
+
+def test_two_pictures_have_a_pose_and_a_camera_each(line, picture, tmp_path):
+    line.insert(1, str(picture))
+    pose = BodyPose.rest(2)
+    np.savez(tmp_path / "pose.npz", poses=np.zeros((2, 72)) + 0.01)
+    cli.main([*line, "--pose", str(tmp_path / "pose.npz")])
+    posture = json.loads((tmp_path / "out" / "posture.json").read_text())
+    assert len(posture["pose"]) == len(posture["cameras"]) == len(pose.translation)
+
+
+def test_a_fit_alone_writes_the_posture_and_can_be_cancelled_at_every_report(picture, checkpoint, tmp_path):
+    request = FitPostureRequest(pictures=(picture,), out_dir=tmp_path / "out", checkpoint=checkpoint)
+    reports = []
+    answer = fit_posture(request, Session(), lambda *report: reports.append(report[:3]))
+    assert answer.posture == tmp_path / "out" / "posture.json"
+    assert answer.posture.is_file()
+    assert [report[0] for report in reports[:2]] == ["read", "load"]
+    shutil.rmtree(tmp_path / "out")
+    for end in range(len(reports)):
+        left = iter(range(end))
+
+        def stop(*_, left=left):
+            next(left)
+
+        with pytest.raises(StopIteration):
+            fit_posture(request, Session(), stop)
+        assert not (tmp_path / "out").exists()
+
+
+def test_impossible_requests_are_one_sentence_and_leave_nothing(line, picture, tmp_path, capsys):
+    plain = tmp_path / "plain.jpg"
+    Image.open(picture).convert("RGB").save(plain)
+    assert "mask" in failure(capsys, ["reconstruct", str(plain), *line[2:]])
+    other = tmp_path / "other.npz"
+    np.savez(other, poses=np.zeros((1, 60)))
+    assert str(other) in failure(capsys, line, "--pose", other)
+    np.savez(other, poses=np.zeros((3, 72)))
+    assert "3 poses for 1 pictures" in failure(capsys, line, "--pose", other)
+    assert "nowhere.npz" in failure(capsys, line, "--pose", tmp_path / "nowhere.npz")
+    assert "cameras.json" in failure(capsys, line, "--cameras", tmp_path / "cameras.json")
+    (tmp_path / "cameras.json").write_text("[]")
+    assert "cameras.json" in failure(capsys, line, "--cameras", tmp_path / "cameras.json")
+    assert "without refining" in failure(capsys, line, "--no-refine")
+    assert "capture" in failure(capsys, line, "--capture", tmp_path)
+
+
+def test_requests_need_pictures_or_a_capture():
+    with refused(FieldError, "capture"):
+        read(ReconstructRequest, {"out_dir": "out"})
+    with refused(FieldError, "pictures"):
+        read(FitPostureRequest, {"out_dir": "out"})
+    with refused(FieldError, "seed"):
+        read(ReconstructRequest, {"out_dir": "out", "capture": "captures", "seed": 3})

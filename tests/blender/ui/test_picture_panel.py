@@ -1,0 +1,205 @@
+"""Human from Picture as the user meets it, with the real client and a child that moves an arm and the pelvis."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import bpy
+import numpy as np
+import pytest
+from blender_primdiffusion.formats.picture_files import write_png
+from jobs_driven import drive, error_of, notice_of, shown, until_running
+from support.errors import refused
+from support.fake_child import request_of
+
+from blender_primdiffusion.capture.picture_camera import picture_of, picture_view, stored_turned
+from blender_primdiffusion.jobs import from_picture
+from blender_primdiffusion.jobs.from_picture import PictureJob, PictureTask
+from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.motion.posture import take_world_posture, world_posture
+from blender_primdiffusion.scene.convention import points_to_backend
+from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.shape import betas_of
+from blender_primdiffusion.ui.picture_panel import PRIMDIFFUSION_PT_human_from_picture
+
+pytestmark = pytest.mark.any_blender
+WIDTH, HEIGHT = 60, 80
+LEFT_SHOULDER = 16
+MOVED = np.array([0.25, 0, 0])
+"""By the fake child."""
+
+
+@pytest.fixture
+def picture(tmp_path) -> Path:
+    write_png(tmp_path / "anna.png", np.full((HEIGHT, WIDTH, 4), 200, np.uint8))
+    return tmp_path / "anna.png"
+
+
+@pytest.fixture
+def chosen(addon, picture, monkeypatch):
+    """The scene with the picture's camera; humans count as on the default body, though tests have a smaller one."""
+    monkeypatch.setattr(from_picture, "on_own_body", lambda _: False)
+    assert bpy.ops.primdiffusion.choose_picture(filepath=str(picture)) == {"FINISHED"}
+    return addon
+
+
+def a_human() -> bpy.types.Collection:
+    bpy.ops.primdiffusion.generate(seed=100)
+    return humans(bpy.context.scene)[0]
+
+
+def focal_length(context) -> float:
+    """Of the scene's camera, pixels."""
+    camera = context.scene.camera
+    return picture_view(context, camera, picture_of(camera)).intrinsics[0, 0]
+
+
+def joint_places(armature) -> np.ndarray:
+    bpy.context.view_layer.update()
+    heads = [armature.matrix_world @ bone.head for bone in armature.pose.bones if bone.name in ("pelvis", "left_wrist")]
+    return points_to_backend(np.array(heads))
+
+
+def test_a_picture_becomes_the_background_of_a_camera_of_its_size(chosen, picture):
+    camera = chosen.scene.camera
+    image = picture_of(camera)
+    assert Path(bpy.path.abspath(image.filepath)) == picture
+    render = chosen.scene.render
+    assert (render.resolution_x, render.resolution_y, render.resolution_percentage) == (WIDTH, HEIGHT, 100)
+    view = picture_view(chosen, camera, image)
+    assert view.intrinsics[:2, 2] == pytest.approx([WIDTH / 2, HEIGHT / 2])
+    assert 2 * np.degrees(np.arctan(HEIGHT / 2 / view.intrinsics[1, 1])) == pytest.approx(45, abs=1e-3)
+    assert view.rotation == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-6)
+    bpy.ops.ed.undo_push(message="after")
+
+
+def test_what_is_no_picture_or_is_stored_turned_leaves_nothing(addon, tmp_path, picture):
+    (tmp_path / "no.png").write_bytes(b"nothing")
+    with refused(RuntimeError, "no.png"):
+        bpy.ops.primdiffusion.choose_picture(filepath=str(tmp_path / "no.png"))
+    with refused(RuntimeError):
+        bpy.ops.primdiffusion.choose_picture(filepath=str(tmp_path / "nowhere.png"))
+    tiff = b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHH", 1, 0x0112, 3, 1, 6, 0) + bytes(4)
+    turned = tmp_path / "turned.jpg"
+    turned.write_bytes(b"\xff\xd8\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff)
+    assert stored_turned(turned)
+    assert not stored_turned(picture)
+    with refused(RuntimeError, "turned.jpg"):
+        bpy.ops.primdiffusion.choose_picture(filepath=str(turned))
+    assert not bpy.data.cameras
+    assert not bpy.data.images
+
+
+def test_a_posture_is_taken_as_it_was_given(addon):
+    armature = armature_of(a_human())
+    armature.rotation_mode = "XYZ"
+    armature.rotation_euler, armature.location = (0.1, -0.2, 2.0), (1.0, 2.0, 0.5)
+    bpy.context.view_layer.update()
+    before = joint_places(armature)
+    pose, translation = world_posture(armature)
+    armature.location = (0, 0, 3)
+    armature.rotation_euler = (0.3, 0, 0)
+    bpy.context.view_layer.update()
+    take_world_posture(armature, pose, translation)
+    bpy.context.view_layer.update()
+    again, moved = world_posture(armature)
+    assert again == pytest.approx(pose, abs=1e-5)
+    assert moved == pytest.approx(translation, abs=1e-5)
+    assert joint_places(armature) == pytest.approx(before, abs=1e-5)
+    armature.scale = (2, 2, 2)
+    bpy.context.view_layer.update()
+    with refused(ValueError, armature.name, "scale"):
+        world_posture(armature)
+
+
+def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
+    person = a_human()
+    armature, focal = armature_of(person), focal_length(chosen)
+    pose, translation = world_posture(armature)
+    betas = np.array(betas_of(person))
+    bpy.ops.ed.undo_push(message="before")
+    assert bpy.ops.primdiffusion.human_from_picture(only_fit=True, human=person.name) == {"FINISHED"}
+    bpy.context.view_layer.update()
+    found, moved = world_posture(armature)
+    assert found[LEFT_SHOULDER, 2] == pytest.approx(pose[LEFT_SHOULDER, 2] - 0.5, abs=1e-5)
+    assert moved == pytest.approx(translation + MOVED, abs=1e-5)
+    assert np.array(betas_of(person)) == pytest.approx(betas + np.eye(10)[1] * 0.5, abs=1e-6)
+    assert focal_length(chosen) == pytest.approx(1.1 * focal, rel=1e-4)
+    assert notice_of("fit_picture").startswith("Fitted in ")
+    assert "A guess." in notice_of("fit_picture")
+    assert len(humans(chosen.scene)) == 1
+    bpy.ops.ed.undo()
+    armature = armature_of(humans(bpy.context.scene)[0])
+    assert world_posture(armature)[1] == pytest.approx(translation, abs=1e-5)
+
+
+def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, picture, tmp_path):
+    mask = tmp_path / "mask.png"
+    write_png(mask, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    assert bpy.ops.primdiffusion.human_from_picture(mask=str(mask), seed=5) == {"FINISHED"}
+    (person,) = humans(chosen.scene)
+    sent = request_of(person_file(person))
+    assert (sent["pictures"], sent["masks"], sent["seed"]) == ([str(picture)], [str(mask)], 5)
+    assert Path(sent["cameras"]).name == "cameras.json"
+    assert "pose" not in sent
+    pose, translation = world_posture(armature_of(person))
+    assert pose[LEFT_SHOULDER] == pytest.approx([0, 0, -0.5], abs=1e-5)
+    assert translation == pytest.approx(MOVED, abs=1e-5)
+
+
+def test_make_human_stands_where_the_posed_one_was_which_is_hidden(chosen):
+    posed = a_human()
+    assert bpy.ops.primdiffusion.human_from_picture(human=posed.name) == {"FINISHED"}
+    made = next(person for person in humans(chosen.scene) if person != posed)
+    assert "pose" in request_of(person_file(made))
+    assert posed.hide_viewport
+    assert posed.hide_render
+    assert world_posture(armature_of(made))[1] == pytest.approx(world_posture(armature_of(posed))[1] + MOVED, abs=0.02)
+
+
+def test_without_picture_human_or_equal_size_there_is_a_sentence(addon, picture):
+    with refused(RuntimeError, "Choose Picture"):
+        bpy.ops.primdiffusion.human_from_picture()
+    bpy.ops.primdiffusion.choose_picture(filepath=str(picture))
+    with refused(RuntimeError, "select the human"):
+        bpy.ops.primdiffusion.human_from_picture(only_fit=True)
+    addon.scene.render.resolution_x = 99
+    with refused(RuntimeError, "99 x 80", "60 x 80"):
+        bpy.ops.primdiffusion.human_from_picture()
+    with refused(RuntimeError, "choose a picture"):
+        bpy.ops.primdiffusion.choose_picture()
+
+
+def test_a_human_on_another_body_is_refused(addon, picture):
+    bpy.ops.primdiffusion.choose_picture(filepath=str(picture))
+    person = a_human()
+    with refused(RuntimeError, person.name, "body"):
+        bpy.ops.primdiffusion.human_from_picture(human=person.name)
+
+
+def test_progress_is_shown_and_cancel_leaves_no_human(chosen, monkeypatch):
+    monkeypatch.setenv("FAKE_ORDER", "takes long")
+    queue.add(chosen, PictureJob(PictureTask.of(chosen, "", None)))
+    until_running()
+    texts = shown(PRIMDIFFUSION_PT_human_from_picture, chosen)
+    assert texts[:2] == ["primdiffusion.choose_picture", "anna.png"]
+    assert "primdiffusion.cancel" in texts
+    bpy.ops.primdiffusion.cancel()
+    drive()
+    assert (error_of("from_picture"), notice_of("from_picture")) == ("", "Cancelled")
+    assert not humans(chosen.scene)
+
+
+@pytest.mark.slow
+def test_the_real_child_makes_a_human_of_a_picture(real_child, tmp_path):
+    pixels = np.zeros((120, 80, 4), np.uint8)
+    pixels[10:110, 34:46] = pixels[24:30, 14:66] = [180, 60, 40, 255]
+    write_png(tmp_path / "anna.png", pixels)
+    bpy.ops.primdiffusion.choose_picture(filepath=str(tmp_path / "anna.png"))
+    assert bpy.ops.primdiffusion.human_from_picture() == {"FINISHED"}
+    (person,) = humans(real_child.scene)
+    view = picture_view(real_child, real_child.scene.camera, picture_of(real_child.scene.camera))
+    pixels, depth = view.project(joint_places(armature_of(person)))
+    assert (depth > 1).all()
+    assert ((pixels > 5) & (pixels < [75, 115])).all()
