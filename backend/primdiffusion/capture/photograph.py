@@ -183,7 +183,8 @@ def _person_box(path: Path, mask: UInt8[np.ndarray, "H W"]) -> tuple[tuple[int, 
     block = math.ceil(max(mask.shape) / MASK_SIDE)
     small = mask[::block, ::block] > 127
     labels = np.empty(small.shape, np.int32)
-    count = ndimage.label(small, np.ones((3, 3)), output=labels)
+    ndimage.label(small, np.ones((3, 3)), output=labels)
+    count = int(labels.max())
     if not count:
         raise FileError(path, "shows nobody: no pixel of the mask is set", "mark the person, white or opaque")
     areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
