@@ -12,6 +12,8 @@ These names, and the types they take and return, are imported when they are firs
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from primdiffusion.version import __version__
+
 if TYPE_CHECKING:
     from primdiffusion.diffusion.checkpoint import load_checkpoint
     from primdiffusion.geometry.camera import Camera
@@ -19,8 +21,7 @@ if TYPE_CHECKING:
     from primdiffusion.primitives.primitives import Primitives
     from primdiffusion.render.march import march
 
-__version__ = "0.1.0"
-__all__ = ["Camera", "Human", "Primitives", "framing", "generate", "load_checkpoint", "march", "place"]
+__all__ = ["Camera", "Human", "Primitives", "__version__", "framing", "generate", "load_checkpoint", "march", "place"]
 
 _MODULES = {
     "Camera": "geometry.camera",

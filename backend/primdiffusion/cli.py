@@ -16,10 +16,10 @@ import traceback
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
-from primdiffusion import __version__
 from primdiffusion.commands.options import OPTIONS
 from primdiffusion.failures import describe
 from primdiffusion.machine import DEVICES, choose_device, share_processors
+from primdiffusion.version import __version__
 
 TRACEBACK = "--traceback"
 DEVICE = "--device"

@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion import __version__
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
 from primdiffusion.diffusion.conditioning import Attributes
@@ -36,6 +35,7 @@ from primdiffusion.primitives.anchors import Anchors, attach, default_anchors, s
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.version import __version__
 
 DEFAULT_SETTINGS = MarchSettings()
 VERTICAL_FOV = math.radians(30)

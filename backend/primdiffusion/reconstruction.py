@@ -20,7 +20,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion import __version__
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views
 from primdiffusion.diffusion.codec import VOXEL_VALUES, CellCodec, LinearCodec, payload_from_cells
@@ -33,6 +32,7 @@ from primdiffusion.human import Human, default_frames, made_by
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.render.cpu_linear import apply_to_codes
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
+from primdiffusion.version import __version__
 
 STEPS = 4
 """Gauss-Newton steps for person coefficients."""

@@ -11,7 +11,6 @@ from typing import Any
 import tyro
 from tqdm import tqdm
 
-from primdiffusion import __version__
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.commands.evaluate_tables import Generated, TableOptions, measure
 from primdiffusion.device import best_device
@@ -36,6 +35,7 @@ from primdiffusion.human import generate, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
+from primdiffusion.version import __version__
 
 DESCRIPTION = "Measure the quality of trained models."
 

@@ -13,7 +13,6 @@ from typing import Any, Literal
 import torch
 from tqdm import tqdm
 
-from primdiffusion import __version__
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.poses import choose_poses, read_motion
 from primdiffusion.device import best_device
@@ -59,6 +58,7 @@ from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person
 from primdiffusion.render.march import MarchSettings, march
+from primdiffusion.version import __version__
 
 FRAMES_TIMED = 10
 

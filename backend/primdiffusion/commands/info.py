@@ -8,7 +8,6 @@ from typing import Any
 
 import torch
 
-from primdiffusion import __version__
 from primdiffusion.commands.options import InfoCommand
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
@@ -20,6 +19,7 @@ from primdiffusion.formats.answers import AttributesAnswer
 from primdiffusion.formats.requests import AttributesRequest
 from primdiffusion.human_file import NoPersonError, format_version, load_human
 from primdiffusion.machine import memory
+from primdiffusion.version import __version__
 
 
 def run(command: InfoCommand) -> None:

@@ -23,7 +23,6 @@ import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
-from primdiffusion import __version__
 from primdiffusion.commands.options import ServeCommand
 from primdiffusion.failures import ErrorDescription, describe, shortened
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
@@ -43,6 +42,7 @@ from primdiffusion.serve.rpc import (
     Wire,
     parse_request,
 )
+from primdiffusion.version import __version__
 
 if TYPE_CHECKING:
     from primdiffusion.commands.session import Session

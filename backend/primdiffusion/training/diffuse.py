@@ -11,7 +11,6 @@ import torch
 import tyro
 from accelerate import PartialState
 
-from primdiffusion import __version__
 from primdiffusion.device import device_info
 from primdiffusion.diffusion.checkpoint import file_hash, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
@@ -25,6 +24,7 @@ from primdiffusion.training.shards import open_people
 from primdiffusion.training.slabs import SlabTask
 from primdiffusion.training.state import TrainingState
 from primdiffusion.training.stored_people import PersonDataset
+from primdiffusion.version import __version__
 
 MODEL = "model.safetensors"
 PHASES = ("person", "local", "slab")

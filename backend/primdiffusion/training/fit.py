@@ -13,7 +13,6 @@ import tyro
 from accelerate import Accelerator, PartialState
 from torch import Tensor, nn
 
-from primdiffusion import __version__
 from primdiffusion.capture.conditioning import default_betas
 from primdiffusion.capture.dataset import CaptureDataset, Position, ProcessRank, SampleSettings
 from primdiffusion.capture.reader import Captures, open_captures
@@ -32,6 +31,7 @@ from primdiffusion.training.fit_losses import Features, load_perceptual, loss_te
 from primdiffusion.training.loop import Step, StepTimer, Task, train
 from primdiffusion.training.run_folder import begin, open_run, versions, write_picture
 from primdiffusion.training.state import TrainingState, adamw
+from primdiffusion.version import __version__
 
 MODEL = "encoder.safetensors"
 SIZE = 256

@@ -21,7 +21,6 @@ from typing import Annotated, NamedTuple
 import torch
 from torch import Tensor
 
-from primdiffusion import __version__
 from primdiffusion.capture.dataset import Views
 from primdiffusion.formats.requests import Count, RayStep
 from primdiffusion.formats.schema import Range, check
@@ -31,6 +30,7 @@ from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.training.config import NotNegative
 from primdiffusion.training.refine_views import PosedView, psnr_of, render_view, scenes_of
+from primdiffusion.version import __version__
 
 BETAS = (0.9, 0.99)
 """Adam's decay rates; short averages, because a run is a few hundred steps."""

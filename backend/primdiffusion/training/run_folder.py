@@ -27,7 +27,6 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from primdiffusion import __version__
 from primdiffusion.failures import optional_package
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import read_regular
@@ -35,6 +34,7 @@ from primdiffusion.formats.whole_files import remove_abandoned, write_atomically
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.folder_lock import lock_folder
 from primdiffusion.training.state import accelerator_of, saved_step
+from primdiffusion.version import __version__
 
 log = logging.getLogger(__name__)
 
