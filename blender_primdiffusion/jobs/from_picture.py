@@ -20,6 +20,7 @@ from ..formats.camera_rig import View
 from ..formats.json_files import read_json
 from ..motion.pose_library import check_posable
 from ..motion.posture import take_world_posture, world_posture
+from ..scene.blend_values import file_path
 from ..scene.handles import handles_from_joints, joints_from_handles
 from ..scene.human import BODY_FILE, armature_of, state_folder
 from ..scene.reshape import check_shapeable, reshape
@@ -76,8 +77,10 @@ class PictureTask:
                 "betas": np.asarray(betas_of(person)).tolist(),
             }
         about = {"K": view.intrinsics.tolist(), "R": view.rotation.tolist(), "T": view.translation.tolist()}
-        path = bpy.path.abspath(image.filepath, library=image.library)
-        return cls(path, mask, camera.session_uid, {"camera0000": about}, (view.width, view.height), posed)
+        path = file_path(image.filepath, image.library)
+        if path is None:
+            raise ValueError(f"the picture of camera {camera.name!r} is not a file on this computer: choose it again")
+        return cls(str(path), mask, camera.session_uid, {"camera0000": about}, (view.width, view.height), posed)
 
     def params(self, folder: Path) -> dict[str, Any]:
         """Parameters that both requests have; writes their files into `folder`."""

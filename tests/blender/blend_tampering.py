@@ -160,6 +160,7 @@ HOLDERS: dict[str, Callable[[], Any]] = {
 """What holds each custom property."""
 SETTINGS = {
     "primdiffusion_captures": ("people", "out", "body", "poses", "hdri"),
+    "primdiffusion_picture": ("mask",),
     "primdiffusion_reconstruct": ("capture",),
 }
 """Paths among the scene's settings."""

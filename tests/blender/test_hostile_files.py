@@ -20,6 +20,7 @@ from blender_primdiffusion.scene.human import armature_of
 LONGEST_SENTENCE = 300
 READS = {
     "import_motion": ("filepath", (".npz", ".npy", ".json", ".bvh", ".fbx")),
+    "choose_picture": ("filepath", (".png", ".jpg")),
     "import_human": ("filepath", (".human", ".human.safetensors", ".npz")),
     "mark_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
     "mark_as_asset POSE": ("picture", (".png", ".jpg", ".exr", ".hdr")),
@@ -29,6 +30,8 @@ WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb",
 """Operators that write the file of their `filepath`."""
 FOLDERS = {"find_missing_volumes", "human_from_captures", "make_pose_assets", "set_up_backend"}
 """Operators on the folder of their `directory`."""
+SENT = {"human_from_picture": {"mask"}}
+"""Files that the backend alone reads: tests/fuzz/test_not_files.py tries its reader."""
 PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
 
 
@@ -129,7 +132,7 @@ def anna(addon, tmp_path, monkeypatch):
 def test_every_operator_with_a_path_gets_hostile_files():
     expected = {name.partition(" ")[0]: {shown} for name, (shown, _) in READS.items()}
     expected |= {name: {"filepath"} for name, _ in WRITES} | {name: {"directory"} for name in FOLDERS}
-    assert with_paths() == expected
+    assert with_paths() == expected | SENT
 
 
 @pytest.mark.parametrize("name", READS)

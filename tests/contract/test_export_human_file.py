@@ -49,7 +49,7 @@ def test_a_reshaped_person_in_a_file_is_the_backends_reshaped_person(saved, tmp_
 
 
 def test_boxes_of_another_body_are_rejected(saved):
-    with refused(ValueError, "[5, 3]", ".human"):
+    with refused(ValueError, "[5, 3]", "generate"):
         reshaped(read_tensors(saved), np.zeros(10), np.ones((5, 3)))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -238,6 +239,44 @@ def read_hdri(path: Path) -> None:
         bpy.data.scenes.remove(scene)
 
 
+def make_photograph(folder: Path) -> Path:
+    from PIL import Image
+
+    pixels = np.zeros((96, 64, 4), np.uint8)
+    pixels[8:88, 24:40] = 200
+    Image.fromarray(pixels).save(folder / "anna.png")
+    return folder / "anna.png"
+
+
+def read_photograph(path: Path) -> None:
+    from primdiffusion.capture.photograph import read_photographs
+
+    read_photographs([path])
+
+
+def place_photograph(path: Path) -> None:
+    import bpy
+
+    from blender_primdiffusion.capture.picture_camera import add_picture_camera
+
+    add_picture_camera(bpy.context, path, np.zeros(3))
+
+
+CAMERA = {"K": [[60.0, 0, 32], [0, 60.0, 48], [0, 0, 1]], "R": np.diag([1.0, -1, -1]).tolist(), "T": [0.0, 0, 3]}
+
+
+def make_posture(folder: Path) -> Path:
+    content = {"format": "primdiffusion-posture", "pose": [[0.1] * 72], "translation": [[0.0] * 3], "betas": [0.5] * 10}
+    (folder / "posture.json").write_text(json.dumps({**content, "cameras": {"camera0000": CAMERA}}), encoding="utf-8")
+    return folder / "posture.json"
+
+
+def read_posture(path: Path) -> None:
+    from primdiffusion.posture.file import read_posture
+
+    read_posture(path, [(64, 96)])
+
+
 def make_scan_picture(folder: Path) -> Path:
     from PIL import Image
 
@@ -309,6 +348,9 @@ TARGETS = tuple(
         ("material of an asset", make_material, read_material),
         ("Blender: preview", make_asset_picture, read_preview),
         ("Blender: HDRI", make_asset_picture, read_hdri),
+        ("Blender: plain picture", make_photograph, place_photograph),
+        ("plain picture", make_photograph, read_photograph),
+        ("posture", make_posture, read_posture),
         ("Blender: picture of a scan", make_scan_picture, find_scan_picture),
         ("Blender: scan", make_mesh, import_scan),
         ("Blender: .blend", make_blend, render_blend),

@@ -39,12 +39,15 @@ def inputs(folder: Path) -> None:
     from tiny_model import save_tiny_checkpoint, tiny_model
 
     from fuzz.data_targets import make_solids, make_weights
+    from fuzz.other_files import CAMERA, make_photograph
 
     for seed, name in enumerate(("a", "b")):
         save_human(folder / f"{name}.human.safetensors", generate(tiny_model(), seed=seed, steps=2))
     save_tiny_checkpoint(folder / "tiny.safetensors")
     save_tiny_encoder(folder / "encoder.safetensors")
     shutil.move(captured(folder / "rendered", people=1, frames=1), folder / "captures")
+    shutil.copy(make_photograph(folder), folder / "mask.png")
+    (folder / "cameras.json").write_text(json.dumps({"camera0000": CAMERA}), encoding="utf-8")
     make_weights(folder)
     make_solids(folder)
     (folder / "pose.json").write_text(json.dumps([0.1] * 72), encoding="utf-8")
@@ -154,8 +157,12 @@ def contained(line: bytes) -> bytes:
 
 @functools.cache
 def session():
-    """One for all requests, as in the child."""
+    """One for all requests, as in the child; a fit to pictures takes one step of each kind."""
+    from primdiffusion import from_pictures
     from primdiffusion.commands.session import Session
+    from primdiffusion.posture.fit import Stage
+
+    from_pictures.ROUNDS = (from_pictures.Round(32, Stage(1, 0.04), 1),)
 
     return Session()
 

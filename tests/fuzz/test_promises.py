@@ -113,7 +113,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "pose", "own pose", "poses .json", "motion .json", "cameras", "batch settings", "human's card", "manifest",
             "packed index", "joints of shots", "captures: settings", "captures: cameras", "captures: completion mark",
-            "captures: about a pack",
+            "captures: about a pack", "posture",
         ),
         (
             "tests/backend/formats/test_json_files.py::test_what_no_reader_can_use_is_one_short_reason",
@@ -138,7 +138,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("tests/backend/capture/test_reader.py::test_a_list_that_names_folders_outside_is_rejected",),
     ),
     "pictures PNG, JPEG, WebP": (
-        ("picture", "shot", "captures: picture", "captures: first picture", "texture of an asset"),
+        ("picture", "shot", "captures: picture", "captures: first picture", "plain picture", "texture of an asset"),
         ("tests/backend/geometry/test_pictures.py::test_a_large_picture_in_a_small_file_is_rejected_by_its_header_and_a_large_file_may_have_it",),
     ),
     "shards of humans": (
@@ -178,8 +178,9 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }  # fmt: skip
 """Kinds of files of the table in SECURITY.md: what tries each in `test_not_files`, and tests of what it says."""
 TRUSTED = {
-    "ONNX network", "Blender: preview", "Blender: HDRI", "Blender: picture of a scan", "Blender: scan",
-    "Blender: .blend", "shape of a scan", "picture of Cycles", "frame", "captures: pack", "material of an asset",
+    "ONNX network", "Blender: preview", "Blender: HDRI", "Blender: picture of a scan", "Blender: plain picture",
+    "Blender: scan", "Blender: .blend", "shape of a scan", "picture of Cycles", "frame", "captures: pack",
+    "material of an asset",
 }  # fmt: skip
 """Files without a largest size: what Blender and onnxruntime read by themselves, what this program has just written,
 and those of which only the head is read, or which are mapped."""

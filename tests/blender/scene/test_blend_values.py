@@ -46,7 +46,8 @@ OF_SCANS = {"primdiffusion_part"}
 OPERATORS_OWN = {
     "scene/blend_values.py",
     "ui/asset_operators.py", "ui/captures_panel.py", "ui/captures_settings.py", "ui/export_operators.py",
-    "ui/human_panel.py", "ui/import_motion.py", "ui/reconstruct_panel.py", "ui/setup/operators.py",
+    "ui/human_panel.py", "ui/import_motion.py", "ui/picture_panel.py", "ui/reconstruct_panel.py",
+    "ui/setup/operators.py",
 }  # fmt: skip
 """Modules that resolve paths: besides the reader, those whose operators are given one by the user or a script."""
 ODD = [7, 0.5, [0.5] * 3, {"a": {"b": 1}}, b"\xff\x00", ["a", "b"], "x" * (blend_values.LONGEST_TEXT + 1)]
