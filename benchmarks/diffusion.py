@@ -7,9 +7,9 @@ meshes, the best that a model can reach; `from_mesh`, `payload` and `codec` are 
 network. `attribute_read_*` is the feature network's accuracy on renders of held-out meshes. Figures that need an
 omitted option are null. Times are of two threads. --quick takes few samples of each.
 
-`python benchmarks/diffusion.py pictures --people DIR --reference DIR --neighbours docs/pictures/neighbours.png` renders
-humans from consecutive seeds, not hand-picked, each beside the nearest training samples by features and by latents,
-with distances (1 is the median of the held-out set). `--comparison docs/pictures/generated_comparison.png --checkpoint
+`python benchmarks/diffusion.py pictures --people DIR --neighbours docs/pictures/neighbours.png` renders humans from
+consecutive seeds, not hand-picked, each beside the nearest human by latents in the folder, with distances (1 is the
+median of the held-out set). `--comparison docs/pictures/generated_comparison.png --checkpoint
 ours/model.safetensors --latents latents/model.safetensors --voxel voxels/voxel.safetensors` renders rows of held-out
 samples, and of the models that benchmarks/tables.py compares.
 """
@@ -42,8 +42,8 @@ from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
-from primdiffusion.evaluation.distances import frechet_distance, kernel_distance, nearest
-from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_of, payload_sources
+from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
+from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_of
 from primdiffusion.evaluation.generation import (
     Comparison,
     ReferenceSet,
@@ -299,7 +299,6 @@ def pictures() -> None:
     parser.add_argument("--people", type=Path, required=True, help="folder of the payloads that were trained on")
     parser.add_argument("--holdout", type=float, default=0.08)
     parser.add_argument("--seed", type=int, default=0, help="of the training run")
-    parser.add_argument("--reference", type=Path, default=Path("runs/reference"))
     parser.add_argument("--checkpoint", type=Path)
     parser.add_argument("--latents", type=Path, help="baseline of train_baselines.py")
     parser.add_argument("--voxel", type=Path, help="baseline of train_baselines.py voxels")
@@ -310,14 +309,7 @@ def pictures() -> None:
     model = load_checkpoint(arguments.checkpoint)
     train, held = split_people(find_people(arguments.people), arguments.holdout, arguments.seed)
     if arguments.neighbours is not None:
-        reference = open_reference_set(
-            payload_sources(train, read_person),
-            payload_sources(held, read_person),
-            arguments.reference,
-            progress("portraits"),
-            epoch,
-        )
-        neighbours(reference, model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
+        neighbours(model, train, held, arguments.count).save(arguments.neighbours, optimize=True)
         print(arguments.neighbours)
     if arguments.comparison is not None:
         comparison(model, held, arguments.latents, arguments.voxel, arguments.count).save(
@@ -326,35 +318,23 @@ def pictures() -> None:
         print(arguments.comparison)
 
 
-def neighbours(
-    reference: ReferenceSet, model: DiffusionModel, train: Sequence[Path], held: Sequence[Path], count: int
-) -> Image.Image:
-    """A column a seed: the person, the nearest by features and the nearest by latents."""
+def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path], count: int) -> Image.Image:
+    """A column a seed: the human, and the training human nearest to it by latents."""
 
     def encode(payload: Payload) -> Tensor:
         return model.encode(payload)
 
     people = list(generated(model, seeds_of(count)))
-    primitives = [place(human) for human in people]
-    by_features = nearest(features_of(reference.network, made_gallery(primitives)), reference.train_features)
-    new = nearest(reference.held_features, reference.train_features).distance.median()
     references = [payload_of(read_person(path), 0) for path in held[:: max(len(held) // 32, 1)]]
     queries = torch.stack([encode(payload).flatten() for payload in (*(h.payload for h in people), *references)])
-    by_latents = nearest_stored(queries, train, read_person, encode, progress("latents"))
-    new_latents = by_latents.distance[count:].median()
-    rows: list[tuple[str, list[tuple[Primitives, str]]]] = [
-        ("generated", [(one, f"seed {seed}") for seed, one in zip(seeds_of(count), primitives, strict=True)]),
-        ("nearest by features", []),
-        ("nearest by latents", []),
-    ]
-    for number in range(count):
-        row = int(by_features.index[number])
-        geometry = int(reference.train.geometry[row])
-        colouring = row - int((reference.train.geometry < geometry).sum())
-        rows[1][1].append((stored_one(train[geometry], colouring), f"{float(by_features.distance[number] / new):.2f}"))
-        path, colouring = train[int(by_latents.file[number])], int(by_latents.colouring[number])
-        rows[2][1].append((stored_one(path, colouring), f"{float(by_latents.distance[number] / new_latents):.2f}"))
-    return sheet(rows, "Distances in units of the median held-out person's: 1 is as new as new people are")
+    found = nearest_stored(queries, train, read_person, encode, progress("latents"))
+    new = found.distance[count:].median()
+    rows: list[tuple[str, list[tuple[Primitives, str]]]] = [("generated", []), ("nearest in training", [])]
+    for number, human in enumerate(people):
+        rows[0][1].append((place(human), f"seed {number}"))
+        nearest = stored_one(train[int(found.file[number])], int(found.colouring[number]))
+        rows[1][1].append((nearest, f"{float(found.distance[number] / new):.2f}"))
+    return sheet(rows, "Distances in units of the median held-out human's: 1 is as new as new humans are")
 
 
 def stored_one(path: Path, colouring: int) -> Primitives:
