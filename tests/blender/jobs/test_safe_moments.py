@@ -58,6 +58,8 @@ def test_a_result_waits_until_undo_and_redo_have_rested(addon, monkeypatch):
     assert names() == {"before", "one"}
 
 
+# In 20 runs Blender 4.5's own redo crashed once and had once no further step; 5.0 and 5.2 have not.
+@pytest.mark.flaky(reruns=2, only_rerun=["redo.poll"], condition=bpy.app.version < (5, 0))
 @pytest.mark.parametrize("pressed", ["undo undo", "undo redo", "undo undo redo"])
 def test_results_between_undo_and_redo_are_steps_of_their_own(addon, resting_at_once, pressed):
     steps("before")
