@@ -197,7 +197,7 @@ def _installing(folder: SetUpFolder, lock: Lock, said: str) -> Step:
 
 
 def _wheel_bytes(folder: Path) -> int:
-    """Bytes of the wheels below a folder, where pip adds and removes some meanwhile."""
+    """Bytes of the wheels below a folder, while pip adds and removes some."""
     total = 0
     for parent, _, names in os.walk(folder):
         with contextlib.suppress(OSError):

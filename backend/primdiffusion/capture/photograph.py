@@ -29,7 +29,7 @@ from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 LARGEST_SIDE = 512
 """Sides of what is kept of a picture, pixels; larger ones are scaled down."""
 SMALLEST_FIGURE = 32
-"""Height of a person, pixels, from which a body can be told."""
+"""Height of a person, pixels, from which a pose can be estimated."""
 SECOND_FIGURE = 0.2
 """Share of the largest component's area from which another is a second person."""
 SPECK = 0.01
@@ -76,7 +76,7 @@ def read_photographs(
     Raises:
         ValueError: there are not as many masks as pictures.
         FileNotFoundError: a file is missing.
-        FileError: a file is not a PNG or JPEG, is damaged or too large, or shows nobody, or more than one person.
+        FileError: a file is not a PNG or JPEG, is damaged or too large, or shows no person, or more than one person.
     """
     if masks and len(masks) != len(pictures):
         raise ValueError(f"there are {len(masks)} masks for {len(pictures)} pictures: give one for each, or none")
@@ -186,7 +186,7 @@ def _person_box(path: Path, mask: UInt8[np.ndarray, "H W"]) -> tuple[tuple[int, 
     ndimage.label(small, np.ones((3, 3)), output=labels)
     count = int(labels.max())
     if not count:
-        raise FileError(path, "shows nobody: no pixel of the mask is set", "mark the person, white or opaque")
+        raise FileError(path, "shows no person: no pixel of the mask is set", "mark the person, white or opaque")
     areas = np.bincount(labels.ravel(), minlength=count + 1)[1:]
     largest = areas.max()
     figures = _figures_beside(labels, 1 + np.flatnonzero(areas >= SECOND_FIGURE * largest), 1 + int(areas.argmax()))

@@ -15,10 +15,11 @@ from primdiffusion.commands.output import FILES, Decode, step_previews, write_hu
 from primdiffusion.commands.progress import ReportProgress, progress_bar, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.editing.edit import OnStep, combined, transfer_garment, transfer_texture, with_payload
+from primdiffusion.editing.edit import OnStep, combined, with_payload
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import read_weights, region_from_weights, region_of
+from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
 from primdiffusion.formats.answers import HumanAnswer
 from primdiffusion.formats.requests import (

@@ -1,5 +1,4 @@
-"""Shared by all edits: encoding, noise levels, conditioning, and provenance. And the edits without a model: clothes
-transferred between humans primitive by primitive, since all share one grid on the body (paper sec. 4)."""
+"""Shared by all edits: encoding, noise levels, conditioning, and provenance."""
 
 from __future__ import annotations
 
@@ -9,13 +8,12 @@ from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep
 from primdiffusion.diffusion.schedule import early_steps
-from primdiffusion.editing.regions import check_region, name_region
 from primdiffusion.human import Human
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Payload
@@ -147,29 +145,3 @@ def added(payload: Payload, residual: Payload, factor: float) -> Payload:
         (payload.density + factor * residual.density).clamp_min(0),
         (payload.delta_scale + factor * residual.delta_scale).clamp_min(0),
     )
-
-
-def transfer_texture(source: Human, target: Human, region: Bool[Tensor, "k"]) -> Human:
-    """Return the target with the source's colours in a region: the paper's exchange of corresponding primitives.
-
-    Densities, delta scales and betas stay the target's. Suits garments of the same cut, skin, hair colour and patterns.
-    Exact and model-free. Raises ValueError for a region that is empty or not a mask of K, and for different bodies.
-    """
-    payload = dataclasses.replace(target.payload, rgb=source.payload.rgb)
-    return _transferred("transfer_texture", source, target, region, payload)
-
-
-def transfer_garment(source: Human, target: Human, region: Bool[Tensor, "k"]) -> Human:
-    """Return the target with the source's colours, densities and delta scales in a region.
-
-    Suits different cuts, such as a coat over a shirt or long hair, because the silhouette changes too. The target's
-    betas stay. The border of the region may be visible; `harmonise` smooths it. Raises as `transfer_texture`.
-    """
-    return _transferred("transfer_garment", source, target, region, source.payload)
-
-
-def _transferred(name: str, source: Human, target: Human, region: Tensor, payload: Payload) -> Human:
-    region = check_region(region)
-    check_correspondence("the source", source.body_setup, "the target", target.body_setup)
-    edit = {"edit": name, "region": name_region(region, target.body_setup), "source": dict(source.provenance)}
-    return with_edit(target, edit, combined(region, payload, target.payload))

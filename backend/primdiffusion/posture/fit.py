@@ -143,7 +143,7 @@ class PostureFit:
         extrinsics = start.camera.world_to_camera
         pelvis = default_body().shape(start.betas).joints[0] + start.pose.translation
         before = (extrinsics[:, :, :3] @ pelvis[:, :, None])[..., 0] + extrinsics[:, :, 3]
-        # A longer lens from farther away shows the same size, so that focal length and distance are told apart.
+        # A longer lens from farther away shows the same size, which separates focal length from distance.
         sideways = before[:, :2] * log_depth.exp()[:, None] + SIDEWAYS_STD_M * self._move[:, :2]
         place = torch.cat([sideways, (before[:, 2] * (log_depth + log_focal).exp())[:, None]], 1)
         pelvis = ((place - extrinsics[:, :, 3])[:, None] @ extrinsics[:, :, :3])[:, 0]

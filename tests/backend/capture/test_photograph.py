@@ -117,7 +117,7 @@ def two_people():
 
 @pytest.mark.parametrize(
     ("mask", "word"),
-    [(pixels(160, 200, 0), "nobody"), (two_people(), "2 separate figures"), (pixels(160, 201, 255), "201 x 160")],
+    [(pixels(160, 200, 0), "no person"), (two_people(), "2 separate figures"), (pixels(160, 201, 255), "201 x 160")],
 )
 def test_masks_of_nobody_two_people_or_another_size_are_refused(tmp_path, mask, word):
     picture = save(tmp_path / "a.jpg", figure()[0])
