@@ -27,7 +27,9 @@ def share_with_installed(user_folder: Path) -> None:
     for folder in (path for path in BACKEND.iterdir() if path.is_dir()):
         own = _cache_of(folder)
         own.mkdir(parents=True, exist_ok=True)
-        _cache_of(user_folder.resolve() / INSTALLED / folder.name).symlink_to(own)
+        installed = _cache_of(user_folder.resolve() / INSTALLED / folder.name)
+        if not installed.exists():  # pytest counts its folders anew where /tmp was emptied; the cache may be older
+            installed.symlink_to(own)
 
 
 def _cache_of(sources: Path) -> Path:
