@@ -87,7 +87,7 @@ def generate(
     On one kind of processor, with one version of torch, every bit is the same on any number of cores and threads
     (`diffusion.fixed_threads`); otherwise, and in a batch, values differ by rounding (about 1e-5 of their range).
 
-    `attributes` condition the sample on attributes in `model.vocabulary`; empty means unconditional, as in the paper.
+    `attributes` condition the sample on attributes in `model.vocabulary`; those left open are drawn from the seed.
     `on_step` is called after each step; raise an exception from it to cancel.
     Raises ValueError for an unknown sampler or attribute, a number of steps outside 1 ... T, or a seed outside
     0 ... 2^63-1.
@@ -115,7 +115,9 @@ def generate_batch(
         final = step.x0
     assert final is not None, "a sampler yields at least one step"
     numbers = {name: float(attributes[name]) for name in model.vocabulary.scalars if name in attributes}
-    conditioning = {"attributes": {**attributes, **numbers}, "guidance": guidance} if attributes else {}
+    conditioning = {"attributes": {**attributes, **numbers}} if attributes else {}
+    if model.vocabulary.width:
+        conditioning["guidance"] = guidance
     shared = {"steps": steps, "sampler": sampler, **conditioning, **made_by(model)}
     people = people_of(model, final, seeds, attributes)
     return [

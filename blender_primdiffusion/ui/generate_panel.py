@@ -132,7 +132,8 @@ class GenerateOptions(Reporting):
         return {
             "steps": self.steps or settings.steps,
             "sampler": self.sampler if self.given("sampler") else settings.sampler,
-            **({"attributes": wanted, "guidance": guidance} if wanted else {}),
+            "guidance": guidance,
+            **({"attributes": wanted} if wanted else {}),
         }
 
 

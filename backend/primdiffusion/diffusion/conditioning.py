@@ -53,6 +53,14 @@ class AttributeVocabulary:
             numbers += self._scalar(name, attributes.get(name))
         return torch.tensor(numbers)
 
+    def complete(self, asked: Float[Tensor, "#b a"], drawn: Float[Tensor, "b a"]) -> Float[Tensor, "b a"]:
+        """Return the conditions `asked` with the values of `drawn` for categories that they leave open."""
+        condition = asked.expand_as(drawn).clone()
+        for block in self.blocks().values():
+            is_open = (condition[:, block] == 0).all(1, keepdim=True)
+            condition[:, block] = torch.where(is_open, drawn[:, block], condition[:, block])
+        return condition
+
     def blocks(self) -> dict[str, slice]:
         """Slice of each category's numbers in a condition."""
         places, start = {}, 0

@@ -62,13 +62,24 @@ class PersonDenoiser(nn.Module):
         )
 
     def forward(
-        self, x: Float[Tensor, "b c h w"], t: Int[Tensor, "b"], condition: Float[Tensor, "b a"] | None = None
+        self,
+        x: Float[Tensor, "b c h w"],
+        t: Int[Tensor, "b"],
+        condition: Float[Tensor, "b a"] | None = None,
+        guidance: float = 1.0,
     ) -> Float[Tensor, "b c h w"]:
-        """Return the x0 guess for latents x at steps t, given `condition` (None: unconditional)."""
+        """Return the x0 guess for latents x at steps t, given `condition` (None: unconditional).
+
+        `guidance` w makes the coefficients u + w (c - u) of the unconditional guess u and the conditional guess c (Ho
+        and Salimans 2022). The rest, which follows them, is the conditional guess: it hardly depends on attributes, and
+        takes most of the time.
+        """
         signal, _ = self.schedule.levels(t, x)
         prior = self.prior
         y, rest = prior.split(x, signal)
         coefficients = self.coefficients(y, t, condition)
+        if condition is not None and guidance != 1.0:
+            coefficients = torch.lerp(self.coefficients(y, t), coefficients, guidance)
         return prior.join(coefficients, self.rest(rest, coefficients, t, condition))
 
     def coefficients(

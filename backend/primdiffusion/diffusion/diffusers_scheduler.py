@@ -3,7 +3,7 @@
 scheduler = PrimDiffusionScheduler.of(model, "dpmpp_2m")
 scheduler.set_timesteps(30)
 for t in scheduler.timesteps:
-    x = scheduler.step(model.denoise(x, int(t)), t, x).prev_sample
+    x = scheduler.step(model.denoise(x, int(t), condition, 2.0), t, x).prev_sample
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from __future__ import annotations
 import dataclasses
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -156,13 +156,22 @@ class PersonPrior(TensorRecord):
             draws = torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=generator.device)
             return draws.to(self.mean.device)
 
-        weight = self.log_weights(condition)[0].flatten().softmax(0)
-        drawn = torch.multinomial(weight.to(generator.device), count, replacement=True, generator=generator)
-        part = drawn.to(self.mean.device)
+        part = self._draw_parts(count, generator, condition)
         group = part // self.log_weight.shape[1]
         in_axes = self.variance[group].sqrt() * normal(count, self.basis.shape[0])
         coefficients = torch.einsum("bij,bi->bj", self.axes[group], in_axes) + self.centre.flatten(0, 1)[part]
         return self.join(coefficients, self.rest_variance.sqrt() * normal(count, *self.mean.shape))
+
+    def sample_kinds(
+        self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 a"] | None = None
+    ) -> Float[Tensor, "count a"]:
+        """Draw kinds of people as conditions, as often as they occur among those that agree with `condition`."""
+        return self.kind.flatten(0, 1)[self._draw_parts(count, generator, condition)]
+
+    def _draw_parts(self, count: int, generator: torch.Generator, condition: Tensor | None) -> Int[Tensor, "n"]:
+        weight = self.log_weights(condition)[0].flatten().softmax(0)
+        drawn = torch.multinomial(weight.to(generator.device), count, replacement=True, generator=generator)
+        return drawn.to(self.mean.device)
 
     def gaussian(self) -> PersonPrior:
         """Return the single Gaussian with this mixture's mean and covariance, as a baseline."""

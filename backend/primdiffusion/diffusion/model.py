@@ -102,18 +102,30 @@ class DiffusionModel:
     ) -> Float[Tensor, "b c h w"]:
         """The denoiser's x0 guess without gradients, all samples at step t.
 
-        With a condition: u + guidance (c - u) of the unconditional guess u and the conditional guess c (Ho and Salimans
-        2022). 1 is the plain conditional guess; more follows the condition more closely at the cost of variety.
+        With a condition, `guidance` is that of `PersonDenoiser.forward`: 1 is the plain conditional guess; more follows
+        the condition more closely at the cost of variety.
         """
         steps = torch.full((len(x),), t, dtype=torch.int64, device=x.device)
         with torch.inference_mode():
             if condition is None:
                 return self.denoiser(x, steps)
-            condition = condition.expand(len(x), -1)
-            conditional = self.denoiser(x, steps, condition)
-            if guidance == 1.0:
-                return conditional
-            return torch.lerp(self.denoiser(x, steps), conditional, guidance)
+            return self.denoiser(x, steps, condition.expand(len(x), -1), guidance)
+
+    def complete(
+        self, generators: Sequence[torch.Generator], condition: Float[Tensor, "#b a"] | None = None
+    ) -> Float[Tensor, "b a"] | None:
+        """Return a condition for each generator: what `condition` asks for, and categories drawn for the others.
+
+        They are drawn as they occur together among the training people. A denoiser that is told all categories draws
+        one outfit; left to choose, it mixes several. Returns `condition` for a model without attributes.
+        """
+        if not self.vocabulary.width or not isinstance(self.denoiser, PersonDenoiser):
+            return condition
+        asked = torch.zeros(1, self.vocabulary.width, device=self.device) if condition is None else condition
+        asked = asked.expand(len(generators), -1)
+        prior = self.denoiser.prior
+        drawn = [prior.sample_kinds(1, one, asked[i : i + 1]) for i, one in enumerate(generators)]
+        return self.vocabulary.complete(asked, torch.cat(drawn))
 
     def start(
         self, generators: Sequence[torch.Generator], t: int, condition: Float[Tensor, "#b a"] | None = None
@@ -176,9 +188,9 @@ def sample(
     """Generate a person for each seed, yielding every step; the last step's x0 is the result (default: 30 DDIM steps).
 
     The same batch of seeds gives the same bits on one kind of device with one version of torch, on any number of cores.
-    A seed's noise is the same in any batch and on any device, so the person is the same up to rounding. To cancel, stop
-    iterating. ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside
-    1 ... T.
+    A seed's noise is the same in any batch and on any device, so the person is the same up to rounding. Categories that
+    `condition` leaves open are drawn (`DiffusionModel.complete`). To cancel, stop iterating.
+    ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside 1 ... T.
     """
     if sampler not in SAMPLERS:
         raise ValueError(f"there is no sampler {sampler!r}; choose one of {', '.join(sorted(SAMPLERS))}")
@@ -187,10 +199,11 @@ def sample(
     chain = model.chain(model.schedule.length, steps)
     generators = [seeded(seed) for seed in seeds]
     with fixed_threads(model.threads):
-        start = model.start(generators, chain[0], condition)
+        conditions = model.complete(generators, condition)
+        start = model.start(generators, chain[0], conditions)
 
     def denoise(x: Tensor, t: int) -> Tensor:
-        return model.denoise(x, t, condition, guidance)
+        return model.denoise(x, t, conditions, guidance)
 
     steps_taken = SAMPLERS[sampler](denoise, model.schedule, start, chain, generators)
     return each_with_fixed_threads(steps_taken, model.threads)

@@ -87,9 +87,9 @@ class Conditioning:
     attributes: Attributes = dataclasses.field(default_factory=dict)
     """Attributes, NAME=VALUE: sex=female "outfit=blouse and skirt" height=1.7. `info` lists the names and values that a
     checkpoint knows."""
-    guidance: Annotated[float, Range(0, 20), Slider(1, 5)] = 1.5
-    """How strongly attributes are followed: 1 as in the training data; more exaggerates and costs variety. No effect
-    without attributes."""
+    guidance: Annotated[float, Range(0, 20), Slider(1, 5)] = 2.0
+    """How strongly attributes are followed, also those that are drawn because none were asked for: 1 as in the training
+    data; more exaggerates and costs variety."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -67,8 +67,6 @@ def _params(options: argparse.Namespace, attributes: Attributes) -> dict[str, ob
     params = {field: getattr(options, field) for field in DECLARED}
     if attributes:
         params["attributes"] = attributes
-    else:
-        del params["guidance"]
     return {**params, **({"checkpoint": str(checkpoint)} if checkpoint else {})}
 
 

@@ -61,9 +61,10 @@ def test_diffusers_loop_draws_the_model_s_own_samples(sampler):
     scheduler = PrimDiffusionScheduler.of(model, sampler)
     scheduler.set_timesteps(6)
     generators = [torch.Generator().manual_seed(5)]
-    x = model.start(generators, int(scheduler.timesteps[0]))
+    condition = model.complete(generators)
+    x = model.start(generators, int(scheduler.timesteps[0]), condition)
     for t in scheduler.timesteps:
-        x, x0 = scheduler.step(model.denoise(x, int(t)), t, x, generators, return_dict=False)
+        x, x0 = scheduler.step(model.denoise(x, int(t), condition, 2.0), t, x, generators, return_dict=False)
     assert torch.equal(x0, last.x0)
 
 

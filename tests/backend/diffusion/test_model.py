@@ -124,9 +124,21 @@ def test_guidance_extrapolates_from_unconditional_to_conditional(model):
         model.denoise(x, 600, condition, 2.0),
     )
     assert (asked - anybody).abs().max() > 0.01
-    assert torch.allclose(guided, 2 * asked - anybody, atol=1e-4)
-    assert torch.allclose(model.denoise(x, 600, condition, 0.0), anybody, atol=1e-5)
+    components = [model.denoiser.prior.split(guess)[0] for guess in (anybody, asked, guided)]
+    assert torch.allclose(components[2], 2 * components[1] - components[0], atol=1e-4)
     assert model.condition({}) is None
+
+
+def test_categories_that_nobody_asked_for_are_drawn_and_those_asked_for_stay(model):
+    suit = model.condition({"outfit": "suit"})
+    generators = [seeded(seed) for seed in range(40)]
+    anything = model.complete(generators, None)
+    assert anything.shape == (40, model.vocabulary.width)
+    assert (anything.sum(1) == 1).all()
+    assert 0 < anything[:, 0].mean() < 1
+    assert torch.equal(model.complete(generators, suit[None]), suit.expand(40, -1))
+    again = [model.complete([seeded(seed)])[0] for seed in range(40)]
+    assert torch.equal(torch.stack(again), anything)
 
 
 def test_asking_draws_the_start_from_those_who_have_it(model):

@@ -87,7 +87,7 @@ def test_redress_changes_the_primitives_of_the_region_alone(person):
     assert ops.redress(parts={"top", "left_foot"}, seed=FINE, steps=2, attributes="outfit=dress") == {"FINISHED"}
     asked = sent(person)
     assert asked["region"] == ["left_foot", "top"]
-    assert (asked["attributes"], asked["guidance"]) == ({"outfit": "dress"}, 1.5)
+    assert (asked["attributes"], asked["guidance"]) == ({"outfit": "dress"}, 2.0)
     after = read_tensors(person_file(person))[0]
     assert [k for k in range(COUNT) if (after["rgb"][k] != before["rgb"][k]).any()] == [1, 2]
     assert paths(humans(bpy.context.scene)[1]) == other

@@ -52,7 +52,7 @@ def test_all_humans_has_a_folder_named_by_their_seed(out, capfd):
     ]
     asked = sent(out / "person_000008")
     assert (asked["seed"], asked["steps"], asked["size"]) == (8, 1, 16)
-    assert (asked["attributes"], asked["guidance"]) == ({"sex": "female", "height": 1.7}, 1.5)
+    assert (asked["attributes"], asked["guidance"]) == ({"sex": "female", "height": 1.7}, 2.0)
     assert report(out)["done"] == ["person_000007", "person_000008"]
     assert "2/2 person_000008 done" in capfd.readouterr().out
 
