@@ -179,6 +179,7 @@ def all_programs(given: Inputs) -> list[Program]:
                          "--pose-count", "2", "--size", "16"],
             resumes=True,
         ),
+        Program("captures coco", lambda out: ["captures", "coco", out], copied=lambda: given.captures, resumes=True),
         Program("captures pack", lambda out: ["captures", "pack", out], copied=lambda: given.captures, resumes=True),
         Program(
             "payloads encode",

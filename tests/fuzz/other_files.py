@@ -40,12 +40,13 @@ def read_view(path: Path) -> None:
 
 
 def read_joints(path: Path) -> None:
+    from primdiffusion.capture.coco import keypoints_of
     from primdiffusion.capture.reader import open_captures
-    from primdiffusion.capture.sheet import joints_of, reprojection_error
+    from primdiffusion.capture.sheet import reprojection_error
 
     captures = open_captures(_root(path))
     subject = captures.subject(captures.subjects[0])
-    joints_of(subject)
+    keypoints_of(subject)
     reprojection_error(subject)
 
 

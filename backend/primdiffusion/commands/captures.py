@@ -1,4 +1,4 @@
-"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet and farm."""
+"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet, coco and farm."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
 from primdiffusion.capture.dataset import open_pack, pack
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
 from primdiffusion.capture.people_files import find_people
@@ -24,6 +25,7 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.requests import PASSES
+from primdiffusion.training.captured_people import read_cards
 
 DESCRIPTION = "Multi-view captures, to train on."
 
@@ -213,6 +215,25 @@ class SheetOfCaptures:
 
 
 @dataclasses.dataclass(frozen=True)
+class AnnotateCaptures:
+    """Write annotations in COCO's format (boxes, masks, 17 keypoints, SMPL) and a table of all images."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder of a capture dataset, with images, masks and depth; the files go there."""
+    people: Path | None = None
+    """Folder of `primdiffusion people` that the captures show: its attributes become columns of the table."""
+
+    def run(self) -> None:
+        """Write both files, and print their paths."""
+        captures = open_captures(self.root)
+        cards = {} if self.people is None else read_cards(self.people)
+        attributes = {name: card.get("attributes", {}) for name, card in cards.items()}
+        with tqdm(total=len(captures.subjects), unit="human", disable=None) as progress:
+            write_coco(captures, attributes, lambda _: progress.update())
+        print(f"{self.root / ANNOTATIONS_FILE}\n{self.root / TABLE_FILE}")
+
+
+@dataclasses.dataclass(frozen=True)
 class FarmCaptures:
     """Render a dataset with Blender on a Ray cluster, one human per task (needs the extra `farm`).
 
@@ -251,6 +272,7 @@ Command = (
     | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
     | Annotated[PackCaptures, tyro.conf.subcommand("pack")]
     | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
+    | Annotated[AnnotateCaptures, tyro.conf.subcommand("coco")]
     | Annotated[FarmCaptures, tyro.conf.subcommand("farm")]
 )
 
