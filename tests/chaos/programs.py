@@ -85,7 +85,7 @@ class Inputs:
     @functools.cached_property
     def captures(self) -> Path:
         """Captures of two humans in two poses."""
-        job = small_job(self.folder / "made", people=2, frames=2, passes=("img", "mask"))
+        job = small_job(self.folder / "made", people=2, frames=2, passes=("img", "mask", "depth"))
         assert {outcome.status for outcome in render(job)} == {"done"}
         return job.out
 
