@@ -255,6 +255,12 @@ def read_photograph(path: Path) -> None:
     read_photographs([path])
 
 
+def read_behind(path: Path) -> None:
+    from primdiffusion.capture.backgrounds import read_background
+
+    read_background(path, 32, 48)
+
+
 def place_photograph(path: Path) -> None:
     import bpy
 
@@ -351,6 +357,7 @@ TARGETS = tuple(
         ("Blender: HDRI", make_asset_picture, read_hdri),
         ("Blender: plain picture", make_photograph, place_photograph),
         ("plain picture", make_photograph, read_photograph),
+        ("background of captures", make_photograph, read_behind),
         ("posture", make_posture, read_posture),
         ("Blender: picture of a scan", make_scan_picture, find_scan_picture),
         ("Blender: scan", make_mesh, import_scan),

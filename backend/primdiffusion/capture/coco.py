@@ -2,8 +2,9 @@
 
     root/annotations.json    images, persons with boxes, run-length masks and COCO's 17 keypoints; cameras and SMPL too
     root/images.csv          one image a line: subject, frame, camera, and attributes where they are known
+    root/composed/           the images over backgrounds, if pictures for them are given
 
-Both follow from the files of the captures alone, so that the same captures give the same bytes.
+All follow from the files of the captures (and these pictures) alone, so that the same captures give the same bytes.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import csv
 import dataclasses
 import json
 from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ import torch
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from primdiffusion.body.model import default_body
+from primdiffusion.capture.backgrounds import Backgrounds, composed_path, write_composed
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import joints_of
 from primdiffusion.formats import capture_layout
@@ -37,7 +40,7 @@ FACE = {"nose": (4526, 4526), "left_eye": (6201, 6246), "right_eye": (21, 66), "
         "right_ear": (4863, 4863)}  # fmt: skip
 """COCO's keypoints that SMPL has no joints for, each the mean of two of the default body's vertices: tip of the nose,
 corners of the eyelids, outermost points of the ears."""
-THICKNESS = {"nose": 0.04, "eye": 0.04, "ear": 0.04, "shoulder": 0.16, "elbow": 0.12, "wrist": 0.1, "hip": 0.2,
+THICKNESS = {"nose": 0.04, "eye": 0.04, "ear": 0.04, "shoulder": 0.16, "elbow": 0.12, "wrist": 0.1, "hip": 0.22,
              "knee": 0.16, "ankle": 0.16}  # fmt: skip
 """Metres: a keypoint deeper behind the nearest surface is hidden. More than from the joint to the surface around the
 limb, in wide clothes, and less than to the far side of a limb in front of it, or from one hip across to the other."""
@@ -61,9 +64,12 @@ _FARTHEST = DEPTH_UNIT * np.iinfo(np.uint16).max
 def write_coco(
     captures: Captures,
     attributes: Mapping[str, Mapping[str, Any]],
+    backgrounds: Backgrounds | None = None,
     report: Callable[[str], object] = lambda subject: None,
 ) -> None:
     """Write annotations.json and images.csv into the captures' folder; both appear at the end or not at all.
+
+    With backgrounds, images over them are written first, and are the annotated ones.
 
     Keypoints are indices of pixels as COCO's: the centre of the upper left pixel is (0, 0). Their visibility is COCO's:
     0 outside of the image or unknown, 1 hidden, 2 visible. The face's are known where the subject has the default body.
@@ -72,25 +78,26 @@ def write_coco(
     Args:
         captures: images, masks and depth of finished subjects.
         attributes: values for the table by subject and name; a subject may lack all or some.
+        backgrounds: pictures to draw from for each view; without them, annotated images are those of the captures.
         report: called with the name of each annotated subject.
 
     Raises:
         FileNotFoundError, FileError, ArrayFileError, BodyFileError: a pass or file is missing, or damaged.
         ValueError: attributes of a subject are not a mapping.
-        OSError: a file cannot be written.
+        OutsideFolderError, OSError: a file cannot be written, or lies behind a link out of the captures.
     """
     if missing := [kind for kind in PASSES if kind not in captures.passes]:
         raise FileError(captures.root, f"has no {' and no '.join(missing)}", f"render with {', '.join(PASSES)}")
     table, annotations = captures.root / TABLE_FILE, captures.root / ANNOTATIONS_FILE
     with replacing(table) as rows_to, replacing(annotations) as annotations_to:
         with rows_to.open("w", encoding="utf-8", newline="") as file:
-            csv.writer(file, lineterminator="\n").writerows(_rows(captures, attributes))
+            csv.writer(file, lineterminator="\n").writerows(_rows(captures, attributes, backgrounds))
         with annotations_to.open("w", encoding="utf-8", newline="\n") as file:
             file.write('{"info":{"description":"PrimDiffusion captures"},"licenses":[],')
             file.write(f'"categories":[{_line(CATEGORY)}],\n"images":[\n')
-            file.writelines(_separated(_line(image.record) for image in _images(captures)))
+            file.writelines(_separated(_line(image.record) for image in _images(captures, backgrounds)))
             file.write('],\n"annotations":[\n')
-            file.writelines(_separated(_annotations(captures, report)))
+            file.writelines(_separated(_annotations(captures, backgrounds, report)))
             file.write("]}\n")
 
 
@@ -153,6 +160,7 @@ class _Image:
     subject: Subject
     frame: int
     camera: int
+    background: Path | None
 
     @property
     def view(self) -> View:
@@ -161,6 +169,8 @@ class _Image:
     @property
     def file_name(self) -> str:
         path = capture_layout.picture_path(self.subject.folder, "img", self.camera, self.frame)
+        if self.background is not None:
+            path = composed_path(self.subject, self.frame, self.camera)
         return path.relative_to(self.subject.folder.parent).as_posix()
 
     @property
@@ -208,7 +218,7 @@ class _Image:
         }
 
 
-def _images(captures: Captures) -> Iterator[_Image]:
+def _images(captures: Captures, backgrounds: Backgrounds | None) -> Iterator[_Image]:
     """All images by subject, frame and camera, numbered from 1."""
     number = 0
     for name in captures.subjects:
@@ -216,28 +226,35 @@ def _images(captures: Captures) -> Iterator[_Image]:
         for frame in range(subject.frames):
             for camera in range(len(subject.views)):
                 number += 1
-                yield _Image(number, subject, frame, camera)
+                background = None if backgrounds is None else backgrounds.drawn(name, frame, camera)
+                yield _Image(number, subject, frame, camera, background)
 
 
-def _annotations(captures: Captures, report: Callable[[str], object]) -> Iterator[str]:
+def _annotations(
+    captures: Captures, backgrounds: Backgrounds | None, report: Callable[[str], object]
+) -> Iterator[str]:
     points = np.empty(0)
-    for image in _images(captures):
+    for image in _images(captures, backgrounds):
         subject = image.subject
         if image.frame == image.camera == 0:
             points = keypoints_of(subject)
+        if image.background is not None:
+            write_composed(subject, image.frame, image.camera, image.background)
         if (annotation := image.annotation(points[image.frame])) is not None:
             yield _line(annotation)
         if (image.frame, image.camera) == (subject.frames - 1, len(subject.views) - 1):
             report(subject.name)
 
 
-def _rows(captures: Captures, attributes: Mapping[str, Mapping[str, Any]]) -> Iterator[list[Any]]:
+def _rows(
+    captures: Captures, attributes: Mapping[str, Mapping[str, Any]], backgrounds: Backgrounds | None
+) -> Iterator[list[Any]]:
     for name in captures.subjects:
         if not isinstance(attributes.get(name, {}), Mapping):
             raise ValueError(f"the attributes of {name} are {attributes[name]!r:.80}: give names and values")
     columns = sorted({column for name in captures.subjects for column in attributes.get(name, {})})
     yield ["image_id", "file_name", "subject", "frame", "camera", *columns]
-    for image in _images(captures):
+    for image in _images(captures, backgrounds):
         own = attributes.get(image.subject.name, {})
         values = [own.get(column, "") for column in columns]
         yield [image.id, image.file_name, image.subject.name, image.frame, image.camera, *values]

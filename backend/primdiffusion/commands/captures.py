@@ -13,6 +13,7 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.backgrounds import Backgrounds
 from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
 from primdiffusion.capture.dataset import open_pack, pack
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
@@ -21,6 +22,7 @@ from primdiffusion.capture.poses import MotionFileError, choose_poses, read_moti
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
+from primdiffusion.evaluation.shots import folder_pictures
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
@@ -222,14 +224,19 @@ class AnnotateCaptures:
     """Folder of a capture dataset, with images, masks and depth; the files go there."""
     people: Path | None = None
     """Folder of `primdiffusion people` that the captures show: its attributes become columns of the table."""
+    backgrounds: Path | None = None
+    """Folder of pictures to put behind the humans; the default leaves the images over black."""
+    seed: int = 0
+    """Seed of the choice of a background for each image."""
 
     def run(self) -> None:
         """Write both files, and print their paths."""
         captures = open_captures(self.root)
         cards = {} if self.people is None else read_cards(self.people)
         attributes = {name: card.get("attributes", {}) for name, card in cards.items()}
+        backgrounds = self.backgrounds and Backgrounds(tuple(folder_pictures(self.backgrounds)), self.seed)
         with tqdm(total=len(captures.subjects), unit="human", disable=None) as progress:
-            write_coco(captures, attributes, lambda _: progress.update())
+            write_coco(captures, attributes, backgrounds, lambda _: progress.update())
         print(f"{self.root / ANNOTATIONS_FILE}\n{self.root / TABLE_FILE}")
 
 
