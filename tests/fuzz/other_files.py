@@ -256,7 +256,7 @@ def read_photograph(path: Path) -> None:
 
 
 def read_behind(path: Path) -> None:
-    from primdiffusion.capture.backgrounds import read_background
+    from primdiffusion.capture.composed import read_background
 
     read_background(path, 32, 48)
 

@@ -1,8 +1,8 @@
 """Annotations of finished captures in COCO's format, for trainers of keypoints and masks, and a table of all images.
 
     root/annotations.json    images, persons with boxes, run-length masks and COCO's 17 keypoints; cameras and SMPL too
-    root/images.csv          one image a line: subject, frame, camera, and attributes where they are known
-    root/composed/           the images over backgrounds, if pictures for them are given
+    root/images.csv          a line for each human in an image: subject, frame, camera, attributes where they are known
+    root/composed/           images over backgrounds, if pictures for them are given, and of humans who stand together
 
 All follow from the files of the captures (and these pictures) alone, so that the same captures give the same bytes.
 """
@@ -12,7 +12,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,10 @@ import torch
 from jaxtyping import Bool, Float, UInt8, UInt16
 
 from primdiffusion.body.model import default_body
-from primdiffusion.capture.backgrounds import Backgrounds, composed_path, write_composed
+from primdiffusion.capture.composed import Backgrounds, StoredView, composed_path, uncovered, write_composed
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import joints_of
+from primdiffusion.capture.together import groups
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -57,6 +58,7 @@ CATEGORY = {"id": 1, "name": "person", "supercategory": "person", "keypoints": K
 SAME_BODY = 0.002
 """Metres between joints of captures and the default body's up to which the captures are of the default body."""
 _JOINTS = [JOINT_NAMES.index(name) for name in KEYPOINTS[len(FACE) :]]
+_HIPS = [KEYPOINTS.index("left_hip"), KEYPOINTS.index("right_hip")]
 _THICKNESS = np.array([THICKNESS[name.rpartition("_")[2]] for name in KEYPOINTS])
 _FARTHEST = DEPTH_UNIT * np.iinfo(np.uint16).max
 
@@ -69,7 +71,7 @@ def write_coco(
 ) -> None:
     """Write annotations.json and images.csv into the captures' folder; both appear at the end or not at all.
 
-    With backgrounds, images over them are written first, and are the annotated ones.
+    With backgrounds, and of humans who stand together (`together`), composed images are written, which are annotated.
 
     Keypoints are indices of pixels as COCO's: the centre of the upper left pixel is (0, 0). Their visibility is COCO's:
     0 outside of the image or unknown, 1 hidden, 2 visible. The face's are known where the subject has the default body.
@@ -157,21 +159,26 @@ def visibility(
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Image:
     id: int
-    subject: Subject
+    subjects: tuple[Subject, ...]
     frame: int
     camera: int
     background: Path | None
 
     @property
     def view(self) -> View:
-        return self.subject.views[self.camera]
+        return self.subjects[0].views[self.camera]
+
+    @property
+    def is_composed(self) -> bool:
+        return self.background is not None or len(self.subjects) > 1
 
     @property
     def file_name(self) -> str:
-        path = capture_layout.picture_path(self.subject.folder, "img", self.camera, self.frame)
-        if self.background is not None:
-            path = composed_path(self.subject, self.frame, self.camera)
-        return path.relative_to(self.subject.folder.parent).as_posix()
+        first = self.subjects[0]
+        path = capture_layout.picture_path(first.folder, "img", self.camera, self.frame)
+        if self.is_composed:
+            path = composed_path(first, self.frame, self.camera)
+        return path.relative_to(first.folder.parent).as_posix()
 
     @property
     def record(self) -> dict[str, Any]:
@@ -181,7 +188,7 @@ class _Image:
             "file_name": self.file_name,
             "width": view.width,
             "height": view.height,
-            "subject": self.subject.name,
+            "subjects": [subject.name for subject in self.subjects],
             "frame": self.frame,
             "camera": self.camera,
             "K": view.intrinsics.tolist(),
@@ -189,61 +196,82 @@ class _Image:
             "T": view.translation.tolist(),
         }
 
-    def annotation(self, points: Float[np.ndarray, "17 3"]) -> dict[str, Any] | None:
-        """The subject in this image; None if it is not in it."""
-        stored = self.subject.pictures(("mask", "depth"), self.frame, self.camera)
-        inside = stored["mask"] >= THRESHOLD
-        if not inside.any():
-            return None
-        columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
-        left, top = int(columns[0]), int(rows[0])
-        pixels, seen = visibility(self.view, points, stored["mask"], stored["depth"])
-        indices = [_rounded(pixel - 0.5, 2) if v else [0, 0] for pixel, v in zip(pixels, seen, strict=True)]
-        smpl = self.subject.smpl
-        return {
-            "id": self.id,
-            "image_id": self.id,
-            "category_id": CATEGORY["id"],
-            "iscrowd": 0,
-            "bbox": [left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top],
-            "area": int(inside.sum()),
-            "num_keypoints": sum(v > 0 for v in seen),
-            "keypoints": [value for (x, y), v in zip(indices, seen, strict=True) for value in (x, y, v)],
-            "segmentation": {"size": list(inside.shape), "counts": run_lengths(inside)},
-            "smpl": {
-                "pose": _rounded(smpl.theta[self.frame], 6),
-                "betas": _rounded(smpl.betas, 6),
-                "translation": _rounded(smpl.translation[self.frame], 6),
-            },
-        }
+    def annotations(self, points: Sequence[Float[np.ndarray, "F 17 3"]]) -> Iterator[dict[str, Any]]:
+        """All subjects of which the image shows a pixel, without ids; writes the image if it is composed."""
+        views = [self._stored(subject, own[self.frame]) for subject, own in zip(self.subjects, points, strict=True)]
+        if self.is_composed:
+            write_composed(views, self.subjects[0], self.frame, self.camera, self.background)
+        mask = np.maximum.reduce([view.mask for view in views])
+        depth = np.minimum.reduce([view.depth - np.uint16(1) for view in views]) + np.uint16(1)  # 0 wraps: the farthest
+        for subject, view, share, own in zip(self.subjects, views, uncovered(views)[:-1], points, strict=True):
+            seen = share * view.mask >= THRESHOLD
+            if seen.any():
+                pixels, visible = visibility(self.view, own[self.frame], mask, depth)
+                yield {
+                    **_outline(seen),
+                    **({"amodal": _mask(view.mask >= THRESHOLD)} if len(views) > 1 else {}),
+                    **_keypoints(pixels, visible),
+                    "subject": subject.name,
+                    "smpl": {
+                        "pose": _rounded(subject.smpl.theta[self.frame], 6),
+                        "betas": _rounded(subject.smpl.betas, 6),
+                        "translation": _rounded(subject.smpl.translation[self.frame], 6),
+                    },
+                }
+
+    def _stored(self, subject: Subject, points: Float[np.ndarray, "17 3"]) -> StoredView:
+        stored = subject.pictures(PASSES if self.is_composed else PASSES[1:], self.frame, self.camera)
+        _, distance = self.view.project(points[_HIPS].mean(0))
+        img = stored.get("img", np.zeros((0, 0, 3), np.uint8))
+        return StoredView(img, stored["mask"], stored["depth"], float(distance))
+
+
+def _mask(inside: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
+    return {"size": list(inside.shape), "counts": run_lengths(inside)}
+
+
+def _outline(inside: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
+    columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
+    left, top = int(columns[0]), int(rows[0])
+    return {
+        "iscrowd": 0,
+        "bbox": [left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top],
+        "area": int(inside.sum()),
+        "segmentation": _mask(inside),
+    }
+
+
+def _keypoints(pixels: Float[np.ndarray, "17 2"], visible: Sequence[int]) -> dict[str, Any]:
+    indices = [_rounded(pixel - 0.5, 2) if v else [0, 0] for pixel, v in zip(pixels, visible, strict=True)]
+    return {
+        "num_keypoints": sum(v > 0 for v in visible),
+        "keypoints": [value for (x, y), v in zip(indices, visible, strict=True) for value in (x, y, v)],
+    }
 
 
 def _images(captures: Captures, backgrounds: Backgrounds | None) -> Iterator[_Image]:
-    """All images by subject, frame and camera, numbered from 1."""
+    """All images by subjects, frame and camera, numbered from 1."""
     number = 0
-    for name in captures.subjects:
-        subject = captures.subject(name)
-        for frame in range(subject.frames):
-            for camera in range(len(subject.views)):
+    for subjects in groups(captures):
+        for frame in range(subjects[0].frames):
+            for camera in range(len(subjects[0].views)):
                 number += 1
-                background = None if backgrounds is None else backgrounds.drawn(name, frame, camera)
-                yield _Image(number, subject, frame, camera, background)
+                background = None if backgrounds is None else backgrounds.drawn(subjects[0].name, frame, camera)
+                yield _Image(number, subjects, frame, camera, background)
 
 
-def _annotations(
-    captures: Captures, backgrounds: Backgrounds | None, report: Callable[[str], object]
-) -> Iterator[str]:
-    points = np.empty(0)
+def _annotations(captures: Captures, backgrounds: Backgrounds | None, report: Callable[[str], object]) -> Iterator[str]:
+    number, points = 0, []
     for image in _images(captures, backgrounds):
-        subject = image.subject
         if image.frame == image.camera == 0:
-            points = keypoints_of(subject)
-        if image.background is not None:
-            write_composed(subject, image.frame, image.camera, image.background)
-        if (annotation := image.annotation(points[image.frame])) is not None:
-            yield _line(annotation)
-        if (image.frame, image.camera) == (subject.frames - 1, len(subject.views) - 1):
-            report(subject.name)
+            points = [keypoints_of(subject) for subject in image.subjects]
+        for annotation in image.annotations(points):
+            number += 1
+            yield _line({"id": number, "image_id": image.id, "category_id": CATEGORY["id"], **annotation})
+        first = image.subjects[0]
+        if (image.frame, image.camera) == (first.frames - 1, len(first.views) - 1):
+            for subject in image.subjects:
+                report(subject.name)
 
 
 def _rows(
@@ -255,9 +283,10 @@ def _rows(
     columns = sorted({column for name in captures.subjects for column in attributes.get(name, {})})
     yield ["image_id", "file_name", "subject", "frame", "camera", *columns]
     for image in _images(captures, backgrounds):
-        own = attributes.get(image.subject.name, {})
-        values = [own.get(column, "") for column in columns]
-        yield [image.id, image.file_name, image.subject.name, image.frame, image.camera, *values]
+        for subject in image.subjects:
+            own = attributes.get(subject.name, {})
+            values = [own.get(column, "") for column in columns]
+            yield [image.id, image.file_name, subject.name, image.frame, image.camera, *values]
 
 
 def _rounded(values: np.ndarray, digits: int) -> list[float]:

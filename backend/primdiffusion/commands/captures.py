@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -13,8 +13,8 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture.backgrounds import Backgrounds
 from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
+from primdiffusion.capture.composed import Backgrounds
 from primdiffusion.capture.dataset import open_pack, pack
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
 from primdiffusion.capture.people_files import find_people
@@ -22,6 +22,7 @@ from primdiffusion.capture.poses import MotionFileError, choose_poses, read_moti
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
+from primdiffusion.capture.together import MOST
 from primdiffusion.evaluation.shots import folder_pictures
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
@@ -63,6 +64,9 @@ class RenderCaptures:
     """Seed of the choice of poses."""
     workers: int = 1
     """Number of processes; each uses a core and about 1 GB."""
+    together: int = 1
+    """Number of humans, 1 to 8, that stand together on a floor, in front of the same cameras; `coco` makes one image of
+    them."""
     shard: str = "0/1"
     """i/n: only every n-th human from the i-th on, i = 0 ... n - 1, to share the work between machines."""
     released_reference: bool = False
@@ -81,6 +85,10 @@ class RenderCaptures:
         names = sorted(people)[index::count]
         if self.pose_count == 0 and len(self.poses) != 1:
             raise ValueError("pose_count 0 takes all frames of one motion file: give one with --poses")
+        if not 1 <= self.together <= MOST:
+            raise ValueError(f"together is {self.together}: give 1 to {MOST}")
+        if self.released_reference and self.together > 1:
+            raise ValueError("the released code expects its reference alone: leave out --together")
         poses, unread = self._poses()
         job = RenderJob(
             people={name: people[name] for name in names},
@@ -92,6 +100,7 @@ class RenderCaptures:
             seed=self.seed,
             released_reference=self.released_reference,
             unread_poses=tuple(unread),
+            together=self._groups(people) if self.together > 1 else (),
             part="report" if count == 1 else f"report-{index}-of-{count}",
         )
         for error in unread:
@@ -105,6 +114,12 @@ class RenderCaptures:
             raise ValueError(
                 f"{outcomes['failed']} of {len(names)} humans{poses_too} failed: {self.out / job.part}.json says why"
             )
+
+    def _groups(self, people: Mapping[str, Path]) -> tuple[dict[str, Path], ...]:
+        """Split all humans, of all shards, into groups by their names."""
+        names = sorted(people)
+        parts = [names[first : first + self.together] for first in range(0, len(names), self.together)]
+        return tuple({name: people[name] for name in part} for part in parts)
 
     def _poses(self) -> tuple[BodyPose, list[str]]:
         """Return the poses, and the errors of unreadable motion files. Raises MotionFileError if all are."""

@@ -12,8 +12,8 @@ from capture_scenes import captured, save_person
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
-from primdiffusion.capture.backgrounds import Backgrounds, compose, read_background
 from primdiffusion.capture.coco import FACE, KEYPOINTS, keypoints_of, run_lengths, visibility, write_coco
+from primdiffusion.capture.composed import Backgrounds, StoredView, compose, read_background
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
@@ -233,7 +233,10 @@ def test_the_table_has_a_line_for_each_image_and_the_attributes_of_its_human(roo
     assert [int(row["image_id"]) for row in rows] == [image["id"] for image in images] == list(range(1, 25))
     for row, image in zip(rows, images, strict=True):
         assert [row["file_name"], row["subject"], int(row["frame"]), int(row["camera"])] == [
-            image[name] for name in ("file_name", "subject", "frame", "camera")
+            image["file_name"],
+            *image["subjects"],
+            image["frame"],
+            image["camera"],
         ]
     assert [rows[0][name] for name in ("hat", "height", "sex")] == ["", "1.5", "female"]
     assert [rows[-1][name] for name in ("hat", "height", "sex")] == ["none, at all", "", ""]
@@ -252,7 +255,7 @@ def test_an_image_without_its_subject_has_no_annotation(root):
     write_coco(open_captures(root), {})
     written = annotations(root)
     (alone,) = {image["id"] for image in written["images"]} - {one["image_id"] for one in written["annotations"]}
-    assert [written["images"][alone - 1][name] for name in ("subject", "frame", "camera")] == [NAME, 1, 2]
+    assert [written["images"][alone - 1][name] for name in ("subjects", "frame", "camera")] == [[NAME], 1, 2]
 
 
 def test_the_face_is_unknown_on_another_body(root):
@@ -269,7 +272,8 @@ def test_the_face_is_unknown_on_another_body(root):
 def test_unfinished_subjects_are_left_out(root):
     capture_layout.write_list(root, [NAME])
     write_coco(open_captures(root), {})
-    assert {image["subject"] for image in annotations(root)["images"]} == {NAME}
+    assert {one["subject"] for one in annotations(root)["annotations"]} == {NAME}
+    assert all(image["subjects"] == [NAME] for image in annotations(root)["images"])
 
 
 @pytest.fixture
@@ -307,8 +311,9 @@ def test_backgrounds_fill_what_the_human_leaves_and_the_seed_draws_them(root, ba
 
 
 def test_half_covered_pixels_mix_in_linear_light():
-    rgba = np.array([[[0, 0, 0, 0], [188, 0, 0, 128], [255, 255, 255, 255]]], np.uint8)
-    mixed = compose(rgba, np.full((1, 3, 3), 255, np.uint8))
+    image, mask = np.array([[[0, 0, 0], [188, 0, 0], [255, 255, 255]]], np.uint8), np.array([[0, 128, 255]], np.uint8)
+    view = StoredView(image, mask, np.full((1, 3), 4000, np.uint16), 1.0)
+    mixed = compose([view], np.full((1, 3, 3), 255, np.uint8))
     assert mixed.tolist() == [[[255, 255, 255], [255, 187, 187], [255, 255, 255]]]
 
 
