@@ -85,7 +85,7 @@ class Inputs:
     @functools.cached_property
     def captures(self) -> Path:
         """Captures of two humans in two poses."""
-        job = small_job(self.folder / "made", people=2, frames=2, passes=("img", "mask"))
+        job = small_job(self.folder / "made", people=2, frames=2, passes=("img", "mask", "depth"))
         assert {outcome.status for outcome in render(job)} == {"done"}
         return job.out
 
@@ -179,6 +179,7 @@ def all_programs(given: Inputs) -> list[Program]:
                          "--pose-count", "2", "--size", "16"],
             resumes=True,
         ),
+        Program("captures coco", lambda out: ["captures", "coco", out], copied=lambda: given.captures, resumes=True),
         Program("captures pack", lambda out: ["captures", "pack", out], copied=lambda: given.captures, resumes=True),
         Program(
             "payloads encode",

@@ -43,6 +43,7 @@ ALLOWED = {
     "open": {
         "formats/regular_files.py",
         "backend/child_streams.py",
+        "capture/coco.py",
         "capture/dataset.py",
         "evaluation/gallery.py",
         "formats/picture_files.py",

@@ -40,12 +40,13 @@ def read_view(path: Path) -> None:
 
 
 def read_joints(path: Path) -> None:
+    from primdiffusion.capture.coco import keypoints_of
     from primdiffusion.capture.reader import open_captures
-    from primdiffusion.capture.sheet import joints_of, reprojection_error
+    from primdiffusion.capture.sheet import reprojection_error
 
     captures = open_captures(_root(path))
     subject = captures.subject(captures.subjects[0])
-    joints_of(subject)
+    keypoints_of(subject)
     reprojection_error(subject)
 
 
@@ -254,6 +255,12 @@ def read_photograph(path: Path) -> None:
     read_photographs([path])
 
 
+def read_behind(path: Path) -> None:
+    from primdiffusion.capture.composed import read_background
+
+    read_background(path, 32, 48)
+
+
 def place_photograph(path: Path) -> None:
     import bpy
 
@@ -350,6 +357,7 @@ TARGETS = tuple(
         ("Blender: HDRI", make_asset_picture, read_hdri),
         ("Blender: plain picture", make_photograph, place_photograph),
         ("plain picture", make_photograph, read_photograph),
+        ("background of captures", make_photograph, read_behind),
         ("posture", make_posture, read_posture),
         ("Blender: picture of a scan", make_scan_picture, find_scan_picture),
         ("Blender: scan", make_mesh, import_scan),

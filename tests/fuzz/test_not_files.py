@@ -138,6 +138,7 @@ OWN = "it reads what ships with the program, or what this program has just writt
 BACKEND = {
     "body/model.py": OWN,
     "body/smpl_files.py": ("SMPL .npz", "SMPL .pkl", "UV .obj"),
+    "capture/composed.py": ("background of captures",),
     "capture/dataset.py": ("captures: pack", "captures: about a pack"),
     "capture/people_files.py": ("glb",),
     "capture/photograph.py": ("plain picture",),

@@ -138,7 +138,10 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("tests/backend/capture/test_reader.py::test_a_list_that_names_folders_outside_is_rejected",),
     ),
     "pictures PNG, JPEG, WebP": (
-        ("picture", "shot", "captures: picture", "captures: first picture", "plain picture", "texture of an asset"),
+        (
+            "picture", "shot", "captures: picture", "captures: first picture", "plain picture", "texture of an asset",
+            "background of captures",
+        ),
         ("tests/backend/geometry/test_pictures.py::test_a_large_picture_in_a_small_file_is_rejected_by_its_header_and_a_large_file_may_have_it",),
     ),
     "shards of humans": (

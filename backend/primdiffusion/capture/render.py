@@ -19,6 +19,7 @@ from PIL import Image
 
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.people_files import SkinnedPerson, read_person
+from primdiffusion.capture.together import places, turned
 from primdiffusion.failures import describe
 from primdiffusion.formats import camera_files, capture_layout, picture_files
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
@@ -67,6 +68,58 @@ def set_up_capture(person: SkinnedPerson, poses: BodyPose, rig: Rig | Sequence[V
     else:
         views = list(rig)
     return CaptureSetup(figure, person.betas, poses, skinning, joints, views)
+
+
+def set_up_together(
+    people: Sequence[SkinnedPerson], own: int, poses: BodyPose, rig: Rig, rng: np.random.Generator
+) -> CaptureSetup:
+    """The setup of one of several humans who stand together, at other places in every pose, in front of one rig.
+
+    Each takes the poses from another one on, turned at random, with the lowest point on the floor y = 0. Circles on the
+    floor around them do not touch.
+
+    Args:
+        people: all humans of the group.
+        own: index of the human to set up.
+        poses: poses [F]; their translation is replaced.
+        rig: the cameras around the group in all poses.
+        rng: the same for all humans of the group.
+
+    Raises:
+        ValueError: a mesh cannot be drawn; the poses are not finite.
+    """
+    frames = len(poses.joint_rotation)
+    yaws = rng.uniform(-math.pi, math.pi, (len(people), frames))
+    own_poses, pelvis, bounds = [], [], []
+    for number, person in enumerate(people):
+        first = number * frames // len(people)
+        rolled = poses.joint_rotation.roll(-first, dims=0)
+        own_poses.append(turned(BodyPose(rolled, torch.zeros_like(poses.translation)), yaws[number]))
+        setup = set_up_capture(person, own_poses[-1], [])
+        pelvis.append(setup.joints[:, 0])
+        bounds.append(np.array([_extent(setup, frame) for frame in range(frames)]))
+    radii = np.array(bounds)[..., 0]
+    at = np.stack([places(radii[:, frame], rng) for frame in range(frames)], axis=1)
+    moves = [
+        np.stack([at[n, :, 0] - pelvis[n][:, 0], -bounds[n][:, 1], at[n, :, 1] - pelvis[n][:, 2]], axis=-1)
+        for n in range(len(people))
+    ]
+    corners = [
+        [at[n, frame, 0] + x * radii[n, frame], y, at[n, frame, 1] + z * radii[n, frame]]
+        for n in range(len(people))
+        for frame in range(frames)
+        for y in (0, bounds[n][frame, 2] - bounds[n][frame, 1])
+        for x, z in ((1, 1), (1, -1), (-1, 1), (-1, -1))
+    ]
+    moved = BodyPose(own_poses[own].joint_rotation, torch.from_numpy(moves[own]).to(poses.translation))
+    return set_up_capture(people[own], moved, rig.views(*bounding_sphere(np.array(corners))))
+
+
+def _extent(setup: CaptureSetup, frame: int) -> tuple[float, float, float]:
+    """Largest distance from the vertical through the pelvis, and lowest and highest point, metres."""
+    points = np.concatenate([part.posed(setup.skinning[frame]).vertices for part in setup.figure.mesh.parts])
+    across = points[:, [0, 2]] - setup.joints[frame, 0, [0, 2]]
+    return float(np.linalg.norm(across, axis=1).max()), float(points[:, 1].min()), float(points[:, 1].max())
 
 
 @contextlib.contextmanager
@@ -152,6 +205,8 @@ class RenderJob:
     """Whether the dataset includes the subject whose name the released code looks up for rest sizes."""
     unread_poses: tuple[str, ...] = ()
     """Errors of skipped pose files, for the report."""
+    together: tuple[Mapping[str, Path], ...] = ()
+    """Groups of humans who stand together, .glb files by name; every subject is in one of them, or there are none."""
     part: str = "report"
     """Name of the report; runs that share a folder need different ones."""
 
@@ -171,6 +226,7 @@ class RenderJob:
             "depth": {"kind": "z", "unit_m": picture_files.DEPTH_UNIT},
             "part_names": list(JOINT_NAMES),
             "released_reference": self.released_reference,
+            **({"together": max(map(len, self.together))} if self.together else {}),
         }
 
 
@@ -264,7 +320,12 @@ def _try(job: RenderJob, name: str, frames: Sequence[int]) -> SubjectResult:
 
 
 def _set_up(job: RenderJob, name: str) -> CaptureSetup:
-    return set_up_capture(read_person(job.people[name]), job.poses, job.rig)
+    group = next((group for group in job.together if name in group), None)
+    if group is None:
+        return set_up_capture(read_person(job.people[name]), job.poses, job.rig)
+    names = sorted(group)
+    rng = np.random.default_rng(capture_layout.view_seed(job.seed, names[0], 0, 0))
+    return set_up_together([read_person(group[n]) for n in names], names.index(name), job.poses, job.rig, rng)
 
 
 def _finish(job: RenderJob, name: str, outcomes: Sequence[SubjectResult]) -> SubjectResult:

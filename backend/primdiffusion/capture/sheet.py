@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from PIL import Image, ImageDraw
 
-from primdiffusion.body.model import BodyModel, BodyPose, default_body
+from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.camera_rig import View
@@ -54,12 +54,16 @@ def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarr
     """World positions of the joints from joints.npz; without it (released layout), those of the body (None: default).
 
     Raises:
-        ArrayFileError: joints.npz is damaged.
+        ArrayFileError: joints.npz is damaged, or of other frames or joints.
     """
+    path = subject.folder / "joints.npz"
     try:
-        return read_numbers(subject.folder / "joints.npz", ("world",))["world"]
+        joints = read_numbers(path, ("world",))["world"]
     except FileNotFoundError:
         return body_joints(subject, default_body() if body is None else body)
+    if joints.shape != (subject.frames, J, 3):
+        raise ArrayFileError(f"{path} has joints of shape {joints.shape} for {subject.frames} frames: render again")
+    return joints
 
 
 def default_joints(subject: Subject) -> Float[np.ndarray, "F J 3"]:

@@ -1,11 +1,11 @@
-"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet and farm."""
+"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet, coco and farm."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +13,8 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
+from primdiffusion.capture.composed import Backgrounds
 from primdiffusion.capture.dataset import open_pack, pack
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
 from primdiffusion.capture.people_files import find_people
@@ -20,10 +22,13 @@ from primdiffusion.capture.poses import MotionFileError, choose_poses, read_moti
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
+from primdiffusion.capture.together import MOST
+from primdiffusion.evaluation.shots import folder_pictures
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.requests import PASSES
+from primdiffusion.training.captured_people import read_cards
 
 DESCRIPTION = "Multi-view captures, to train on."
 
@@ -59,6 +64,9 @@ class RenderCaptures:
     """Seed of the choice of poses."""
     workers: int = 1
     """Number of processes; each uses a core and about 1 GB."""
+    together: int = 1
+    """Number of humans, 1 to 8, that stand together on a floor, in front of the same cameras; `coco` makes one image of
+    them."""
     shard: str = "0/1"
     """i/n: only every n-th human from the i-th on, i = 0 ... n - 1, to share the work between machines."""
     released_reference: bool = False
@@ -77,6 +85,10 @@ class RenderCaptures:
         names = sorted(people)[index::count]
         if self.pose_count == 0 and len(self.poses) != 1:
             raise ValueError("pose_count 0 takes all frames of one motion file: give one with --poses")
+        if not 1 <= self.together <= MOST:
+            raise ValueError(f"together is {self.together}: give 1 to {MOST}")
+        if self.released_reference and self.together > 1:
+            raise ValueError("the released code expects its reference alone: leave out --together")
         poses, unread = self._poses()
         job = RenderJob(
             people={name: people[name] for name in names},
@@ -88,6 +100,7 @@ class RenderCaptures:
             seed=self.seed,
             released_reference=self.released_reference,
             unread_poses=tuple(unread),
+            together=self._groups(people) if self.together > 1 else (),
             part="report" if count == 1 else f"report-{index}-of-{count}",
         )
         for error in unread:
@@ -101,6 +114,12 @@ class RenderCaptures:
             raise ValueError(
                 f"{outcomes['failed']} of {len(names)} humans{poses_too} failed: {self.out / job.part}.json says why"
             )
+
+    def _groups(self, people: Mapping[str, Path]) -> tuple[dict[str, Path], ...]:
+        """Split all humans, of all shards, into groups by their names."""
+        names = sorted(people)
+        parts = [names[first : first + self.together] for first in range(0, len(names), self.together)]
+        return tuple({name: people[name] for name in part} for part in parts)
 
     def _poses(self) -> tuple[BodyPose, list[str]]:
         """Return the poses, and the errors of unreadable motion files. Raises MotionFileError if all are."""
@@ -213,6 +232,30 @@ class SheetOfCaptures:
 
 
 @dataclasses.dataclass(frozen=True)
+class AnnotateCaptures:
+    """Write annotations in COCO's format (boxes, masks, 17 keypoints, SMPL) and a table of all images."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder of a capture dataset, with images, masks and depth; the files go there."""
+    people: Path | None = None
+    """Folder of `primdiffusion people` that the captures show: its attributes become columns of the table."""
+    backgrounds: Path | None = None
+    """Folder of pictures to put behind the humans; the default leaves the images over black."""
+    seed: int = 0
+    """Seed of the choice of a background for each image."""
+
+    def run(self) -> None:
+        """Write both files, and print their paths."""
+        captures = open_captures(self.root)
+        cards = {} if self.people is None else read_cards(self.people)
+        attributes = {name: card.get("attributes", {}) for name, card in cards.items()}
+        backgrounds = self.backgrounds and Backgrounds(tuple(folder_pictures(self.backgrounds)), self.seed)
+        with tqdm(total=len(captures.subjects), unit="human", disable=None) as progress:
+            write_coco(captures, attributes, backgrounds, lambda _: progress.update())
+        print(f"{self.root / ANNOTATIONS_FILE}\n{self.root / TABLE_FILE}")
+
+
+@dataclasses.dataclass(frozen=True)
 class FarmCaptures:
     """Render a dataset with Blender on a Ray cluster, one human per task (needs the extra `farm`).
 
@@ -251,6 +294,7 @@ Command = (
     | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
     | Annotated[PackCaptures, tyro.conf.subcommand("pack")]
     | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
+    | Annotated[AnnotateCaptures, tyro.conf.subcommand("coco")]
     | Annotated[FarmCaptures, tyro.conf.subcommand("farm")]
 )
 

@@ -1,0 +1,303 @@
+"""Annotations of finished captures in COCO's format, for trainers of keypoints and masks, and a table of all images.
+
+    root/annotations.json    images, persons with boxes, run-length masks and COCO's 17 keypoints; cameras and SMPL too
+    root/images.csv          a line for each human in an image: subject, frame, camera, attributes where they are known
+    root/composed/           images over backgrounds, if pictures for them are given, and of humans who stand together
+
+All follow from the files of the captures (and these pictures) alone, so that the same captures give the same bytes.
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, UInt8, UInt16
+
+from primdiffusion.body.model import default_body
+from primdiffusion.capture.composed import Backgrounds, StoredView, composed_path, uncovered, write_composed
+from primdiffusion.capture.reader import Captures, Subject
+from primdiffusion.capture.sheet import joints_of
+from primdiffusion.capture.together import groups
+from primdiffusion.formats import capture_layout
+from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.picture_files import DEPTH_UNIT
+from primdiffusion.formats.regular_files import FileError
+from primdiffusion.formats.whole_files import replacing
+
+ANNOTATIONS_FILE, TABLE_FILE = "annotations.json", "images.csv"
+PASSES = ("img", "mask", "depth")
+"""Passes that annotations need."""
+THRESHOLD = 128
+"""Masks are the pixels with at least this coverage, of 255: half the pixel."""
+FACE = {"nose": (4526, 4526), "left_eye": (6201, 6246), "right_eye": (21, 66), "left_ear": (10882, 10882),
+        "right_ear": (4863, 4863)}  # fmt: skip
+"""COCO's keypoints that SMPL has no joints for, each the mean of two of the default body's vertices: tip of the nose,
+corners of the eyelids, outermost points of the ears."""
+THICKNESS = {"nose": 0.04, "eye": 0.04, "ear": 0.04, "shoulder": 0.16, "elbow": 0.12, "wrist": 0.1, "hip": 0.22,
+             "knee": 0.16, "ankle": 0.16}  # fmt: skip
+"""Metres: a keypoint deeper behind the nearest surface is hidden. More than from the joint to the surface around the
+limb, in wide clothes, and less than to the far side of a limb in front of it, or from one hip across to the other."""
+KEYPOINTS = (*FACE, *(
+    f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")
+))  # fmt: skip
+"""COCO's 17 keypoints in their order."""
+SKELETON = (
+    (16, 14), (14, 12), (17, 15), (15, 13), (12, 13), (6, 12), (7, 13), (6, 7), (6, 8), (7, 9), (8, 10), (9, 11),
+    (2, 3), (1, 2), (1, 3), (2, 4), (3, 5), (4, 6), (5, 7),
+)  # fmt: skip
+"""COCO's limbs between keypoints, which are counted from 1."""
+CATEGORY = {"id": 1, "name": "person", "supercategory": "person", "keypoints": KEYPOINTS, "skeleton": SKELETON}
+SAME_BODY = 0.002
+"""Metres between joints of captures and the default body's up to which the captures are of the default body."""
+_JOINTS = [JOINT_NAMES.index(name) for name in KEYPOINTS[len(FACE) :]]
+_HIPS = [KEYPOINTS.index("left_hip"), KEYPOINTS.index("right_hip")]
+_THICKNESS = np.array([THICKNESS[name.rpartition("_")[2]] for name in KEYPOINTS])
+_FARTHEST = DEPTH_UNIT * np.iinfo(np.uint16).max
+
+
+def write_coco(
+    captures: Captures,
+    attributes: Mapping[str, Mapping[str, Any]],
+    backgrounds: Backgrounds | None = None,
+    report: Callable[[str], object] = lambda subject: None,
+) -> None:
+    """Write annotations.json and images.csv into the captures' folder; both appear at the end or not at all.
+
+    With backgrounds, and of humans who stand together (`together`), composed images are written, which are annotated.
+
+    Keypoints are indices of pixels as COCO's: the centre of the upper left pixel is (0, 0). Their visibility is COCO's:
+    0 outside of the image or unknown, 1 hidden, 2 visible. The face's are known where the subject has the default body.
+    An image without a pixel of its subject has no annotation.
+
+    Args:
+        captures: images, masks and depth of finished subjects.
+        attributes: values for the table by subject and name; a subject may lack all or some.
+        backgrounds: pictures to draw from for each view; without them, annotated images are those of the captures.
+        report: called with the name of each annotated subject.
+
+    Raises:
+        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a pass or file is missing, or damaged.
+        ValueError: attributes of a subject are not a mapping.
+        OutsideFolderError, OSError: a file cannot be written, or lies behind a link out of the captures.
+    """
+    if missing := [kind for kind in PASSES if kind not in captures.passes]:
+        raise FileError(captures.root, f"has no {' and no '.join(missing)}", f"render with {', '.join(PASSES)}")
+    table, annotations = captures.root / TABLE_FILE, captures.root / ANNOTATIONS_FILE
+    with replacing(table) as rows_to, replacing(annotations) as annotations_to:
+        with rows_to.open("w", encoding="utf-8", newline="") as file:
+            csv.writer(file, lineterminator="\n").writerows(_rows(captures, attributes, backgrounds))
+        with annotations_to.open("w", encoding="utf-8", newline="\n") as file:
+            file.write('{"info":{"description":"PrimDiffusion captures"},"licenses":[],')
+            file.write(f'"categories":[{_line(CATEGORY)}],\n"images":[\n')
+            file.writelines(_separated(_line(image.record) for image in _images(captures, backgrounds)))
+            file.write('],\n"annotations":[\n')
+            file.writelines(_separated(_annotations(captures, backgrounds, report)))
+            file.write("]}\n")
+
+
+def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
+    """COCO's uncompressed run lengths: of pixels column by column, outside and inside in turn, outside first."""
+    pixels = mask.T.ravel()
+    changes = np.flatnonzero(pixels[1:] != pixels[:-1]) + 1
+    runs = np.diff(changes, prepend=0, append=pixels.size).tolist()
+    return [0, *runs] if pixels[0] else runs
+
+
+def keypoints_of(subject: Subject) -> Float[np.ndarray, "F 17 3"]:
+    """World positions of COCO's keypoints; the face's are NaN where the subject's joints are not the default body's.
+
+    Raises:
+        ArrayFileError: joints.npz is damaged.
+    """
+    joints, body = joints_of(subject).astype(np.float64), default_body()
+    points = np.full((subject.frames, len(KEYPOINTS), 3), np.nan)
+    points[:, len(FACE) :] = joints[:, _JOINTS]
+    if len(subject.smpl.betas) > body.shape_basis.shape[-1]:
+        return points
+    shaped = body.to(dtype=torch.float64).shape(torch.from_numpy(subject.smpl.betas).double())
+    for frame in range(subject.frames):
+        posed = shaped.pose(subject.smpl.pose(frame).to(dtype=torch.float64))
+        apart = np.linalg.norm(posed.joints[:, :3, 3].numpy() - joints[frame], axis=-1)
+        if apart.max() <= SAME_BODY:
+            points[frame, : len(FACE)] = posed.vertices.numpy()[list(FACE.values())].mean(1)
+    return points
+
+
+def visibility(
+    view: View,
+    points: Float[np.ndarray, "17 3"],
+    mask: UInt8[np.ndarray, "H W"],
+    depth: UInt16[np.ndarray, "H W"],
+) -> tuple[Float[np.ndarray, "17 2"], list[int]]:
+    """Pixels of keypoints in the world, pixel centres at +0.5, and COCO's visibility of each.
+
+    A keypoint is visible if the surface at its pixel is at most THICKNESS in front of it, or if there is none. `mask`
+    and `depth` are as stored; depth does not reach beyond 16 m, where keypoints in the mask count as hidden.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        pixels, far = view.project(points)
+    seen = []
+    for (x, y), z, thickness in zip(pixels, far, _THICKNESS, strict=True):
+        if not (z > 0 and 0 <= x < view.width and 0 <= y < view.height):
+            seen.append(0)
+            continue
+        at = int(y), int(x)
+        surface = depth[at] * DEPTH_UNIT if depth[at] else np.inf
+        beyond = z > _FARTHEST and mask[at] >= THRESHOLD
+        seen.append(1 if beyond or z - surface > thickness else 2)
+    return pixels, seen
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Image:
+    id: int
+    subjects: tuple[Subject, ...]
+    frame: int
+    camera: int
+    background: Path | None
+
+    @property
+    def view(self) -> View:
+        return self.subjects[0].views[self.camera]
+
+    @property
+    def is_composed(self) -> bool:
+        return self.background is not None or len(self.subjects) > 1
+
+    @property
+    def file_name(self) -> str:
+        first = self.subjects[0]
+        path = capture_layout.picture_path(first.folder, "img", self.camera, self.frame)
+        if self.is_composed:
+            path = composed_path(first, self.frame, self.camera)
+        return path.relative_to(first.folder.parent).as_posix()
+
+    @property
+    def record(self) -> dict[str, Any]:
+        view = self.view
+        return {
+            "id": self.id,
+            "file_name": self.file_name,
+            "width": view.width,
+            "height": view.height,
+            "subjects": [subject.name for subject in self.subjects],
+            "frame": self.frame,
+            "camera": self.camera,
+            "K": view.intrinsics.tolist(),
+            "R": view.rotation.tolist(),
+            "T": view.translation.tolist(),
+        }
+
+    def annotations(self, points: Sequence[Float[np.ndarray, "F 17 3"]]) -> Iterator[dict[str, Any]]:
+        """All subjects of which the image shows a pixel, without ids; writes the image if it is composed."""
+        views = [self._stored(subject, own[self.frame]) for subject, own in zip(self.subjects, points, strict=True)]
+        if self.is_composed:
+            write_composed(views, self.subjects[0], self.frame, self.camera, self.background)
+        mask = np.maximum.reduce([view.mask for view in views])
+        depth = np.minimum.reduce([view.depth - np.uint16(1) for view in views]) + np.uint16(1)  # 0 wraps: the farthest
+        for subject, view, share, own in zip(self.subjects, views, uncovered(views)[:-1], points, strict=True):
+            seen = share * view.mask >= THRESHOLD
+            if seen.any():
+                pixels, visible = visibility(self.view, own[self.frame], mask, depth)
+                yield {
+                    **_outline(seen),
+                    **({"amodal": _mask(view.mask >= THRESHOLD)} if len(views) > 1 else {}),
+                    **_keypoints(pixels, visible),
+                    "subject": subject.name,
+                    "smpl": {
+                        "pose": _rounded(subject.smpl.theta[self.frame], 6),
+                        "betas": _rounded(subject.smpl.betas, 6),
+                        "translation": _rounded(subject.smpl.translation[self.frame], 6),
+                    },
+                }
+
+    def _stored(self, subject: Subject, points: Float[np.ndarray, "17 3"]) -> StoredView:
+        stored = subject.pictures(PASSES if self.is_composed else PASSES[1:], self.frame, self.camera)
+        _, distance = self.view.project(points[_HIPS].mean(0))
+        img = stored.get("img", np.zeros((0, 0, 3), np.uint8))
+        return StoredView(img, stored["mask"], stored["depth"], float(distance))
+
+
+def _mask(inside: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
+    return {"size": list(inside.shape), "counts": run_lengths(inside)}
+
+
+def _outline(inside: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
+    columns, rows = np.flatnonzero(inside.any(0)), np.flatnonzero(inside.any(1))
+    left, top = int(columns[0]), int(rows[0])
+    return {
+        "iscrowd": 0,
+        "bbox": [left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top],
+        "area": int(inside.sum()),
+        "segmentation": _mask(inside),
+    }
+
+
+def _keypoints(pixels: Float[np.ndarray, "17 2"], visible: Sequence[int]) -> dict[str, Any]:
+    indices = [_rounded(pixel - 0.5, 2) if v else [0, 0] for pixel, v in zip(pixels, visible, strict=True)]
+    return {
+        "num_keypoints": sum(v > 0 for v in visible),
+        "keypoints": [value for (x, y), v in zip(indices, visible, strict=True) for value in (x, y, v)],
+    }
+
+
+def _images(captures: Captures, backgrounds: Backgrounds | None) -> Iterator[_Image]:
+    """All images by subjects, frame and camera, numbered from 1."""
+    number = 0
+    for subjects in groups(captures):
+        for frame in range(subjects[0].frames):
+            for camera in range(len(subjects[0].views)):
+                number += 1
+                background = None if backgrounds is None else backgrounds.drawn(subjects[0].name, frame, camera)
+                yield _Image(number, subjects, frame, camera, background)
+
+
+def _annotations(captures: Captures, backgrounds: Backgrounds | None, report: Callable[[str], object]) -> Iterator[str]:
+    number, points = 0, []
+    for image in _images(captures, backgrounds):
+        if image.frame == image.camera == 0:
+            points = [keypoints_of(subject) for subject in image.subjects]
+        for annotation in image.annotations(points):
+            number += 1
+            yield _line({"id": number, "image_id": image.id, "category_id": CATEGORY["id"], **annotation})
+        first = image.subjects[0]
+        if (image.frame, image.camera) == (first.frames - 1, len(first.views) - 1):
+            for subject in image.subjects:
+                report(subject.name)
+
+
+def _rows(
+    captures: Captures, attributes: Mapping[str, Mapping[str, Any]], backgrounds: Backgrounds | None
+) -> Iterator[list[Any]]:
+    for name in captures.subjects:
+        if not isinstance(attributes.get(name, {}), Mapping):
+            raise ValueError(f"the attributes of {name} are {attributes[name]!r:.80}: give names and values")
+    columns = sorted({column for name in captures.subjects for column in attributes.get(name, {})})
+    yield ["image_id", "file_name", "subject", "frame", "camera", *columns]
+    for image in _images(captures, backgrounds):
+        for subject in image.subjects:
+            own = attributes.get(subject.name, {})
+            values = [own.get(column, "") for column in columns]
+            yield [image.id, image.file_name, subject.name, image.frame, image.camera, *values]
+
+
+def _rounded(values: np.ndarray, digits: int) -> list[float]:
+    return (np.round(values.astype(np.float64), digits) + 0.0).tolist()  # + 0.0: no negative zeros
+
+
+def _line(record: Mapping[str, Any]) -> str:
+    return json.dumps(record, separators=(",", ":"), allow_nan=False)
+
+
+def _separated(lines: Iterator[str]) -> Iterator[str]:
+    """Lines of a JSON list."""
+    for number, line in enumerate(lines):
+        yield f",\n{line}" if number else line
