@@ -76,6 +76,7 @@ NEED_MORE = ("nearest_neighbour_ratio_latent", "fid_ours", "kid_100_ours", "fid_
 """Figures that are null without people or weights."""
 TITLES = {
     "ours": "ours",
+    "unguided": "ours, no attributes drawn",
     "old": "ours, the checkpoint before",
     "gaussian": "one Gaussian of the training people",
     "voxel": "diffusion on 64^3 voxels",
@@ -173,6 +174,7 @@ def comparisons(
     seeds = seeds_of(count)
     sets: dict[str, Callable[[], Iterable[Primitives]]] = {
         "ours": lambda: placed(generated(model, seeds)),
+        "unguided": lambda: placed(generated(model, seeds, guidance=0.0)),
         "gaussian": lambda: placed(gaussian(model, seeds)),
         "from_mesh": lambda: from_meshes(assets, seeds_of(count, OTHER_SEED)),
         "from_mesh_codec": lambda: from_meshes(assets, seeds_of(count, OTHER_SEED), model),
@@ -249,7 +251,7 @@ def quality_figures(rows: Mapping[str, Comparison], reference: ReferenceSet | No
     ours, floor, old = (rows[name].frechet if name in rows else None for name in ("ours", "floor", "old"))
     figures["distance_ratio_floor"] = round(ours / floor, 4) if ours and floor else None
     figures["distance_ratio_old_checkpoint"] = round(ours / old, 4) if ours and old else None
-    for name in ("ours", "old", "gaussian", "voxel", "floor"):
+    for name in ("ours", "unguided", "old", "gaussian", "voxel", "floor"):
         row = rows.get(name)
         suffix = "" if name == "ours" else f"_{name}"
         figures[f"nearest_neighbour_ratio{suffix}"] = None if row is None else round(row.nearest_ratio, 4)

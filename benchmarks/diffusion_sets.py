@@ -11,6 +11,7 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
 from primdiffusion.evaluation.gallery import payload_of
 from primdiffusion.evaluation.portraits import PORTRAITS, camera_of
+from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate_batch, place
 from primdiffusion.people.assets import Assets
@@ -28,10 +29,12 @@ TOGETHER = 8
 """Batch size of sampling."""
 
 
-def generated(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
-    """Ours, with the default sampler and steps."""
+def generated(
+    model: DiffusionModel, seeds: Sequence[int], guidance: float = requests.Conditioning.guidance
+) -> Iterator[Human]:
+    """Ours, with the default sampler and steps; without guidance (0) attributes that are drawn have no effect."""
     for first in range(0, len(seeds), TOGETHER):
-        yield from generate_batch(model, seeds[first : first + TOGETHER])
+        yield from generate_batch(model, seeds[first : first + TOGETHER], guidance=guidance)
 
 
 def gaussian(model: DiffusionModel, seeds: Sequence[int]) -> Iterator[Human]:
