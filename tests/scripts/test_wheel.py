@@ -62,7 +62,12 @@ def wheel(built):
 def test_the_wheel_holds_the_whole_package_and_nothing_else(wheel):
     names = {name for name in wheel.namelist() if ".dist-info/" not in name}
     assert names == sources()
-    wanted = {"weights/default.safetensors", "weights/encoder.safetensors", "weights/pose_depth.safetensors", "py.typed"}
+    wanted = {
+        "weights/default.safetensors",
+        "weights/encoder.safetensors",
+        "weights/pose_depth.safetensors",
+        "py.typed",
+    }
     wanted |= {"body/data/body.npz", "human.py"}
     assert {f"primdiffusion/{name}" for name in wanted} <= names
 
