@@ -136,8 +136,12 @@ def blender_extension_tool() -> Path | None:
 
 
 def validate(archive: Path, tool: Path) -> None:
-    """Raises BuildError with the tool's output if Blender would reject the zip."""
-    command = [sys.executable, str(tool), "validate", "--valid-tags", "", str(archive)]
+    """Raises BuildError with the tool's output if `blender --command extension validate` would reject the zip.
+
+    As there, tags must be in Blender's list, which is that of extensions.blender.org.
+    """
+    tags = tool.parents[3] / "modules" / "_bpy_internal" / "extensions" / "tags.py"
+    command = [sys.executable, str(tool), "validate", "--valid-tags", str(tags), str(archive)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, encoding="utf-8")
     if done.returncode != 0:
         raise BuildError(f"Blender's extension tool rejects {archive.name}: {(done.stdout + done.stderr).strip()}")

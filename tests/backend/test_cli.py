@@ -1,5 +1,6 @@
 """The command line as a user meets it."""
 
+import dataclasses
 import itertools
 import json
 import os
@@ -12,7 +13,11 @@ import pytest
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.commands import info
+from primdiffusion.formats.schema import FieldError
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
+from primdiffusion.render.march import RELEASED, march
 from tiny_encoder import save_tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
@@ -131,6 +136,28 @@ def test_render_draws_each_view_at_any_width_and_height(person, tmp_path):
     assert (shown["boxes"] | ~shown["colour"]).all(), "boxes hold the person"
     for first, second in itertools.combinations(pictures, 2):
         assert np.abs(pictures[first] - pictures[second]).mean() > 1
+
+
+def test_released_compositing_is_that_of_encoded_colours_and_backgrounds(person, tmp_path):
+    """Released pictures are colour + (1 - alpha) background, all of them sRGB-encoded."""
+    human, pictures = str(person / "person.human.safetensors"), {}
+    for background in ("black", "white", "transparent"):
+        line = ["render", human, "--out", str(tmp_path / "a.png"), "--size", "64", "--background", background]
+        cli.run([*line, "--compositing", "released"])
+        pictures[background] = np.asarray(Image.open(tmp_path / "a.png")).astype(float) / 255
+    primitives = place(load_human(Path(human)))
+    encoded = dataclasses.replace(primitives, rgb=encode_srgb(primitives.rgb))
+    rendering = march(encoded, framing(primitives, 0.0, 64, 64), RELEASED)
+    colour, alpha = rendering.rgb.numpy(), rendering.alpha.numpy()[..., None]
+    assert ((alpha > 0.2) & (alpha < 0.8)).any()
+    assert np.abs(pictures["black"] - colour).max() < 0.005
+    assert np.abs(pictures["white"] - (colour + 1 - alpha)).max() < 0.005
+    assert (
+        np.abs(pictures["transparent"] * pictures["transparent"][..., 3:] - np.append(colour, alpha**2, 2)).max() < 0.01
+    )
+    for other in (["--view", "depth"], ["--step", "0.002"]):
+        with pytest.raises(FieldError, match="compositing"):
+            cli.run([*line, "--compositing", "released", *other])
 
 
 def test_a_finer_step_changes_little_and_a_coarse_one_much(person, tmp_path):

@@ -51,16 +51,19 @@ def test_the_zip_holds_addon_backend_and_licence_and_nothing_stray(archive):
     assert WEIGHTS.is_file() == ("bundled/primdiffusion/weights/default.safetensors" in names)
 
 
-def test_blenders_own_tool_accepts_the_zip_and_rejects_one_without_a_licence(archive, tmp_path):
+@pytest.mark.parametrize(
+    ("entry", "spoilt", "named"), [("license =", "licence =", "licen"), ('"Rigging"', '"Rig"', "invalid tag")]
+)
+def test_blenders_own_tool_accepts_the_zip_and_rejects_a_spoilt_manifest(entry, spoilt, named, archive, tmp_path):
     tool = build_addon.blender_extension_tool()
     assert tool is not None
     build_addon.validate(archive, tool)
     spoiled = tmp_path / "spoiled.zip"
     with zipfile.ZipFile(archive) as source, zipfile.ZipFile(spoiled, "w") as target:
         manifest = source.read("blender_manifest.toml").decode()
-        target.writestr("blender_manifest.toml", manifest.replace("license", "licence"))
+        target.writestr("blender_manifest.toml", manifest.replace(entry, spoilt))
         target.writestr("__init__.py", source.read("__init__.py"))
-    with refused(build_addon.BuildError, "licen"):
+    with refused(build_addon.BuildError, named):
         build_addon.validate(spoiled, tool)
 
 

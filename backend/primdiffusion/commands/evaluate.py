@@ -18,7 +18,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation import generation, reconstruction
 from primdiffusion.evaluation.attribute_network import features_of
-from primdiffusion.evaluation.distances import NEIGHBOURS
+from primdiffusion.evaluation.distances import NEIGHBOURS, too_few_samples
 from primdiffusion.evaluation.gallery import (
     COLOURINGS,
     made_gallery,
@@ -174,6 +174,9 @@ class EvaluateGeneration:
             }
             _write(self.json, record)
         print(generation.table(rows))
+        note = too_few_samples(self.count, *reference.held_features.shape)
+        if note is not None:
+            print(f"\nFrechet distance: {note}.")
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:

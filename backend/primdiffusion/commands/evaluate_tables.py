@@ -51,6 +51,7 @@ from primdiffusion.evaluation.tables import (
     compare_pictures,
     evaluate,
     floor_cells,
+    remarks,
     table,
 )
 from primdiffusion.human import Human, framing, generate, place
@@ -161,6 +162,7 @@ def measure(options: TableOptions, generated: Generated, assets: Path | None) ->
         "choices": choices,
         "resolution": resolution,
         "rows": {row: {name: cell._asdict() for name, cell in cells.items()} for row, cells in rows.items()},
+        "remarks": remarks(rows),
         "own_network": networks.own.card,
     }
     return record, table(int(options.table or 1), rows, choices, resolution)

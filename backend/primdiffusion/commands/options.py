@@ -90,16 +90,23 @@ class RenderCommand(PoseOptions):
     """colour; depth in false colours, bright where near; alpha in grey; boxes: the primitives."""
     step: RayStep = RAY_STEP
     """Metres between samples of a ray; finer is slower and more accurate."""
+    compositing: Literal["linear", "released"] = "linear"
+    """linear, as in Blender; released, as the authors' code: sRGB-encoded colours, boxes in index order, a sample each
+    millimetre, rays through pixel corners."""
     background: Literal["black", "white", "transparent"] = "black"
     """Background behind the human."""
     depth: Annotated[Path, Ending((".png",))] | None = None
     """A second PNG: depth in false colours, bright where near."""
 
     def check(self) -> None:
-        """Raise FieldError for one file with two contents, and as `PoseOptions`."""
+        """Raise FieldError for one file with two contents, for what `released` does not have, as `PoseOptions`."""
         super().check()
         if self.depth is not None and real_path(self.depth) == real_path(self.out):
             raise FieldError(("depth",), f"is {self.depth}, as out: give two different files")
+        if self.compositing == "released" and (self.view, self.step) != ("colour", RAY_STEP):
+            raise FieldError(
+                ("compositing",), "is released, which has its own step and the view colour: omit the others"
+            )
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

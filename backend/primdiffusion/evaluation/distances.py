@@ -12,6 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+ENOUGH = 10
+"""Samples per feature; with fewer, the bias of a Frechet distance is not small beside differences between models."""
 NEIGHBOURS = 3
 """k of precision and recall (Kynkäänniemi et al. 2019)."""
 ROWS_AT_ONCE = 512
@@ -33,6 +35,16 @@ def frechet_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) 
     overlap = torch.linalg.svdvals(roots[0] @ roots[1].T).sum()
     spread = sum(root.square().sum() for root in roots)
     return float((means[0] - means[1]).square().sum() + spread - 2 * overlap)
+
+
+def too_few_samples(first: int, second: int, features: int) -> str | None:
+    """What to know of a Frechet distance between sets of these sizes; None for sets that are large enough."""
+    if min(first, second) >= ENOUGH * features:
+        return None
+    return (
+        f"{min(first, second)} samples for {features} features are fewer than {ENOUGH} each ({ENOUGH * features}): the "
+        "distance is biased, so compare it only with those of sets of the same sizes"
+    )
 
 
 def kernel_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> float:

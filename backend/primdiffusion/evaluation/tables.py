@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets
+from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
 from primdiffusion.evaluation.onnx_networks import DepthNetwork, PoseNetwork
 from primdiffusion.evaluation.pose_depth_metrics import correct_joints, depth_error
 from primdiffusion.evaluation.pose_depth_network import (
@@ -54,6 +54,8 @@ class Cell(NamedTuple):
     """What stands after +-: the standard deviation over KID's subsets, or over pictures."""
     why: str | None = None
     """Why there is no value."""
+    note: str | None = None
+    """What to know before the value is compared with others."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +158,11 @@ def compare_pictures(
 def _frechet(fake: Scores, real: Scores, name: str, option: str) -> Cell:
     if name not in fake.features:
         return Cell(None, why=f"no weights file: name one with {option}")
-    return Cell(frechet_distance(fake.features[name], real.features[name]))
+    return _distance(fake.features[name], real.features[name])
+
+
+def _distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> Cell:
+    return Cell(frechet_distance(first, second), note=too_few_samples(len(first), len(second), first.shape[1]))
 
 
 def _kid(fake: Scores, real: Scores, subsets: int, size: int, seed: int) -> Cell:
@@ -196,9 +202,7 @@ def _own_distances(fake: Scores, real: Scores) -> tuple[Cell, Cell]:
     count = min(len(made), len(true) // 2)
     spread = torch.linspace(0, len(made) - 1, count).long()
     second = true[-count:]
-    distances = (frechet_distance(made[spread], second), frechet_distance(true[:count], second))
-    generated, own = (Cell(distance) for distance in distances)
-    return generated, own
+    return _distance(made[spread], second), _distance(true[:count], second)
 
 
 COLUMNS = {
@@ -220,6 +224,34 @@ OF_TABLE = {
 """Columns of the paper's tables, then our own network's."""
 
 
+NETWORK_SCORES = {"pckh": 1, "own_pckh": 1, "depth": -1, "own_depth": -1}
+"""Columns that score how well a network reads joints or depth from pictures; 1: higher is better, -1: lower is."""
+
+
+def remarks(rows: Mapping[str, Mapping[str, Cell]]) -> list[str]:
+    """Sentences on figures that do not mean what they seem to: scores that real pictures do not win, biased distances.
+
+    Rows are those of a table, "real" among them.
+    """
+    found = []
+    for column, sign in NETWORK_SCORES.items():
+        values = {row: cells[column].value for row, cells in rows.items() if row != "floor" and column in cells}
+        true = values.pop("real", None)
+        if true is None:
+            continue
+        as_good = {row: value for row, value in values.items() if value is not None and sign * (value - true) >= 0}
+        if as_good:
+            named = ", ".join(f"{row} {value:.4g}" for row, value in as_good.items())
+            found.append(
+                f"{COLUMNS[column]} does not discriminate: real pictures have {true:.4g}, which {named} reach or pass, "
+                "so a better figure does not mean better pictures."
+            )
+    for column, title in COLUMNS.items():
+        notes = dict.fromkeys(cells[column].note for cells in rows.values() if column in cells)
+        found += [f"{title}: {note}." for note in notes if note is not None]
+    return found
+
+
 def floor_cells(card: Mapping[str, Any]) -> dict[str, Cell]:
     """The own network's errors on renders of held-out meshes, from its card: no model can be expected to have less."""
     errors = card["errors"]
@@ -229,7 +261,7 @@ def floor_cells(card: Mapping[str, Any]) -> dict[str, Cell]:
 def table(
     number: int, rows: Mapping[str, Mapping[str, Cell]], choices: Mapping[str, Any], resolution: str | None = None
 ) -> str:
-    """Format as Markdown: the table, every choice, and a sentence for each empty column of the first row."""
+    """Format as Markdown: the table, every choice, `remarks`, and a sentence for each empty column of the first row."""
     columns = OF_TABLE[number]
     names = ["pictures", *(["resolution"] if number == 2 else []), *(COLUMNS[column] for column in columns)]
     lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
@@ -237,6 +269,8 @@ def table(
         texts = [row, *([(resolution or "-") if row == "generated" else "-"] if number == 2 else [])]
         lines.append(f"| {' | '.join(texts + [_text(cells.get(column)) for column in columns])} |")
     lines += ["", *(f"{name}: {_plain(value)}" for name, value in choices.items())]
+    said = remarks({row: {name: cells[name] for name in columns if name in cells} for row, cells in rows.items()})
+    lines += ["", *said] if said else []
     first = next(iter(rows.values()))
     missing = {COLUMNS[column]: first[column].why for column in columns if first[column].value is None}
     if missing:

@@ -7,6 +7,8 @@ import json
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import tyro
+
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.formats.json_files import parse_json
@@ -102,8 +104,9 @@ class RunSettings:
 
     data: Path
     """Training set."""
-    run: Path
-    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed."""
+    run: Annotated[Path, tyro.conf.arg(aliases=("--run-folder",))]
+    """Folder of the run: weights, metrics, images and settings; an unfinished run is resumed. --run-folder is the same,
+    for torchrun, which takes --run for its own --run-path."""
     minutes: NotNegative | None = None
     """Time limit, after which the run can be resumed; 0 writes the model of the last saved state."""
     seed: int = 0

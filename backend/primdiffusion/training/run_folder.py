@@ -87,6 +87,7 @@ def begin(
         ValueError: settings or training set differ from those of the run, or files are damaged.
         OSError: the folder cannot be written to.
     """
+    log.info("training on %d %s", processes, "process" if processes == 1 else "processes, each with its own batches")
     steps = {phase: saved_step(state_path(config.run, phase)) for phase in phases}
     saved, noted = config.run / CONFIG, config.run / RUN
     started = {"people": list(people), **about, "starts": []}

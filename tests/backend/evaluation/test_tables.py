@@ -14,11 +14,13 @@ from primdiffusion.evaluation.shots import JOINTS, SIDE, Shot
 from primdiffusion.evaluation.tables import (
     COLUMNS,
     OF_TABLE,
+    Cell,
     Networks,
     Scores,
     check_counts,
     compare_pictures,
     evaluate,
+    remarks,
     table,
 )
 from support.errors import refused
@@ -89,6 +91,40 @@ def test_empty_columns_say_why():
     text = table(1, {"generated": cells}, {"poses": ["a", "b"], "FPS": None})
     assert f"FID is empty: {cells['fid'].why}." in text
     assert "poses: a, b" in text
+
+
+def test_scores_that_real_pictures_do_not_win_are_said_not_to_discriminate():
+    """Figures of docs/results/tables_table.md: no ranking can be read from a score that renders of meshes lose."""
+
+    def row(joints: float | None, depth: float | None) -> dict[str, Cell]:
+        return {"own_pckh": Cell(joints), "own_depth": Cell(depth), "pckh": Cell(None, why="no weights file")}
+
+    rows = {
+        "ours": row(49.28, 133.5),
+        "voxels": row(35.29, 119.3),
+        "real": row(37.92, 150.4),
+        "floor": row(31.41, 103.2),
+    }
+    joints, depth = remarks(rows)
+    assert joints.startswith("own PCKh@0.5 does not discriminate: real pictures have 37.92, which ours 49.28 reach or")
+    assert depth.startswith("own depth x 100 does not discriminate: real pictures have 150.4, which ours 133.5, voxels")
+    assert joints in table(2, rows | {"ours": rows["ours"] | empty(2)}, {})
+    assert remarks({"generated": row(30.0, 160.0), "real": row(37.92, 150.4)}) == []
+
+
+def empty(number: int) -> dict[str, Cell]:
+    return {
+        name: Cell(None, why="it was not asked for")
+        for name in OF_TABLE[number]
+        if name not in ("own_pckh", "own_depth")
+    }
+
+
+def test_frechet_distances_of_few_pictures_are_said_to_be_biased():
+    few, many = (compare_pictures(judged(count, 1), judged(2 * count, 0), 5, 8, 0) for count in (79, 90))
+    assert "FID: 79 samples for 8 features are fewer than 10 each (80): the distance is biased" in table(1, few, {})
+    assert [text.partition(":")[0] for text in remarks(few)] == ["FID", "own distance"]
+    assert remarks(many) == []
 
 
 def test_ten_fakes_against_five_reals_are_one_sentence(tmp_path):

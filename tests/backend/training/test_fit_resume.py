@@ -197,8 +197,9 @@ def test_another_number_of_processes_is_reported(captures, begun, caplog):
     about = json.loads((begun.run / RUN).read_text())
     about["starts"][0]["processes"] = 4
     (begun.run / RUN).write_text(json.dumps(about))
-    with caplog.at_level(logging.WARNING):
+    with caplog.at_level(logging.INFO):
         fit(settings(captures, begun.run, steps=2))
+    assert "training on 1 process\n" in caplog.text
     assert "resuming on 1 processes instead of 4" in caplog.text
 
 
