@@ -77,16 +77,6 @@ def reshaped(folder: Path) -> list[Path]:
     return pictures
 
 
-def views(folder: Path) -> list[Path]:
-    """Colour, depth, alpha and primitives of the engine."""
-    scene = _stage(folder, 23, "Walking")
-    pictures = []
-    for name in ("COLOUR", "DEPTH", "ALPHA", "BOXES"):
-        scene.primdiffusion_render.view = name
-        pictures.append(render(scene, folder / f"{name}.png", (300, 480)))
-    return pictures
-
-
 def _stage(folder: Path, seed: int, name: str) -> bpy.types.Scene:
     scene = empty_file(folder / "still.blend")
     person = generate(seed)
@@ -112,5 +102,4 @@ STILLS: dict[str, Callable[[Path], list[Path]]] = {
     "group": group,
     "redressed": redressed,
     "reshaped": reshaped,
-    "views": views,
 }
