@@ -40,7 +40,7 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
     assert sum(o.type == "VOLUME" for o in person.all_objects) == 8
     sent = request_of(person_file(person))
     assert Path(sent.pop("out_dir")).name.startswith("generate_")
-    assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "size": 16, "picture_px": 256}
+    assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "guidance": 2.0, "size": 16, "picture_px": 256}
     assert not queue.busy
     assert error_of("generate") == ""
     assert queue.info["device_name"] == "fake device"
