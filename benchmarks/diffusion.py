@@ -76,7 +76,7 @@ NEED_MORE = ("nearest_neighbour_ratio_latent", "fid_ours", "kid_100_ours", "fid_
 """Figures that are null without people or weights."""
 TITLES = {
     "ours": "ours",
-    "unguided": "ours, no attributes drawn",
+    "unguided": "ours, guidance 0",
     "old": "ours, the checkpoint before",
     "gaussian": "one Gaussian of the training people",
     "voxel": "diffusion on 64^3 voxels",
