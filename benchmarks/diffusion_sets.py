@@ -32,7 +32,7 @@ TOGETHER = 8
 def generated(
     model: DiffusionModel, seeds: Sequence[int], guidance: float = requests.Conditioning.guidance
 ) -> Iterator[Human]:
-    """Ours, with the default sampler and steps; at a guidance of 0 person components are denoised without attributes."""
+    """Ours, with the default sampler and steps; at guidance 0 person components are denoised without attributes."""
     for first in range(0, len(seeds), TOGETHER):
         yield from generate_batch(model, seeds[first : first + TOGETHER], guidance=guidance)
 

@@ -49,6 +49,8 @@ def test_a_person_is_as_tall_and_heavy_and_dressed_as_asked_for():
     assert weight == pytest.approx(90.0, abs=0.1)
     assert person.provenance["attributes"] == {"outfit": "suit", "height": 1.9, "weight": 90.0}
     assert person.provenance["guidance"] == 1.0
+    anyone = generate(tiny_model(), seed=3, steps=3).provenance
+    assert (anyone["guidance"], "attributes" in anyone) == (2.0, False), "it acts on what the seed chooses"
     jeans = generate(tiny_model(), seed=3, steps=3, attributes={"outfit": "jeans"}, guidance=1.0)
     assert not torch.allclose(person.payload.rgb, jeans.payload.rgb, atol=1e-4)
     with refused(ValueError, "guidance"):

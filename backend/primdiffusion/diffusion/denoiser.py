@@ -71,8 +71,7 @@ class PersonDenoiser(nn.Module):
         """Return the x0 guess for latents x at steps t, given `condition` (None: unconditional).
 
         `guidance` w makes the coefficients u + w (c - u) of the unconditional guess u and the conditional guess c (Ho
-        and Salimans 2022). The rest, which follows them, is the conditional guess: it hardly depends on attributes, and
-        takes most of the time.
+        and Salimans 2022). The rest, which takes most of the time, is the conditional guess that follows from them.
         """
         signal, _ = self.schedule.levels(t, x)
         prior = self.prior

@@ -116,8 +116,8 @@ class DiffusionModel:
     ) -> Float[Tensor, "b a"] | None:
         """Return a condition for each generator: what `condition` asks for, and categories drawn for the others.
 
-        They are drawn as they occur together among the training people. A denoiser that is told all categories draws
-        one outfit; left to choose, it mixes several. Returns `condition` for a model without attributes.
+        They are drawn as they occur together among the training people. With all categories given the denoiser draws
+        one outfit; with some left open it can mix several. Returns `condition` for a model without attributes.
         """
         if not self.vocabulary.width or not isinstance(self.denoiser, PersonDenoiser):
             return condition

@@ -149,8 +149,8 @@ def inpaint(
 
     The region starts from pure noise. Betas, and the payload outside the region, stay bit-identical: those primitives
     are never decoded. `attributes` condition the region; without any the result is unconditional. Costs nearly
-    2 * `steps` denoiser calls, twice as many with attributes. Deterministic as `human.generate`. With `masking`
-    "released" the sampler is `paste_after_steps`, at `steps` calls.
+    2 * `steps` denoiser calls. Deterministic as `human.generate`. With `masking` "released" the sampler is
+    `paste_after_steps`, at `steps` calls.
 
     Raises ValueError for a region that is empty, whole or not a mask of K, steps outside 1 ... T, a seed outside
     0 ... 2^63-1, unknown attributes and an unknown masking.

@@ -88,8 +88,8 @@ class Conditioning:
     """Attributes, NAME=VALUE: sex=female "outfit=blouse and skirt" height=1.7. `info` lists the names and values that a
     checkpoint knows."""
     guidance: Annotated[float, Range(0, 20), Slider(1, 5)] = 2.0
-    """How strongly attributes are followed, also those that are drawn because none were asked for: 1 as in the training
-    data; more exaggerates and costs variety."""
+    """How strongly attributes are followed, in a new human also those that the seed chooses: 1 as in the training data;
+    more exaggerates and costs variety."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

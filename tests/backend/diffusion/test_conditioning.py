@@ -12,6 +12,13 @@ def test_what_is_not_asked_for_is_zero():
     assert WORDS.encode({"sex": "female", "height": 1.8}).tolist() == pytest.approx([1, 0, 0, 0, 0, 1, 1])
 
 
+def test_what_is_left_open_is_completed_and_what_is_asked_for_stays():
+    asked = torch.stack([WORDS.encode({}), WORDS.encode({"hair": "bob", "height": 1.8})])
+    drawn = WORDS.encode({"sex": "male", "hair": "long"}).expand(2, -1)
+    expected = [{"sex": "male", "hair": "long"}, {"sex": "male", "hair": "bob", "height": 1.8}]
+    assert torch.equal(WORDS.complete(asked, drawn), torch.stack([WORDS.encode(each) for each in expected]))
+
+
 @pytest.mark.parametrize(
     ("asked", "words"),
     [

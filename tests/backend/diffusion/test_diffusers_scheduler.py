@@ -5,10 +5,12 @@ import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
 from primdiffusion.diffusion.diffusers_scheduler import PrimDiffusionScheduler
 from primdiffusion.diffusion.model import sample
+from primdiffusion.formats import requests
 from support.errors import refused
 from tiny_model import tiny_model
 
 SHAPE = (2, 3, 4, 4)
+GUIDANCE = requests.Conditioning.guidance
 TRAILING = {"beta_schedule": "linear", "beta_start": 1e-4, "beta_end": 0.02, "timestep_spacing": "trailing"}
 
 
@@ -57,14 +59,15 @@ def test_noise_is_added_as_diffusers_adds_it():
 @pytest.mark.parametrize("sampler", ["ddim", "dpmpp_2m", "ddpm"])
 def test_diffusers_loop_draws_the_model_s_own_samples(sampler):
     model = tiny_model()
-    *_, last = sample(model, [5], steps=6, sampler=sampler)
+    seeds = range(5, 13)
+    *_, last = sample(model, seeds, steps=6, sampler=sampler)
     scheduler = PrimDiffusionScheduler.of(model, sampler)
     scheduler.set_timesteps(6)
-    generators = [torch.Generator().manual_seed(5)]
+    generators = [torch.Generator().manual_seed(seed) for seed in seeds]
     condition = model.complete(generators)
     x = model.start(generators, int(scheduler.timesteps[0]), condition)
     for t in scheduler.timesteps:
-        x, x0 = scheduler.step(model.denoise(x, int(t), condition, 2.0), t, x, generators, return_dict=False)
+        x, x0 = scheduler.step(model.denoise(x, int(t), condition, GUIDANCE), t, x, generators, return_dict=False)
     assert torch.equal(x0, last.x0)
 
 

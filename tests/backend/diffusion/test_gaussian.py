@@ -120,6 +120,14 @@ def test_draws_are_of_the_kind_that_is_asked_for(prior):
     assert torch.allclose(c.mean(0), torch.einsum("gm,gmr->r", share, prior.centre), atol=0.05)
 
 
+def test_kinds_are_drawn_as_often_as_their_parts_occur(prior):
+    draws = prior.sample_kinds(40_000, torch.Generator().manual_seed(7))
+    expected = torch.einsum("gm,gma->a", prior.log_weight.exp(), prior.kind)
+    assert torch.allclose(draws.mean(0), expected, atol=0.01)
+    asked = torch.eye(3, dtype=F64)[2:]
+    assert torch.equal(prior.sample_kinds(50, torch.Generator().manual_seed(7), asked)[:, 2], torch.ones(50, dtype=F64))
+
+
 def test_an_unknown_kind_excludes_no_part(prior):
     nobody = type(prior)(**{**vars(prior), "kind": torch.zeros_like(prior.kind)})
     asked = torch.eye(3, dtype=F64)[:1]

@@ -116,16 +116,17 @@ def test_company_changes_no_value_by_more_than_rounding():
         assert (one - other).abs().max() < 1e-5 * (one.max() - one.min())
 
 
-def test_guidance_extrapolates_from_unconditional_to_conditional(model):
+def test_guidance_extrapolates_person_components_and_the_rest_follows_from_them(model):
     x, condition = torch.randn(2, 4, GRID, GRID), model.condition({"outfit": "suit"})
-    anybody, asked, guided = (
-        model.denoise(x, 600),
-        model.denoise(x, 600, condition),
-        model.denoise(x, 600, condition, 2.0),
-    )
-    assert (asked - anybody).abs().max() > 0.01
-    components = [model.denoiser.prior.split(guess)[0] for guess in (anybody, asked, guided)]
-    assert torch.allclose(components[2], 2 * components[1] - components[0], atol=1e-4)
+    denoiser = model.denoiser
+    y, rest = denoiser.prior.split(x, torch.tensor(model.schedule.signal(600)))
+    t, conditions = torch.full((2,), 600), condition.expand(2, -1)
+    with torch.inference_mode():
+        unconditional, conditional = denoiser.coefficients(y, t), denoiser.coefficients(y, t, conditions)
+        guided = 2 * conditional - unconditional
+        expected = denoiser.prior.join(guided, denoiser.rest(rest, guided, t, conditions))
+    assert (conditional - unconditional).abs().max() > 0.01
+    assert torch.allclose(model.denoise(x, 600, condition, 2.0), expected, atol=1e-4)
     assert model.condition({}) is None
 
 
