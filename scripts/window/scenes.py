@@ -15,6 +15,7 @@ import bpy
 from file_scenes import cancelled_captures, five_humans, handles, other_files, read_back
 from moving_scenes import opening, playing, turning
 from panels import show, sidebar, view, wide_view
+from picture_scene import from_picture
 from press import Steps, invoke, press, wait
 from start import (
     FIRST_SEED,
@@ -348,6 +349,7 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "rendered": rendered,
     "denoising_in_view": denoising_in_view,
     "captures": captures,
+    "from_picture": from_picture,
     "export": export,
     "cancelled": cancelled,
     "missing": missing,

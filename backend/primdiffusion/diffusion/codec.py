@@ -37,6 +37,9 @@ DEAD_ZONE = (0.08, 0.84)
 person. The default for codecs that store none: fitted to payloads from meshes, at 96 numbers a primitive."""
 FITTED_DEAD_ZONE = (0.03, 0.94)
 """For codecs of fitted payloads, whose densities are exact enough for silhouettes."""
+HAZE = (0.12, 0.22)
+"""Largest relative density among a voxel and its neighbours: a voxel below the first is haze and becomes empty, one
+above the second stays as it is. Voxels of a surface have a dense neighbour, specks beside a person have none."""
 SMALLEST_DELTA_S = 0.2
 """Released values are never clamped (SPEC 1.13). Usual values are around 1; a box of five times its rest size is an
 outlier, and 0 has no reciprocal."""
@@ -122,7 +125,8 @@ def cells_from_payload(
 ) -> Float[Tensor, "*b k v"]:
     """Inverse of `payload_from_cells`; `full_density` (1/m) is the density stored as 1.
 
-    Denser voxels are clamped to it. The dead zone is undone between empty and full voxels, which stay 0 and 1.
+    Denser voxels are clamped to it. The dead zone is undone between empty and full voxels, which stay 0 and 1; haze
+    that is gone stays gone.
     """
     start, width = dead_zone
     relative = (payload.density / full_density).clamp(0, 1)
@@ -134,12 +138,20 @@ def cells_from_payload(
 def payload_from_cells(
     cells: Float[Tensor, "*b k v"], full_density: float, dead_zone: tuple[float, float] = DEAD_ZONE
 ) -> Payload:
-    """Return the payload of decoded cells: clamped, with the dead zone applied to density."""
+    """Return the payload of decoded cells: clamped, with the dead zone applied to density, and without haze."""
     start, width = dead_zone
     voxels, scale = cells.split((VOXEL_VALUES, 3), dim=-1)
     voxels = voxels.unflatten(-1, (4, S, S, S))
-    density = ((voxels[..., 3, :, :, :] - start) / width).clamp(0, 1) * full_density
+    density = _without_haze(((voxels[..., 3, :, :, :] - start) / width).clamp(0, 1)) * full_density
     return Payload(decode_srgb(voxels[..., :3, :, :, :].clamp(0, 1)), density, (scale / SCALE_VALUE).clamp_min(0))
+
+
+def _without_haze(density: Float[Tensor, "*b d h w"]) -> Float[Tensor, "*b d h w"]:
+    """Relative densities without voxels that no neighbour in their box supports, see HAZE."""
+    boxes = density.reshape(-1, 1, S, S, S)
+    densest = torch.nn.functional.max_pool3d(boxes, kernel_size=3, stride=1, padding=1)
+    first, second = HAZE
+    return (boxes * ((densest - first) / (second - first)).clamp(0, 1)).view_as(density)
 
 
 def mirror_cells(cells: Float[Tensor, "*b k v"]) -> Float[Tensor, "*b k v"]:

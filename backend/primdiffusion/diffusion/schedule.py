@@ -152,7 +152,7 @@ def dense_steps(length: int, steps: int, power: float = 2.2) -> list[int]:
     return chain
 
 
-def early_steps(length: int, steps: int, last: int = 100) -> list[int]:
+def early_steps(length: int, steps: int, last: int = 50) -> list[int]:
     """Evenly spaced descending t from T-1 to `last`, from which the last step goes to the clean sample at once.
 
     What is undecided there becomes its mean instead of a draw. A network that has not learned the finest detail draws

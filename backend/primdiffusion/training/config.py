@@ -147,7 +147,7 @@ class TrainingConfig(RunSettings):
     at the start; for the default preset) or sqrt_linear (the released code's)."""
     chain: Literal["trailing", "dense", "early"] | None = None
     """Timesteps in sampling: trailing (evenly spaced; for the paper preset), dense (denser at low noise) or early (down
-    to t = 100, from which the mean is taken; for the default preset)."""
+    to t = 50, from which the mean is taken; for the default preset)."""
     start_from: Path | None = None
     """Checkpoint of the default preset to go on from in a new run: its codec, closed form, attributes and sizes of
     networks are kept, and the networks start with its weights."""

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.diffusion.codec import (
+    HAZE,
     SCALE_VALUE,
     SLAB_UNIT,
     VALUES,
@@ -136,6 +137,23 @@ def test_cells_of_a_payload_are_what_it_is_decoded_from():
     assert torch.allclose(again.rgb, payload.rgb, atol=1e-4)
     assert torch.allclose(again.density, payload.density, atol=1e-3)
     assert torch.allclose(again.delta_scale, payload.delta_scale, atol=1e-5)
+
+
+def test_haze_without_a_dense_neighbour_becomes_empty():
+    density = 0.3 * torch.rand(K, S, S, S) ** 3
+    payload = Payload(torch.rand(K, 3, S, S, S), density, torch.ones(K, 3))
+    decoded = payload_from_cells(cells_from_payload(payload, 1.0, (0.0, 1.0)), 1.0, (0.0, 1.0)).density
+    padded = torch.nn.functional.pad(density, (1,) * 6)
+    steps = range(3)
+    densest = torch.stack(
+        [padded[:, a : a + S, b : b + S, c : c + S] for a in steps for b in steps for c in steps]
+    ).amax(0)
+    first, second = HAZE
+    assert (decoded[densest <= first] == 0).all()
+    assert torch.allclose(decoded[densest >= second], density[densest >= second], atol=1e-6)
+    between = (densest > first) & (densest < second)
+    assert between.any()
+    assert (decoded[between] < density[between]).all()
 
 
 def test_decoded_payloads_are_clamped_and_their_haze_removed():

@@ -93,7 +93,7 @@ def test_early_steps_are_evenly_spaced_from_the_end_to_a_level_of_noise(steps):
     gaps = -np.diff(chain)
     assert (gaps > 0).all()
     assert steps == 1 or gaps.max() - gaps.min() <= 1
-    assert chain[-1] == {1: 999, 950: 50, 1000: 0}.get(steps, 100)
+    assert chain[-1] == {1: 999, 1000: 0}.get(steps, 50)
 
 
 def test_the_fine_schedule_ends_as_the_paper_s_and_begins_with_less_noise():

@@ -1,0 +1,98 @@
+"""Human from Picture, from a picture of a human that the window has drawn itself (see `scenes.py`)."""
+
+from __future__ import annotations
+
+import math
+from importlib import import_module
+from pathlib import Path
+
+import bpy
+from panels import show
+from press import Steps, press, wait
+from start import FIRST_SEED, SECOND_SEED, armatures, begin, queue_of, select
+from visible_scene import at_rest
+
+_SIZE = (480, 640)
+_MOST_S = 300.0
+
+
+def from_picture(module: str, python: str) -> Steps:
+    """One standing human from its picture alone, and one with raised arms from a human posed over the picture."""
+    yield from from_a_standing_start(module, python)
+    yield from from_a_posed_start(module, python)
+
+
+def from_a_standing_start(module: str, python: str) -> Steps:
+    picture = yield from drawn(module, python, FIRST_SEED, "Relaxed")
+    yield from chosen(module, python, picture)
+    yield "picture_chosen"
+    yield from pressed(module, "picture_fitting")
+    yield "picture_made"
+    bpy.context.view_layer.objects.active.select_set(False)
+    press("view3d.view_axis", "EXEC_DEFAULT", type="LEFT")
+    yield from at_rest(module)
+    yield "picture_from_the_side"
+
+
+def from_a_posed_start(module: str, python: str) -> Steps:
+    picture = yield from drawn(module, python, SECOND_SEED, "Waving")
+    yield from chosen(module, python, picture)
+    gallery = import_module(f"{module}.ui.gallery")
+    press("primdiffusion.add_from_gallery", human=gallery.items()[0][0])
+    yield from wait(lambda: not queue_of(module).busy and bool(armatures()), _MOST_S)
+    (armature,) = armatures()
+    armature.location = armature.rotation_euler = (0.0, 0.0, 0.0)
+    select(armature)
+    press("primdiffusion.apply_pose", pose_name="Waving")
+    armature.rotation_euler.z += math.radians(8)
+    yield from at_rest(module)
+    yield "picture_posed"
+    yield from pressed(module, "picture_posed_fitting", only_fit=True)
+    yield "picture_fitted"
+    yield from pressed(module, "picture_posed_making")
+    yield "picture_posed_made"
+
+
+def drawn(module: str, python: str, seed: int, pose: str) -> Steps:
+    """Returns a PNG with alpha of a human in a pose, drawn by the engine."""
+    yield from begin(module, python)
+    bpy.data.objects.remove(bpy.data.objects["Cube"])
+    press("primdiffusion.generate", seed=seed)
+    yield from wait(lambda: not queue_of(module).busy, _MOST_S)
+    (armature,) = armatures()
+    select(armature)
+    press("primdiffusion.apply_pose", pose_name=pose)
+    press("primdiffusion.add_camera")
+    scene = bpy.context.scene
+    scene.render.engine, scene.render.film_transparent = "PRIMDIFFUSION", True
+    scene.render.resolution_x, scene.render.resolution_y = _SIZE
+    scene.view_settings.view_transform = "Standard"
+    scene.render.image_settings.color_mode = "RGBA"
+    path = Path(bpy.app.tempdir) / f"{pose.lower()}.png"
+    scene.render.filepath = str(path)
+    bpy.ops.render.render(write_still=True)
+    yield 1.0
+    return path
+
+
+def chosen(module: str, python: str, picture: Path) -> Steps:
+    """The picture as the background of a new camera in Blender's factory scene without its cube."""
+    yield from begin(module, python)
+    bpy.data.objects.remove(bpy.data.objects["Cube"])
+    yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_human_from_picture")
+    if press("primdiffusion.choose_picture", filepath=str(picture)) != {"FINISHED"}:
+        raise RuntimeError("the picture was not taken")
+    yield 2.0
+
+
+def pressed(module: str, name: str, **given: object) -> Steps:
+    """Make Human or Fit, photographed while it runs and until the view is at rest."""
+    if press("primdiffusion.human_from_picture", **given) == {"CANCELLED"}:
+        raise RuntimeError("the button was refused: see the line above")
+    yield 4.0
+    yield name
+    yield from wait(lambda: not queue_of(module).busy, _MOST_S)
+    last = queue_of(module).last
+    if last is not None and last.sentence:
+        print(last.sentence, flush=True)
+    yield from at_rest(module)
