@@ -192,9 +192,21 @@ class PictureJob(Job):
         armature.matrix_world = Matrix.Identity(4)
         context.view_layer.update()
         take_world_posture(armature, fitted.pose, fitted.translation)
-        if (camera := self.task.camera_now()) is not None:
+        camera = self.task.camera_now()
+        if camera is not None:
             aim_at_picture(camera, fitted.view)
+        if not self.posed_over:
+            _stand_at_origin(context, armature, camera)
         for other in context.scene.collection.children_recursive:
             if other.session_uid == self.posed_over:
                 other.hide_viewport = other.hide_render = True
         return notice
+
+
+def _stand_at_origin(context: bpy.types.Context, armature: bpy.types.Object, camera: bpy.types.Object | None) -> None:
+    """Move the human onto the floor, and the camera with it: one picture does not tell where the floor is."""
+    context.view_layer.update()
+    back = Matrix.Translation(-armature.matrix_world.translation)
+    for moved in (armature, camera):
+        if moved is not None:
+            moved.matrix_world = back @ moved.matrix_world

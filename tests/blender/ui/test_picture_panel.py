@@ -138,15 +138,20 @@ def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
 def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, picture, tmp_path):
     mask = tmp_path / "mask.png"
     write_png(mask, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    camera = chosen.scene.camera
+    before = np.array(camera.matrix_world.translation)
     assert bpy.ops.primdiffusion.human_from_picture(mask=str(mask), seed=5) == {"FINISHED"}
     (person,) = humans(chosen.scene)
     sent = request_of(person_file(person))
     assert (sent["pictures"], sent["masks"], sent["seed"]) == ([str(picture)], [str(mask)], 5)
     assert Path(sent["cameras"]).name == "cameras.json"
     assert "pose" not in sent
-    pose, translation = world_posture(armature_of(person))
+    armature = armature_of(person)
+    pose, translation = world_posture(armature)
     assert pose[LEFT_SHOULDER] == pytest.approx([0, 0, -0.5], abs=1e-5)
-    assert translation == pytest.approx(MOVED, abs=1e-5)
+    assert np.array(armature.matrix_world.translation) == pytest.approx(np.zeros(3), abs=1e-5)  # on the floor
+    moved = np.array(camera.matrix_world.translation) - before
+    assert points_to_backend(moved) == pytest.approx(translation - MOVED, abs=1e-5)  # the camera sees it as fitted
 
 
 def test_make_human_stands_where_the_posed_one_was_which_is_hidden(chosen):
