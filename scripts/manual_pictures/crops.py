@@ -40,14 +40,19 @@ WINDOWS = {
 """Whole windows, or the part of the main window in WINDOW_PART."""
 STACKS = {"set_up_progress": ("set_up_real_0", "set_up_real_1", "set_up_real_2")}
 """The extension's part of the preferences, one below the other."""
+ROWS = {"window_picture": ("picture_posed", "picture_fitted", "picture_posed_made")}
+"""Camera's frame and sidebar of the main window, side by side."""
 DIALOGS = {"motion_dialog": "motion_dialog"}
 WINDOW_PART = (0, 24, 1320, 1190)
 """Pixels of the main window: without the properties and the timeline."""
 PREFERENCES_PART = (172, 240, 872, 548)
 """Pixels of the preferences' window: the extension's part, down to a whole row."""
+ROW_PART = (320, 80, 1300, 1100)
+"""Pixels of the main window in ROWS."""
 _STACKED_ROWS = 130
 """Pixels of the preferences' part: down to the end of the backend's box while a set-up runs."""
 _WINDOW_WIDTH = 880
+_ROW_SIZE = (490, 510)
 _PANEL_WIDTH = 262
 _PANEL_RGB, _SECTION_RGB, _COLUMN, _RUN = 74, 67, 8, 10
 """Greys of panels, and of what is in their open sections, at this distance from the sidebar's left edge, over at least
@@ -73,6 +78,10 @@ def crop_all(shots: Path, out: Path) -> None:
     for name, seen in STACKS.items():
         if _are_there(shots, *seen):
             save_png(_column([_preferences_top(shots, shot) for shot in seen]), out / f"{name}.png")
+    for name, seen in ROWS.items():
+        if _are_there(shots, *seen):
+            parts = [_read(shots, shot)[0].crop(ROW_PART).resize(_ROW_SIZE, Image.Resampling.LANCZOS) for shot in seen]
+            save_jpeg(_row(parts), out / f"{name}.jpg")
     for name, shot in DIALOGS.items():
         if _are_there(shots, shot):
             save_png(_changed_part(shots, shot), out / f"{name}.png")

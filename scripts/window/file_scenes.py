@@ -1,8 +1,9 @@
-"""Scenes of whole files: five humans, one deleted and back, humans of another file, exports read back, handles, and a
-capture that is cancelled (see `scenes.py`)."""
+"""Scenes of whole files: five humans, one deleted and back, humans of another file, copies, exports read back, handles,
+and a capture that is cancelled (see `scenes.py`)."""
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Callable
 from importlib import import_module
@@ -65,6 +66,42 @@ def other_files(module: str, python: str) -> Steps:
     yield from sidebar()
     yield "other_files"
     expect(module, 2)
+
+
+def copies(module: str, python: str) -> Steps:
+    """Shift-D and Alt-D; Save As in the same folder, of which the first file and its humans' files are then deleted."""
+    yield from with_people(module, python, FIRST_SEED)
+    folder = Path(tempfile.mkdtemp(dir=bpy.app.tempdir))
+    first, second = folder / "first.blend", folder / "second.blend"
+    bpy.ops.wm.save_as_mainfile(filepath=str(first))
+    yield from sidebar()
+    window, area = view()
+    for key, count, aside in (("shift+d", 2, 1.0), ("alt+d", 3, -1.0)):
+        select(armatures()[0])
+        yield {"point": [area.x + area.width // 2, window.height - area.y - area.height // 2]}
+        yield {"key": key}
+        yield 0.5
+        yield {"key": "Return"}
+        yield from wait(lambda count=count: len(armatures()) == count, 20)
+        bpy.context.view_layer.objects.active.location.x += aside
+        expect(module, count)
+        yield from at_rest(module)
+    press("view3d.view_all", "EXEC_DEFAULT")
+    yield from at_rest(module)
+    yield "copies"
+    bpy.ops.wm.save_as_mainfile(filepath=str(second))
+    yield from wait(lambda: not queue_of(module).busy, 300)
+    yield 5.0
+    bpy.ops.wm.read_homefile(use_factory_startup=True)
+    for path in folder.iterdir():
+        if path.name.startswith("first"):
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
+    bpy.ops.wm.open_mainfile(filepath=str(second), load_ui=False)
+    expect(module, 3)
+    press("view3d.view_all", "EXEC_DEFAULT")
+    yield from at_rest(module)
+    yield from sidebar()
+    yield "copies_saved_as"
 
 
 def read_back(module: str, python: str) -> Steps:

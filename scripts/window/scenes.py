@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 
 import bpy
-from file_scenes import cancelled_captures, five_humans, handles, other_files, read_back
+from file_scenes import cancelled_captures, copies, five_humans, handles, other_files, read_back
 from moving_scenes import opening, playing, turning
 from panels import show, sidebar, view, wide_view
 from picture_scene import from_picture
@@ -355,6 +355,7 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "missing": missing,
     "five_humans": five_humans,
     "other_files": other_files,
+    "copies": copies,
     "read_back": read_back,
     "handles": handles,
     "cancelled_captures": cancelled_captures,

@@ -84,7 +84,9 @@ def _read(
     report("load", 0, 1, None)
     model = session.model(request.checkpoint)
     start = start_of(photographs, model, request.pose, request.cameras)
-    warnings = [] if len(photographs) > 1 else ["only one picture: the sides that it does not show are guessed"]
+    warnings = []
+    if len(photographs) == 1 and isinstance(request, ReconstructRequest):
+        warnings.append("only one picture: the sides that it does not show are guessed")
     if request.pose is None:
         warnings.append("no pose was given: the person is taken to stand upright, facing the camera")
     return model, photographs, start, warnings
