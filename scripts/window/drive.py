@@ -20,7 +20,7 @@ import bpy
 
 sys.path.append(str(Path(__file__).resolve().parent))
 ARCHIVE, REQUEST, PYTHON, *SCENES = sys.argv[sys.argv.index("--") + 1 :]
-MODULE = "bl_ext.user_default.primdiffusion"
+MODULE = f"bl_ext.user_default.{Path(ARCHIVE).name.partition('-')[0]}"
 
 
 def play() -> Iterator[float]:
@@ -28,8 +28,9 @@ def play() -> Iterator[float]:
     import scenes
     from setting_up import set_up_real
     from undo_scenes import undo_and_timers
+    from viewer_scene import viewer
 
-    on_request = {"set_up_real": set_up_real, "undo_and_timers": undo_and_timers}
+    on_request = {"set_up_real": set_up_real, "undo_and_timers": undo_and_timers, "viewer": viewer}
     asked_for = {name: scene for name, scene in on_request.items() if name in SCENES}
     yield 2.0
     install()

@@ -82,7 +82,8 @@ def copies(module: str, python: str) -> Steps:
         yield {"key": key}
         yield 0.5
         yield {"key": "Return"}
-        yield from wait(lambda count=count: len(armatures()) == count, 20)
+        humans = import_module(f"{module}.scene.human").humans
+        yield from wait(lambda count=count: len(humans(bpy.context.scene)) == count, 20)
         bpy.context.view_layer.objects.active.location.x += aside
         expect(module, count)
         yield from at_rest(module)

@@ -48,7 +48,9 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--chroot", type=Path, help="folder of a system that has Blender (debootstrap)")
     parser.add_argument("--out", type=Path, default=ROOT / "window_out", help="folder for the pictures")
     parser.add_argument("--size", default="1600x1400", help="size of the screen in pixels")
-    parser.add_argument("--scenes", nargs="*", default=[], help="names of scenes to play; none: all")
+    parser.add_argument(
+        "--scenes", nargs="*", default=[], help="names of scenes to play; none: all; viewer, by itself: the viewer"
+    )
     parser.add_argument("--python", type=Path, default=ROOT / ".venv/bin/python", help="interpreter of the backend")
     parser.add_argument("--time", type=float, default=3000.0, help="seconds after which Blender is ended")
     return parser.parse_args()
@@ -137,7 +139,8 @@ def main() -> int:
         ["Xvfb", f":{display}", "-screen", "0", f"{options.size}x24", "-ac"], stderr=subprocess.DEVNULL
     )
     try:
-        subprocess.run([sys.executable, ROOT / "build_addon.py", "--out", scratch], check=True)
+        which = ["--viewer"] if options.scenes == ["viewer"] else []
+        subprocess.run([sys.executable, ROOT / "build_addon.py", *which, "--out", scratch], check=True)
         archive = next(scratch.glob("*.zip"))
         environment = {
             **os.environ,

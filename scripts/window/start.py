@@ -28,7 +28,8 @@ def begin(module: str, python: str) -> Steps:
         setattr(around, name, value)
     queue_of(module).outcomes.clear()
     yield 1.5
-    bpy.context.preferences.addons[module].preferences.backend_python = python
+    if python:
+        bpy.context.preferences.addons[module].preferences.backend_python = python
 
 
 def with_people(module: str, python: str, *seeds: int) -> Steps:
