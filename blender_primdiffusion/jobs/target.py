@@ -58,7 +58,7 @@ def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
     if len(people) == 1:
         return people[0]
     if not people:
-        raise ValueError("there is no human in the scene: generate one first")
+        raise ValueError("there is no human in the scene: add one first")
     raise ValueError(f"{len(people)} humans are in the scene: select the one you mean")
 
 

@@ -68,7 +68,7 @@ def humans_extent(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[
     """Lowest and highest corner [3] of all humans in a scene, as posed. Raises ValueError when there are none."""
     extents = [posed_extent(collection) for collection in humans(scene)]
     if not extents:
-        raise ValueError(f"there is no human in the scene {scene.name!r}; generate one first")
+        raise ValueError(f"there is no human in the scene {scene.name!r}; add one first")
     return np.min([low for low, _ in extents], 0), np.max([high for _, high in extents], 0)
 
 

@@ -24,7 +24,7 @@ class OnPerson(Reporting):
     def poll(cls, context: bpy.types.Context) -> bool:
         found = bool(humans(context.scene))
         if not found:
-            cls.poll_message_set("There is no human in the scene: generate one first")
+            cls.poll_message_set("There is no human in the scene: add one first")
         return found
 
     def act(self, context: bpy.types.Context) -> set[str]:
@@ -118,7 +118,7 @@ class OnArmature(Reporting):
         found = may_have_joints(context)
         if not found:
             cls.poll_message_set(
-                "There is no human in the scene: generate one, or select an armature with SMPL's joints"
+                "There is no human in the scene: add one, or select an armature with SMPL's joints"
             )
         return found
 
