@@ -1,13 +1,15 @@
 """Measures reconstruction by the person prior from one view: what it shows, what it does not, and whose human it is.
 
 `python benchmarks/from_pictures.py --assets DIR --json F --sheet F.png` makes dressed humans from seeds that no
-training set uses and draws their meshes from 16 sides with the rasteriser, every second human in another pose than T.
-Each is reconstructed from the front view alone, and from every second view. Means over humans, of sRGB-encoded pictures
-over grey, over the figure and 8 pixels around it:
+training set uses and draws their meshes from 32 sides with the rasteriser, every second human in another pose than T.
+Each is reconstructed from the front view alone, and from more. Means over humans, of sRGB-encoded pictures over grey,
+over the figure and 8 pixels around it:
 
-    one_view_psnr, one_view_ssim    the eight views that neither reconstruction was given
+    one_view_psnr, one_view_ssim    eight views that no reconstruction was given
     eight_views_psnr                the same, from eight views
+    frames_N_psnr                   the same, from N frames of a turntable
     encoder_psnr                    the same, by the encoder from the front view: a baseline
+    mirrored_psnr                   the same, by the mean human with the front view and its mirror image as its back
     one_view_seen_psnr              the front view, which was given
     one_view_seen_gap_db            that from eight views, less that from one
     identity_rate                   humans whose unseen views are nearer to their own pictures than to anyone else's
@@ -18,9 +20,10 @@ The sheet has a row for each human: the given view, then two others beside the t
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -35,22 +38,25 @@ from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation.image_metrics import figure_psnr, ssim
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
-from primdiffusion.human import Human, place
+from primdiffusion.human import Human, default_frames, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.reconstruction import reconstruct, reconstruct_by_prior
+from primdiffusion.reconstruction import PersonComponents, reconstruct, reconstruct_by_prior, targets_of
+from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
 from record import command_line, report
 from torch import Tensor
 
 SEED = 31_000_000
 """Seed of the first human; training sets count from 0."""
-CAMERAS, SIZE, POSES = 16, 512, 2
+CAMERAS, SIZE, POSES = 32, 512, 2
+FRAMES, EIGHT = (1, 4, 16), 8
 GREY = decode_srgb(torch.tensor(0.5))
 VIEW = 256
 """Pixels a side of the sheet's pictures."""
@@ -59,11 +65,14 @@ VIEW = 256
 class Case(NamedTuple):
     """A captured human."""
 
-    given: CapturedPerson
-    """From the front."""
-    more: CapturedPerson
-    """From every second side."""
+    by_frames: Mapping[int, CapturedPerson]
+    """From so many sides, evenly spaced, the first of which is the front."""
     unseen: Views
+    """From sides between them."""
+
+    @property
+    def given(self) -> CapturedPerson:
+        return self.by_frames[1]
 
 
 def main() -> None:
@@ -85,14 +94,17 @@ def main() -> None:
             began = time.perf_counter()
             one = reconstruct_by_prior(model, case.given)
             seconds = time.perf_counter() - began
-            many, by_encoder = reconstruct_by_prior(model, case.more), reconstruct(encoder, case.given)
+            many = {count: reconstruct_by_prior(model, person) for count, person in case.by_frames.items() if count > 1}
+            many[1], by_encoder, mirrored = one, reconstruct(encoder, case.given), by_mirror(model, case.given)
             pictures, targets = pictures_of(one, case.unseen), over_grey(case.unseen)
-            seen = [psnr_of(human, case.given.views) for human in (one, many)]
+            seen = [psnr_of(human, case.given.views) for human in (one, many[EIGHT])]
             rows.append({
                 "one_view_psnr": psnr_of(one, case.unseen),
                 "one_view_ssim": float(ssim(pictures, targets).mean()),
-                "eight_views_psnr": psnr_of(many, case.unseen),
+                "eight_views_psnr": psnr_of(many[EIGHT], case.unseen),
+                **{f"frames_{count}_psnr": psnr_of(many[count], case.unseen) for count in FRAMES},
                 "encoder_psnr": psnr_of(by_encoder, case.unseen),
+                "mirrored_psnr": psnr_of(mirrored, case.unseen),
                 "one_view_seen_psnr": seen[0],
                 "one_view_seen_gap_db": seen[1] - seen[0],
                 "one_view_seconds_cpu": seconds,
@@ -126,14 +138,37 @@ def captured(folder: Path, assets: Path | None, count: int) -> Captures:
 def case_of(captures: Captures, name: str, frame: int) -> Case:
     subject = captures.subject(name)
     front = max(range(CAMERAS), key=lambda camera: subject.views[camera].position[2])
-    even = [(front + step) % CAMERAS for step in range(0, CAMERAS, 2)]
-    odd = [(front + step) % CAMERAS for step in range(1, CAMERAS, 2)]
+
+    def around(count: int, first: int = 0) -> list[int]:
+        return [(front + first + step) % CAMERAS for step in range(0, CAMERAS, CAMERAS // count)]
 
     def person(cameras: Sequence[int]) -> CapturedPerson:
         views = conditioning_views(captures, name, frame, cameras)
         return CapturedPerson(name, frame, tuple(cameras), views, default_betas(subject), ())
 
-    return Case(person([front]), person(even), conditioning_views(captures, name, frame, odd))
+    by_frames = {count: person(around(count)) for count in (*FRAMES, EIGHT)}
+    return Case(by_frames, conditioning_views(captures, name, frame, around(EIGHT, first=1)))
+
+
+def by_mirror(model: DiffusionModel, person: CapturedPerson) -> Human:
+    """Fit the mean human's voxels to the front view, and to its mirror image seen from the opposite side."""
+    views, components = person.views, PersonComponents.of(model)
+    frames = default_frames(person.betas, views.pose)
+    turned = views.camera.world_to_camera @ half_turn_about(frames.position.mean(0))
+    intrinsics = views.camera.intrinsics.clone()
+    intrinsics[..., 0, 2] = views.camera.width - intrinsics[..., 0, 2]
+    camera = dataclasses.replace(views.camera, intrinsics=intrinsics, world_to_camera=turned)
+    back = dataclasses.replace(views, rgba=views.rgba.flip(2), camera=camera)
+    targets = [target for side in (views, back) for target in targets_of(side, [frames], SIZE)]
+    payload = fit_payload(components.payload(components.mean), targets, components.full_density)
+    return Human(payload, person.betas, {})
+
+
+def half_turn_about(point: Float[Tensor, "3"]) -> Float[Tensor, "4 4"]:
+    """Rotation by 180 degrees about the vertical (y) through a point."""
+    turn = torch.diag(torch.tensor([-1.0, 1.0, -1.0, 1.0]))
+    turn[0, 3], turn[2, 3] = 2 * point[0], 2 * point[2]
+    return turn
 
 
 def over_grey(views: Views) -> Float[Tensor, "v H W 3"]:
