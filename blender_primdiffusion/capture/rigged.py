@@ -11,7 +11,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from ..motion.skeleton import chain
+from ..formats.poses.skeleton import chain
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from .scan_files import ScanError, ScanFile
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import ArrayFileError, all_finite, array_names, read_arrays
 from ..formats.json_files import parse_json
+from ..formats.poses.files import POSE_KEYS, MotionFileError, motion_from_arrays
 from ..formats.regular_files import open_regular, portable_name, real_path
-from ..motion.files import POSE_KEYS, MotionFileError, motion_from_arrays
 
 ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
 """Files of scans; of several with the same name in a folder, the first of these is used."""

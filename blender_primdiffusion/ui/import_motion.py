@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..formats.joints import JOINT_NAMES
-from ..motion.bvh import BvhError, bone_names, parse_bvh
-from ..motion.files import MotionFileError, read_motion
-from ..motion.rigs import UnknownBonesError, map_bones
+from ..formats.poses.bvh import BvhError, bone_names, parse_bvh
+from ..formats.poses.files import MotionFileError, read_motion
+from ..formats.poses.rigs import UnknownBonesError, map_bones
 from ..scene.human import armature_of, humans
 from .drawing import draw_lines, property_columns
 from .motion_placing import Placement, extend_range, facts, place_motion

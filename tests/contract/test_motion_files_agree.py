@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from blender_primdiffusion.formats.poses.rotation import from_axis_angle
 from primdiffusion.capture import poses
 from primdiffusion.pose_file import read_pose
 from support.errors import refused
 
 from blender_primdiffusion.motion import files
-from blender_primdiffusion.motion.rotation import from_axis_angle
 
 FRAMES = 4
 RNG = np.random.default_rng(1)

@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES, PARENTS
+from ..joints import JOINT_NAMES, PARENTS
 from .rotation import about_axis, between
 from .skeleton import REST_JOINTS
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -11,17 +10,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, array_names, read_arrays, read_npy
-from ..formats.json_files import read_json
-from ..formats.motion_size import MotionTooLongError, check_motion_size
-from ..formats.regular_files import TooLargeError
-from ..formats.rotations import first_improper, improper_text
-from ..formats.whole_files import replacing
-from .adjust import axis_direction, axis_name, find_up, turn_y_up
+from ..arrays import ArrayFileError, array_names, read_arrays, read_npy
+from ..json_files import read_json
+from ..motion_size import MotionTooLongError, check_motion_size
+from ..regular_files import TooLargeError
+from ..rotations import first_improper, improper_text
+from .axes import axis_direction, axis_name, find_up, turn_y_up
 from .bvh import BvhError, read_bvh
 from .motion import LARGEST_NUMBER, Detected, Motion
-from .rotation import about_axis, from_axis_angle, nearest, to_axis_angle
-from .skeleton import REST_JOINTS
+from .rotation import from_axis_angle, nearest
 
 MOST_NUMBERS = 40_000_000
 """Of an array: an hour of SMPL-X at 60 frames/s has 36 million."""
@@ -84,31 +81,6 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
     if up:
         return _turned(motion, axis_name(axes @ axis_direction(up)), up)
     return _upright(motion, axes) if detect_up else motion
-
-
-def write_amass(path: Path, motion: Motion, betas: NDArray, pelvis: NDArray = REST_JOINTS[0]) -> None:
-    """Write a motion in AMASS' format (72 numbers a frame, z up), with the body's shape [n] and rest pelvis [3].
-
-    As in AMASS, `trans` moves the body after its root has turned about the rest pelvis of its y-up body, so
-    pelvis + trans is the position of the pelvis. The file appears whole or not at all. Raises OSError.
-    """
-    up = about_axis(0, np.pi / 2)
-    turned = np.array(motion.rotations)
-    turned[:, 0] = up @ turned[:, 0]
-    places = (motion.translations + pelvis) @ up.T - pelvis
-    try:
-        os.stat(path.parent)  # a folder that is missing is a slip of the finger: `replacing` would make it
-        with replacing(path) as partial, partial.open("wb") as stream:
-            np.savez(
-                stream,
-                poses=to_axis_angle(turned).reshape(len(turned), -1),
-                trans=places,
-                betas=np.asarray(betas, np.float64),
-                gender=np.array("neutral"),
-                mocap_framerate=np.array(motion.fps),
-            )
-    except OSError as error:
-        raise OSError(f"the motion could not be written to {str(path)!r} ({error.strerror or error})") from error
 
 
 def _read_npz(path: Path) -> tuple[Motion, bool]:

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES, PARENTS
-from ..formats.regular_files import TooLargeError, read_regular
+from ..joints import JOINT_NAMES, PARENTS
+from ..regular_files import TooLargeError, read_regular
 from .motion import LARGEST_NUMBER, Detected, Motion
 from .rigs import BoneMap, UnknownBonesError, chosen_bones, facing, map_bones, rig_from_smpl
 from .rotation import about_axis
