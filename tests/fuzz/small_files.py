@@ -160,7 +160,7 @@ def read_motion(path: Path) -> object:
 
 
 def read_poses(path: Path) -> object:
-    from primdiffusion.capture.poses import read_motion
+    from primdiffusion.pose_file import read_motion
 
     return read_motion(path)
 
