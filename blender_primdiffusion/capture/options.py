@@ -38,9 +38,7 @@ def parser() -> argparse.ArgumentParser:
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
     add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
-    add(
-        "--pose-files", type=Path, nargs="+", default=[], help="AMASS or pose .npz, .npy, .json, .pkl, .bvh, or folders"
-    )
+    add("--pose-files", type=Path, nargs="+", default=[], help="poses: .npz, .npy, .json, .pkl, .bvh, or folders")
     add("--poses", type=int, default=20, help="how many; the first is near-T (default %(default)s)")
     add("--cameras", type=int, default=rig.count, help="how many (default %(default)s)")
     add("--arrangement", choices=get_args(Arrangement), default=rig.arrangement)

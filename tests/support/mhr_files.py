@@ -67,7 +67,7 @@ def mhr_arrays(axis_angle: np.ndarray, moves: np.ndarray) -> dict[str, np.ndarra
 def write_mhr(path: Path, arrays: dict[str, np.ndarray]) -> Path:
     """Write arrays as .npz, .json or .pkl; the latter two as the list of humans of a picture."""
     if path.suffix == ".npz":
-        np.savez(path, **arrays)
+        np.savez(path, **arrays)  # pyright: ignore[reportArgumentType]
     elif path.suffix == ".json":
         path.write_text(json.dumps([{key: array.tolist() for key, array in arrays.items()}]), encoding="utf-8")
     else:
