@@ -31,7 +31,7 @@ class RigSkeleton:
     joint: NDArray[np.int64]
     """The SMPL joint that each bone is [N]; -1 for fingers, twists and the like, which stay with their parents."""
     at_rest: NDArray[np.float64]
-    """How each part is turned from SMPL's rest to the rig's [24, 3, 3] (`motion.rigs`)."""
+    """How each part is turned from SMPL's rest to the rig's [24, 3, 3] (`formats.poses.rigs`)."""
     body_joints: NDArray[np.float64]
     """The fitted body's joints at SMPL's rest [24, 3]: the whole turns about its pelvis."""
 
