@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..formats.arrays import MOST_BODY_VALUES, ArrayFileError, all_finite, read_arrays
 from ..formats.body_layout import body_data
 from ..formats.joints import JOINT_NAMES, PARENTS
-from ..motion.skeleton import chain, joint_positions
+from ..formats.poses.skeleton import chain, joint_positions
 
 BETAS = 10
 """Shape components in use."""

@@ -19,10 +19,10 @@ from ..formats.camera_files import write_layouts
 from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
+from ..formats.poses.files import read_motion
+from ..formats.poses.motion import Motion, MotionFileError
 from ..formats.removing import check_unlinked
 from ..formats.whole_files import remove_abandoned, temporary_folder
-from ..motion.files import MotionFileError, read_motion
-from ..motion.motion import Motion
 from ..motion.poses import built_in_poses, pick_poses
 from .body import Body, read_body
 from .passes import write_passes

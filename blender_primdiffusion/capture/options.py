@@ -13,6 +13,7 @@ from ..console import UsageError
 from ..formats.arrays import all_finite
 from ..formats.camera_rig import Arrangement, Rig, View
 from ..formats.json_files import read_json
+from ..formats.poses.files import ENDINGS
 from ..formats.requests import LAYOUTS, PASSES, check_seed
 from .blender_camera import CameraError
 from .settings import Background, CaptureSettings, Device, Light
@@ -21,7 +22,6 @@ MARK = "PRIMDIFFUSION "
 """Begins each line of --progress json; an object follows: {"line": ...}, or the fields of `job.Progress`."""
 ASK_FROM = 100
 """Views, before which a user at a terminal is asked."""
-_POSE_ENDINGS = (".npz", ".npy", ".json", ".bvh")
 
 
 def parser() -> argparse.ArgumentParser:
@@ -38,7 +38,7 @@ def parser() -> argparse.ArgumentParser:
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
     add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
-    add("--pose-files", type=Path, nargs="+", default=[], help="AMASS or pose .npz, .npy, .json, .bvh, or folders")
+    add("--pose-files", type=Path, nargs="+", default=[], help="poses: .npz, .npy, .json, .pkl, .bvh, or folders")
     add("--poses", type=int, default=20, help="how many; the first is near-T (default %(default)s)")
     add("--cameras", type=int, default=rig.count, help="how many (default %(default)s)")
     add("--arrangement", choices=get_args(Arrangement), default=rig.arrangement)
@@ -135,9 +135,9 @@ def _files_of_poses(paths: Sequence[Path]) -> Iterator[Path]:
         if not path.is_dir():
             yield path
             continue
-        found = sorted(file for file in path.rglob("*") if file.suffix.lower() in _POSE_ENDINGS and file.is_file())
+        found = sorted(file for file in path.rglob("*") if file.suffix.lower() in ENDINGS and file.is_file())
         if not found:
-            raise ValueError(f"{path} holds no pose files: {', '.join(_POSE_ENDINGS)}")
+            raise ValueError(f"{path} holds no pose files: {', '.join(ENDINGS)}")
         yield from found
 
 

@@ -11,7 +11,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from ..motion.skeleton import chain
+from ..formats.poses.skeleton import chain
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from .scan_files import ScanError, ScanFile
 
@@ -31,7 +31,7 @@ class RigSkeleton:
     joint: NDArray[np.int64]
     """The SMPL joint that each bone is [N]; -1 for fingers, twists and the like, which stay with their parents."""
     at_rest: NDArray[np.float64]
-    """How each part is turned from SMPL's rest to the rig's [24, 3, 3] (`motion.rigs`)."""
+    """How each part is turned from SMPL's rest to the rig's [24, 3, 3] (`formats.poses.rigs`)."""
     body_joints: NDArray[np.float64]
     """The fitted body's joints at SMPL's rest [24, 3]: the whole turns about its pelvis."""
 

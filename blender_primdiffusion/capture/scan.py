@@ -10,9 +10,9 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..motion.rigs import BoneMap, facing, map_bones, rig_from_smpl
-from ..motion.rotation import to_axis_angle
-from ..scene.convention import matrix_to_quaternion, points_to_blender
+from ..formats.poses.rigs import BoneMap, facing, map_bones, rig_from_smpl
+from ..formats.poses.rotation import matrix_to_quaternion, to_axis_angle
+from ..scene.convention import points_to_blender
 from .bind import bind_static
 from .body import Body, ShapeFit, fit_joints
 from .registration import stand_up

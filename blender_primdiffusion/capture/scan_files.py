@@ -13,10 +13,11 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, all_finite, array_names, read_arrays
+from ..formats.arrays import ArrayFileError, all_finite, read_arrays
 from ..formats.json_files import parse_json
+from ..formats.poses.files import POSE_KEYS, motion_from_arrays
+from ..formats.poses.motion import MotionFileError
 from ..formats.regular_files import open_regular, portable_name, real_path
-from ..motion.files import POSE_KEYS, MotionFileError, motion_from_arrays
 
 ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
 """Files of scans; of several with the same name in a folder, the first of these is used."""
@@ -210,9 +211,6 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
         motion = motion_from_arrays({key: arrays[key] for key in POSE_KEYS if key in arrays}, path)
     except (ArrayFileError, MotionFileError, OSError) as e:
         raise ScanError(str(e)) from e
-    except StopIteration:
-        names = ", ".join(name[:16] for name in array_names(path)[:8])
-        raise ScanError(f"{path} holds no pose ({names}): it needs global_orient and body_pose, or pose") from None
     betas = next((arrays[key] for key in _SHAPE_KEYS if key in arrays), np.zeros(10))
     scale = arrays.get("scale", np.ones(1))
     return Parameters(

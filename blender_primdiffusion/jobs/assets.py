@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from ..formats.answers import RenderAnswer
 from ..formats.joints import JOINT_NAMES, PARENTS
+from ..formats.poses.rotation import from_axis_angle, to_axis_angle
+from ..formats.poses.skeleton import REST_JOINTS, joint_positions
 from ..formats.regular_files import check_regular
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import builtin_poses, current_pose
 from ..motion.poses import grounding
-from ..motion.rotation import from_axis_angle, to_axis_angle
-from ..motion.skeleton import REST_JOINTS, joint_positions
 from ..places import own_folder
 from ..scene.armature import build_armature, keyframe_poses
 from ..scene.blend_values import as_shown

@@ -14,11 +14,11 @@ import numpy as np
 
 from ..engine.picture import pose_of
 from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
+from ..formats.poses.skeleton import unchain
 from ..formats.regular_files import exists_in_its_folder
 from ..formats.removing import remove_file
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import rest_joints
-from ..motion.skeleton import unchain
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
 from ..scene.body import body_of_file, shape_model_of

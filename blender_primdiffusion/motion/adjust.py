@@ -1,4 +1,4 @@
-"""Adjust motion: frame rate, range, place, floor, up axis, and length of the path for other legs."""
+"""Adjust motion: frame rate, range, place, floor, and length of the path for other legs."""
 
 from __future__ import annotations
 
@@ -8,16 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..scene.convention import continuous_quaternions, matrix_to_quaternion
-from .motion import Motion
-from .rotation import between, from_quaternion, slerp
-from .skeleton import REST_JOINTS, joint_positions
+from ..formats.poses.motion import Motion
+from ..formats.poses.rotation import from_quaternion, matrix_to_quaternion, slerp
+from ..formats.poses.skeleton import REST_JOINTS, joint_positions
+from ..scene.convention import continuous_quaternions
 
 _FEET = [JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right") for part in ("ankle", "foot")]
 _STANDING_SHARE = 5.0
 """Percentile of the heights of feet that counts as the floor: single frames may dip below it."""
-_CLEAR = 0.6
-"""Least mean cosine between the pelvis' up direction and an axis for that axis to count as up."""
 _TRAVEL = 0.5
 """Least length of the path, metres, from which feet are evaluated."""
 _STILL = 0.1
@@ -125,38 +123,6 @@ def stride_ratio(motion: Motion, rest: NDArray) -> float | None:
     if not _FACTORS[0] < best < _FACTORS[-1] or sliding(best) > 1 - _STANDING:
         return None
     return 1.0 if abs(best - 1) < _AS_IT_IS else best
-
-
-def find_up(pelvis: NDArray) -> str:
-    """The axis, such as "z" or "-y", along which pelvises [F, 3, 3] point up on average; "" where none is clear.
-
-    People stand, sit and walk more than they lie, so over a motion the mean is vertical.
-    """
-    mean = np.asarray(pelvis)[:, :, 1].mean(0)
-    return "" if np.abs(mean).max() < _CLEAR else axis_name(mean)
-
-
-def axis_name(direction: NDArray) -> str:
-    """The axis, such as "z" or "-y", nearest to a direction [3]."""
-    axis = int(np.abs(direction).argmax())
-    return ("-" if direction[axis] < 0 else "") + "xyz"[axis]
-
-
-def axis_direction(name: str) -> NDArray[np.float64]:
-    """The unit vector [3] of an axis such as "z" or "-y"."""
-    return np.eye(3)["xyz".index(name[-1])] * (-1 if name[0] == "-" else 1)
-
-
-def turn_y_up(rotations: NDArray, translations: NDArray, up: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Joint rotations [F, 24, 3, 3] and translations [F, 3] of a world in which `up` is up, turned to y up.
-
-    Translations as in SMPL's files: relative to a body whose pelvis is at its rest position, not at the origin.
-    """
-    turn = between(axis_direction(up), np.array([0.0, 1.0, 0.0]))
-    rotations = np.array(rotations, np.float64)
-    rotations[:, 0] = turn @ rotations[:, 0]
-    pelvis = REST_JOINTS[0]
-    return rotations, (np.asarray(translations) + pelvis) @ turn.T - pelvis
 
 
 def _legs(rest: NDArray) -> float:

@@ -8,10 +8,11 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from .motion import Detected, Motion
+from ..formats.poses.motion import Detected, Motion
+from ..formats.poses.rotation import about_axis
+from ..formats.poses.skeleton import REST_JOINTS
+from .legs import FLOOR, FootTrack, joint, leg_length, reach
 from .poses import Arm, Leg, Pose
-from .rotation import about_axis
-from .skeleton import FLOOR, REST_JOINTS, FootTrack, joint, leg_length, reach
 
 CYCLE_SECONDS = 1.1
 """Two steps."""

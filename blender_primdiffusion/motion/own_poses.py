@@ -44,7 +44,7 @@ def delete_pose(pose: Path) -> None:
 def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> Path:
     """Write a pose [24, 3] (axis-angle, radians) with its translation [3] (metres), both y up; returns the file.
 
-    `files.read_motion` reads the file too (`pose`, `transl`). Raises PoseFileError for a name that is empty, taken or
+    `formats.poses.files` reads the file too (`pose`, `transl`). Raises PoseFileError for a name that is empty, taken or
     no valid file name, and where the folder cannot be written to.
     """
     name = name.strip()

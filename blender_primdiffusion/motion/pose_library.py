@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite
 from ..formats.joints import JOINT_NAMES
+from ..formats.poses.rotation import from_axis_angle, matrix_to_quaternion, slerp, to_axis_angle
 from ..scene.armature import bone_bases, model_origin, rest_rotations
-from ..scene.convention import BLENDER_FROM_BACKEND, matrix_to_quaternion, points_to_backend
+from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from ..scene.handles import key_handles
 from .adjust import leg_ratio
 from .poses import LIBRARY, grounding
-from .rotation import from_axis_angle, slerp, to_axis_angle
 
 _MIRROR = np.array([1.0, -1.0, -1.0])
 """Signs of an axis-angle vector when left and right are swapped."""

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from .motion import Motion
-from .rotation import about_axis
-from .skeleton import FLOOR, REST_JOINTS, joint_positions
+from ..formats.poses.motion import Motion
+from ..formats.poses.rotation import about_axis
+from ..formats.poses.skeleton import REST_JOINTS, joint_positions
+from .legs import FLOOR
 
 X, Y, Z = 0, 1, 2
 _CLEARANCE = REST_JOINTS[:, 1] - FLOOR

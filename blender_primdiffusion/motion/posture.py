@@ -7,10 +7,10 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..formats.poses.rotation import from_axis_angle, to_axis_angle
 from ..scene.armature import model_origin
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend, points_to_blender
 from .pose_library import apply_pose, check_posable, current_pose, rest_joints
-from .rotation import from_axis_angle, to_axis_angle
 
 _UNSCALED = 1e-3
 

@@ -14,9 +14,10 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
+from ..formats.poses.rotation import matrix_to_quaternion
 from .actions import action_curves, last_key, new_action
 from .blend_values import stored_numbers
-from .convention import continuous_quaternions, matrix_to_quaternion, points_to_blender, rotations_to_blender
+from .convention import continuous_quaternions, points_to_blender, rotations_to_blender
 from .human import ORIGIN
 from .limbs import place_controls
 

@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
+from ..formats.poses.rotation import matrix_to_quaternion
 from .armature import build_armature
 from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT
-from .convention import frames_to_blender, matrix_to_quaternion, points_to_blender
+from .convention import frames_to_blender, points_to_blender
 from .human import BETAS, BODY_MARK, HOME, MARK, ORIGIN, stored_path, volume_name
 from .material import volume_material
 from .stand_in import build_stand_in

@@ -1,5 +1,4 @@
-"""The one place where the backend's axes (y up, facing +z) become Blender's (z up, facing -y), and matrices become
-quaternions.
+"""The one place where the backend's axes (y up, facing +z) become Blender's (z up, facing -y).
 
 Both systems are right-handed and in metres, so the change is a quarter turn about x: the human's left stays +x.
 """
@@ -38,30 +37,6 @@ def transforms_to_backend(matrices: NDArray) -> NDArray[np.float64]:
     matrices = np.asarray(matrices, np.float64)
     linear = BLENDER_FROM_BACKEND.T @ matrices[..., :3, :3] @ BLENDER_FROM_BACKEND
     return np.concatenate([linear, points_to_backend(matrices[..., :3, 3])[..., None]], -1)
-
-
-def matrix_to_quaternion(rotation: NDArray) -> NDArray[np.float64]:
-    """Unit quaternions [..., 4] of rotations [..., 3, 3], w >= 0.
-
-    Of the four products 4 q_i q the one with the largest q_i is taken, so no half turn divides by zero.
-    """
-    r = np.asarray(rotation, np.float64)
-    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    xy, xz, yz = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
-    products = np.stack(
-        [
-            np.stack([1 + xx + yy + zz, wx, wy, wz], -1),
-            np.stack([wx, 1 + xx - yy - zz, xy, xz], -1),
-            np.stack([wy, xy, 1 - xx + yy - zz, yz], -1),
-            np.stack([wz, xz, yz, 1 - xx - yy + zz], -1),
-        ],
-        -2,
-    )
-    largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), -1)
-    best: NDArray[np.float64] = np.take_along_axis(products, largest[..., None, None], -2)[..., 0, :]
-    best = best / np.linalg.norm(best, axis=-1, keepdims=True)
-    return best * np.where(best[..., :1] < 0, -1.0, 1.0)
 
 
 def continuous_quaternions(quaternions: NDArray) -> NDArray[np.float64]:

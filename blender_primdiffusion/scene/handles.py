@@ -14,9 +14,10 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..formats.poses.rotation import matrix_to_quaternion
 from .actions import action_curves, frames_in_use, loops, own_curves, repeat
 from .armature import add_keys, editing_bones, rest_rotations
-from .convention import continuous_quaternions, matrix_to_quaternion
+from .convention import continuous_quaternions
 from .export_model import scene_with_only
 from .limbs import CONTROLS, LIMBS, POLE_M, Limb, place_controls
 

@@ -45,7 +45,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
 
     poses: bpy.props.StringProperty(
         name="Poses",
-        description="A file or folder of AMASS or pose .npz, .npy, .json or .bvh; empty: built-in poses",
+        description="A file or folder of AMASS or pose .npz, .npy, .json, .pkl or .bvh; empty: built-in poses",
         subtype="FILE_PATH",
     )
     pose_count: bpy.props.IntProperty(

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..formats.joints import JOINT_NAMES
-from ..motion.bvh import BvhError, bone_names, parse_bvh
-from ..motion.files import MotionFileError, read_motion
-from ..motion.rigs import UnknownBonesError, map_bones
+from ..formats.poses.bvh import bone_names, parse_bvh
+from ..formats.poses.files import ENDINGS, read_motion
+from ..formats.poses.motion import MotionFileError
+from ..formats.poses.rigs import UnknownBonesError, map_bones
 from ..scene.human import armature_of, humans
 from .drawing import draw_lines, property_columns
 from .motion_placing import Placement, extend_range, facts, place_motion
@@ -58,7 +59,6 @@ def nearest_to(mouse: tuple[float, float], seen: dict[str, NDArray]) -> str:
     return name
 
 
-SUFFIXES = (".npz", ".npy", ".json", ".bvh")
 _UP_ITEMS = [
     ("AUTO", "Found in the File", "Detected from the orientation of the pelvis"),
     *[
@@ -83,7 +83,7 @@ class FileFacts:
 def look_at(filepath: str, up: str = "") -> FileFacts:
     """What is in a file; cached until the file changes. Does not raise: `error` holds what is wrong."""
     path = Path(bpy.path.abspath(filepath))
-    if path.suffix.lower() not in SUFFIXES or not path.is_file():
+    if path.suffix.lower() not in ENDINGS or not path.is_file():
         return FileFacts({}, (), {})
     stat = path.stat()
     return _look_at(str(path), up, stat.st_mtime_ns, stat.st_size)
@@ -97,7 +97,7 @@ def _look_at(path: str, up: str, _changed: int, _size: int) -> FileFacts:
             bones = tuple(bone_names(parse_bvh(Path(path))))
             map_bones(bones)
         motion = read_motion(path, up)
-    except (MotionFileError, UnknownBonesError, BvhError, OSError) as error:
+    except (MotionFileError, UnknownBonesError, OSError) as error:
         return FileFacts({}, bones, {}, str(error))
     return FileFacts(facts(motion), bones, dict(motion.detected.bones))
 
@@ -135,7 +135,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     filepath: bpy.props.StringProperty(
         name="File", description="Path of the motion", subtype="FILE_PATH", options={"SKIP_SAVE"}
     )
-    filter_glob: bpy.props.StringProperty(default=";".join(f"*{s}" for s in SUFFIXES), options={"HIDDEN"})
+    filter_glob: bpy.props.StringProperty(default=";".join(f"*{s}" for s in ENDINGS), options={"HIDDEN"})
     up: bpy.props.EnumProperty(name="Up Axis", description="Which axis of the file points up", items=_UP_ITEMS)
     fps: bpy.props.FloatProperty(
         name="Source Rate",
@@ -191,7 +191,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         if not self.filepath:
-            raise ValueError("no file was chosen: choose an .npz, .npy, .json or .bvh file")
+            raise ValueError("no file was chosen: choose an .npz, .npy, .json, .pkl or .bvh file")
         chosen = None
         if self.bones == "CHOSEN":
             chosen = {joint: getattr(self, bone_property(joint)) for joint in JOINT_NAMES}

@@ -10,8 +10,8 @@ import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
+from ..motion.amass import write_amass
 from ..motion.built_in_motions import built_in_motion
-from ..motion.files import write_amass
 from ..motion.pose_library import check_posable
 from ..scene.actions import action_curves
 from ..scene.armature import pose_from_joint_rotations

@@ -12,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
+from ..formats.poses.motion import Motion
+from ..formats.poses.rotation import nearest
+from ..formats.poses.skeleton import unchain
 from ..motion.adjust import cut, from_origin, in_place, on_floor, resample, scale_places, stride_ratio
-from ..motion.motion import Motion
 from ..motion.pose_library import check_posable, rest_joints
-from ..motion.rotation import nearest
-from ..motion.skeleton import unchain
 from ..scene.actions import last_key, push_to_strip
 from ..scene.armature import append_poses, keyframe_poses, model_origin, rest_rotations
 from ..scene.blend_values import stored_numbers

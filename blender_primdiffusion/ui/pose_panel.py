@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from ..formats.picture_files import write_png
+from ..formats.poses.rotation import to_axis_angle
+from ..formats.poses.skeleton import joint_positions
 from ..jobs.assets import clay_figure
 from ..motion.own_poses import delete_pose, load_pose, own_poses, picture_of, save_pose
 from ..motion.pose_library import (
@@ -25,8 +27,6 @@ from ..motion.pose_library import (
     standing,
 )
 from ..motion.poses import LIBRARY
-from ..motion.rotation import to_axis_angle
-from ..motion.skeleton import joint_positions
 from ..places import own_folder
 from ..scene.handles import handles_from_joints, joints_from_handles
 from .drawing import SidebarPanel, property_columns

@@ -9,10 +9,10 @@ from pathlib import Path
 import bpy
 import numpy as np
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.motion import Motion
 from synthetic import axis_angle
 
 from blender_primdiffusion.capture.body import Body, read_body
-from blender_primdiffusion.motion.motion import Motion
 from blender_primdiffusion.scene.convention import points_to_blender
 
 FACES = 1500

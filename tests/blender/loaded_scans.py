@@ -9,10 +9,10 @@ from pathlib import Path
 import bpy
 import numpy as np
 import scan_fixtures
+from blender_primdiffusion.formats.poses.rotation import from_axis_angle
 
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.scan import Scan, find_scans, load_scan
-from blender_primdiffusion.motion.rotation import from_axis_angle
 
 BODY = read_body()
 RNG = np.random.default_rng(0)

@@ -8,10 +8,10 @@ from pathlib import Path
 import bpy
 import numpy as np
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.rotation import about_axis
 from mathutils import Matrix
 
 from blender_primdiffusion.capture.body import Body, skin, skinning_transforms
-from blender_primdiffusion.motion.rotation import about_axis
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 

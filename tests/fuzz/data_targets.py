@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -41,8 +42,23 @@ def as_json(folder: Path) -> Path:
     return folder / "poses.json"
 
 
+def as_pickle(folder: Path) -> Path:
+    (folder / "poses.pkl").write_bytes(pickle.dumps({"poses": random_pose(), "trans": np.zeros((3, 3))}))
+    return folder / "poses.pkl"
+
+
+def as_mhr(ending: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        from support.mhr_files import mhr_arrays, write_mhr
+
+        turns = random_pose().reshape(3, 24, 3)
+        return write_mhr(folder / f"poses.{ending}", mhr_arrays(turns, np.zeros((3, 3))))
+
+    return make
+
+
 def read_poses(path: Path) -> None:
-    from primdiffusion.capture.poses import read_motion
+    from primdiffusion.pose_file import read_motion
 
     finite_members(read_motion(path))
 
@@ -272,6 +288,9 @@ TARGETS = (
     Target("poses .npy", as_npy, NPY, read_poses),
     Target("poses .npz", as_npz, mutations.NPZ, read_poses),
     Target("poses .json", as_json, mutations.JSON, read_poses),
+    Target("poses .pkl", as_pickle, mutations.PLAIN, read_poses),
+    Target("MHR .npz", as_mhr("npz"), mutations.NPZ, read_poses),
+    Target("MHR .json", as_mhr("json"), mutations.JSON, read_poses),
     Target("pose .npz", as_npz, mutations.NPZ, read_single_pose),
     Target("encoder", make_encoder, mutations.SAFETENSORS, read_encoder),
     Target("painted weights", make_weights, mutations.NPZ, read_weights),

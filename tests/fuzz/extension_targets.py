@@ -109,7 +109,8 @@ def read_proxy(path: Path) -> None:
 
 def read_motion(path: Path) -> None:
     """As Import Motion does, and its file browser before."""
-    from blender_primdiffusion.motion.files import read_motion
+    from blender_primdiffusion.formats.poses.files import read_motion
+
     from blender_primdiffusion.ui.import_motion import look_at
 
     look_at(str(path))

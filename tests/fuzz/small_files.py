@@ -154,13 +154,13 @@ def small_motion(folder: Path) -> Path:
 
 
 def read_motion(path: Path) -> object:
-    from blender_primdiffusion.motion.files import read_motion
+    from blender_primdiffusion.formats.poses.files import read_motion
 
     return read_motion(path)
 
 
 def read_poses(path: Path) -> object:
-    from primdiffusion.capture.poses import read_motion
+    from primdiffusion.pose_file import read_motion
 
     return read_motion(path)
 
@@ -193,10 +193,9 @@ def bvh(frames: int, extra: int = 0) -> Callable[[Path], Path]:
     """A motion of which the root alone turns about one axis, two characters a frame; with `extra` joints."""
 
     def make(folder: Path) -> Path:
+        from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
         from bvh_files import motion_of, write_bvh
         from primdiffusion.formats.joints import JOINT_NAMES
-
-        from blender_primdiffusion.motion.skeleton import REST_JOINTS
 
         path = write_bvh(folder / "a.bvh", REST_JOINTS, *motion_of(), {name: name for name in JOINT_NAMES})
         head = path.read_text().split("MOTION")[0]

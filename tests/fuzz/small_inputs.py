@@ -214,14 +214,14 @@ INPUTS: dict[str, SmallInput] = {
     "poses of bytes and noise": SmallInput(motion(*_NOISY, noise=4_000_000), read_poses, small_motion, "motion"),
     "motion of bytes and noise": SmallInput(motion(*_NOISY, noise=4_000_000), read_motion, small_motion, "motion"),
     "pose of bytes and noise": SmallInput(
-        motion(*_NOISY, noise=4_000_000), read_pose, small_motion, "motion", is_read=True
+        motion(*_NOISY, noise=4_000_000), read_pose, small_motion, "motion"
     ),
     "captured poses": SmallInput(
         captured_poses(55_000), read_captured_poses, captured_poses(2), "motion", is_read=True
     ),
     "captured poses of bytes": SmallInput(captured_poses(850_000), read_captured_poses, captured_poses(2), "motion"),
     "pose of bytes": SmallInput(
-        motion(("poses", "i1", (_WHOLE // 72, 72))), read_pose, small_motion, "motion", is_read=True
+        motion(("poses", "i1", (_WHOLE // 72, 72))), read_pose, small_motion, "motion"
     ),
     "bvh of many frames": SmallInput(bvh(480_000), read_motion, bvh(4), "motion"),
     "bvh of many joints": SmallInput(bvh(5000, extra=900), read_motion, bvh(4), "motion"),

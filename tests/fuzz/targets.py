@@ -165,10 +165,9 @@ def read_own_pose(path: Path) -> None:
 
 
 def make_bvh(folder: Path) -> Path:
+    from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
     from bvh_files import motion_of, write_bvh
     from primdiffusion.formats.joints import JOINT_NAMES
-
-    from blender_primdiffusion.motion.skeleton import REST_JOINTS
 
     return write_bvh(folder / "a.bvh", REST_JOINTS, *motion_of(), {name: name for name in JOINT_NAMES})
 
@@ -181,7 +180,7 @@ def make_amass(folder: Path) -> Path:
 
 
 def read_motion_file(path: Path) -> None:
-    from blender_primdiffusion.motion.files import read_motion
+    from blender_primdiffusion.formats.poses.files import read_motion
 
     motion = read_motion(path)
     finite(motion.rotations, motion.translations, motion.fps)

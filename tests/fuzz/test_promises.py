@@ -82,8 +82,8 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/backend/test_torch_file.py::test_the_public_loader_gets_the_checked_members_alone",
         ),
     ),
-    "SMPL bodies `.pkl`, `.npz`": (
-        ("SMPL .npz", "SMPL .pkl"),
+    "SMPL bodies `.pkl`, `.npz`, poses `.pkl`": (
+        ("SMPL .npz", "SMPL .pkl", "poses .pkl"),
         (
             "tests/backend/body/test_smpl_files.py::test_hostile_pickle_is_rejected_by_name_and_does_not_run",
             "tests/backend/body/test_smpl_files.py::test_npz_with_pickled_objects_is_rejected",
@@ -95,7 +95,8 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "arrays `.npz`: motion, AMASS, captures, payloads, bodies of earlier `.blend` files": (
         (
-            "AMASS", "poses .npz", "pose .npz", "parameters of a scan", "captures: poses", "captures: pickled poses",
+            "AMASS", "poses .npz", "pose .npz", "MHR .npz", "parameters of a scan", "captures: poses",
+            "captures: pickled poses",
             "captures: joints", "payload", "payload of a gallery", "painted weights", "solids",
             "earlier body file", "body of captures", "proxy", "merged grid",
         ),
@@ -111,9 +112,9 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "JSON: poses, cameras, captures, sets of humans": (
         (
-            "pose", "own pose", "poses .json", "motion .json", "cameras", "batch settings", "human's card", "manifest",
-            "packed index", "joints of shots", "captures: settings", "captures: cameras", "captures: completion mark",
-            "captures: about a pack", "posture",
+            "pose", "own pose", "poses .json", "motion .json", "MHR .json", "cameras", "batch settings", "human's card",
+            "manifest", "packed index", "joints of shots", "captures: settings", "captures: cameras",
+            "captures: completion mark", "captures: about a pack", "posture",
         ),
         (
             "tests/backend/formats/test_json_files.py::test_what_no_reader_can_use_is_one_short_reason",

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, J
-from primdiffusion.body.smpl_pickle import BodyFileError, as_array, read_pickle
 from primdiffusion.formats.arrays import ArrayFileError, all_finite, array_names, read_arrays, read_npy
 from primdiffusion.formats.regular_files import FileContent, read_regular
+from primdiffusion.formats.smpl_pickle import BodyFileError, as_array, read_pickle
 
 LARGEST_BODY_FILE = 512 * 2**20
 """SMPL with 300 shape components takes 250 MB."""

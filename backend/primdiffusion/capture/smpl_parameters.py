@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float32
 
 from primdiffusion.body.model import BodyPose, J
-from primdiffusion.body.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
 from primdiffusion.formats.arrays import ArrayFileError, all_finite, read_numbers, read_pickled_bytes
 from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 from primdiffusion.formats.motion_size import MotionTooLongError, check_motion_size
+from primdiffusion.formats.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
 

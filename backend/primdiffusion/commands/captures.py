@@ -18,7 +18,7 @@ from primdiffusion.capture.composed import Backgrounds
 from primdiffusion.capture.dataset import open_pack, pack
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
 from primdiffusion.capture.people_files import find_people
-from primdiffusion.capture.poses import MotionFileError, choose_poses, read_motion, read_motions
+from primdiffusion.capture.poses import choose_poses, read_motions
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
@@ -27,7 +27,9 @@ from primdiffusion.evaluation.shots import folder_pictures
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
+from primdiffusion.formats.poses.motion import MotionFileError
 from primdiffusion.formats.requests import PASSES
+from primdiffusion.pose_file import read_motion
 from primdiffusion.training.captured_people import read_cards
 
 DESCRIPTION = "Multi-view captures, to train on."
@@ -45,7 +47,7 @@ class RenderCaptures:
     out: Path
     """Output folder."""
     poses: tuple[Path, ...] = ()
-    """Motion files (AMASS and other .npz, .npy, .json); the default is the built-in poses."""
+    """Motion files (AMASS and other .npz, .npy, .json, .pkl, .bvh); the default is the built-in poses."""
     pose_count: int = 20
     """Poses of each human, the near-T pose first; 0: all frames of one motion file, in order, with its translation."""
     cameras: int = 36

@@ -14,7 +14,7 @@ import torch
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture.poses import choose_poses, read_motion
+from primdiffusion.capture.poses import choose_poses
 from primdiffusion.device import best_device
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
@@ -58,6 +58,7 @@ from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person
+from primdiffusion.pose_file import read_motion
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.version import __version__
 

@@ -60,7 +60,7 @@ class PoseOptions:
     """A pose on the command line."""
 
     pose: Path | None = None
-    """.json or .npz with 72 axis-angle numbers (24 joints x 3, radians); the default is the T pose."""
+    """Pose file (.npz, .npy, .json, .pkl, .bvh), such as 72 axis-angle numbers (24 x 3, radians); default: T pose."""
     frame: int = 0
     """Frame of a pose file with several."""
 

@@ -231,7 +231,7 @@ class Pictures:
     masks: tuple[Path, ...] = ()
     """A mask for each picture, of its size: opaque or white where the person is; pictures with alpha need none."""
     pose: Path | None = None
-    """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl), or a posture.json; without
+    """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl, .bvh), or a posture.json; without
     it, the person is taken to stand upright, facing the camera."""
     cameras: Path | None = None
     """Cameras of the pictures, as a cameras.json of captures; without it, the lens is that of the EXIF data or a usual
@@ -303,7 +303,7 @@ class RenderRequest:
     yaw: float = 0.0
     """Camera position around the human, radians: 0 in front, pi/2 at the human's left."""
     pose: Path | list | None = None
-    """72 axis-angle values (24 x 3, radians), or a pose file (.json, .npz); None for the T pose."""
+    """72 axis-angle values (24 x 3, radians), or a pose file; None for the T pose."""
     depth: Annotated[Path, Ending((".png",))] | None = None
     """A second PNG, of the depth."""
 

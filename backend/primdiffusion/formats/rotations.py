@@ -30,9 +30,9 @@ def first_improper(matrices: NDArray) -> tuple[int, int] | None:
     return int(frame), int(joint)
 
 
-def improper_text(frame: int | str, joint: int) -> str:
+def improper_text(frame: int | str, joint: int | str) -> str:
     """Describe a matrix that is not a rotation, as a part of a sentence."""
-    name = JOINT_NAMES[joint] if joint < _NAMED else str(joint)
+    name = JOINT_NAMES[joint] if isinstance(joint, int) and joint < _NAMED else joint
     return (
         f"a matrix for joint {name} in frame {frame} that is not a rotation: orthonormal within {TOLERANCE:g}, "
         "determinant 1"

@@ -19,13 +19,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture.poses import read_motion
 from primdiffusion.capture.reader import views_in
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
+from primdiffusion.pose_file import read_motion
 
 FORMAT = "primdiffusion-posture"
 BETAS = 10
@@ -44,7 +44,7 @@ class PostureFile:
 
 
 def read_posture(path: Path, sizes: Sequence[tuple[int, int]]) -> PostureFile:
-    """Read a pose file (`capture.poses.read_motion`) or a posture of pictures of `sizes` (width, height).
+    """Read a pose file (`primdiffusion.pose_file`) or a posture of pictures of `sizes` (width, height).
 
     Raises FileNotFoundError, and ValueError for what is no pose or of another rig; the message names the file.
     """

@@ -107,8 +107,8 @@ def _add_declared(made: argparse.ArgumentParser, field: str, option: str) -> Non
 
 def _add_motion(made: argparse.ArgumentParser) -> None:
     moved = made.add_mutually_exclusive_group()
-    moved.add_argument("--pose", type=Path, metavar="FILE", help="stand as in its first frame; .npz, .npy, .json, .bvh")
-    moved.add_argument("--motion", type=Path, metavar="FILE", help="move as in it: AMASS .npz, .npy, .json, .bvh")
+    moved.add_argument("--pose", type=Path, metavar="FILE", help="stand as in its first frame: .npz, .json, .pkl, .bvh")
+    moved.add_argument("--motion", type=Path, metavar="FILE", help="move as in it: AMASS .npz, .npy, .json, .pkl, .bvh")
 
 
 def _add_python(made: argparse.ArgumentParser) -> None:

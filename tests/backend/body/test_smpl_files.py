@@ -13,7 +13,7 @@ import scipy.sparse
 import torch
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.body.smpl_files import load_body
-from primdiffusion.body.smpl_pickle import BodyFileError, UnsafePickleError
+from primdiffusion.formats.smpl_pickle import BodyFileError, UnsafePickleError
 from smplx.lbs import lbs
 from support.errors import refused
 

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.poses import MotionFileError, built_in_poses, choose_poses, read_motion
+from primdiffusion.capture.poses import built_in_poses, choose_poses
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import ArrayFileError
+from primdiffusion.formats.poses.motion import MotionFileError
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from primdiffusion.pose_file import read_motion
 from support.errors import refused
 
 THETA = np.random.default_rng(0).uniform(-0.5, 0.5, (5, 72))

@@ -15,7 +15,6 @@ from capture_scenes import captured, small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose
-from primdiffusion.body.smpl_pickle import UnsafePickleError
 from primdiffusion.capture.dataset import PACK_FOLDER, pack
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import open_captures
@@ -26,6 +25,7 @@ from primdiffusion.formats.arrays import ArrayFileError, read_numbers
 from primdiffusion.formats.capture_repair import verify
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.removing import OutsideFolderError
+from primdiffusion.formats.smpl_pickle import UnsafePickleError
 from primdiffusion.raster.multisample import render_view
 from support.errors import refused
 

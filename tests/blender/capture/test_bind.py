@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle, to_axis_angle
 from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load
 from support.errors import refused
 
 from blender_primdiffusion.capture.bind import join_surface, surface_weights, unpose
 from blender_primdiffusion.capture.body import skin
 from blender_primdiffusion.capture.scan import ScanError
-from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
 
 SCANNED = scan_fixtures.a_pose() @ from_axis_angle(np.random.default_rng(5).normal(0, 0.12, (24, 3)))
 PLACE = np.array([0.4, 1.1, 0.3])

@@ -26,6 +26,7 @@ from blender_primdiffusion.formats.capture_layout import (
     picture_path,
 )
 from blender_primdiffusion.formats.capture_repair import repair, verify
+from blender_primdiffusion.formats.poses.motion import Motion
 from blender_primdiffusion.formats.whole_files import writer
 from capture_child import PEOPLE, small
 from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
@@ -36,7 +37,6 @@ from blender_primdiffusion.capture.job import CaptureError, _name_reference, run
 from blender_primdiffusion.capture.report import Report
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.stage import data_blocks
-from blender_primdiffusion.motion.motion import Motion
 
 pytestmark = pytest.mark.any_blender
 

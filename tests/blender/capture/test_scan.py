@@ -12,12 +12,12 @@ import scan_fixtures
 import synthetic
 from blender_primdiffusion.formats.camera_rig import bounding_sphere
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.rigs import RIGS, UnknownBonesError, map_bones
+from blender_primdiffusion.formats.poses.rotation import about_axis
 from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load, own_person
 from support.errors import refused
 
 from blender_primdiffusion.capture.scan import Scan, ScanError
-from blender_primdiffusion.motion.rigs import RIGS, UnknownBonesError, map_bones
-from blender_primdiffusion.motion.rotation import about_axis
 
 HANDS = np.isin(BODY.skin_weights.argmax(1), [JOINT_NAMES.index("left_hand"), JOINT_NAMES.index("right_hand")])
 

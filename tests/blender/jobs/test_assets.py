@@ -9,12 +9,12 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.poses.rotation import from_axis_angle
 from support.errors import refused
 from support.fake_child import PICTURE
 
 from blender_primdiffusion.jobs.assets import SIDE, clay_figure, picture_of_file
 from blender_primdiffusion.motion.pose_library import builtin_poses, current_pose
-from blender_primdiffusion.motion.rotation import from_axis_angle
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file, volume_path
 from blender_primdiffusion.ui import export_panel

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.files import read_motion
+from blender_primdiffusion.formats.poses.motion import Motion, MotionFileError
+from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle, slerp, to_axis_angle
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from bvh_files import motion_of, write_bvh
 from support.errors import refused
 
 from blender_primdiffusion.motion.adjust import cut, from_origin, in_place, leg_ratio, on_floor, resample
-from blender_primdiffusion.motion.files import MotionFileError, read_motion
-from blender_primdiffusion.motion.motion import Motion
-from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, slerp, to_axis_angle
-from blender_primdiffusion.motion.skeleton import REST_JOINTS
 
 pytestmark = pytest.mark.any_blender
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.rotation import to_axis_angle
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joint_positions
 
 from blender_primdiffusion.motion.built_in_motions import MOTIONS, built_in_motion
-from blender_primdiffusion.motion.rotation import to_axis_angle
-from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, FootTrack, chain, joint, joint_positions, reach
+from blender_primdiffusion.motion.legs import FLOOR, FootTrack, joint, reach
 
 pytestmark = pytest.mark.any_blender
 

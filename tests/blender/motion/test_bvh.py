@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.bvh import parse_bvh
+from blender_primdiffusion.formats.poses.files import read_motion
+from blender_primdiffusion.formats.poses.motion import MotionFileError
+from blender_primdiffusion.formats.poses.rotation import about_axis, to_axis_angle
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joint_positions
 from bvh_files import FRAMES, motion_of, write_bvh
 
-from blender_primdiffusion.motion.bvh import parse_bvh
-from blender_primdiffusion.motion.files import MotionFileError, read_motion
-from blender_primdiffusion.motion.rotation import about_axis, to_axis_angle
-from blender_primdiffusion.motion.skeleton import REST_JOINTS, chain, joint_positions
 from blender_primdiffusion.scene.armature import build_armature, keyframe_poses
 from blender_primdiffusion.scene.convention import points_to_blender
 

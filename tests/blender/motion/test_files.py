@@ -9,11 +9,11 @@ import zipfile
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.arrays import ArrayFileError, read_arrays
+from blender_primdiffusion.formats.poses.files import read_motion
+from blender_primdiffusion.formats.poses.motion import DEFAULT_FPS, MotionFileError
+from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle, to_axis_angle
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from support.errors import refused
-
-from blender_primdiffusion.motion.files import DEFAULT_FPS, MotionFileError, read_motion
-from blender_primdiffusion.motion.rotation import about_axis, from_axis_angle, to_axis_angle
-from blender_primdiffusion.motion.skeleton import REST_JOINTS
 
 pytestmark = pytest.mark.any_blender
 

@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
-from support.errors import refused
-
-from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.motion.motion import Motion
-from blender_primdiffusion.motion.poses import BUILT_IN, built_in_poses, pick_poses
-from blender_primdiffusion.motion.rotation import (
+from blender_primdiffusion.formats.poses.motion import Motion
+from blender_primdiffusion.formats.poses.rotation import (
     about_axis,
     between,
     from_axis_angle,
@@ -19,7 +15,12 @@ from blender_primdiffusion.motion.rotation import (
     nearest,
     to_axis_angle,
 )
-from blender_primdiffusion.motion.skeleton import FLOOR, REST_JOINTS, chain, joint_positions, unchain
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joint_positions, unchain
+from support.errors import refused
+
+from blender_primdiffusion.capture.body import read_body
+from blender_primdiffusion.motion.legs import FLOOR
+from blender_primdiffusion.motion.poses import BUILT_IN, built_in_poses, pick_poses
 
 pytestmark = pytest.mark.any_blender
 

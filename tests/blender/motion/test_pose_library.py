@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.rotation import from_axis_angle, to_axis_angle
+from blender_primdiffusion.formats.poses.skeleton import joint_positions
 from support.errors import refused
 
 from blender_primdiffusion.jobs.assets import clay_figure, picture_of_file
@@ -22,8 +24,6 @@ from blender_primdiffusion.motion.pose_library import (
     mirrored,
     rest_joints,
 )
-from blender_primdiffusion.motion.rotation import from_axis_angle, to_axis_angle
-from blender_primdiffusion.motion.skeleton import joint_positions
 from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of

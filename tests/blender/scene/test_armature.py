@@ -6,6 +6,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.poses.rotation import matrix_to_quaternion
 from oracle import TOLERANCE_M, Z_UP, blended_vertices
 from support.errors import refused
 
@@ -14,7 +15,6 @@ from blender_primdiffusion.scene.build import build_body_mesh
 from blender_primdiffusion.scene.convention import (
     continuous_quaternions,
     frames_to_blender,
-    matrix_to_quaternion,
     points_to_blender,
     rotations_to_blender,
 )

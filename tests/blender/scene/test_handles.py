@@ -6,13 +6,13 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from mathutils import Matrix, Vector
 from oracle import Z_UP
 
 from blender_primdiffusion.motion.built_in_motions import built_in_motion
 from blender_primdiffusion.motion.pose_library import current_pose
 from blender_primdiffusion.motion.poses import LIBRARY
-from blender_primdiffusion.motion.skeleton import REST_JOINTS
 from blender_primdiffusion.scene.actions import action_curves, loops, repeat
 from blender_primdiffusion.scene.armature import (
     build_armature,

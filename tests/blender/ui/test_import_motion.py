@@ -12,13 +12,13 @@ import pytest
 import synthetic
 from amass_files import feet, write_amass
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.files import read_motion
+from blender_primdiffusion.formats.poses.rotation import about_axis
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from bvh_files import motion_of, write_bvh
 from support.errors import refused
 
-from blender_primdiffusion.motion.files import read_motion
 from blender_primdiffusion.motion.pose_library import current_pose
-from blender_primdiffusion.motion.rotation import about_axis
-from blender_primdiffusion.motion.skeleton import REST_JOINTS
 from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.build import build_human

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import synthetic
 from amass_files import feet, write_amass
+from blender_primdiffusion.formats.poses.files import read_motion
 
-from blender_primdiffusion.motion.files import read_motion
 from blender_primdiffusion.motion.pose_library import current_pose
 from blender_primdiffusion.scene.actions import action_curves, last_key, loops
 from blender_primdiffusion.ui.motion_panel import PRIMDIFFUSION_MT_actions, PRIMDIFFUSION_PT_motion

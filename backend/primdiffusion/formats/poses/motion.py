@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..regular_files import FileError
 from .rotation import to_axis_angle
 from .skeleton import joint_positions
 
@@ -32,6 +33,18 @@ class Detected:
 
 LARGEST_NUMBER = 1e6
 """Of angles and lengths in files, in any unit: larger angles have few digits left after the point."""
+MOST_NUMBERS = 40_000_000
+"""Of an array: an hour of SMPL-X at 60 frames/s has 36 million."""
+LARGEST_FPS, SMALLEST_FPS = 10_000.0, 0.1
+DEFAULT_FPS = 30.0
+"""Frame rate of motion whose file does not state it."""
+NO_RATE = f"states no frame rate: {DEFAULT_FPS:g} frames per second are assumed"
+RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate")
+"""Names of a frame rate in files."""
+
+
+class MotionFileError(FileError):
+    """A file of poses cannot be used; the message says what is wrong and what to do."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,3 +86,33 @@ class Motion:
     def joints(self) -> NDArray[np.float64]:
         """Joint positions of the average skeleton [F, 24, 3], metres."""
         return joint_positions(self.rotations, self.translations)
+
+
+def first_of(arrays: Mapping[str, NDArray], keys: Iterable[str]) -> NDArray | None:
+    """The first of the arrays that is there."""
+    return next((arrays[key] for key in keys if key in arrays), None)
+
+
+def check_numbers(arrays: Mapping[str, NDArray], name: str) -> None:
+    """Raise MotionFileError, which calls the file `name`, for arrays that are not the numbers of a motion."""
+    for key, array in arrays.items():
+        if array.dtype.kind not in "iuf":
+            raise MotionFileError(f"{name}: {key!r} holds {array.dtype} instead of numbers")
+        if array.size == 0:
+            raise MotionFileError(f"{name}: {key!r} holds no frame; export the motion again")
+        if not np.isfinite(array).all():
+            raise MotionFileError(f"{name}: {key!r} holds NaN or infinite numbers; export the motion again")
+        if array.size > MOST_NUMBERS or np.abs(array.astype(np.float64)).max() > LARGEST_NUMBER:
+            raise MotionFileError(
+                f"{name}: {key!r} holds more than {MOST_NUMBERS} numbers, or one above {LARGEST_NUMBER:g}; cut the "
+                "motion into pieces, or export it again"
+            )
+
+
+def stated_rate(arrays: Mapping[str, NDArray], name: str) -> float:
+    """The frame rate in arrays of a file called `name`; 0 where they state none. Raises MotionFileError."""
+    rate = first_of(arrays, RATES)
+    stated = float(rate.ravel()[0]) if rate is not None and rate.size == 1 and float(rate.ravel()[0]) > 0 else 0.0
+    if stated and not SMALLEST_FPS <= stated <= LARGEST_FPS:
+        raise MotionFileError(f"{name} states {stated:g} frames per second; export the motion again")
+    return stated

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES, PARENTS
+from ..joints import JOINT_NAMES, PARENTS
 from .rotation import about_axis, between
-from .skeleton import REST_JOINTS
+from .skeleton import REST_JOINTS, unchain
 
 _SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
 RIGS: dict[str, dict[str, str]] = {
@@ -74,6 +74,12 @@ RIGS: dict[str, dict[str, str]] = {
         "spine2": "chest2", "spine3": "chest3", "neck": "neck", "head": "head", "collar": "{left}collar",
         "shoulder": "{left}shoulder|{left}uparm", "elbow": "{left}elbow|{left}lowarm",
         "wrist": "{left}wrist|{left}hand",
+    },
+    "MHR": {
+        "pelvis": "root", "hip": "{l}upleg", "knee": "{l}lowleg", "ankle": "{l}foot", "foot": "{l}ball",
+        "spine1": "cspine0", "spine2": "cspine1", "spine3": "cspine3", "neck": "cneck", "head": "chead",
+        "collar": "{l}clavicle", "shoulder": "{l}uparm", "elbow": "{l}lowarm", "wrist": "{l}wrist",
+        "tip": "{l}middle1",
     },
 }  # fmt: skip
 """Common rigs: SMPL's body part -> the bone's name without separators, lower case; `{l}` and `{left}` stand for the
@@ -205,6 +211,32 @@ def rig_from_smpl(
         if np.linalg.norm(here) > _SHORTEST:
             turned[joint] = between(there, here) @ turned[joint]
     return turned
+
+
+def retarget(
+    bones: BoneMap, rest: Mapping[str, NDArray], turned: Mapping[str, NDArray]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Joint rotations of SMPL [F, 24, 3, 3], y up as the rest pose stands, and the rotation [3, 3] from the rig's axes.
+
+    Each body part gets its bone's rotation in the world; the difference between the rig's rest pose and SMPL's T is
+    added (`rig_from_smpl`). `rest` are places of bones at rest [3] and `turned` their rotations in the world from there
+    [F, 3, 3], by name. A joint without a bone follows its parent. Raises ValueError where `rest` is no person.
+    """
+    heads = {joint: rest[bone] for joint, bone in bones.joints.items()}
+    tips = {joint: rest[bone] for joint, bone in bones.tips.items()}
+    from_file = facing(heads).T
+    at_rest = rig_from_smpl(
+        {joint: from_file @ place for joint, place in heads.items()},
+        {joint: from_file @ place for joint, place in tips.items()},
+    )
+    frames = len(turned[bones.joints["pelvis"]])
+    world = np.tile(np.eye(3), (frames, len(JOINT_NAMES), 1, 1))
+    for joint, name in enumerate(JOINT_NAMES):
+        if name in bones.joints:
+            world[:, joint] = from_file @ turned[bones.joints[name]] @ from_file.T @ at_rest[joint]
+        elif joint:
+            world[:, joint] = world[:, PARENTS[joint]]
+    return unchain(world), from_file
 
 
 def _missing_joints(joints: Mapping[str, str]) -> list[str]:

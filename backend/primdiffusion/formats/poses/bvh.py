@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES, PARENTS
-from ..formats.regular_files import TooLargeError, read_regular
-from .motion import LARGEST_NUMBER, Detected, Motion
-from .rigs import BoneMap, UnknownBonesError, chosen_bones, facing, map_bones, rig_from_smpl
+from ..joints import JOINT_NAMES
+from ..regular_files import TooLargeError, read_regular
+from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion, MotionFileError
+from .rigs import BoneMap, UnknownBonesError, chosen_bones, map_bones, retarget
 from .rotation import about_axis
-from .skeleton import REST_JOINTS, unchain
+from .skeleton import REST_JOINTS
 
 LARGEST_BYTES = 64 * 2**20
 LONGEST_HIERARCHY = 2**20
@@ -34,10 +34,6 @@ LONGEST_FRAME_TIME, SHORTEST_FRAME_TIME = 10.0, 1e-4
 _CHANNELS = {f"{axis}{kind}": (kind, "XYZ".index(axis)) for axis in "XYZ" for kind in ("position", "rotation")}
 _MOTION = re.compile(r"\s*Frames:\s*(\d{1,15})\s+Frame\s+Time:\s*(\S{1,40})", re.IGNORECASE)
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "decimetres": 0.1}
-
-
-class BvhError(ValueError):
-    """A BVH file cannot be used; the message names the file."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +87,8 @@ def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motio
     """The motion of a BVH file on SMPL's skeleton, y up judging by the rest pose, and the rotation [3, 3] from the
     file's axes.
 
-    Each body part gets its rotation in the world; the difference between the file's rest pose and SMPL's T is added
-    (`rigs.rig_from_smpl`). The root's path is scaled by the length of the legs, so feet slide little. Positions of
-    joints other than the root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises BvhError.
+    See `rigs.retarget`. The root's path is scaled by the length of the legs, so feet slide little. Positions of joints
+    other than the root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises MotionFileError.
     """
     hierarchy = parse_bvh(path)
     try:
@@ -101,7 +96,7 @@ def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motio
         bones = map_bones(names) if chosen is None else chosen_bones(names, chosen)
         return _retarget(hierarchy, bones, path)
     except (UnknownBonesError, ValueError) as e:
-        raise BvhError(f"{path}: {e}") from e
+        raise MotionFileError(f"{path}: {e}") from e
 
 
 def bone_names(hierarchy: Hierarchy) -> list[str]:
@@ -110,29 +105,29 @@ def bone_names(hierarchy: Hierarchy) -> list[str]:
 
 
 def parse_bvh(path: Path) -> Hierarchy:
-    """Parse a BVH file. Raises BvhError where it is no BVH file or truncated."""
+    """Parse a BVH file. Raises MotionFileError where it is no BVH file or truncated."""
     try:
         text = read_regular(path, LARGEST_BYTES).decode("utf-8", errors="replace")
     except TooLargeError as e:
-        raise BvhError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces") from e
+        raise MotionFileError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces") from e
     head, found, tail = text.partition("MOTION")
     if not found or "HIERARCHY" not in head:
-        raise BvhError(f"{path} is not a BVH file: it has no HIERARCHY followed by MOTION")
+        raise MotionFileError(f"{path} is not a BVH file: it has no HIERARCHY followed by MOTION")
     if len(head) > LONGEST_HIERARCHY:
-        raise BvhError(f"{path} has a HIERARCHY of more than {LONGEST_HIERARCHY} characters: export it again")
+        raise MotionFileError(f"{path} has a HIERARCHY of more than {LONGEST_HIERARCHY} characters: export it again")
     try:
         names, parents, offsets, channels = _parse_hierarchy(head.split("HIERARCHY", 1)[1].split())
         values, frame_time = _parse_motion(tail, sum(map(len, channels)), len(names))
     except (ValueError, IndexError, KeyError, OverflowError) as e:
-        raise BvhError(f"{path} is not a complete BVH file ({e!s:.120}): export it again") from e
+        raise MotionFileError(f"{path} is not a complete BVH file ({e!s:.120}): export it again") from e
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
-        raise BvhError(f"{path} holds NaN or infinite numbers: export the motion again")
+        raise MotionFileError(f"{path} holds NaN or infinite numbers: export the motion again")
     if max(np.abs(values).max(initial=0), np.abs(offsets).max(initial=0)) > LARGEST_NUMBER:
-        raise BvhError(
+        raise MotionFileError(
             f"{path} holds numbers above {LARGEST_NUMBER:g}, which are no angles or lengths: export it again"
         )
     if not names:
-        raise BvhError(f"{path} has no ROOT: export the motion again")
+        raise MotionFileError(f"{path} has no ROOT: export the motion again")
     return Hierarchy(names, parents, offsets, channels, values, frame_time)
 
 
@@ -207,40 +202,25 @@ def _parse_motion(text: str, columns: int, joints: int) -> tuple[NDArray[np.floa
 
 
 def _retarget(hierarchy: Hierarchy, bones: BoneMap, path: Path) -> tuple[Motion, NDArray[np.float64]]:
-    rest = hierarchy.rest()
+    places = hierarchy.rest()
     index = {name: number for number, name in reversed(list(enumerate(hierarchy.names)))}
-    heads = {joint: rest[index[bone]] for joint, bone in bones.joints.items()}
-    tips = {joint: rest[index[bone]] for joint, bone in bones.tips.items()}
-    for joint in ("left_wrist", "right_wrist"):
-        end = f"{bones.joints[joint]}_end"
-        if joint not in tips and end in index:
-            tips[joint] = rest[index[end]]
-    backend_from_file = facing(heads).T
-    heads = {joint: backend_from_file @ place for joint, place in heads.items()}
-    tips = {joint: backend_from_file @ place for joint, place in tips.items()}
-    at_rest = rig_from_smpl(heads, tips)
-
+    rest = {name: places[number] for name, number in index.items()}
+    tips = {joint: f"{bones.joints[joint]}_end" for joint in ("left_wrist", "right_wrist")}
+    tips = {joint: end for joint, end in tips.items() if end in index} | bones.tips
     turned, root = hierarchy.world()
-    world = np.tile(np.eye(3), (len(turned), len(JOINT_NAMES), 1, 1))
-    for joint, name in enumerate(JOINT_NAMES):
-        if name in bones.joints:
-            bone = backend_from_file @ turned[:, index[bones.joints[name]]] @ backend_from_file.T
-            world[:, joint] = bone @ at_rest[joint]
-        elif joint:
-            world[:, joint] = world[:, PARENTS[joint]]
-    metres, unit = _unit(heads)
-    pelvis = _pelvis(hierarchy, turned, root, rest, index[bones.joints["pelvis"]]) @ backend_from_file.T
-    fps, notes = 1 / hierarchy.frame_time if hierarchy.frame_time > 0 else 30.0, [f"bones as {bones.rig} names them"]
-    if not hierarchy.frame_time > 0:
-        notes.append("states no frame rate: 30 frames per second are assumed")
+    turns = {bone: turned[:, index[bone]] for bone in bones.joints.values()}
+    rotations, from_file = retarget(dataclasses.replace(bones, tips=tips), rest, turns)
+    metres, unit = _unit({joint: rest[bone] for joint, bone in bones.joints.items()})
+    pelvis = _pelvis(hierarchy, turned, root, index[bones.joints["pelvis"]]) @ from_file.T
+    stated = 1 / hierarchy.frame_time if hierarchy.frame_time > 0 else 0.0
+    notes = [f"bones as {bones.rig} names them"] + ([] if stated else [NO_RATE])
     notes.append(f"lengths in {unit}, 1 taken as {metres:.4g} m so that the legs are an average person's")
-    stated = fps if hierarchy.frame_time > 0 else 0.0
     detected = Detected(bones.rig, "y", f"{unit} (1 = {metres:.4g} m)", stated, bones.joints, average_legs=True)
-    motion = Motion(unchain(world), pelvis * metres - REST_JOINTS[0], fps, path.stem, tuple(notes), detected)
-    return motion, backend_from_file
+    moved = pelvis * metres - REST_JOINTS[0]
+    return Motion(rotations, moved, stated or DEFAULT_FPS, path.stem, tuple(notes), detected), from_file
 
 
-def _pelvis(hierarchy: Hierarchy, turned: NDArray, root: NDArray, rest: NDArray, pelvis: int) -> NDArray[np.float64]:
+def _pelvis(hierarchy: Hierarchy, turned: NDArray, root: NDArray, pelvis: int) -> NDArray[np.float64]:
     """Positions of the pelvis [F, 3], which may not be the root."""
     chain = []
     while pelvis > 0:

@@ -15,9 +15,8 @@ import pickletools
 import re
 
 import numpy as np
-import scipy.sparse
 
-from primdiffusion.formats.regular_files import FileContent
+from .regular_files import FileContent
 
 MOST_OPERATIONS = 300_000
 """SMPL's files have a few thousand: their arrays are one string each. Indices of the memo, for which the unpickler
@@ -292,6 +291,11 @@ def _dense(data: np.ndarray, indices: np.ndarray, starts: np.ndarray, shape: np.
     rows, columns = (int(n) for n in shape)
     if min(rows, columns) < 0 or rows * columns > MOST_NUMBERS or len(starts) != columns + 1:
         raise ValueError(f"a sparse matrix claims {rows} x {columns} entries, which its other parts contradict")
-    matrix = scipy.sparse.csc_matrix((data, indices, starts), shape=(rows, columns))
-    matrix.check_format(full_check=True)
-    return matrix.toarray()
+    counts = np.diff(starts)
+    if starts[0] != 0 or (counts < 0).any() or not len(data) == len(indices) == starts[-1]:
+        raise ValueError("a sparse matrix has columns that do not follow each other")
+    if len(indices) and not 0 <= indices.min() <= indices.max() < rows:
+        raise ValueError(f"a sparse matrix has an entry outside its {rows} rows")
+    dense = np.zeros((rows, columns), data.dtype)
+    np.add.at(dense, (indices, np.repeat(np.arange(columns), counts)), data)
+    return dense

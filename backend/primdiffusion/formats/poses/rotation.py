@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.convention import matrix_to_quaternion
-
 _BLOCK = 100_000
 """Rotations made at once: each step below takes as much memory as its result."""
 
@@ -37,6 +35,30 @@ def to_axis_angle(rotation: NDArray) -> NDArray[np.float64]:
     sine = np.linalg.norm(quaternion[..., 1:], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(sine, quaternion[..., :1])
     return quaternion[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-12), 2.0)
+
+
+def matrix_to_quaternion(rotation: NDArray) -> NDArray[np.float64]:
+    """Unit quaternions [..., 4] of rotations [..., 3, 3], w >= 0.
+
+    Of the four products 4 q_i q the one with the largest q_i is taken, so no half turn divides by zero.
+    """
+    r = np.asarray(rotation, np.float64)
+    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
+    wx, wy, wz = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
+    xy, xz, yz = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
+    products = np.stack(
+        [
+            np.stack([1 + xx + yy + zz, wx, wy, wz], -1),
+            np.stack([wx, 1 + xx - yy - zz, xy, xz], -1),
+            np.stack([wy, xy, 1 - xx + yy - zz, yz], -1),
+            np.stack([wz, xz, yz, 1 - xx - yy + zz], -1),
+        ],
+        -2,
+    )
+    largest = np.argmax(np.diagonal(products, axis1=-2, axis2=-1), -1)
+    best: NDArray[np.float64] = np.take_along_axis(products, largest[..., None, None], -2)[..., 0, :]
+    best = best / np.linalg.norm(best, axis=-1, keepdims=True)
+    return best * np.where(best[..., :1] < 0, -1.0, 1.0)
 
 
 def from_quaternion(quaternion: NDArray) -> NDArray[np.float64]:

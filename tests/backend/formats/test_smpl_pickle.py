@@ -6,8 +6,8 @@ import time
 import tracemalloc
 
 import pytest
-from primdiffusion.body import smpl_pickle
-from primdiffusion.body.smpl_pickle import BodyFileError, as_array, load_restricted
+from primdiffusion.formats import smpl_pickle
+from primdiffusion.formats.smpl_pickle import BodyFileError, as_array, load_restricted
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,1 @@
+"""Files of poses and motion in every form that people have, as motion of SMPL's skeleton."""

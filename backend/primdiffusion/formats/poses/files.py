@@ -1,0 +1,275 @@
+"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, and SAM 3D Body's poses of MHR."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..arrays import ArrayFileError, array_names, read_arrays, read_npy
+from ..json_files import read_json
+from ..motion_size import MotionTooLongError, check_motion_size
+from ..regular_files import TooLargeError, read_regular
+from ..rotations import first_improper, improper_text
+from ..smpl_pickle import as_array, load_restricted
+from . import mhr
+from .axes import axis_direction, axis_name, find_up, turn_y_up
+from .bvh import read_bvh
+from .motion import (
+    DEFAULT_FPS,
+    NO_RATE,
+    RATES,
+    Detected,
+    Motion,
+    MotionFileError,
+    check_numbers,
+    first_of,
+    stated_rate,
+)
+from .rotation import from_axis_angle, nearest
+
+LARGEST_PICKLE = 64 * 2**20
+"""Bytes of a .pkl."""
+_POSES = ("poses", "pose", "theta", "fullpose")
+_ROOT, _REST = ("global_orient", "root_orient"), ("body_pose", "pose_body")
+_TRANSLATIONS = ("trans", "transl", "translation")
+POSE_KEYS = (*_POSES, *_ROOT, *_REST, *_TRANSLATIONS, *RATES)
+"""Names of arrays in pose files."""
+_KEYS = tuple(dict.fromkeys((*POSE_KEYS, *mhr.KEYS)))
+ENDINGS = (".npz", ".npy", ".json", ".pkl", ".bvh")
+"""Of the files that are read."""
+UP_AXES = ("", "x", "-x", "y", "-y", "z", "-z")
+"""Axes that may point up in a file; the empty one stands for detection."""
+_BODIES = {24: "SMPL", 22: "SMPL without hands", 52: "SMPL-H", 55: "SMPL-X"}
+_BODY_JOINTS = 22
+"""Joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
+
+
+def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None = None) -> Motion:
+    """The motion in a file, y up.
+
+    `up` is the file's axis that points up ("y", "-z", ...), detected where empty; `bones` maps SMPL's joints to the
+    bones of a .bvh, likewise.
+
+    - .npz of AMASS: `poses` [F, 72 | 156 | 165] (SMPL, SMPL-H, SMPL-X; fingers, jaw and eyes are left out), `trans`,
+      `mocap_framerate`, `mocap_frame_rate` or `fps`. z should be up; the actual axis is detected from the pelvis.
+    - .npz of poses, y up: `global_orient` with `body_pose`, or `pose`; axis-angle or matrices; `transl` is optional.
+    - .npy: [F, 72], [72], [F, 24, 3] or [F, 24, 3, 3]. .json: the same as lists, or an object with the names above.
+    - .pkl: a dictionary of such arrays, as estimators of SMPL write it; nothing in it is run (`smpl_pickle`).
+    - .npz, .json and .pkl of SAM 3D Body: see `mhr`.
+    - .bvh: any rig that `rigs` knows.
+
+    Without a frame rate it is `DEFAULT_FPS`, with a note. Raises MotionFileError where there is no such file, or it
+    holds objects, NaN or other data.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise MotionFileError(f"there is no pose file {path}: check the path")
+    if up not in UP_AXES:
+        raise MotionFileError(f"the axis {up!r} cannot be up: give one of {_listed(list(UP_AXES[1:]))}")
+    suffix = path.suffix.lower()
+    if suffix not in ENDINGS:
+        raise MotionFileError(f"{path} is no pose file: {', '.join(ENDINGS[:-1])} and {ENDINGS[-1]} files are")
+    axes = np.eye(3)
+    try:
+        if suffix == ".bvh":
+            (motion, axes), detect_up = read_bvh(path, bones), True
+        else:
+            arrays = _READERS[suffix](path)
+            motion = motion_from_arrays(arrays, path)
+            detect_up = suffix == ".npz" and "trans" in arrays and ("poses" in arrays or "pose_body" in arrays)
+    except (ArrayFileError, TooLargeError) as e:
+        raise MotionFileError(str(e)) from e
+    except OSError as e:
+        raise MotionFileError(f"{path} cannot be read ({e.strerror or e}): check that it may be opened") from e
+    if up:
+        return _turned(motion, axis_name(axes @ axis_direction(up)), up)
+    return _upright(motion, axes) if detect_up else motion
+
+
+def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
+    """The motion of arrays of a file, axes unchanged. Raises MotionFileError, and OSError where there is no such file.
+
+    Their names are `POSE_KEYS` or `mhr.KEYS`.
+    """
+    try:
+        check_motion_size(path, max((array.size for array in arrays.values()), default=0))
+    except MotionTooLongError as e:
+        raise MotionFileError(str(e)) from e
+    if mhr.ROTATIONS in arrays or (mhr.holds_some(arrays) and not _holds_smpl(arrays)):
+        return mhr.motion_of(arrays, path)
+    return motion_from_numbers(arrays, str(path))
+
+
+def motion_from_numbers(content: Any, name: str) -> Motion:
+    """The motion of arrays by their usual names, or of lists as in JSON, axes unchanged; errors call it `name`.
+
+    Raises MotionFileError where it holds no poses.
+    """
+    arrays = _arrays(content, name)
+    if not _holds_smpl(arrays):
+        raise MotionFileError(f"{name} holds no poses: it needs 'pose', or 'global_orient' and 'body_pose'")
+    check_numbers(arrays, name)
+    rest, poses = first_of(arrays, _REST), first_of(arrays, _POSES)
+    if rest is None:
+        assert poses is not None
+        given = _matrices(poses, name)
+        rotations, joints = _rotations(given, name), given.shape[1]
+    else:
+        given = _matrices(rest, name, joints_before=1)
+        rotations, joints = _rotations(given, name, joints_before=1), given.shape[1] + 1
+        root = first_of(arrays, _ROOT)
+        if root is not None:
+            if root.ndim == 3 and root.shape[1:] == (3, 3):
+                root = root[:, None]  # a matrix a frame
+            first = _matrices(root, name)[:, 0]
+            if len(first) not in (1, len(rotations)):
+                raise MotionFileError(f"{name}: {len(first)} frames of global_orient but {len(rotations)} of body_pose")
+            rotations[:, 0] = first
+    frames = len(rotations)
+    translations = first_of(arrays, _TRANSLATIONS)
+    translations = np.zeros((frames, 3)) if translations is None else np.asarray(translations, np.float64)
+    if translations.size not in (3, 3 * frames):
+        raise MotionFileError(f"{name}: {frames} frames of poses but translations of shape {translations.shape}")
+    translations = np.array(np.broadcast_to(translations.reshape(-1, 3), (frames, 3)))
+    stated = stated_rate(arrays, name)
+    detected = Detected(rig=_BODIES.get(joints, f"{joints} joints"), up="y", fps=stated)
+    notes = (NO_RATE,) if not stated and frames > 1 else ()
+    return Motion(rotations, translations, stated or DEFAULT_FPS, Path(name).stem, notes, detected)
+
+
+def _holds_smpl(arrays: Mapping[str, NDArray]) -> bool:
+    return any(key in arrays for key in (*_POSES, *_REST))
+
+
+def _read_npz(path: Path) -> dict[str, NDArray]:
+    names = array_names(path)
+    arrays = read_arrays(path, optional=_KEYS)
+    if not (_holds_smpl(arrays) or mhr.holds_some(arrays)):
+        if "smpl" in names:
+            raise MotionFileError(
+                f"{path} holds pickled objects, which are never read: use the version with plain arrays"
+            )
+        raise MotionFileError(
+            f"{path} holds no poses: it holds {_listed(names)} and needs 'poses', or 'global_orient' and 'body_pose'"
+        )
+    return arrays
+
+
+def _read_npy(path: Path) -> dict[str, NDArray]:
+    return {"pose": read_npy(path)}
+
+
+def _read_json(path: Path) -> dict[str, NDArray]:
+    try:
+        content = read_json(path)
+    except (ValueError, OSError) as e:
+        raise MotionFileError(f"{path} is not JSON that can be read ({e!s:.120}): export it again") from e
+    return _arrays(_one_human(content, path), str(path))
+
+
+def _read_pickle(path: Path) -> dict[str, NDArray]:
+    try:
+        content = _one_human(load_restricted(read_regular(path, LARGEST_PICKLE), str(path)), path)
+        if not isinstance(content, dict):
+            raise ValueError(f"it contains a {type(content).__name__}")
+        found = {key: content[key] for key in _KEYS if key in content}
+        return {key: np.asarray(value) if key == mhr.NAMES else as_array(value) for key, value in found.items()}
+    except MotionFileError:
+        raise
+    except (ValueError, TypeError) as e:
+        raise MotionFileError(f"{path} is not a pickled dictionary of poses ({e!s:.160}): save it as .npz") from e
+
+
+_READERS = {".npz": _read_npz, ".npy": _read_npy, ".json": _read_json, ".pkl": _read_pickle}
+
+
+def _one_human(content: Any, path: Path) -> Any:
+    """SAM 3D Body's list of humans as its only one; other content as it is. Raises MotionFileError for several."""
+    if not isinstance(content, list) or not content or not all(isinstance(human, dict) for human in content):
+        return content
+    if len(content) > 1:
+        raise MotionFileError(path, f"holds {len(content)} humans", "save one of them in a file of its own")
+    return content[0]
+
+
+def _arrays(content: Any, name: str) -> dict[str, NDArray]:
+    """The arrays of a mapping, or of poses alone."""
+    if not isinstance(content, Mapping):
+        content = {"pose": content}
+    try:
+        return {key: np.asarray(content[key]) for key in _KEYS if key in content}
+    except (ValueError, TypeError, OverflowError) as e:
+        raise MotionFileError(f"{name} holds something else than lists of numbers of equal length ({e!s:.80})") from e
+
+
+def _upright(motion: Motion, axes: NDArray) -> Motion:
+    """The motion with its detected up axis turned to y; `axes` is the rotation from the file's axes so far."""
+    up = find_up(motion.rotations[:, 0])
+    if not up:
+        unknown = dataclasses.replace(motion.detected, up="")
+        note = "does not state which axis is up: y is assumed"
+        return dataclasses.replace(motion, notes=(*motion.notes, note), detected=unknown)
+    return _turned(motion, up, axis_name(axes.T @ axis_direction(up)))
+
+
+def _turned(motion: Motion, up: str, in_file: str) -> Motion:
+    rotations, translations = turn_y_up(motion.rotations, motion.translations, up)
+    return dataclasses.replace(
+        motion,
+        rotations=rotations,
+        translations=translations,
+        notes=(*motion.notes, f"{in_file} is up in the file"),
+        detected=dataclasses.replace(motion.detected, up=in_file),
+    )
+
+
+def _rotations(given: NDArray, name: str, joints_before: int = 0) -> NDArray[np.float64]:
+    """Rotations [F, 24, 3, 3] from matrices [F, n, 3, 3] without the first `joints_before` joints; missing joints get
+    the identity.
+
+    SMPL-H and SMPL-X have fingers instead of SMPL's two hand joints, so only the body's 22 joints are used.
+    """
+    count = given.shape[1] + joints_before
+    if count == 24:
+        taken = 24
+    elif count == _BODY_JOINTS or count > 24:
+        taken = _BODY_JOINTS
+    else:
+        raise MotionFileError(
+            f"{name} holds poses of {count} joints (shape {given.shape}): needed are SMPL's 24, 22 without hands, or "
+            "those of SMPL-H or SMPL-X"
+        )
+    rotations = np.tile(np.eye(3), (len(given), 24, 1, 1))
+    rotations[:, joints_before:taken] = given[:, : taken - joints_before]
+    return rotations
+
+
+def _matrices(values: NDArray, name: str, joints_before: int = 0) -> NDArray[np.float64]:
+    """Rotation matrices [F, n, 3, 3] of axis-angle numbers [3 n], [F, 3 n], [F, n, 3], or of matrices [F, n, 3, 3]."""
+    values = np.asarray(values, np.float64)
+    if values.ndim in (3, 4) and values.shape[-2:] == (3, 3):
+        given = values if values.ndim == 4 else values[None]
+        improper = first_improper(given)
+        if improper is not None:
+            raise MotionFileError(
+                f"{name} holds {improper_text(improper[0], improper[1] + joints_before)}; export the poses again"
+            )
+        return nearest(given)
+    if values.ndim == 1:
+        values = values[None]
+    if values.ndim == 2 and values.shape[1] == 3 and values.shape[0] in (_BODY_JOINTS, 23, 24, 52, 55):
+        values = values.reshape(1, -1)  # one pose, a row a joint
+    if values.ndim not in (2, 3) or values.shape[-1] % 3 or (values.ndim == 3 and values.shape[-1] != 3):
+        raise MotionFileError(
+            f"{name} holds poses of shape {values.shape}: needed are 72 axis-angle numbers a frame (24 joints x 3)"
+        )
+    return from_axis_angle(values.reshape(len(values), -1, 3))
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(f"{name[:16]!r}" for name in names[:8]) or "nothing"
