@@ -20,6 +20,7 @@ from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
 from ..formats.removing import check_unlinked
+from ..formats.requests import FLOAT_DEPTH
 from ..formats.whole_files import remove_abandoned, temporary_folder
 from ..motion.files import MotionFileError, read_motion
 from ..motion.motion import Motion
@@ -60,7 +61,7 @@ def _in_place(motion: Motion) -> Motion:
     return dataclasses.replace(motion, translations=np.zeros_like(motion.translations))
 
 
-_CENTRE_PASSES = frozenset({"depth", "normal", "part"})
+_CENTRE_PASSES = frozenset({"depth", FLOAT_DEPTH, "normal", "part"})
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 

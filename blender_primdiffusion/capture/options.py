@@ -48,6 +48,7 @@ def parser() -> argparse.ArgumentParser:
     add("--margin", type=float, default=rig.margin, help="room around people (default %(default)s)")
     add("--camera-file", type=Path, help='fixed cameras: {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}')
     add("--passes", nargs="+", default=PASSES, choices=PASSES)
+    add("--float-depth", action="store_true", help="also depth as OpenEXR, float32")
     add("--light", choices=get_args(Light), default="uniform")
     add("--hdri", type=Path, help="the picture of --light hdri")
     add("--background", choices=get_args(Background), default="black")
@@ -95,6 +96,7 @@ def settings_of(options: argparse.Namespace) -> CaptureSettings:
         pose_files=tuple(_files_of_poses(options.pose_files)),
         pose_count=options.poses,
         passes=tuple(kind for kind in PASSES if kind in options.passes),
+        float_depth=options.float_depth,
         light=options.light,
         hdri=options.hdri,
         background=options.background,

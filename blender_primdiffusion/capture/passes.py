@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.capture_layout import picture_path
-from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_png
+from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_exr, write_png
 from ..formats.regular_files import read_regular
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
@@ -182,6 +182,8 @@ def write_passes(
             write_png(path, np.concatenate([straight, _bytes(alpha)], -1))
         elif kind == "mask":
             write_png(path, _bytes(colours.alpha))
+        elif kind == "depth_float":
+            write_exr(path, np.where(np.isfinite(centres.depth), centres.depth, 0))
         elif kind == "depth":
             write_png(path, depth_steps(centres.depth))
         elif kind == "normal":

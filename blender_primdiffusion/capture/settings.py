@@ -12,7 +12,7 @@ from ..formats.camera_rig import Rig, View
 from ..formats.capture_layout import ENDINGS
 from ..formats.joints import JOINT_NAMES
 from ..formats.picture_files import DEPTH_UNIT
-from ..formats.requests import LAYOUTS, PASSES
+from ..formats.requests import FLOAT_DEPTH, LAYOUTS, PASSES
 
 Light = Literal["uniform", "dome", "hdri"]
 Background = Literal["black", "transparent"]
@@ -35,6 +35,8 @@ class CaptureSettings:
     """Motion and pose files; empty for the built-in poses."""
     pose_count: int = 20
     passes: tuple[str, ...] = PASSES
+    float_depth: bool = False
+    """Adds the pass "depth_float": OpenEXR."""
     light: Light = "uniform"
     """uniform: every surface shows its own colour; dome: a white sky; hdri: the picture `hdri`."""
     hdri: Path | None = None
@@ -84,7 +86,7 @@ class CaptureSettings:
     def kinds(self) -> tuple[str, ...]:
         """The passes to write, the one that marks a view as done last."""
         last = "img" if "img" in self.passes else self.passes[-1]
-        more = ("rgba",) if self.background == "transparent" else ()
+        more = [*["rgba"] * (self.background == "transparent"), *[FLOAT_DEPTH] * self.float_depth]
         return (*(kind for kind in ENDINGS if kind in (*self.passes, *more) and kind != last), last)
 
     @property

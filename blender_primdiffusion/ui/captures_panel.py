@@ -296,6 +296,7 @@ def _draw_output(layout: bpy.types.UILayout, asked, _context) -> None:
     for name in ("width", "height", "background"):
         layout.prop(asked, name)
     layout.column().prop(asked, "passes")
+    layout.prop(asked, "float_depth")
     layout.column().prop(asked, "layouts")
     layout.prop(asked, "released_reference")
     row = layout.row(align=True)

@@ -131,6 +131,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         items=_PASS_ITEMS,
         default=set(PASSES),
     )
+    float_depth: bpy.props.BoolProperty(name="Float Depth", description="Also write depth as OpenEXR, 32 bits")
     layouts: bpy.props.EnumProperty(
         name="Also for",
         description="Also write camera files in the layouts of other projects",
@@ -188,6 +189,7 @@ def words_of(
     ):
         words += [name, setting_path(path, label)] if path else []
     words += ["--denoise"] if asked.denoise else []
+    words += ["--float-depth"] if asked.float_depth else []
     words += ["--released-reference"] if asked.released_reference else []
     words += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]
     words += ["--layouts", *(name for name in LAYOUTS if name in asked.layouts)]

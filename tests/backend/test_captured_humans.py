@@ -211,6 +211,31 @@ def test_a_generated_human_stands_beside_a_mesh(tmp_path):
     assert np.median(shown[mask == 255][:, 0]) > 200
 
 
+def test_float_depth_is_written_only_if_asked_for_and_goes_on(whole, tmp_path):
+    assert not (whole / "captures" / "ada" / "depth_float").exists()
+    words_of = [
+        *words(whole)[:5],
+        str(tmp_path / "out"),
+        *words(whole)[6:],
+        "--passes",
+        "img",
+        "depth",
+        "--float-depth",
+    ]
+    cli.main(words_of)
+    assert capture_layout.read_about(tmp_path / "out")["passes"] == ["img", "depth", "depth_float"]
+    before = everything(tmp_path / "out")
+    for name in ("ada", "box"):
+        path = capture_layout.picture_path(tmp_path / "out" / name, "depth_float", 1, 0)
+        path.write_bytes(path.read_bytes()[:-3])
+        (tmp_path / "out" / name / capture_layout.COMPLETE_FILE).unlink()
+    cli.main(words_of)
+    after = everything(tmp_path / "out")
+    assert {name for name in before if before[name] != after[name]} <= {"report.json"}
+    cli.main(["captures", "verify", str(tmp_path / "out")])
+    assert open_captures(tmp_path / "out").view("ada", 0, 0).depth is not None
+
+
 @pytest.mark.parametrize("passes", [["normal"], ["img", "part"]])
 def test_passes_that_volumes_do_not_have_are_refused(whole, tmp_path, capsys, passes):
     with pytest.raises(SystemExit):

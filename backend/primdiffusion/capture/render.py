@@ -29,7 +29,7 @@ from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.removing import check_unlinked
-from primdiffusion.formats.requests import PASSES
+from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.raster.multisample import RenderedView
@@ -213,6 +213,8 @@ def write_view(subject: Path, passes: Sequence[str], camera: int, frame: int, re
                 Image.fromarray(srgb_bytes(rendered.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
         elif kind == "mask":
             picture_files.write_png(path, np.round(rendered.coverage.clip(0, 1) * 255).astype(np.uint8))
+        elif kind == "depth_float":
+            picture_files.write_exr(path, rendered.depth)
         elif kind == "depth":
             picture_files.write_png(path, picture_files.depth_steps(rendered.depth))
         elif kind == "normal":
@@ -296,8 +298,9 @@ def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
         ValueError: a pass is unknown, or workers is less than 1.
         OSError: the folder cannot be written.
     """
-    if unknown := set(job.passes) - set(PASSES) or not job.passes:
-        raise ValueError(f"passes {unknown or '()'} cannot be rendered: choose from {', '.join(PASSES)}")
+    possible = (*PASSES, FLOAT_DEPTH)
+    if unknown := set(job.passes) - set(possible) or not job.passes:
+        raise ValueError(f"passes {unknown or '()'} cannot be rendered: choose from {', '.join(possible)}")
     if workers < 1:
         raise ValueError(f"workers is {workers}: give 1 or more")
     capture_layout.claim(job.out, job.about)

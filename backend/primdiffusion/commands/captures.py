@@ -28,7 +28,7 @@ from primdiffusion.evaluation.shots import folder_pictures
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
-from primdiffusion.formats.requests import PASSES
+from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.training.captured_people import read_cards
 
 DESCRIPTION = "Multi-view captures, to train on."
@@ -59,6 +59,8 @@ class RenderCaptures:
     """Elevations of the rings, degrees above the horizon."""
     passes: tuple[str, ...] | None = None
     """Passes to write; the default is all, and img, mask and depth if one of the humans is a generated one."""
+    float_depth: bool = False
+    """Also write depth as OpenEXR, float32: without the steps of 0.25 mm and the limit of 16 m that the PNGs have."""
     samples: int = 3
     """Samples along each side of a pixel, an odd number: 3 gives 9 samples per pixel. Generated humans take nine times
     as long with 3 as with 1."""
@@ -129,7 +131,8 @@ class RenderCaptures:
                 f"the generated human {volume} has no pass {', '.join(sorted(missing))}: choose from "
                 f"{', '.join(possible)}"
             )
-        return possible if self.passes is None else self.passes
+        passes = possible if self.passes is None else self.passes
+        return (*passes, FLOAT_DEPTH) if self.float_depth else passes
 
     def _groups(self, people: Mapping[str, Path]) -> tuple[dict[str, Path], ...]:
         """Split all humans, of all shards, into groups by their names."""

@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from blender_primdiffusion.formats.camera_rig import Rig, View, look_at
 from blender_primdiffusion.formats.capture_layout import picture_path
+from blender_primdiffusion.formats.capture_repair import verify
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.picture_files import DEPTH_UNIT
 from bpy_extras.object_utils import world_to_camera_view
@@ -21,7 +22,7 @@ from scipy.ndimage import center_of_mass, grey_dilation
 from blender_primdiffusion.capture.blender_camera import aim, view_of
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.job import run
-from blender_primdiffusion.capture.passes import srgb_bytes
+from blender_primdiffusion.capture.passes import srgb_bytes, write_passes
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.skinned_surface import cameras_inside
 from blender_primdiffusion.capture.stage import Stage, shoot_centres, shoot_colours
@@ -270,6 +271,40 @@ def test_files_hold_what_was_rendered(empty_scene, tmp_path):
     two = {(0.9, 0.3, 0.1), (0.1, 0.4, 0.8)}  # the chequers' colours are sRGB
     nearest = np.min([np.abs(read["rgba"][..., :3] / 255 - colour).max(-1) for colour in two], 0)
     assert (nearest[solid] < 0.02).mean() > 0.25  # the others mix two squares
+
+
+def read_by_blender(path) -> np.ndarray:
+    image = bpy.data.images.load(str(path))
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    found = pixels.reshape(image.size[1], image.size[0], 4)[::-1, :, 0]
+    bpy.data.images.remove(image)
+    return found
+
+
+def test_float_depth_in_files_is_what_rays_meet(stage, tmp_path):
+    person, view = put(stage), odd_view()
+    write_passes(tmp_path, ("depth", "depth_float"), (0, 0), None, shoot_centres(stage, view, seed=5))
+    metres = read_by_blender(picture_path(tmp_path, "depth_float", 0, 0))
+    depth, _ = cast(person, view)
+    assert (np.isfinite(depth) != (metres > 0)).mean() < 0.001
+    both = np.isfinite(depth) & (metres > 0)
+    assert both.sum() > 300
+    assert np.median(np.abs(depth - metres)[both]) < 1e-5
+    steps = np.asarray(Image.open(picture_path(tmp_path, "depth", 0, 0)))
+    assert np.abs(metres - steps * DEPTH_UNIT).max() <= DEPTH_UNIT / 2 + 1e-6
+
+
+def test_float_depth_is_a_pass_that_is_asked_for(empty_scene, tmp_path):
+    rig = Rig(count=1, width=SIZE, height=SIZE)
+    assert "depth_float" not in CaptureSettings(tmp_path, rig=rig).about(1)["passes"]
+    settings = CaptureSettings(tmp_path, rig=rig, passes=("img",), float_depth=True, samples=1, device="cpu")
+    list(run(empty_scene, settings, [NamedPerson("anna")], poses=POSES, load=load_painted))
+    assert verify(tmp_path) == {}
+    path = picture_path(tmp_path / "anna", "depth_float", 0, 1)
+    assert (read_by_blender(path) > 0).sum() > 300
+    path.write_bytes(path.read_bytes()[:-1])
+    assert path in verify(tmp_path)
 
 
 def test_colours_are_encoded_as_srgb():
