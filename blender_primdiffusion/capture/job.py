@@ -223,6 +223,7 @@ def _check_outside(scan: Scan, context: bpy.types.Context, views: list[View], fr
 def _shoot(stage: Stage, settings: CaptureSettings, folder: Path, view: View, where: tuple[int, int]) -> None:
     seed = view_seed(settings.seed, folder.name, *where)
     kinds = settings.kinds
+    stage.choose_hdri(seed)
     colours = shoot_colours(stage, view, seed, settings.samples) if set(kinds) - _CENTRE_PASSES else None
     centres = shoot_centres(stage, view, seed) if set(kinds) & _CENTRE_PASSES else None
     write_passes(folder, kinds, where, colours, centres)

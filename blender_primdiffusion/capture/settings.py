@@ -15,7 +15,8 @@ from ..formats.picture_files import DEPTH_UNIT
 from ..formats.requests import FLOAT_DEPTH, LAYOUTS, PASSES
 
 Light = Literal["uniform", "dome", "hdri"]
-Background = Literal["black", "transparent"]
+Background = Literal["black", "transparent", "hdri"]
+HDRI_ENDINGS = (".hdr", ".exr")
 Device = Literal["auto", "cpu", "gpu"]
 
 
@@ -40,8 +41,10 @@ class CaptureSettings:
     light: Light = "uniform"
     """uniform: every surface shows its own colour; dome: a white sky; hdri: the picture `hdri`."""
     hdri: Path | None = None
+    """A picture, or a folder of which the seed of every view chooses one."""
     background: Background = "black"
-    """transparent adds the pass "rgba", with straight alpha; img stays over black."""
+    """transparent adds the pass "rgba", with straight alpha, hdri the pass "hdri", over the environment of the HDRI
+    light; img stays over black."""
     samples: int = 16
     """Per pixel."""
     denoise: bool = False
@@ -65,6 +68,9 @@ class CaptureSettings:
             f"layouts {self.layouts}: choose of {', '.join(LAYOUTS)}": not set(self.layouts) <= set(LAYOUTS),
             f"light {self.light}: choose of {', '.join(get_args(Light))}": self.light not in get_args(Light),
             "the HDRI light needs a picture: name its file": self.light == "hdri" and self.hdri is None,
+            "the background hdri needs the light hdri": self.background == "hdri" and self.light != "hdri",
+            f"{self.hdri} holds no HDRI: choose a folder with .hdr or .exr pictures":
+                self.light == "hdri" and self.hdri is not None and not self.hdris,
             f"background {self.background}: choose of {', '.join(get_args(Background))}":
                 self.background not in get_args(Background),
             f"{self.samples} samples: one or more": self.samples < 1,
@@ -86,8 +92,15 @@ class CaptureSettings:
     def kinds(self) -> tuple[str, ...]:
         """The passes to write, the one that marks a view as done last."""
         last = "img" if "img" in self.passes else self.passes[-1]
-        more = [*["rgba"] * (self.background == "transparent"), *[FLOAT_DEPTH] * self.float_depth]
+        more = {"transparent": ["rgba"], "hdri": ["hdri"]}.get(self.background, []) + [FLOAT_DEPTH] * self.float_depth
         return (*(kind for kind in ENDINGS if kind in (*self.passes, *more) and kind != last), last)
+
+    @property
+    def hdris(self) -> tuple[Path, ...]:
+        """The pictures of the HDRI light, sorted by name."""
+        if self.hdri is None or not self.hdri.is_dir():
+            return () if self.hdri is None else (self.hdri,)
+        return tuple(sorted(path for path in self.hdri.iterdir() if path.suffix.lower() in HDRI_ENDINGS))
 
     @property
     def camera_count(self) -> int:
@@ -110,6 +123,7 @@ class CaptureSettings:
             "depth": {"kind": "z", "unit_m": DEPTH_UNIT},
             "part_names": list(JOINT_NAMES),
             "released_reference": self.released_reference,
+            **({"hdris": [path.name for path in self.hdris]} if self.hdri and self.hdri.is_dir() else {}),
         }
 
 

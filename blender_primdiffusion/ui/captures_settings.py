@@ -103,7 +103,11 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
             ("hdri", "HDRI", "An environment picture"),
         ],
     )
-    hdri: bpy.props.StringProperty(name="HDRI", description="Environment picture, .exr or .hdr", subtype="FILE_PATH")
+    hdri: bpy.props.StringProperty(
+        name="HDRI",
+        description="Environment picture, .exr or .hdr, or a folder of them, one for each view",
+        subtype="FILE_PATH",
+    )
     denoise: bpy.props.BoolProperty(
         name="Denoise", description="Colours under a dome or HDRI light; never masks, depth, normals or parts"
     )
@@ -122,7 +126,11 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     background: bpy.props.EnumProperty(
         name="Background",
         description="What is behind the people",
-        items=[("black", "Black", ""), ("transparent", "Transparent", "One more pass: PNG with straight alpha")],
+        items=[
+            ("black", "Black", ""),
+            ("transparent", "Transparent", "One more pass: PNG with straight alpha"),
+            ("hdri", "HDRI", "One more pass: over the environment picture of the light HDRI"),
+        ],
     )
     passes: bpy.props.EnumProperty(
         name="Passes",

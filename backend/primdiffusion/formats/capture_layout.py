@@ -11,6 +11,7 @@
     root/{id}/normal/cameraNNNN/FFFF.png           8 bits: (world normal + 1) / 2; 0, 0, 0: nothing
     root/{id}/part/cameraNNNN/FFFF.png             8 bits: 1 + the joint that moves the surface most; 0: nothing
     root/{id}/rgba/cameraNNNN/FFFF.png             sRGB with straight alpha; only where the background is transparent
+    root/{id}/hdri/cameraNNNN/FFFF.jpg             sRGB over the environment of the HDRI; only with that background
     root/{id}/cameras.json                         {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}
     root/{id}/joints.npz                           world [F,24,3], pixel [C,F,24,2], depth [C,F,24]
     root/{id}/outputs_re_fitting/refit_smpl_2nd.npz        "smpl": the released code's pickled dictionary
@@ -48,7 +49,7 @@ from .whole_files import remove_abandoned, temporary_name, write_atomically
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {
     "img": ".jpg", "mask": ".png", "depth": ".png", "depth_float": ".exr", "normal": ".png", "part": ".png",
-    "rgba": ".png",
+    "rgba": ".png", "hdri": ".jpg",
 }  # fmt: skip
 """File extensions of passes."""
 SMPL_FOLDER, SMPL_FILE, SMPL_PLAIN_FILE = "outputs_re_fitting", "refit_smpl_2nd.npz", "refit_smpl_2nd_plain.npz"
