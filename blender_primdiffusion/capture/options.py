@@ -37,6 +37,7 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=_seed, default=0, help="of the choice of poses and of the noise (default %(default)s)")
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
+    add("--together", type=int, default=1, metavar="N", help="stand N people together on a floor, at most 8")
     add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
     add("--pose-files", type=Path, nargs="+", default=[], help="AMASS or pose .npz, .npy, .json, .bvh, or folders")
     add("--poses", type=int, default=20, help="how many; the first is near-T (default %(default)s)")
@@ -105,6 +106,7 @@ def settings_of(options: argparse.Namespace) -> CaptureSettings:
         device=options.device,
         threads=options.threads,
         shard=options.shard,
+        together=options.together,
         layouts=tuple(options.layouts),
         released_reference=options.released_reference,
         body=options.body,

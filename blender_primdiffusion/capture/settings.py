@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 
 from ..formats.camera_rig import Rig, View
 from ..formats.capture_layout import ENDINGS
+from ..formats.group_places import MOST
 from ..formats.joints import JOINT_NAMES
 from ..formats.picture_files import DEPTH_UNIT
 from ..formats.requests import FLOAT_DEPTH, LAYOUTS, PASSES
@@ -54,6 +55,8 @@ class CaptureSettings:
     """Threads of Cycles on the CPU; 0 for all cores."""
     shard: tuple[int, int] = (0, 1)
     """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
+    together: int = 1
+    """Subjects that stand together on a floor, in front of the same cameras; each is rendered alone."""
     layouts: tuple[str, ...] = LAYOUTS
     released_reference: bool = False
     """Whether the first subject is also stored under the name that the released code expects."""
@@ -75,6 +78,11 @@ class CaptureSettings:
                 self.background not in get_args(Background),
             f"{self.samples} samples: one or more": self.samples < 1,
             f"{self.pose_count} poses: 1 to 10000": not 1 <= self.pose_count <= 10000,
+            f"{self.together} together: 1 to {MOST}": not 1 <= self.together <= MOST,
+            "the released code expects its reference alone: render it without together":
+                self.together > 1 and self.released_reference,
+            "people who stand together are rendered alone: put pictures behind them with captures coco --backgrounds":
+                self.together > 1 and self.background == "hdri",
             f"shard {index}/{count}: 0/{count} to {count - 1}/{count}": not 0 <= index < count,
             f"{self.threads} threads: 0 (all) to 1024": not 0 <= self.threads <= 1024,
             f"device {self.device}: choose of {', '.join(get_args(Device))}": self.device not in get_args(Device),
@@ -123,6 +131,7 @@ class CaptureSettings:
             "depth": {"kind": "z", "unit_m": DEPTH_UNIT},
             "part_names": list(JOINT_NAMES),
             "released_reference": self.released_reference,
+            **({"together": self.together} if self.together > 1 else {}),
             **({"hdris": [path.name for path in self.hdris]} if self.hdri and self.hdri.is_dir() else {}),
         }
 

@@ -258,6 +258,7 @@ def _draw_poses(layout: bpy.types.UILayout, asked, _context) -> None:
     """Which poses they take."""
     layout.prop(asked, "poses")
     layout.prop(asked, "pose_count")
+    layout.prop(asked, "together")
 
 
 def _draw_cameras(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:

@@ -43,6 +43,11 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         name="of", description="Number of parts the people are divided into", min=1, default=1
     )
 
+    together: bpy.props.IntProperty(
+        name="Together", description="People who stand together on a floor, in front of the same cameras",
+        default=1, min=1, max=8,
+    )  # fmt: skip
+
     poses: bpy.props.StringProperty(
         name="Poses",
         description="A file or folder of AMASS or pose .npz, .npy, .json or .bvh; empty: built-in poses",
@@ -188,7 +193,7 @@ def words_of(
     words += ["--shard", f"{min(asked.shard, asked.shards - 1)}/{asked.shards}"]
     words += ["--poses", str(asked.pose_count), "--size", str(asked.width), str(asked.height)]
     words += ["--samples", str(asked.samples), "--light", asked.light, "--device", asked.device]
-    words += ["--background", asked.background]
+    words += ["--background", asked.background, "--together", str(asked.together)]
     hdri = asked.hdri if asked.light == "hdri" else ""
     for name, label, path in (
         ("--body", "Body", asked.body),

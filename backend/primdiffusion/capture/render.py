@@ -22,11 +22,12 @@ from PIL import Image
 
 from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.together import places, turned
+from primdiffusion.capture.together import turned
 from primdiffusion.failures import describe
 from primdiffusion.formats import camera_files, capture_layout, picture_files
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
+from primdiffusion.formats.group_places import extent, first_frames, stand_together
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.removing import check_unlinked
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
@@ -131,36 +132,18 @@ def set_up_together(
     """
     frames = len(poses.joint_rotation)
     yaws = rng.uniform(-math.pi, math.pi, (len(people), frames))
-    own_poses, pelvis, bounds = [], [], []
-    for number, person in enumerate(people):
-        first = number * frames // len(people)
+    own_poses, pelvis, extents = [], [], []
+    for person, first, yaw in zip(people, first_frames(len(people), frames), yaws, strict=True):
         rolled = poses.joint_rotation.roll(-first, dims=0)
-        own_poses.append(turned(BodyPose(rolled, torch.zeros_like(poses.translation)), yaws[number]))
+        own_poses.append(turned(BodyPose(rolled, torch.zeros_like(poses.translation)), yaw))
         setup = set_up_capture(person, own_poses[-1], [])
         pelvis.append(setup.joints[:, 0])
-        bounds.append(np.array([_extent(setup, frame) for frame in range(frames)]))
-    radii = np.array(bounds)[..., 0]
-    at = np.stack([places(radii[:, frame], rng) for frame in range(frames)], axis=1)
-    moves = [
-        np.stack([at[n, :, 0] - pelvis[n][:, 0], -bounds[n][:, 1], at[n, :, 1] - pelvis[n][:, 2]], axis=-1)
-        for n in range(len(people))
-    ]
-    corners = [
-        [at[n, frame, 0] + x * radii[n, frame], y, at[n, frame, 1] + z * radii[n, frame]]
-        for n in range(len(people))
-        for frame in range(frames)
-        for y in (0, bounds[n][frame, 2] - bounds[n][frame, 1])
-        for x, z in ((1, 1), (1, -1), (-1, 1), (-1, -1))
-    ]
+        extents.append(
+            [extent(setup.figure.points(s), joint) for s, joint in zip(setup.skinning, pelvis[-1], strict=True)]
+        )
+    moves, corners = stand_together(np.array(pelvis), np.array(extents), rng)
     moved = BodyPose(own_poses[own].joint_rotation, torch.from_numpy(moves[own]).to(poses.translation))
-    return set_up_capture(people[own], moved, rig.views(*bounding_sphere(np.array(corners))))
-
-
-def _extent(setup: CaptureSetup, frame: int) -> tuple[float, float, float]:
-    """Largest distance from the vertical through the pelvis, and lowest and highest point, metres."""
-    points = setup.figure.points(setup.skinning[frame])
-    across = points[:, [0, 2]] - setup.joints[frame, 0, [0, 2]]
-    return float(np.linalg.norm(across, axis=1).max()), float(points[:, 1].min()), float(points[:, 1].max())
+    return set_up_capture(people[own], moved, rig.views(*bounding_sphere(corners)))
 
 
 @contextlib.contextmanager

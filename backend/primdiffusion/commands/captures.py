@@ -21,13 +21,13 @@ from primdiffusion.capture.poses import MotionFileError, choose_poses, read_moti
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
-from primdiffusion.capture.together import MOST
 from primdiffusion.captured_humans import PASSES as PASSES_OF_VOLUMES
 from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_of
 from primdiffusion.evaluation.shots import folder_pictures
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
+from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.training.captured_people import read_cards
 
