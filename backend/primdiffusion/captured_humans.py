@@ -165,7 +165,9 @@ def find_subjects(path: str | Path) -> dict[str, Path]:
         people = find_people(path)
     except FileNotFoundError:
         if not generated:
-            raise
+            raise FileNotFoundError(
+                f"{path} contains no NAME/person.glb and no NAME.human: make some with primdiffusion people or generate"
+            ) from None
         people = {}
     if twice := sorted(people.keys() & generated.keys()):
         raise ValueError(f"{people[twice[0]]} and {generated[twice[0]]} are two humans of one name: rename one")
