@@ -113,6 +113,8 @@ def _run(options: argparse.Namespace, say: Say, stop: Stop) -> int:
     if options.repair and options.out.exists():
         _check(options, say)
     settings = settings_of(options)
+    if settings.together > 1 and options.only:
+        raise ValueError("people who stand together need each other: give --shard instead of --only")
     scans = scans_in(options.people, options.only)
     if options.list:
         index, count = settings.shard

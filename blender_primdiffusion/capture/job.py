@@ -22,9 +22,11 @@ from ..formats.capture_repair import is_complete_view, list_subjects, remove_dam
 from ..formats.poses.files import read_motion
 from ..formats.poses.motion import Motion, MotionFileError
 from ..formats.removing import check_unlinked
+from ..formats.requests import FLOAT_DEPTH
 from ..formats.whole_files import remove_abandoned, temporary_folder
 from ..motion.poses import built_in_poses, pick_poses
 from .body import Body, read_body
+from .group import Placed, groups_of, place_group
 from .passes import write_passes
 from .report import Report
 from .scan import Scan, ScanFile, load_scan
@@ -60,7 +62,7 @@ def _in_place(motion: Motion) -> Motion:
     return dataclasses.replace(motion, translations=np.zeros_like(motion.translations))
 
 
-_CENTRE_PASSES = frozenset({"depth", "normal", "part"})
+_CENTRE_PASSES = frozenset({"depth", FLOAT_DEPTH, "normal", "part"})
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
@@ -119,11 +121,12 @@ def run(
     ordered = sorted(scans, key=lambda scan: scan.name)
     index, count = settings.shard
     mine = ordered[index::count]
+    places = _Places(context, settings, ordered, poses, body, load)
     clock = _Clock(len(mine) * len(poses) * settings.camera_count, report)
     clock.note(*(f"{failure['what']}: {failure['why']}" for failure in report.failed))
     try:
         for scan_file in mine:
-            yield from _try_subject(context, settings, scan_file, poses, body, load, clock)
+            yield from _try_subject(context, settings, scan_file, places, body, load, clock)
             if settings.released_reference and scan_file is ordered[0] and scan_file.name in report.done:
                 _name_reference(settings.out, scan_file.name)
             report.write(settings.out, settings.shard)
@@ -133,12 +136,31 @@ def run(
     return report
 
 
+class _Places:
+    """Poses of every subject, and cameras where a group shares them; groups are measured once."""
+
+    def __init__(self, context, settings: CaptureSettings, ordered: Sequence[ScanFile], poses: Motion, body, load):
+        self.frames = len(poses)
+        self._place = lambda group: place_group(context, settings, group, poses, body, load)
+        self._alone = None if settings.together > 1 else Placed(poses, list(settings.cameras), "")
+        self._groups = list(groups_of(ordered, settings.together))
+        self._placed: dict[str, Placed] = {}
+
+    def of(self, scan_file: ScanFile) -> Placed:
+        """Raises ScanError where one of the group cannot be loaded."""
+        if self._alone is not None:
+            return self._alone
+        if scan_file.name not in self._placed:
+            self._placed = self._place(next(group for group in self._groups if scan_file in group))
+        return self._placed[scan_file.name]
+
+
 def _try_subject(
-    context, settings, scan_file, poses, body, load, clock: _Clock
+    context, settings, scan_file, places: _Places, body, load, clock: _Clock
 ) -> Generator[CaptureProgress, None, None]:
     folder, report = settings.out / scan_file.name, clock.report
     clock.begin(scan_file.name)
-    views = len(poses) * settings.camera_count
+    views = places.frames * settings.camera_count
     wrong = damage(folder, checksums=False)
     if not wrong:
         report.skipped.append(scan_file.name)
@@ -147,7 +169,7 @@ def _try_subject(
     try:
         check_unlinked(folder)
         remove_damaged(folder, wrong)
-        yield from _capture(context, settings, scan_file, poses, body, load, clock)
+        yield from _capture(context, settings, scan_file, places.of(scan_file), body, load, clock)
         complete(folder)
         report.done.append(scan_file.name)
         list_subjects(settings.out)
@@ -176,8 +198,10 @@ def _name_reference(root: Path, subject: str) -> None:
             os.replace(partial / subject, reference)
 
 
-def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> Generator[CaptureProgress, None, None]:
-    folder = settings.out / scan_file.name
+def _capture(
+    context, settings, scan_file, placed: Placed, body, load, clock: _Clock
+) -> Generator[CaptureProgress, None, None]:
+    folder, poses = settings.out / scan_file.name, placed.poses
     with contextlib.closing(Stage(context, settings)) as stage:
         clock.note_once(stage.device_note)
         with stage.entered() as own:
@@ -186,7 +210,7 @@ def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> 
             for obj in scan.objects:
                 mark_parts(obj, scan.joint_of_group)
             prepare_materials(scan.objects, unlit=settings.light == "uniform")
-            views = list(settings.cameras) or _views_around(scan, settings, poses)
+            views = placed.views or _views_around(scan, settings, poses)
             joints = np.stack([scan.pose(*pose) for pose in zip(poses.rotations, poses.translations, strict=True)])
         theta = poses.axis_angle().reshape(len(poses), 72)
         write_smpl(folder, theta[:, :3], theta[:, 3:], scan.betas, poses.translations)
@@ -203,6 +227,7 @@ def _capture(context, settings, scan_file, poses, body, load, clock: _Clock) -> 
             for camera, view in enumerate(views):
                 if camera in missing:
                     with clock.rendering():
+                        stage.choose_hdri(view_seed(settings.seed, placed.first or scan_file.name, frame, camera))
                         _shoot(stage, settings, folder, view, (frame, camera))
                 yield clock.step(frame, camera)
 

@@ -37,6 +37,7 @@ def parser() -> argparse.ArgumentParser:
     add("--seed", type=_seed, default=0, help="of the choice of poses and of the noise (default %(default)s)")
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
+    add("--together", type=int, default=1, metavar="N", help="stand N people together on a floor, at most 8")
     add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
     add("--pose-files", type=Path, nargs="+", default=[], help="poses: .npz, .npy, .json, .pkl, .bvh, or folders")
     add("--poses", type=int, default=20, help="how many; the first is near-T (default %(default)s)")
@@ -48,9 +49,10 @@ def parser() -> argparse.ArgumentParser:
     add("--margin", type=float, default=rig.margin, help="room around people (default %(default)s)")
     add("--camera-file", type=Path, help='fixed cameras: {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}')
     add("--passes", nargs="+", default=PASSES, choices=PASSES)
+    add("--float-depth", action="store_true", help="also depth as OpenEXR, float32")
     add("--light", choices=get_args(Light), default="uniform")
-    add("--hdri", type=Path, help="the picture of --light hdri")
-    add("--background", choices=get_args(Background), default="black")
+    add("--hdri", type=Path, help="the picture of --light hdri, or a folder of them, one for each view")
+    add("--background", choices=get_args(Background), default="black", help="hdri: one more pass, over the HDRI")
     add("--samples", type=int, default=16, help="of a pixel (default %(default)s)")
     add("--denoise", action="store_true", help="of img under a dome or HDRI light")
     add("--device", choices=get_args(Device), default="auto")
@@ -95,6 +97,7 @@ def settings_of(options: argparse.Namespace) -> CaptureSettings:
         pose_files=tuple(_files_of_poses(options.pose_files)),
         pose_count=options.poses,
         passes=tuple(kind for kind in PASSES if kind in options.passes),
+        float_depth=options.float_depth,
         light=options.light,
         hdri=options.hdri,
         background=options.background,
@@ -103,6 +106,7 @@ def settings_of(options: argparse.Namespace) -> CaptureSettings:
         device=options.device,
         threads=options.threads,
         shard=options.shard,
+        together=options.together,
         layouts=tuple(options.layouts),
         released_reference=options.released_reference,
         body=options.body,

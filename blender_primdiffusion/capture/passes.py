@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.capture_layout import picture_path
-from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_png
+from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_exr, write_png
 from ..formats.regular_files import read_regular
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
@@ -122,6 +122,8 @@ def _text(data: bytes, at: int) -> tuple[str, int]:
 
 
 JPEG_QUALITY = 95
+_ENVIRONMENT = ("Environment", "Env")
+"""The pass's name in Blender 5 and before."""
 _NOTHING_M = 1e9
 """Cycles gives rays that hit nothing a depth of 1e10."""
 
@@ -134,6 +136,8 @@ class Colours:
     """Linear, premultiplied [H, W, 3]."""
     alpha: NDArray[np.float32]
     """Share of the pixel that is covered [H, W]."""
+    environment: NDArray[np.float32] | None = None
+    """What the rest of the pixel shows of the HDRI [H, W, 3], linear; None if it was not rendered."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -150,13 +154,16 @@ class Centres:
 
 def read_colours(path: Path) -> Colours:
     """The combined pass of a multilayer EXR; with denoising only its colours are denoised, not its alpha."""
-    red, green, blue, alpha = _chosen(path, [f"Combined.{channel}" for channel in "RGBA"])
-    return Colours(np.stack([red, green, blue], -1), alpha)
+    planes = read_exr(path)
+    red, green, blue, alpha = _chosen(path, planes, [f"Combined.{channel}" for channel in "RGBA"])
+    name = next((name for name in _ENVIRONMENT if any(plane.endswith(f".{name}.R") for plane in planes)), None)
+    behind = None if name is None else np.stack(_chosen(path, planes, [f"{name}.{channel}" for channel in "RGB"]), -1)
+    return Colours(np.stack([red, green, blue], -1), alpha, behind)
 
 
 def read_centres(path: Path) -> Centres:
     """The passes of a multilayer EXR that was rendered through the pixels' centres."""
-    depth, x, y, z, part = _chosen(path, ["Depth.Z", "Normal.X", "Normal.Y", "Normal.Z", f"{PART}.X"])
+    depth, x, y, z, part = _chosen(path, read_exr(path), ["Depth.Z", "Normal.X", "Normal.Y", "Normal.Z", f"{PART}.X"])
     depth = np.where(depth < _NOTHING_M, depth, np.float32(np.inf))
     normal = points_to_backend(np.stack([x, y, z], -1))
     part = np.where(np.isfinite(depth), np.round(part), 0)  # behind a hole it is the hole's
@@ -176,12 +183,16 @@ def write_passes(
         path = picture_path(subject, kind, camera, frame)
         if kind == "img":
             _write_jpeg(path, srgb_bytes(colours.rgb))
+        elif kind == "hdri":
+            _write_jpeg(path, srgb_bytes(colours.rgb + colours.environment))
         elif kind == "rgba":
             alpha = np.clip(colours.alpha, 0, 1)[..., None]
             straight = srgb_bytes(colours.rgb / np.where(alpha > 0, alpha, 1))
             write_png(path, np.concatenate([straight, _bytes(alpha)], -1))
         elif kind == "mask":
             write_png(path, _bytes(colours.alpha))
+        elif kind == "depth_float":
+            write_exr(path, np.where(np.isfinite(centres.depth), centres.depth, 0))
         elif kind == "depth":
             write_png(path, depth_steps(centres.depth))
         elif kind == "normal":
@@ -218,9 +229,8 @@ def _write_jpeg(path: Path, pixels: NDArray[np.uint8]) -> None:
         bpy.data.images.remove(sheet)
 
 
-def _chosen(path: Path, endings: list[str]) -> list[NDArray[np.float32]]:
+def _chosen(path: Path, planes: dict[str, NDArray], endings: list[str]) -> list[NDArray[np.float32]]:
     """Planes by the ends of their names, of one size and without NaN: that is 0. Raises ExrError."""
-    planes = read_exr(path)
     found = [next((plane for name, plane in planes.items() if name.endswith(f".{ending}")), None) for ending in endings]
     shapes = {plane.shape for plane in found if plane is not None}
     missing = [ending for ending, plane in zip(endings, found, strict=True) if plane is None]

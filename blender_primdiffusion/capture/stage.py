@@ -102,15 +102,16 @@ class Stage:
         self.scratch = Path(tempfile.mkdtemp(prefix="primdiffusion_capture_", dir=bpy.app.tempdir or None))
         """Folder for rendered files."""
         self._context = context
+        self._hdris, self._environment = settings.hdris if settings.light == "hdri" else (), None
         try:
             with self.added:
                 self.scene = bpy.data.scenes.new("PrimDiffusion Capture")
                 self.camera = bpy.data.objects.new("Capture", bpy.data.cameras.new("Capture"))
                 self.scene.collection.objects.link(self.camera)
                 self.scene.camera = self.camera
-                _light(self.scene, settings)
+                self._environment = _light(self.scene, settings)
             _set_up_cycles(self.scene, settings)
-            _set_up_passes(self.scene)
+            _set_up_passes(self.scene, settings)
             self.device_note = choose_device(self.scene, settings.device)
         except BaseException:
             self.close()
@@ -130,6 +131,16 @@ class Stage:
                 window.scene = self.scene
                 stack.callback(setattr, window, "scene", before)
             yield bpy.context
+
+    def choose_hdri(self, seed: int) -> None:
+        """Light by the picture that a view's seed chooses of a folder. Raises StageError."""
+        if len(self._hdris) > 1 and self._environment is not None:
+            before, path = self._environment.image, self._hdris[seed % len(self._hdris)]
+            if before.filepath == str(path):
+                return
+            with self.added:
+                self._environment.image = _load_hdri(path)
+            bpy.data.images.remove(before)
 
     def close(self) -> None:
         """Remove everything from the file."""
@@ -156,8 +167,9 @@ def _set_up_cycles(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
     files.file_format, files.color_depth, files.exr_codec = "OPEN_EXR_MULTILAYER", "32", "NONE"
 
 
-def _set_up_passes(scene: bpy.types.Scene) -> None:
+def _set_up_passes(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
     layer = scene.view_layers[0]
+    layer.use_pass_environment = settings.background == "hdri"
     layer.name = "Capture"
     layer.use_pass_z = layer.use_pass_normal = True
     layer.pass_alpha_threshold = OPAQUE
@@ -165,21 +177,28 @@ def _set_up_passes(scene: bpy.types.Scene) -> None:
     part.name, part.type = PART, "VALUE"
 
 
-def _light(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
+def _light(scene: bpy.types.Scene, settings: CaptureSettings) -> bpy.types.ShaderNodeTexEnvironment | None:
+    """Light the scene; returns the node with the HDRI, if there is one."""
     world = scene.world = bpy.data.worlds.new("Capture")
     if world.node_tree is None:
         world.use_nodes = True
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
     grey = 1.0 if settings.light == "dome" else 0.0
     background.inputs["Color"].default_value = (grey, grey, grey, 1.0)
-    if settings.light == "hdri":
-        picture = world.node_tree.nodes.new("ShaderNodeTexEnvironment")
-        try:
-            check_regular(str(settings.hdri))  # Blender would wait for a pipe
-            picture.image = bpy.data.images.load(str(settings.hdri))
-        except (RuntimeError, OSError) as error:
-            raise StageError(f"the HDRI {settings.hdri} cannot be read: choose an .hdr or .exr picture") from error
-        world.node_tree.links.new(picture.outputs["Color"], background.inputs["Color"])
+    if settings.light != "hdri":
+        return None
+    picture = world.node_tree.nodes.new("ShaderNodeTexEnvironment")
+    picture.image = _load_hdri(settings.hdris[0])
+    world.node_tree.links.new(picture.outputs["Color"], background.inputs["Color"])
+    return picture
+
+
+def _load_hdri(path: Path) -> bpy.types.Image:
+    try:
+        check_regular(str(path))  # Blender would wait for a pipe
+        return bpy.data.images.load(str(path))
+    except (RuntimeError, OSError) as error:
+        raise StageError(f"the HDRI {path} cannot be read: choose an .hdr or .exr picture") from error
 
 
 _NARROWEST_PX = 0.01

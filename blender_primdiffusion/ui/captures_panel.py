@@ -258,6 +258,7 @@ def _draw_poses(layout: bpy.types.UILayout, asked, _context) -> None:
     """Which poses they take."""
     layout.prop(asked, "poses")
     layout.prop(asked, "pose_count")
+    layout.prop(asked, "together")
 
 
 def _draw_cameras(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:
@@ -296,6 +297,7 @@ def _draw_output(layout: bpy.types.UILayout, asked, _context) -> None:
     for name in ("width", "height", "background"):
         layout.prop(asked, name)
     layout.column().prop(asked, "passes")
+    layout.prop(asked, "float_depth")
     layout.column().prop(asked, "layouts")
     layout.prop(asked, "released_reference")
     row = layout.row(align=True)

@@ -43,6 +43,11 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         name="of", description="Number of parts the people are divided into", min=1, default=1
     )
 
+    together: bpy.props.IntProperty(
+        name="Together", description="People who stand together on a floor, in front of the same cameras",
+        default=1, min=1, max=8,
+    )  # fmt: skip
+
     poses: bpy.props.StringProperty(
         name="Poses",
         description="A file or folder of AMASS or pose .npz, .npy, .json, .pkl or .bvh; empty: built-in poses",
@@ -103,7 +108,11 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
             ("hdri", "HDRI", "An environment picture"),
         ],
     )
-    hdri: bpy.props.StringProperty(name="HDRI", description="Environment picture, .exr or .hdr", subtype="FILE_PATH")
+    hdri: bpy.props.StringProperty(
+        name="HDRI",
+        description="Environment picture, .exr or .hdr, or a folder of them, one for each view",
+        subtype="FILE_PATH",
+    )
     denoise: bpy.props.BoolProperty(
         name="Denoise", description="Colours under a dome or HDRI light; never masks, depth, normals or parts"
     )
@@ -122,7 +131,11 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     background: bpy.props.EnumProperty(
         name="Background",
         description="What is behind the people",
-        items=[("black", "Black", ""), ("transparent", "Transparent", "One more pass: PNG with straight alpha")],
+        items=[
+            ("black", "Black", ""),
+            ("transparent", "Transparent", "One more pass: PNG with straight alpha"),
+            ("hdri", "HDRI", "One more pass: over the environment picture of the light HDRI"),
+        ],
     )
     passes: bpy.props.EnumProperty(
         name="Passes",
@@ -131,6 +144,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         items=_PASS_ITEMS,
         default=set(PASSES),
     )
+    float_depth: bpy.props.BoolProperty(name="Float Depth", description="Also write depth as OpenEXR, 32 bits")
     layouts: bpy.props.EnumProperty(
         name="Also for",
         description="Also write camera files in the layouts of other projects",
@@ -179,7 +193,7 @@ def words_of(
     words += ["--shard", f"{min(asked.shard, asked.shards - 1)}/{asked.shards}"]
     words += ["--poses", str(asked.pose_count), "--size", str(asked.width), str(asked.height)]
     words += ["--samples", str(asked.samples), "--light", asked.light, "--device", asked.device]
-    words += ["--background", asked.background]
+    words += ["--background", asked.background, "--together", str(asked.together)]
     hdri = asked.hdri if asked.light == "hdri" else ""
     for name, label, path in (
         ("--body", "Body", asked.body),
@@ -188,6 +202,7 @@ def words_of(
     ):
         words += [name, setting_path(path, label)] if path else []
     words += ["--denoise"] if asked.denoise else []
+    words += ["--float-depth"] if asked.float_depth else []
     words += ["--released-reference"] if asked.released_reference else []
     words += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]
     words += ["--layouts", *(name for name in LAYOUTS if name in asked.layouts)]

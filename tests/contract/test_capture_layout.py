@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -108,6 +109,21 @@ def test_pngs_are_what_another_reader_reads(tmp_path):
         picture_files.write_png(tmp_path / "a.png", pixels)
         assert np.array_equal(np.asarray(Image.open(tmp_path / "a.png")), pixels)
         assert picture_files.is_whole_picture(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("cut", [0, 4, 40, 250, 330, -1])
+def test_an_exr_that_is_cut_short_or_changed_is_not_whole(tmp_path, cut):
+    path = tmp_path / "a.exr"
+    picture_files.write_exr(path, np.ones((37, 53)))
+    content = path.read_bytes()
+    path.write_bytes(content[:cut])
+    assert not picture_files.is_whole_picture(path)
+    path.write_bytes(content + b"\0")
+    assert not picture_files.is_whole_picture(path)
+    window = content.index(b"box2i") + 10
+    for numbers in ((0, 0, 2**31 - 1, 2**31 - 1), (0, 0, -9, -9), (0, 0, 52, 2**31 - 1)):
+        path.write_bytes(content[:window] + struct.pack("<4i", *numbers) + content[window + 16 :])
+        assert not picture_files.is_whole_picture(path)
 
 
 def test_smpl_parameters_are_read_plain_and_as_the_released_code_does(tmp_path):

@@ -163,6 +163,8 @@ class _Image:
     frame: int
     camera: int
     background: Path | None
+    kind: str = "img"
+    """Pass that is annotated where nothing is composed."""
 
     @property
     def view(self) -> View:
@@ -175,7 +177,7 @@ class _Image:
     @property
     def file_name(self) -> str:
         first = self.subjects[0]
-        path = capture_layout.picture_path(first.folder, "img", self.camera, self.frame)
+        path = capture_layout.picture_path(first.folder, self.kind, self.camera, self.frame)
         if self.is_composed:
             path = composed_path(first, self.frame, self.camera)
         return path.relative_to(first.folder.parent).as_posix()
@@ -251,13 +253,13 @@ def _keypoints(pixels: Float[np.ndarray, "17 2"], visible: Sequence[int]) -> dic
 
 def _images(captures: Captures, backgrounds: Backgrounds | None) -> Iterator[_Image]:
     """All images by subjects, frame and camera, numbered from 1."""
-    number = 0
+    number, kind = 0, "hdri" if "hdri" in captures.passes else "img"
     for subjects in groups(captures):
         for frame in range(subjects[0].frames):
             for camera in range(len(subjects[0].views)):
                 number += 1
                 background = None if backgrounds is None else backgrounds.drawn(subjects[0].name, frame, camera)
-                yield _Image(number, subjects, frame, camera, background)
+                yield _Image(number, subjects, frame, camera, background, kind)
 
 
 def _annotations(captures: Captures, backgrounds: Backgrounds | None, report: Callable[[str], object]) -> Iterator[str]:

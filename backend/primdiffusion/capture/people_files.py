@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 
-from primdiffusion.body.model import J, default_body
+from primdiffusion.body.model import BodyModel, J, default_body
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import JsonError, parse_json
@@ -24,6 +24,7 @@ from primdiffusion.formats.regular_files import read_regular
 from primdiffusion.geometry.pictures import MOST_PIXELS, decoded, decoded_bytes, opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.raster.multisample import Figure, figure_from_mesh
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\x00"
 NUMBERS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -157,6 +158,15 @@ class SkinnedPerson:
 
     mesh: TexturedMesh
     betas: Float[np.ndarray, "n"]
+
+    @property
+    def body(self) -> BodyModel:
+        """The default body."""
+        return default_body()
+
+    def figure(self) -> Figure:
+        """Prepare the mesh for rendering. Raises ValueError as `figure_from_mesh`."""
+        return figure_from_mesh(self.mesh)
 
 
 def find_people(folder: str | Path) -> dict[str, Path]:

@@ -1,4 +1,7 @@
-"""Render captures of textured humans with the rasteriser, in several processes; skip complete subjects and views."""
+"""Render captures of humans in several processes; skip complete subjects and views.
+
+Textured meshes are drawn by the rasteriser. What else can be posed and drawn is a `Drawable` too.
+"""
 
 from __future__ import annotations
 
@@ -8,39 +11,78 @@ import dataclasses
 import json
 import math
 import multiprocessing
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
 from jaxtyping import Float
 from PIL import Image
 
-from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.capture.people_files import SkinnedPerson, read_person
-from primdiffusion.capture.together import places, turned
+from primdiffusion.body.model import BodyModel, BodyPose
+from primdiffusion.capture.people_files import read_person
+from primdiffusion.capture.together import turned
 from primdiffusion.failures import describe
 from primdiffusion.formats import camera_files, capture_layout, picture_files
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
+from primdiffusion.formats.group_places import extent, first_frames, stand_together
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.removing import check_unlinked
-from primdiffusion.formats.requests import PASSES
+from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
-from primdiffusion.raster.multisample import Figure, RenderedView, figure_from_mesh, render_view
+from primdiffusion.raster.multisample import RenderedView
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.worker_process import begin_worker
 
 JPEG_QUALITY = 95
 
 
+class PosedDrawable(Protocol):
+    """A human in a pose."""
+
+    def seen_from(self, view: View, samples: int) -> RenderedView:
+        """Draw with `samples` x `samples` samples per pixel, an odd number each; deterministic."""
+        ...
+
+
+class Drawable(Protocol):
+    """A human prepared for drawing in many poses; `skinning` [J, 4, 4] maps the rest pose to the world."""
+
+    def points(self, skinning: Float[np.ndarray, "J 4 4"]) -> Float[np.ndarray, "n 3"]:
+        """Points in the world around which everything visible is."""
+        ...
+
+    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> PosedDrawable:
+        """Pose the human."""
+        ...
+
+
+class Person(Protocol):
+    """A human of a file."""
+
+    @property
+    def betas(self) -> Float[np.ndarray, "n"]:
+        """Shape coefficients of `body`."""
+        ...
+
+    @property
+    def body(self) -> BodyModel:
+        """The body that is posed."""
+        ...
+
+    def figure(self) -> Drawable:
+        """Prepare for drawing. Raises ValueError if the human cannot be drawn."""
+        ...
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class CaptureSetup:
     """A subject, its poses and its cameras."""
 
-    figure: Figure
+    figure: Drawable
     betas: Float[np.ndarray, "n"]
     poses: BodyPose
     """[F]."""
@@ -51,19 +93,19 @@ class CaptureSetup:
     views: list[View]
 
 
-def set_up_capture(person: SkinnedPerson, poses: BodyPose, rig: Rig | Sequence[View]) -> CaptureSetup:
+def set_up_capture(person: Person, poses: BodyPose, rig: Rig | Sequence[View]) -> CaptureSetup:
     """Pose the subject in all `poses` [F] and place the cameras: a rig that shows every pose whole, or given views.
 
     Raises:
-        ValueError: the mesh cannot be drawn; the poses are not finite.
+        ValueError: the human cannot be drawn; the poses are not finite.
     """
-    figure = figure_from_mesh(person.mesh)
+    figure = person.figure()
     with _one_thread():
-        shaped = default_body().to(dtype=torch.float64).shape(torch.from_numpy(person.betas).double())
+        shaped = person.body.to(dtype=torch.float64).shape(torch.from_numpy(person.betas).double())
         body = shaped.pose(poses.to(dtype=torch.float64))
     skinning, joints = body.skinning.numpy(), body.joints[..., :3, 3].numpy()
     if isinstance(rig, Rig):
-        moved = [part.posed(matrices).vertices for matrices in skinning for part in person.mesh.parts]
+        moved = [figure.points(matrices) for matrices in skinning]
         views = rig.views(*bounding_sphere(np.concatenate(moved)))
     else:
         views = list(rig)
@@ -71,7 +113,7 @@ def set_up_capture(person: SkinnedPerson, poses: BodyPose, rig: Rig | Sequence[V
 
 
 def set_up_together(
-    people: Sequence[SkinnedPerson], own: int, poses: BodyPose, rig: Rig, rng: np.random.Generator
+    people: Sequence[Person], own: int, poses: BodyPose, rig: Rig, rng: np.random.Generator
 ) -> CaptureSetup:
     """The setup of one of several humans who stand together, at other places in every pose, in front of one rig.
 
@@ -86,40 +128,22 @@ def set_up_together(
         rng: the same for all humans of the group.
 
     Raises:
-        ValueError: a mesh cannot be drawn; the poses are not finite.
+        ValueError: a human cannot be drawn; the poses are not finite.
     """
     frames = len(poses.joint_rotation)
     yaws = rng.uniform(-math.pi, math.pi, (len(people), frames))
-    own_poses, pelvis, bounds = [], [], []
-    for number, person in enumerate(people):
-        first = number * frames // len(people)
+    own_poses, pelvis, extents = [], [], []
+    for person, first, yaw in zip(people, first_frames(len(people), frames), yaws, strict=True):
         rolled = poses.joint_rotation.roll(-first, dims=0)
-        own_poses.append(turned(BodyPose(rolled, torch.zeros_like(poses.translation)), yaws[number]))
+        own_poses.append(turned(BodyPose(rolled, torch.zeros_like(poses.translation)), yaw))
         setup = set_up_capture(person, own_poses[-1], [])
         pelvis.append(setup.joints[:, 0])
-        bounds.append(np.array([_extent(setup, frame) for frame in range(frames)]))
-    radii = np.array(bounds)[..., 0]
-    at = np.stack([places(radii[:, frame], rng) for frame in range(frames)], axis=1)
-    moves = [
-        np.stack([at[n, :, 0] - pelvis[n][:, 0], -bounds[n][:, 1], at[n, :, 1] - pelvis[n][:, 2]], axis=-1)
-        for n in range(len(people))
-    ]
-    corners = [
-        [at[n, frame, 0] + x * radii[n, frame], y, at[n, frame, 1] + z * radii[n, frame]]
-        for n in range(len(people))
-        for frame in range(frames)
-        for y in (0, bounds[n][frame, 2] - bounds[n][frame, 1])
-        for x, z in ((1, 1), (1, -1), (-1, 1), (-1, -1))
-    ]
+        extents.append(
+            [extent(setup.figure.points(s), joint) for s, joint in zip(setup.skinning, pelvis[-1], strict=True)]
+        )
+    moves, corners = stand_together(np.array(pelvis), np.array(extents), rng)
     moved = BodyPose(own_poses[own].joint_rotation, torch.from_numpy(moves[own]).to(poses.translation))
-    return set_up_capture(people[own], moved, rig.views(*bounding_sphere(np.array(corners))))
-
-
-def _extent(setup: CaptureSetup, frame: int) -> tuple[float, float, float]:
-    """Largest distance from the vertical through the pelvis, and lowest and highest point, metres."""
-    points = np.concatenate([part.posed(setup.skinning[frame]).vertices for part in setup.figure.mesh.parts])
-    across = points[:, [0, 2]] - setup.joints[frame, 0, [0, 2]]
-    return float(np.linalg.norm(across, axis=1).max()), float(points[:, 1].min()), float(points[:, 1].max())
+    return set_up_capture(people[own], moved, rig.views(*bounding_sphere(corners)))
 
 
 @contextlib.contextmanager
@@ -159,7 +183,7 @@ def render_frames(
         for camera, view in enumerate(setup.views):
             if not is_complete_view(subject, passes, camera, frame):
                 posed = setup.figure.posed(setup.skinning[frame]) if posed is None else posed
-                write_view(subject, passes, camera, frame, render_view(posed, view, samples))
+                write_view(subject, passes, camera, frame, posed.seen_from(view, samples))
             yield frame, camera
 
 
@@ -172,6 +196,8 @@ def write_view(subject: Path, passes: Sequence[str], camera: int, frame: int, re
                 Image.fromarray(srgb_bytes(rendered.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
         elif kind == "mask":
             picture_files.write_png(path, np.round(rendered.coverage.clip(0, 1) * 255).astype(np.uint8))
+        elif kind == "depth_float":
+            picture_files.write_exr(path, rendered.depth)
         elif kind == "depth":
             picture_files.write_png(path, picture_files.depth_steps(rendered.depth))
         elif kind == "normal":
@@ -192,7 +218,7 @@ class RenderJob:
     """Subjects, poses, cameras and passes of a dataset."""
 
     people: Mapping[str, Path]
-    """.glb files by subject name."""
+    """Files of humans by subject name."""
     poses: BodyPose
     """[F]; frame 0 is close to the T pose."""
     out: Path
@@ -206,7 +232,11 @@ class RenderJob:
     unread_poses: tuple[str, ...] = ()
     """Errors of skipped pose files, for the report."""
     together: tuple[Mapping[str, Path], ...] = ()
-    """Groups of humans who stand together, .glb files by name; every subject is in one of them, or there are none."""
+    """Groups of humans who stand together, files by name; every subject is in one of them, or there are none."""
+    read: Callable[[Path], Person] = read_person
+    """Reads a human's file; a function of a module, as other processes call it too."""
+    renderer: str = "rasteriser"
+    """Name in dataset.json of what draws the humans."""
     part: str = "report"
     """Name of the report; runs that share a folder need different ones."""
 
@@ -220,7 +250,7 @@ class RenderJob:
             "passes": list(self.passes),
             "light": "uniform",
             "background": "black",
-            "renderer": "rasteriser",
+            "renderer": self.renderer,
             "samples": self.samples**2,
             "world": "metres, y up, facing +z",
             "depth": {"kind": "z", "unit_m": picture_files.DEPTH_UNIT},
@@ -251,8 +281,9 @@ def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
         ValueError: a pass is unknown, or workers is less than 1.
         OSError: the folder cannot be written.
     """
-    if unknown := set(job.passes) - set(PASSES) or not job.passes:
-        raise ValueError(f"passes {unknown or '()'} cannot be rendered: choose from {', '.join(PASSES)}")
+    possible = (*PASSES, FLOAT_DEPTH)
+    if unknown := set(job.passes) - set(possible) or not job.passes:
+        raise ValueError(f"passes {unknown or '()'} cannot be rendered: choose from {', '.join(possible)}")
     if workers < 1:
         raise ValueError(f"workers is {workers}: give 1 or more")
     capture_layout.claim(job.out, job.about)
@@ -322,10 +353,10 @@ def _try(job: RenderJob, name: str, frames: Sequence[int]) -> SubjectResult:
 def _set_up(job: RenderJob, name: str) -> CaptureSetup:
     group = next((group for group in job.together if name in group), None)
     if group is None:
-        return set_up_capture(read_person(job.people[name]), job.poses, job.rig)
+        return set_up_capture(job.read(job.people[name]), job.poses, job.rig)
     names = sorted(group)
     rng = np.random.default_rng(capture_layout.view_seed(job.seed, names[0], 0, 0))
-    return set_up_together([read_person(group[n]) for n in names], names.index(name), job.poses, job.rig, rng)
+    return set_up_together([job.read(group[n]) for n in names], names.index(name), job.poses, job.rig, rng)
 
 
 def _finish(job: RenderJob, name: str, outcomes: Sequence[SubjectResult]) -> SubjectResult:

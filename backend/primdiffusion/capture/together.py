@@ -6,37 +6,14 @@ has a whole mask too.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import torch
 from jaxtyping import Float
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.reader import Captures, Subject
+from primdiffusion.formats.group_places import MOST
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-
-MOST = 8
-"""Humans in a group."""
-GAP = 0.05
-"""Metres at least between the circles on the floor around two humans."""
-WIDENING = 0.05
-"""Metres by which the disc that a place is drawn from grows whenever a place is not free."""
-
-
-def places(radii: Float[np.ndarray, "n"], rng: np.random.Generator) -> Float[np.ndarray, "n 2"]:
-    """Draw centres of circles on the floor that are at least GAP apart, metres; the first is in the middle."""
-    found = np.zeros((len(radii), 2))
-    for number, radius in enumerate(radii):
-        reach = 0.0
-        while number:
-            angle, distance = rng.uniform(0, 2 * math.pi), reach * math.sqrt(rng.uniform())
-            found[number] = distance * math.cos(angle), distance * math.sin(angle)
-            apart = np.linalg.norm(found[:number] - found[number], axis=1)
-            if (apart >= radii[:number] + radius + GAP).all():
-                break
-            reach += WIDENING
-    return found
 
 
 def turned(poses: BodyPose, yaw: Float[np.ndarray, "F"]) -> BodyPose:

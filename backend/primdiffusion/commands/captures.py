@@ -17,18 +17,19 @@ from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
 from primdiffusion.capture.composed import Backgrounds
 from primdiffusion.capture.dataset import open_pack, pack
 from primdiffusion.capture.farm import Farm, FarmResult, render_on
-from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses, read_motions
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
-from primdiffusion.capture.together import MOST
+from primdiffusion.captured_humans import PASSES as PASSES_OF_VOLUMES
+from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_of
 from primdiffusion.evaluation.shots import folder_pictures
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
+from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.poses.motion import MotionFileError
-from primdiffusion.formats.requests import PASSES
+from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.pose_file import read_motion
 from primdiffusion.training.captured_people import read_cards
 
@@ -37,13 +38,13 @@ DESCRIPTION = "Multi-view captures, to train on."
 
 @dataclasses.dataclass(frozen=True)
 class RenderCaptures:
-    """Render humans of `primdiffusion people` in many poses from many sides, unlit, with the fast rasteriser.
+    """Render humans of `primdiffusion people` and generated ones in many poses from many sides, unlit, without Blender.
 
     Finished subjects are skipped: running the command again resumes it.
     """
 
     people: Path
-    """Folder of humans."""
+    """Folder of humans: those of `primdiffusion people`, and .human files; or one .human file."""
     out: Path
     """Output folder."""
     poses: tuple[Path, ...] = ()
@@ -58,10 +59,13 @@ class RenderCaptures:
     """Arrangement of the cameras."""
     elevations: tuple[float, ...] = (-10.0, 15.0, 40.0)
     """Elevations of the rings, degrees above the horizon."""
-    passes: tuple[str, ...] = PASSES
-    """Passes to write."""
+    passes: tuple[str, ...] | None = None
+    """Passes to write; the default is all, and img, mask and depth if one of the humans is a generated one."""
+    float_depth: bool = False
+    """Also write depth as OpenEXR, float32: without the steps of 0.25 mm and the limit of 16 m that the PNGs have."""
     samples: int = 3
-    """Samples along each side of a pixel, an odd number: 3 gives 9 samples per pixel."""
+    """Samples along each side of a pixel, an odd number: 3 gives 9 samples per pixel. Generated humans take nine times
+    as long with 3 as with 1."""
     seed: int = 0
     """Seed of the choice of poses."""
     workers: int = 1
@@ -81,7 +85,8 @@ class RenderCaptures:
             ValueError: settings are invalid, or a human could not be rendered (see the report).
         """
         index, count = parse_shard(self.shard)
-        people = find_people(self.people)
+        people = find_subjects(self.people)
+        passes = self._passes(people)
         if self.released_reference:
             people = {**people, capture_layout.RELEASED_REFERENCE: next(iter(people.values()))}
         names = sorted(people)[index::count]
@@ -97,12 +102,14 @@ class RenderCaptures:
             poses=poses,
             out=self.out,
             rig=Rig(self.arrangement, self.cameras, self.elevations, width=self.size, height=self.size),
-            passes=self.passes,
+            passes=passes,
             samples=self.samples,
             seed=self.seed,
             released_reference=self.released_reference,
             unread_poses=tuple(unread),
             together=self._groups(people) if self.together > 1 else (),
+            read=read_subject,
+            renderer=renderer_of(tuple(people.values())),
             part="report" if count == 1 else f"report-{index}-of-{count}",
         )
         for error in unread:
@@ -116,6 +123,18 @@ class RenderCaptures:
             raise ValueError(
                 f"{outcomes['failed']} of {len(names)} humans{poses_too} failed: {self.out / job.part}.json says why"
             )
+
+    def _passes(self, people: Mapping[str, Path]) -> tuple[str, ...]:
+        """Return the passes to write. Raises ValueError for those that a human does not have."""
+        volume = next((name for name in sorted(people) if is_generated(people[name])), None)
+        possible = PASSES if volume is None else PASSES_OF_VOLUMES
+        if volume is not None and (missing := set(self.passes or ()) - set(possible)):
+            raise ValueError(
+                f"the generated human {volume} has no pass {', '.join(sorted(missing))}: choose from "
+                f"{', '.join(possible)}"
+            )
+        passes = possible if self.passes is None else self.passes
+        return (*passes, FLOAT_DEPTH) if self.float_depth else passes
 
     def _groups(self, people: Mapping[str, Path]) -> tuple[dict[str, Path], ...]:
         """Split all humans, of all shards, into groups by their names."""

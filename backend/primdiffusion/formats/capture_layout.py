@@ -7,9 +7,11 @@
     root/{id}/img/cameraNNNN/FFFF.jpg              sRGB over the background
     root/{id}/mask/cameraNNNN/FFFF.png             8 bits: share of the pixel that the person covers
     root/{id}/depth/cameraNNNN/FFFF.png            16 bits, in units of 0.25 mm along the optical axis; 0: nothing
+    root/{id}/depth_float/cameraNNNN/FFFF.exr      metres along the optical axis, float32; 0: nothing; only if asked for
     root/{id}/normal/cameraNNNN/FFFF.png           8 bits: (world normal + 1) / 2; 0, 0, 0: nothing
     root/{id}/part/cameraNNNN/FFFF.png             8 bits: 1 + the joint that moves the surface most; 0: nothing
     root/{id}/rgba/cameraNNNN/FFFF.png             sRGB with straight alpha; only where the background is transparent
+    root/{id}/hdri/cameraNNNN/FFFF.jpg             sRGB over the environment of the HDRI; only with that background
     root/{id}/cameras.json                         {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}
     root/{id}/joints.npz                           world [F,24,3], pixel [C,F,24,2], depth [C,F,24]
     root/{id}/outputs_re_fitting/refit_smpl_2nd.npz        "smpl": the released code's pickled dictionary
@@ -45,7 +47,10 @@ from .removing import check_inside, remove_file
 from .whole_files import remove_abandoned, temporary_name, write_atomically
 
 FORMAT, VERSION = "primdiffusion-captures", 1
-ENDINGS = {"img": ".jpg", "mask": ".png", "depth": ".png", "normal": ".png", "part": ".png", "rgba": ".png"}
+ENDINGS = {
+    "img": ".jpg", "mask": ".png", "depth": ".png", "depth_float": ".exr", "normal": ".png", "part": ".png",
+    "rgba": ".png", "hdri": ".jpg",
+}  # fmt: skip
 """File extensions of passes."""
 SMPL_FOLDER, SMPL_FILE, SMPL_PLAIN_FILE = "outputs_re_fitting", "refit_smpl_2nd.npz", "refit_smpl_2nd_plain.npz"
 RELEASED_REFERENCE = "seq_000016-rp_alison_rigged_002"

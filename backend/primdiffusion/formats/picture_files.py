@@ -1,4 +1,4 @@
-"""Encoding of capture images, and PNG files without an imaging library."""
+"""Encoding of capture images, and PNG and OpenEXR files without an imaging library."""
 
 from __future__ import annotations
 
@@ -19,6 +19,10 @@ LARGEST_PICTURE = 512 * 2**20
 """Bytes."""
 _PNG, _PNG_END = b"\x89PNG\r\n\x1a\n", b"\x00\x00\x00\x00IEND\xaeB\x60\x82"
 _JPEG, _JPEG_END = b"\xff\xd8", b"\xff\xd9"
+_EXR, _EXR_LINES = b"\x76\x2f\x31\x01\x02\x00\x00\x00", 16
+"""Magic number and version 2; lines of a chunk compressed by ZIP."""
+_EXR_CHANNEL = b"Y"
+"""Luminance: the name that programs for pictures read too."""
 
 
 def write_png(path: Path, pixels: NDArray) -> None:
@@ -40,6 +44,47 @@ def write_png(path: Path, pixels: NDArray) -> None:
         file.write(_PNG_END)
 
 
+def write_exr(path: Path, values: NDArray) -> None:
+    """Write [H, W] as an OpenEXR of one float32 channel Y, compressed by ZIP: the same bytes on every machine."""
+    values = np.ascontiguousarray(values, "<f4")
+    if values.ndim != 2:
+        raise ValueError(f"an OpenEXR of {values.shape} cannot be written: give [H, W]")
+    header = _exr_header(*values.shape)
+    chunks = [_exr_chunk(first, values[first : first + _EXR_LINES]) for first in range(0, len(values), _EXR_LINES)]
+    sizes = [len(header) + 8 * len(chunks), *map(len, chunks[:-1])]
+    with replacing(path) as partial, partial.open("wb") as file:
+        file.write(header)
+        file.write(np.cumsum(sizes).astype("<u8").tobytes())
+        file.writelines(chunks)
+
+
+def _exr_header(height: int, width: int) -> bytes:
+    window = struct.pack("<4i", 0, 0, width - 1, height - 1)
+    attributes = (
+        (b"channels", b"chlist", _EXR_CHANNEL + b"\0" + struct.pack("<iB3x2i", 2, 0, 1, 1) + b"\0"),
+        (b"compression", b"compression", b"\x03"),
+        (b"dataWindow", b"box2i", window),
+        (b"displayWindow", b"box2i", window),
+        (b"lineOrder", b"lineOrder", b"\0"),
+        (b"pixelAspectRatio", b"float", struct.pack("<f", 1)),
+        (b"screenWindowCenter", b"v2f", struct.pack("<2f", 0, 0)),
+        (b"screenWindowWidth", b"float", struct.pack("<f", 1)),
+    )
+    entries = (name + b"\0" + kind + b"\0" + struct.pack("<i", len(data)) + data for name, kind, data in attributes)
+    return _EXR + b"".join(entries) + b"\0"
+
+
+def _exr_chunk(first: int, lines: NDArray[np.float32]) -> bytes:
+    """Bytes of even places before those of odd ones, as differences, through zlib; plain if that is not smaller."""
+    plain = lines.tobytes()
+    places = np.frombuffer(plain, np.uint8)
+    sorted_bytes = np.concatenate([places[::2], places[1::2]])
+    sorted_bytes[1:] += 128 - sorted_bytes[:-1]
+    packed = zlib.compress(sorted_bytes.tobytes(), 6)
+    data = packed if len(packed) < len(plain) else plain
+    return struct.pack("<2i", first, len(data)) + data
+
+
 def depth_steps(depth: NDArray) -> NDArray[np.uint16]:
     """Convert metres along the optical axis to units of a depth file; 0 if not finite or out of range."""
     steps = np.where(np.isfinite(depth), np.round(np.nan_to_num(depth, posinf=0) / DEPTH_UNIT), 0)
@@ -54,7 +99,9 @@ def normal_bytes(normal: NDArray, covered: NDArray) -> NDArray[np.uint8]:
 
 
 def is_whole_picture(path: Path) -> bool:
-    """Return whether a .png or .jpg has its first and last bytes; does not decode it."""
+    """Return whether a .png, .jpg or .exr of captures has its first and last bytes; does not decode it."""
+    if path.suffix == ".exr":
+        return _is_whole_exr(path)
     head, tail = (_PNG, _PNG_END) if path.suffix == ".png" else (_JPEG, _JPEG_END)
     try:
         with open_regular(path, LARGEST_PICTURE) as file:
@@ -62,4 +109,22 @@ def is_whole_picture(path: Path) -> bool:
             file.seek(-len(tail), os.SEEK_END)
             return begins and file.read() == tail
     except (OSError, TooLargeError):
+        return False
+
+
+def _is_whole_exr(path: Path) -> bool:
+    """Whether the file has the header that `write_exr` gives it, and ends with the last chunk of its table."""
+    length = len(_exr_header(1, 1))
+    try:
+        with open_regular(path, LARGEST_PICTURE) as file:
+            header = file.read(length)
+            _, _, right, bottom = struct.unpack_from("<4i", header, header.index(b"box2i\0") + 10)
+            if header != _exr_header(bottom + 1, right + 1):
+                return False
+            file.seek(8 * (bottom // _EXR_LINES), os.SEEK_CUR)
+            (last,) = struct.unpack("<Q", file.read(8))
+            file.seek(last + 4)
+            (size,) = struct.unpack("<i", file.read(4))
+            return file.seek(0, os.SEEK_END) == last + 8 + size
+    except (OSError, TooLargeError, struct.error, ValueError, OverflowError):
         return False

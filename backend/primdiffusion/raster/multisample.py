@@ -47,8 +47,12 @@ class Figure:
 
     def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> PosedFigure:
         """Pose the figure by linear blend skinning, world <- rest."""
-        vertices = np.concatenate([part.posed(skinning).vertices for part in self.mesh.parts])
+        vertices = self.points(skinning)
         return PosedFigure(self, vertices, self._normals(vertices))
+
+    def points(self, skinning: Float[np.ndarray, "J 4 4"]) -> Float64[np.ndarray, "V 3"]:
+        """The vertices of all parts in a pose."""
+        return np.concatenate([part.posed(skinning).vertices for part in self.mesh.parts])
 
     def _normals(self, vertices: np.ndarray) -> np.ndarray:
         """Area-weighted unit normals of vertices."""
@@ -75,6 +79,10 @@ class PosedFigure:
     """Metres."""
     normals: Float32[np.ndarray, "V 3"]
     """Unit, outwards from the front of faces."""
+
+    def seen_from(self, view: View, samples: int) -> RenderedView:
+        """See `render_view`."""
+        return render_view(self, view, samples)
 
 
 def figure_from_mesh(mesh: TexturedMesh) -> Figure:

@@ -356,3 +356,14 @@ def test_damage_is_named_and_the_earlier_files_stay(root):
         write_coco(open_captures(root), {NAME: ["tall"]})  # type: ignore
     assert [(root / name).read_text() for name in WRITTEN] == ["earlier", "earlier"]
     assert not list(root.glob(".*"))
+
+
+def test_captures_over_hdris_are_annotated_in_that_pass(root):
+    about = json.loads((root / "dataset.json").read_text())
+    about["passes"].append("hdri")
+    (root / "dataset.json").write_text(json.dumps(about))
+    captures = open_captures(root)
+    write_coco(captures, {})
+    names = [image["file_name"] for image in annotations(root)["images"]]
+    assert names[0] == f"{NAME}/hdri/camera0000/0000.jpg"
+    assert all("/hdri/" in name for name in names)

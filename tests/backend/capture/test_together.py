@@ -15,9 +15,10 @@ from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import render, set_up_together
-from primdiffusion.capture.together import GAP, groups, places, turned
+from primdiffusion.capture.together import groups, turned
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig
+from primdiffusion.formats.group_places import GAP, places
 from primdiffusion.geometry.srgb import decode_srgb
 from support.errors import refused
 

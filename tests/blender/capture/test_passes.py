@@ -5,11 +5,13 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import bpy
 import numpy as np
 import pytest
 from support.errors import refused
 
 from blender_primdiffusion.capture.passes import ExrError, read_colours, read_exr
+from blender_primdiffusion.formats import picture_files
 
 WIDTH, HEIGHT = 6, 4
 CHANNELS = tuple(f"ViewLayer.Combined.{name}" for name in "ABGR")
@@ -66,3 +68,24 @@ def test_a_damaged_picture_is_one_sentence(tmp_path, content):
     with refused(ExrError, "a.exr") as error:
         read_colours(path)
     assert len(str(error.value)) - len(str(tmp_path)) < 300
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (16, 5), (37, 53), (64, 48)])
+def test_blender_reads_the_numbers_of_an_exr(tmp_path, shape):
+    values = np.random.default_rng(0).uniform(0, 50, shape).astype(np.float32)
+    values[: shape[0] // 2] = 0
+    path = tmp_path / "a.exr"
+    picture_files.write_exr(path, values)
+    image = bpy.data.images.load(str(path))
+    try:
+        image.colorspace_settings.name = "Non-Color"
+        assert image.is_float
+        assert tuple(image.size) == (shape[1], shape[0])
+        pixels = np.empty(4 * values.size, np.float32)
+        image.pixels.foreach_get(pixels)
+    finally:
+        bpy.data.images.remove(image)
+    assert np.array_equal(pixels.reshape(*shape, 4)[::-1, :, 0], values)
+    assert picture_files.is_whole_picture(path)
+    with refused(ValueError, str((*shape, 3))):
+        picture_files.write_exr(path, np.zeros((*shape, 3)))

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import trimesh
 from blender_primdiffusion.formats.camera_rig import Rig, View, look_at
-from blender_primdiffusion.formats.capture_layout import picture_path
+from blender_primdiffusion.formats.capture_layout import COMPLETE_FILE, picture_path, view_seed
+from blender_primdiffusion.formats.capture_repair import verify
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.picture_files import DEPTH_UNIT
 from bpy_extras.object_utils import world_to_camera_view
@@ -17,11 +18,12 @@ from capture_person import NamedPerson, PaintedPerson, load_painted, plain, shad
 from mathutils import Vector
 from PIL import Image
 from scipy.ndimage import center_of_mass, grey_dilation
+from support.errors import refused
 
 from blender_primdiffusion.capture.blender_camera import aim, view_of
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.job import run
-from blender_primdiffusion.capture.passes import srgb_bytes
+from blender_primdiffusion.capture.passes import srgb_bytes, write_passes
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.skinned_surface import cameras_inside
 from blender_primdiffusion.capture.stage import Stage, shoot_centres, shoot_colours
@@ -270,6 +272,91 @@ def test_files_hold_what_was_rendered(empty_scene, tmp_path):
     two = {(0.9, 0.3, 0.1), (0.1, 0.4, 0.8)}  # the chequers' colours are sRGB
     nearest = np.min([np.abs(read["rgba"][..., :3] / 255 - colour).max(-1) for colour in two], 0)
     assert (nearest[solid] < 0.02).mean() > 0.25  # the others mix two squares
+
+
+def read_by_blender(path) -> np.ndarray:
+    image = bpy.data.images.load(str(path))
+    pixels = np.empty(4 * image.size[0] * image.size[1], np.float32)
+    image.pixels.foreach_get(pixels)
+    found = pixels.reshape(image.size[1], image.size[0], 4)[::-1, :, 0]
+    bpy.data.images.remove(image)
+    return found
+
+
+def test_float_depth_in_files_is_what_rays_meet(stage, tmp_path):
+    person, view = put(stage), odd_view()
+    write_passes(tmp_path, ("depth", "depth_float"), (0, 0), None, shoot_centres(stage, view, seed=5))
+    metres = read_by_blender(picture_path(tmp_path, "depth_float", 0, 0))
+    depth, _ = cast(person, view)
+    assert (np.isfinite(depth) != (metres > 0)).mean() < 0.001
+    both = np.isfinite(depth) & (metres > 0)
+    assert both.sum() > 300
+    assert np.median(np.abs(depth - metres)[both]) < 1e-5
+    steps = np.asarray(Image.open(picture_path(tmp_path, "depth", 0, 0)))
+    assert np.abs(metres - steps * DEPTH_UNIT).max() <= DEPTH_UNIT / 2 + 1e-6
+
+
+def test_float_depth_is_a_pass_that_is_asked_for(empty_scene, tmp_path):
+    rig = Rig(count=1, width=SIZE, height=SIZE)
+    assert "depth_float" not in CaptureSettings(tmp_path, rig=rig).about(1)["passes"]
+    settings = CaptureSettings(tmp_path, rig=rig, passes=("img",), float_depth=True, samples=1, device="cpu")
+    list(run(empty_scene, settings, [NamedPerson("anna")], poses=POSES, load=load_painted))
+    assert verify(tmp_path) == {}
+    path = picture_path(tmp_path / "anna", "depth_float", 0, 1)
+    assert (read_by_blender(path) > 0).sum() > 300
+    path.write_bytes(path.read_bytes()[:-1])
+    assert path in verify(tmp_path)
+
+
+def save_hdri(path, colour) -> None:
+    """Radiance's format: a sky of one colour, below one, above the horizon, black below it."""
+    sky = bytes([*(round(256 * value) for value in colour), 128])  # the last is the exponent, 0
+    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 16\n" + 64 * sky + 64 * bytes(4))
+
+
+def test_hdris_of_a_folder_light_views_by_their_seeds_and_are_behind_people(empty_scene, tmp_path):
+    colours = {"a.hdr": (0.9, 0.1, 0.1), "b.hdr": (0.1, 0.9, 0.1), "c.hdr": (0.1, 0.1, 0.9)}
+    (tmp_path / "skies").mkdir()
+    for name, colour in colours.items():
+        save_hdri(tmp_path / "skies" / name, colour)
+    rig = Rig(count=6, elevations=(0.0,), width=SIZE, height=SIZE)
+    settings = CaptureSettings(
+        tmp_path / "out", rig=rig, samples=4, light="hdri", hdri=tmp_path / "skies", background="hdri", device="cpu",
+        passes=("img", "mask"),
+    )  # fmt: skip
+    assert settings.about(2)["hdris"] == list(colours)
+    before = set(bpy.data.images)
+    list(run(empty_scene, settings, [NamedPerson("anna")], poses=POSES, load=load_painted))
+    assert set(bpy.data.images) <= before | {image for image in bpy.data.images if image.type == "RENDER_RESULT"}
+    used = set()
+    for camera in range(6):
+        behind, alone, mask = (
+            np.asarray(Image.open(picture_path(tmp_path / "out/anna", kind, camera, 0))).astype(int)
+            for kind in ("hdri", "img", "mask")
+        )
+        name = list(colours)[view_seed(0, "anna", 0, camera) % 3]
+        used.add(name)
+        above, below = behind[:4, :8].mean((0, 1)), behind[-4:, :8].mean((0, 1))
+        assert np.abs(above - srgb_bytes(np.array(colours[name]))).max() < 4
+        assert below.max() < 4
+        assert alone[:4, :8].max() < 16
+        brightness = (behind - alone) @ (0.299, 0.587, 0.114)
+        assert np.abs(brightness)[mask == 255].mean() < 6  # JPEG keeps brightness better than colour
+    assert len(used) > 1
+    again = picture_path(tmp_path / "out/anna", "hdri", 3, 1)
+    content = again.read_bytes()
+    again.unlink()
+    (tmp_path / "out/anna" / COMPLETE_FILE).unlink()
+    list(run(empty_scene, settings, [NamedPerson("anna")], poses=POSES, load=load_painted))
+    assert again.read_bytes() == content
+
+
+def test_a_background_of_hdris_needs_them(tmp_path):
+    with refused(ValueError, "hdri"):
+        CaptureSettings(tmp_path, background="hdri")
+    with refused(ValueError, str(tmp_path)):
+        CaptureSettings(tmp_path, light="hdri", hdri=tmp_path)
+    assert "hdris" not in CaptureSettings(tmp_path, light="hdri", hdri=tmp_path / "a.hdr").about(1)
 
 
 def test_colours_are_encoded_as_srgb():

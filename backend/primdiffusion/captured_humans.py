@@ -1,0 +1,197 @@
+"""Generated humans as subjects of captures: drawn by the marcher, in the poses and from the cameras of meshes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from primdiffusion.body.model import BodyModel
+from primdiffusion.capture.people_files import SUBJECT_NAME, SkinnedPerson, find_people, read_person
+from primdiffusion.capture.reader import as_camera
+from primdiffusion.formats.camera_rig import View
+from primdiffusion.human import Human, body_of, place_skinned
+from primdiffusion.human_file import load_human
+from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives, S
+from primdiffusion.raster.multisample import RenderedView
+from primdiffusion.render.march import march
+
+ENDINGS = (".human.safetensors", ".human")
+PERSON_FILE = "person.human.safetensors"
+"""Name of the file in a folder of its own, as Blender stores humans."""
+PASSES = ("img", "mask", "depth")
+"""Passes that volumes have."""
+VISIBLE = 0.03
+"""Opacity of a voxel from which it counts where cameras and floor are placed; the surface lies within about 5 mm."""
+RAYS_AT_ONCE = 2**21
+"""Rays of a band of a picture: limits memory."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VolumetricPerson:
+    """A generated human, as captures take it."""
+
+    human: Human
+
+    @property
+    def betas(self) -> Float[np.ndarray, "n"]:
+        """Shape coefficients of the body."""
+        return self.human.betas.double().numpy()
+
+    @property
+    def body(self) -> BodyModel:
+        """The human's own body."""
+        return body_of(self.human)[0]
+
+    def figure(self) -> VolumetricFigure:
+        """Find the visible voxels. Raises ValueError if there are none."""
+        shown = visible_voxels(place_skinned(self.human, torch.eye(4).repeat(24, 1, 1), torch.eye(4)))
+        if not shown.any():
+            raise ValueError("the human is empty, no voxel is visible: generate it again")
+        return VolumetricFigure(self.human, shown)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class VolumetricFigure:
+    """A generated human whose visible voxels are known."""
+
+    human: Human
+    shown: torch.Tensor
+    """[K, S, S, S], bool."""
+
+    def primitives(self, skinning: Float[np.ndarray, "J 4 4"]) -> Primitives:
+        """The human's boxes in a pose, world <- rest."""
+        return place_skinned(self.human, torch.from_numpy(skinning).float(), torch.eye(4))
+
+    def points(self, skinning: Float[np.ndarray, "J 4 4"]) -> Float[np.ndarray, "n 3"]:
+        """Centres of the visible voxels in the world, metres."""
+        boxes = self.primitives(skinning)
+        box, depth, row, column = self.shown.nonzero(as_tuple=True)
+        places = torch.linspace(-1, 1, S)
+        local = torch.stack([places[column], places[row], places[depth]], dim=-1) * boxes.half_extent[box]
+        turned = (boxes.rotation[box] * local[:, None]).sum(-1)
+        return (boxes.position[box] + turned).double().numpy()
+
+    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> PosedVolume:
+        """Pose the human."""
+        return PosedVolume(self.primitives(skinning))
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class PosedVolume:
+    """A generated human in a pose."""
+
+    primitives: Primitives
+
+    def seen_from(self, view: View, samples: int) -> RenderedView:
+        """Draw with `samples` x `samples` rays per pixel; depth is the first hit of the ray through its centre.
+
+        Colour is linear and premultiplied by coverage; a pixel without a hit, of opacity below one half, has no depth.
+        Normals and parts are not drawn and stay 0.
+
+        Raises:
+            ValueError: `samples` is not odd and positive, so that no ray would be at the pixel's centre.
+        """
+        if samples < 1 or samples % 2 == 0:
+            raise ValueError(f"samples is {samples}: give an odd number, 1, 3, 5, ...")
+        rendered = RenderedView(
+            rgb=np.zeros((view.height, view.width, 3), np.float32),
+            coverage=np.zeros((view.height, view.width), np.float32),
+            depth=np.zeros((view.height, view.width), np.float32),
+            normal=np.zeros((view.height, view.width, 3), np.float32),
+            part=np.zeros((view.height, view.width), np.uint8),
+        )
+        rows = max(1, RAYS_AT_ONCE // (view.width * samples**2))
+        for top in range(0, view.height, rows):
+            _draw_band(self.primitives, view, samples, slice(top, min(top + rows, view.height)), rendered)
+        return rendered
+
+
+def _draw_band(primitives: Primitives, view: View, samples: int, rows: slice, rendered: RenderedView) -> None:
+    height = rows.stop - rows.start
+    finer = np.array([[samples, 0, 0], [0, samples, -rows.start * samples], [0, 0, 1.0]]) @ view.intrinsics
+    fine = View(finer, view.rotation, view.translation, view.width * samples, height * samples)
+    drawn = march(primitives, as_camera(fine))
+    blocks = height, samples, view.width, samples
+    rendered.rgb[rows] = drawn.rgb.numpy().reshape(*blocks, 3).mean((1, 3)).clip(0, 1)
+    rendered.coverage[rows] = drawn.alpha.numpy().reshape(blocks).mean((1, 3))
+    hit = drawn.first_hit.numpy()[samples // 2 :: samples, samples // 2 :: samples]
+    rendered.depth[rows] = np.where(np.isfinite(hit), hit, 0) / _secants(view)[rows]
+
+
+def _secants(view: View) -> Float[np.ndarray, "H W"]:
+    """Distance along each pixel's ray per metre along the optical axis."""
+    rows, columns = np.mgrid[: view.height, : view.width] + 0.5
+    rays = np.stack([columns, rows, np.ones_like(rows)], axis=-1) @ np.linalg.inv(view.intrinsics).T
+    return np.linalg.norm(rays, axis=-1)
+
+
+def visible_voxels(primitives: Primitives) -> torch.Tensor:
+    """Whether the opacity across each voxel [K, S, S, S] is at least VISIBLE."""
+    faded = torch.exp(-WINDOW_SHARPNESS * torch.linspace(-1, 1, S).pow(WINDOW_POWER))
+    window = faded[:, None, None] * faded[:, None] * faded
+    edge = 2 * primitives.half_extent.amin(-1) / (S - 1)
+    return primitives.density * window * edge[:, None, None, None] >= VISIBLE
+
+
+def find_subjects(path: str | Path) -> dict[str, Path]:
+    """Find the humans of a folder, generated ones and those of `primdiffusion people`, sorted by name; or one file.
+
+    Generated ones are NAME.human, NAME.human.safetensors or NAME/person.human.safetensors.
+
+    Raises:
+        FileNotFoundError: the folder does not exist or contains none.
+        ValueError: two files have one name, or that of the file is no name of a subject.
+    """
+    path = Path(path)
+    if path.is_file():
+        name = _name(path)
+        if is_generated(path) and SUBJECT_NAME.fullmatch(name):
+            return {name: path}
+        raise ValueError(f"{path} is no human to capture: choose a folder, or NAME.human of letters, digits and . _ -")
+    generated: dict[str, Path] = {}
+    for found in sorted([*path.glob("*.human"), *path.glob("*.human.safetensors"), *path.glob(f"*/{PERSON_FILE}")]):
+        name = _name(found)
+        if not SUBJECT_NAME.fullmatch(name):
+            continue
+        if name in generated:
+            raise ValueError(f"{generated[name]} and {found} are two humans of one name: rename one")
+        generated[name] = found
+    try:
+        people = find_people(path)
+    except FileNotFoundError:
+        if not generated:
+            raise FileNotFoundError(
+                f"{path} contains no NAME/person.glb and no NAME.human: make some with primdiffusion people or generate"
+            ) from None
+        people = {}
+    if twice := sorted(people.keys() & generated.keys()):
+        raise ValueError(f"{people[twice[0]]} and {generated[twice[0]]} are two humans of one name: rename one")
+    return dict(sorted({**people, **generated}.items()))
+
+
+def is_generated(path: Path) -> bool:
+    """Whether a file is, by its name, a generated human."""
+    return path.name.endswith(ENDINGS)
+
+
+def renderer_of(paths: Sequence[Path]) -> str:
+    """What draws the humans of these files, as dataset.json names it."""
+    generated = {is_generated(path) for path in paths}
+    return " and ".join(name for kind, name in ((False, "rasteriser"), (True, "marcher")) if kind in generated)
+
+
+def read_subject(path: Path) -> SkinnedPerson | VolumetricPerson:
+    """Read a human for captures. Raises as `load_human` and `read_person`."""
+    return VolumetricPerson(load_human(path)) if is_generated(path) else read_person(path)
+
+
+def _name(path: Path) -> str:
+    if path.name == PERSON_FILE:
+        return path.parent.name
+    ending = next((ending for ending in ENDINGS if path.name.endswith(ending)), "")
+    return path.name.removesuffix(ending)
