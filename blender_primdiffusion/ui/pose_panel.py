@@ -28,10 +28,9 @@ from ..motion.poses import LIBRARY
 from ..motion.rotation import to_axis_angle
 from ..motion.skeleton import joint_positions
 from ..places import own_folder
-from ..scene.handles import handles_from_joints, joints_from_handles
+from ..scene.handles import add_handles, bake_handles, handles_from_joints, has_handles, joints_from_handles
 from .drawing import SidebarPanel, property_columns
-from .handle_operators import draw_handles
-from .on_person import OnArmature, may_have_joints, warn_of_rest
+from .on_person import OnArmature, may_have_joints, target_armature, warn_of_rest
 
 _PICTURES = Path(__file__).parents[1] / "motion" / "data" / "thumbnails"
 _collections: list = []
@@ -314,6 +313,43 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
             raise OSError(f"{str(own[name])!r} could not be deleted ({error.strerror or error})") from error
         settings.property_unset("pose")
         return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_add_handles(OnArmature, bpy.types.Operator):
+    """Add handles that hold hands and feet where they are (IK), and poles that elbows and knees point to"""
+
+    bl_idname = "primdiffusion.add_handles"
+    bl_label = "Add IK Handles"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        check_posable(armature)
+        add_handles(context, armature)
+        warn_of_rest(self, armature)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_bake_handles(OnArmature, bpy.types.Operator):
+    """Turn the joints as the IK handles show, on every frame where the pose is animated, and remove the handles"""
+
+    bl_idname = "primdiffusion.bake_handles"
+    bl_label = "Bake and Remove Handles"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        check_posable(armature)
+        bake_handles(context, armature)
+        return {"FINISHED"}
+
+
+def draw_handles(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """The button that adds handles, or the one that bakes them."""
+    try:
+        armature = target_armature(context)
+    except ValueError:
+        return
+    name = "bake_handles" if has_handles(armature) else "add_handles"
+    layout.operator(f"primdiffusion.{name}", icon="CON_KINEMATIC")
 
 
 class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
