@@ -46,14 +46,11 @@ class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
     bl_idname = "primdiffusion.set_attachment"
     bl_label = "Set Attachment"
     bl_options = {"UNDO"}
+    described_by = ("mode",)
 
     mode: bpy.props.EnumProperty(
         name="Attachment", description="How volumes follow the body", items=ATTACHMENT_ITEMS, default="ARMATURE"
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(text for name, _, text in ATTACHMENT_ITEMS if name == properties.mode)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         set_attachment(person, self.mode)
@@ -101,6 +98,7 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.merge"
     bl_label = "Merge Volumes"
+    described_by = ("what",)
 
     what: bpy.props.EnumProperty(name="Merge", description="What is merged", items=_MERGES, options=SKIP)
     voxel: bpy.props.FloatProperty(
@@ -113,21 +111,16 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
     frame_start: bpy.props.IntProperty(name="Start", description="Not given: the scene's", options=SKIP)
     frame_end: bpy.props.IntProperty(name="End", description="Not given: the scene's", options=SKIP)
 
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(text for name, _, text in _MERGES if name == properties.what)
-
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         if self.what == "NOTHING":
             _unmerge(person)
             bpy.ops.ed.undo_push(message="Unmerge")
             return {"FINISHED"}
-        given, target = self.properties.is_property_set, HumanTarget.of(person)
-        voxel = self.voxel if given("voxel") else context.scene.primdiffusion_merging.voxel
+        target, voxel = HumanTarget.of(person), self.chosen("voxel", context.scene.primdiffusion_merging)
         if self.what == "POSE":
             moment = _moment(person, context.evaluated_depsgraph_get())
             return submit(self, context, MergeJob(target, moment, voxel))
-        start, end = (getattr(self if given(name) else context.scene, name) for name in ("frame_start", "frame_end"))
+        start, end = (self.chosen(name, context.scene) for name in ("frame_start", "frame_end"))
         if not 1 < end - start + 1 <= _MOST_FRAMES:
             raise ValueError(
                 f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"

@@ -144,8 +144,6 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
 
 
 _SKIP = {"SKIP_SAVE"}
-_CAPTURES = "Stop rendering; finished pictures stay, and the next run resumes from them"
-_SET_UP = "Stop; the next Set Up Backend uses what was downloaded"
 
 
 class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
@@ -153,24 +151,21 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
 
     bl_idname = "primdiffusion.cancel"
     bl_label = "Cancel"
+    described_by = ("what",)
 
     what: bpy.props.EnumProperty(
         name="Cancel",
         description="What to stop",
         items=[
             ("JOB", "Job", "Stop this job, or remove it from the queue; nothing is added to the scene"),
-            ("CAPTURES", "Captures", _CAPTURES),
-            ("SET_UP", "Set-Up", _SET_UP),
+            ("CAPTURES", "Captures", "Stop rendering; finished pictures stay, and the next run resumes from them"),
+            ("SET_UP", "Set-Up", "Stop; the next Set Up Backend uses what was downloaded"),
         ],
         options=_SKIP,
     )
     number: bpy.props.IntProperty(
         name="Number", description="Number of the queued job; 0 is the running one", min=0, options=_SKIP
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return {"CAPTURES": _CAPTURES, "SET_UP": _SET_UP}.get(properties.what, str(cls.__doc__))
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:

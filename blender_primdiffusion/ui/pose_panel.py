@@ -172,6 +172,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
 
     bl_idname = "primdiffusion.apply_pose"
     bl_label = "Apply Pose"
+    described_by = ("what",)
 
     what: bpy.props.EnumProperty(name="Pose To Apply", description="Which pose", items=_POSES, options=_SKIP)
     pose_name: bpy.props.StringProperty(
@@ -190,10 +191,6 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
         name="Feet on the Floor", description="Move the body down until the feet are on the floor", default=True
     )
 
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(text for name, _, text in _POSES if name == properties.what)
-
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.what != "LIBRARY":
             return self.execute(context)
@@ -201,8 +198,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
         if not self.pose_name:
             self.pose_name = settings.pose
         for name in ("amount", "mirror", "only_selected"):
-            if not self.properties.is_property_set(name):
-                setattr(self, name, getattr(settings, name))
+            setattr(self, name, self.chosen(name, settings))
         return self.execute(context)
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -258,6 +254,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
 
     bl_idname = "primdiffusion.save_pose"
     bl_label = "Save Pose"
+    described_by = ("delete",)
 
     pose_name: bpy.props.StringProperty(
         name="Name", description="Name of the new pose, or of the one to delete", default="My Pose", options=_SKIP
@@ -267,11 +264,6 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
         description="Delete the chosen pose from your own poses in the library, for all .blend files",
         options=_SKIP,
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        told = properties.rna_type.properties["delete"].description if properties.delete else str(cls.__doc__)
-        return told
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self.delete:
@@ -302,7 +294,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
 
     def _delete(self, settings: PRIMDIFFUSION_PG_motion) -> set[str]:
         """One of the user's own poses: the one named, else the panel's. A file cannot be undone."""
-        name = self.pose_name if self.properties.is_property_set("pose_name") else settings.pose
+        name = self.pose_name if self.given("pose_name") else settings.pose
         own = own_poses(poses_folder())
         if name not in own:
             raise ValueError(f"{name!r} is not one of your own poses: only those can be deleted")

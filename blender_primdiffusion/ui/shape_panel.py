@@ -210,7 +210,7 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         return next(text for name, _, text in _SHAPES if name == properties.to)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        if self.to == "RANDOM" and not self.properties.is_property_set("seed"):
+        if self.to == "RANDOM" and not self.given("seed"):
             self.seed = random.randrange(2**31)
         return self.execute(context)
 
@@ -234,9 +234,8 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         if self.to == "RANDOM":
             drawn = np.random.default_rng(self.seed).normal(0.0, self.spread, BETA_COUNT)
             return np.clip(drawn, -_FARTHEST, _FARTHEST)
-        given = self.properties.is_property_set
-        betas = np.array(self.betas) if given("betas") else betas_of(person)
-        height, weight = (getattr(self, name) if given(name) else None for name in ("height", "weight"))
+        betas = np.array(self.betas) if self.given("betas") else betas_of(person)
+        height, weight = (getattr(self, name) if self.given(name) else None for name in ("height", "weight"))
         return betas_of_measures(shape_model_of(person), betas, height, weight)
 
     def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:

@@ -245,8 +245,8 @@ class Dialog:
     """An export in the file browser, which calls `check` after each change."""
 
     def __init__(self, **given):
-        self.given, self.filepath, self.reported = given, "", []
-        self.properties = SimpleNamespace(is_property_set=lambda name: name in self.given)
+        self.filepath, self.reported = "", []
+        self.properties = SimpleNamespace(is_property_set=lambda name: name in given)
         vars(self).update(given)
 
     def __getattr__(self, name):
