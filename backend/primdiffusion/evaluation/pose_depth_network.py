@@ -140,8 +140,7 @@ def cell_means(values: Float[Tensor, "h w"], mask: Tensor) -> Float[Tensor, "32 
 def save_pose_depth_network(path: Path, network: PoseDepthNetwork) -> None:
     """Write the network in half precision with its card, atomically."""
     tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
-    space = {"categories": network.space.categories, "scalars": network.space.scalars}
-    metadata = {"space": json.dumps(space), "card": json.dumps(network.card)}
+    metadata = {"space": network.space.to_json(), "card": json.dumps(network.card)}
     write_atomically(path, tensor_file.save(tensors, metadata=metadata))
 
 
@@ -158,11 +157,7 @@ def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
         raise FileNotFoundError(f"no network of joints and depth at {path}: install the package again")
     try:
         tensors, metadata = tensor_file.read(path)
-        stated = parse_json(metadata["space"])
-        space = AttributeSpace(
-            {name: tuple(values) for name, values in stated["categories"].items()},
-            {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
-        )
+        space = AttributeSpace.from_json(metadata["space"])
         network = tensor_file.load_network(lambda: PoseDepthNetwork(space), tensors)
         network.card = dict(parse_json(metadata["card"]))
     except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:

@@ -23,7 +23,7 @@ from primdiffusion.failures import describe
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.json_files import parse_json, read_json
 from primdiffusion.formats.requests import Count, Seed
-from primdiffusion.formats.schema import Range, check
+from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD
 from primdiffusion.people.payloads import store_person, voxels_from_payload
@@ -33,7 +33,7 @@ from primdiffusion.training.stored_people import read_person
 
 
 @dataclasses.dataclass(frozen=True)
-class EncodeSettings:
+class EncodeSettings(Checked):
     """Settings of encoding."""
 
     views: Count = 8
@@ -46,10 +46,6 @@ class EncodeSettings:
     """Largest side of the images used in refinement, pixels."""
     seed: Seed = 0
     """Seed of the order of images in refinement."""
-
-    def __post_init__(self) -> None:
-        """Raise FieldError for values out of range."""
-        check(self)
 
 
 def encode_people(

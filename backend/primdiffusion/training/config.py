@@ -12,13 +12,12 @@ import tyro
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.requests import Count, Share
-from primdiffusion.formats.schema import Range, check
+from primdiffusion.formats.requests import Count, NotNegative, Share
+from primdiffusion.formats.schema import Checked, Range
 
 Weighting = Literal["whitened", "plain", "min_snr"]
 Tracker = Literal["tensorboard", "wandb"]
 Levels = Literal["uniform", "log_uniform", "log_normal"]
-NotNegative = Annotated[float, Range(0, 1e30)]
 Positive = Annotated[float, Range(1e-12, 1e30)]
 Decay = Annotated[float, Range(0, 0.999999)]
 
@@ -52,7 +51,7 @@ class PriorConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class PhaseConfig:
+class PhaseConfig(Checked):
     """Training of one network."""
 
     steps: Count
@@ -93,13 +92,9 @@ class PhaseConfig:
     bfloat16: bool = False
     """Run the network in bfloat16 where the device multiplies it faster than float32."""
 
-    def __post_init__(self) -> None:
-        """Raise FieldError for values out of range."""
-        check(self)
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunSettings:
+class RunSettings(Checked):
     """Where a run is, and how it is stopped, measured and saved: the same for every task."""
 
     data: Path
@@ -121,10 +116,6 @@ class RunSettings:
     """Steps between images made with the averaged weights."""
     tracker: Tracker | None = None
     """Where metrics go besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
-
-    def __post_init__(self) -> None:
-        """Raise FieldError for values out of range."""
-        check(self)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -155,10 +155,10 @@ def saved_step(path: Path) -> int:
         raise ValueError(f"{path} is damaged ({error!s:.100}): start a new run folder") from error
 
 
-def learning_rate_factor(step: int, steps: int, warm_up: int = 100, last: float = 0.1) -> float:
-    """A linear rise over `warm_up` steps times a cosine from 1 to `last` over `steps`."""
+def learning_rate_factor(step: int, steps: int) -> float:
+    """A linear rise over 100 steps times a cosine from 1 to 0.1 over `steps`."""
     cosine = 0.5 + 0.5 * math.cos(math.pi * min(1.0, step / steps))
-    return min(1.0, (step + 1) / warm_up) * (last + (1 - last) * cosine)
+    return min(1.0, (step + 1) / 100) * (0.1 + 0.9 * cosine)
 
 
 def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:
