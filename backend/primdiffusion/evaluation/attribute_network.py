@@ -21,6 +21,7 @@ from torch.nn import functional
 from primdiffusion import tensor_file
 from primdiffusion.evaluation.portraits import PORTRAITS
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import written_whole
 
 CATEGORIES = ("sex", "age", "outfit", "pattern", "shoes", "hair", "hair_colour", "hat")
@@ -256,13 +257,9 @@ def load_attribute_network(path: Path) -> AttributeNetwork:
     """Load what `save_attribute_network` wrote. Raises FileNotFoundError, and ValueError for an unreadable file."""
     if not path.is_file():
         raise FileNotFoundError(f"no feature network at {path}: choose a folder to train one in")
-    try:
+    reason = "is not a feature network of this version"
+    with as_file_error(path, reason, "delete it to train a new one", OSError, RuntimeError):
         tensors, metadata = tensor_file.read(path)
         space = AttributeSpace.from_json(metadata["answers"])
         network = tensor_file.load_network(lambda: AttributeNetwork(space), tensors)
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(
-            f"{path} is not a feature network of this version ({reason}): delete it to train a new one"
-        ) from error
     return network.eval().requires_grad_(False)

@@ -21,6 +21,7 @@ from primdiffusion import tensor_file
 from primdiffusion.evaluation.attribute_network import AttributeSpace, detail_energies
 from primdiffusion.evaluation.shots import JOINTS
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import write_atomically
 
 INPUT = 128
@@ -155,12 +156,10 @@ def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
             return load_pose_depth_network(found)
     if not path.is_file():
         raise FileNotFoundError(f"no network of joints and depth at {path}: install the package again")
-    try:
+    reason = "is not a network of joints and depth of this version"
+    with as_file_error(path, reason, "install the package again", OSError, RuntimeError):
         tensors, metadata = tensor_file.read(path)
         space = AttributeSpace.from_json(metadata["space"])
         network = tensor_file.load_network(lambda: PoseDepthNetwork(space), tensors)
         network.card = dict(parse_json(metadata["card"]))
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path} is not a network of joints and depth of this version ({reason})") from error
     return network.eval().requires_grad_(False)

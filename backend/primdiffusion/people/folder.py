@@ -25,7 +25,7 @@ from primdiffusion.body.model import default_body
 from primdiffusion.capture.people_files import LARGEST_GLB
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import TooLargeError, read_regular
+from primdiffusion.formats.regular_files import TooLargeError, as_file_error, read_regular
 from primdiffusion.formats.removing import remove_folder
 from primdiffusion.formats.requests import check_seed
 from primdiffusion.formats.whole_files import remove_abandoned, temporary_name, write_atomically
@@ -147,11 +147,9 @@ def is_whole(folder: Path, seed: int) -> bool:
 
 def unknown_licences(root: Path) -> list[str]:
     """Assets in a folder's manifest whose licence is unknown. Raises ValueError for a damaged one, OSError."""
-    try:
+    with as_file_error(root / MANIFEST, "is damaged", "make the humans again"):
         manifest = read_json(root / MANIFEST)
         return [str(asset["path"]) for asset in manifest["assets"] if asset["licence"] == UNKNOWN]
-    except (ValueError, TypeError, LookupError) as error:
-        raise ValueError(f"{root / MANIFEST} is damaged ({error!s:.80}): make the humans again") from error
 
 
 def _identity(person: Person, seed: int) -> dict[str, Any]:

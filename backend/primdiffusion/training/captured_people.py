@@ -22,6 +22,7 @@ from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.failures import describe
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.json_files import parse_json, read_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.requests import Count, Seed
 from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.human import Human
@@ -129,10 +130,8 @@ def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
     for name, path in find_people(people).items():
         card = path.parent / CARD
         if path.name != f"{name}.glb" and card.is_file():
-            try:
+            with as_file_error(card, "is damaged", "make the human again"):
                 cards[name] = dict(read_json(card))
-            except (ValueError, TypeError) as error:
-                raise ValueError(f"{card} is damaged ({error!s:.160}): make the human again") from error
     return cards
 
 

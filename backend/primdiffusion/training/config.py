@@ -12,6 +12,7 @@ import tyro
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.requests import Count, NotNegative, Share
 from primdiffusion.formats.schema import Checked, Range
 
@@ -215,10 +216,8 @@ _ADDED = {"unet.attention_context": "input", "slab.optimiser": "adamw"}
 
 def check_resumable(saved: str, config: RunSettings) -> None:
     """Raise ValueError, naming the settings in which a saved run differs from `config`, except those allowed to."""
-    try:
+    with as_file_error(config.run, "has damaged settings", "give a new folder"):
         before = _comparable(parse_json(saved))
-    except (ValueError, AttributeError) as error:
-        raise ValueError(f"the settings in {config.run} are damaged ({error!s:.160}): give a new folder") from error
     now = _comparable(parse_json(to_json(config)))
     for name, value in _ADDED.items():
         if name in now and name not in before:

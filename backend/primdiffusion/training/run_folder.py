@@ -30,7 +30,7 @@ from torch import Tensor
 
 from primdiffusion.failures import optional_package
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.regular_files import as_file_error, read_regular
 from primdiffusion.formats.removing import remove_file
 from primdiffusion.formats.whole_files import (
     create_folders,
@@ -175,12 +175,10 @@ def versions() -> dict[str, str]:
 
 def _earlier(config: RunSettings, people: Sequence[str], saved: str, processes: int) -> list[Mapping[str, Any]]:
     """Return the earlier starts of the run. Raises ValueError for another training set."""
-    try:
+    with as_file_error(config.run / RUN, "is damaged", "give a new folder"):
         before = parse_json(saved)
         known, starts = before["people"], before.get("starts", [])
         were = starts[-1]["processes"] if starts else processes
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ValueError(f"{config.run / RUN} is damaged ({error!s:.160}): give a new folder") from error
     if known != list(people):
         raise ValueError(
             f"the run in {config.run} has another training set than {config.data} ({len(known)} and {len(people)} "
