@@ -13,13 +13,12 @@ from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
-from primdiffusion.formats.requests import Count, NotNegative, Share
+from primdiffusion.formats.requests import Count, NotNegative, Positive, Share
 from primdiffusion.formats.schema import Checked, Range
 
 Weighting = Literal["whitened", "plain", "min_snr"]
 Tracker = Literal["tensorboard", "wandb"]
 Levels = Literal["uniform", "log_uniform", "log_normal"]
-Positive = Annotated[float, Range(1e-12, 1e30)]
 Decay = Annotated[float, Range(0, 0.999999)]
 
 

@@ -6,9 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from primdiffusion.formats.requests import Count, NotNegative
+from primdiffusion.formats.requests import Count, NotNegative, Positive
 from primdiffusion.formats.schema import Checked, Range
-from primdiffusion.training.config import Decay, Positive, RunSettings
+from primdiffusion.training.config import Decay, RunSettings
 
 Preset = Literal[
     "default",
