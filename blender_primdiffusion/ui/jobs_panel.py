@@ -22,6 +22,7 @@ from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
 from .backend_state import being_set_up, cancel_set_up
 from .captures_session import captures
+from .declared import SKIP
 from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
 
 TEXT = "PrimDiffusion Diagnostics"
@@ -143,9 +144,6 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
         return {"FINISHED"}
 
 
-_SKIP = {"SKIP_SAVE"}
-
-
 class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
     """Stop this job, or remove it from the queue; nothing is added to the scene"""
 
@@ -161,10 +159,10 @@ class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
             ("CAPTURES", "Captures", "Stop rendering; finished pictures stay, and the next run resumes from them"),
             ("SET_UP", "Set-Up", "Stop; the next Set Up Backend uses what was downloaded"),
         ],
-        options=_SKIP,
+        options=SKIP,
     )
     number: bpy.props.IntProperty(
-        name="Number", description="Number of the queued job; 0 is the running one", min=0, options=_SKIP
+        name="Number", description="Number of the queued job; 0 is the running one", min=0, options=SKIP
     )
 
     @classmethod
@@ -195,7 +193,7 @@ class PRIMDIFFUSION_OT_try_again(Reporting, bpy.types.Operator):
     bl_label = "Try Again"
 
     kind: bpy.props.StringProperty(
-        name="Kind", description="Kind of job, such as generate; empty: the last one that ended", options=_SKIP
+        name="Kind", description="Kind of job, such as generate; empty: the last one that ended", options=SKIP
     )
 
     @classmethod

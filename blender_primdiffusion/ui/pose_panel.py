@@ -29,6 +29,7 @@ from ..motion.rotation import to_axis_angle
 from ..motion.skeleton import joint_positions
 from ..places import own_folder
 from ..scene.handles import add_handles, bake_handles, handles_from_joints, has_handles, joints_from_handles
+from .declared import SKIP
 from .drawing import SidebarPanel, property_columns
 from .on_person import OnArmature, may_have_joints, target_armature, warn_of_rest
 
@@ -96,36 +97,29 @@ def free() -> None:
         previews.remove(_collections.pop())
 
 
+_AMOUNT = bpy.props.FloatProperty(
+    name="Amount", description="Strength of the pose: 0 none, 1 full", default=1.0, min=0.0, max=1.0, subtype="FACTOR"
+)
+_MIRROR = bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
+_ONLY_SELECTED = bpy.props.BoolProperty(
+    name="Only Selected Bones", description="Change only the selected bones", default=False
+)
+
+
 class PRIMDIFFUSION_PG_motion(bpy.types.PropertyGroup):
     """Motion settings of a scene."""
 
     pose: bpy.props.EnumProperty(name="Pose", description="The pose to apply", items=pose_items)
-    amount: bpy.props.FloatProperty(
-        name="Amount",
-        description="Strength of the pose: 0 none, 1 full",
-        default=1.0,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
-    mirror: bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
-    only_selected: bpy.props.BoolProperty(
-        name="Only Selected Bones",
-        description="Change only the selected bones",
-        default=False,
-    )
-
-
-_SKIP = {"SKIP_SAVE"}
+    amount: _AMOUNT
+    mirror: _MIRROR
+    only_selected: _ONLY_SELECTED
 
 
 class _Posing(OnArmature):
     """Base of the operators that change a pose."""
 
     bl_options = {"REGISTER", "UNDO"}
-    only_selected: bpy.props.BoolProperty(
-        name="Only Selected Bones", description="Change only the selected bones", default=False
-    )
+    only_selected: _ONLY_SELECTED
 
     def joints(self, armature: bpy.types.Object) -> list[str]:
         """Which to change. Raises ValueError where none is selected."""
@@ -174,19 +168,12 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
     bl_label = "Apply Pose"
     described_by = ("what",)
 
-    what: bpy.props.EnumProperty(name="Pose To Apply", description="Which pose", items=_POSES, options=_SKIP)
+    what: bpy.props.EnumProperty(name="Pose To Apply", description="Which pose", items=_POSES, options=SKIP)
     pose_name: bpy.props.StringProperty(
-        name="Pose", description="Name of the pose in the library; empty: the panel's", options=_SKIP
+        name="Pose", description="Name of the pose in the library; empty: the panel's", options=SKIP
     )
-    amount: bpy.props.FloatProperty(
-        name="Amount",
-        description="Strength of the pose: 0 none, 1 full",
-        default=1.0,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
-    mirror: bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
+    amount: _AMOUNT
+    mirror: _MIRROR
     ground: bpy.props.BoolProperty(
         name="Feet on the Floor", description="Move the body down until the feet are on the floor", default=True
     )
@@ -257,12 +244,12 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
     described_by = ("delete",)
 
     pose_name: bpy.props.StringProperty(
-        name="Name", description="Name of the new pose, or of the one to delete", default="My Pose", options=_SKIP
+        name="Name", description="Name of the new pose, or of the one to delete", default="My Pose", options=SKIP
     )
     delete: bpy.props.BoolProperty(
         name="Delete",
         description="Delete the chosen pose from your own poses in the library, for all .blend files",
-        options=_SKIP,
+        options=SKIP,
     )
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
