@@ -54,6 +54,7 @@ from chain_sets import (
     stored,
     stored_fit,
 )
+from figure_metrics import compare_detail, detail_energy, figure_psnr
 from jaxtyping import Float
 from numpy import ndarray
 from PIL import Image
@@ -62,7 +63,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import window_weight
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.regions import region_of
-from primdiffusion.evaluation.image_metrics import compare_detail, detail_energy, figure_psnr, overlap, ssim
+from primdiffusion.evaluation.image_metrics import overlap, ssim
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.people.assets import Assets, open_assets

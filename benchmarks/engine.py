@@ -42,7 +42,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
 from walk import walk_and_wave
 
 import blender_primdiffusion
-from blender_primdiffusion.engine import final
+from blender_primdiffusion.engine import engine
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import armature_of
@@ -108,26 +108,26 @@ def timed(module: object, name: str, seconds: list[float]) -> Iterator[None]:
 def overhead(change: Callable[[int], None]) -> dict[str, float]:
     """Milliseconds of each part of the frame with the least overhead; `change(i)` is called before frame i."""
     drawings: list = []
-    plain = final.render_layer
+    plain = engine.render_layer
 
     def recorded(engine: object, depsgraph: object) -> object:
         drawings.append(plain(engine, depsgraph))
         return drawings[-1]
 
     whole, gather, fill = [], [], []
-    final.render_layer = recorded
+    engine.render_layer = recorded
     try:
         with (
-            timed(final, "render_layer", whole),
-            timed(final, "picture_of", gather),
-            timed(final, "solids_file", gather),
-            timed(final, "_fill", fill),
+            timed(engine, "render_layer", whole),
+            timed(engine, "picture_of", gather),
+            timed(engine, "solids_file", gather),
+            timed(engine, "_fill", fill),
         ):
             for frame in range(WARM_UP + FRAMES):
                 change(frame)
                 bpy.ops.render.render()
     finally:
-        final.render_layer = plain
+        engine.render_layer = plain
     rows = []
     for frame in range(WARM_UP, WARM_UP + FRAMES):
         child = drawings[frame].result

@@ -29,6 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from figure_metrics import figure_psnr
 from jaxtyping import Float
 from PIL import Image
 from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views, default_betas
@@ -40,7 +41,7 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.evaluation.image_metrics import figure_psnr, ssim
+from primdiffusion.evaluation.image_metrics import ssim
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, default_frames, place

@@ -35,6 +35,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from figure_metrics import figure_psnr
 from from_pictures import GREY, POSES, VIEW, Case, captured, case_of, over_grey
 from jaxtyping import Float
 from PIL import Image
@@ -43,7 +44,6 @@ from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.evaluation.image_metrics import figure_psnr
 from primdiffusion.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, human_in, start_of
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix

@@ -27,7 +27,7 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.diffusion.fixed_threads import GRID_THREADS, fixed_threads
 from primdiffusion.formats import compact_human
 from primdiffusion.formats.human_metadata import check_provenance, provenance_of, version_fault
-from primdiffusion.formats.regular_files import FileError, TooLargeError
+from primdiffusion.formats.regular_files import FileError, as_file_error
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human
 from primdiffusion.primitives.anchors import Anchors
@@ -93,13 +93,9 @@ def load_human(path: str | Path) -> Human:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no human file {path}: check the path, or generate a human")
-    try:
+    with as_file_error(path, "is damaged or no safetensors file", "generate the human again", OSError):
         file = tensor_file.opened(path, LARGEST_FILE)
         tensors, metadata = file.finite_tensors(_KNOWN), file.metadata
-    except TooLargeError:
-        raise
-    except (ValueError, OSError) as e:
-        raise FileError(path, f"is damaged or no safetensors file ({e!s:.160})", "generate the human again") from e
     _check_format(path, metadata)
     tensors = _expanded(path, tensors, metadata)
     _check_shapes(path, tensors)
@@ -132,11 +128,9 @@ def _expanded(path: Path, tensors: dict[str, torch.Tensor], metadata: Mapping[st
     """Tensors of a compact file in float32, others as they are."""
     if compact_human.METADATA not in metadata:
         return tensors
-    try:
+    with as_file_error(path, "does not contain a valid human", "generate it again"):
         stored = {name: tensors[name].numpy() for name in ("rgb", "density") if name in tensors}
         expanded = compact_human.expand(stored, metadata[compact_human.METADATA])
-    except (ValueError, KeyError, TypeError) as e:  # numpy has no bfloat16
-        raise FileError(path, f"does not contain a valid human ({e!s:.100})", "generate it again") from e
     return {**tensors, **{name: torch.from_numpy(values) for name, values in expanded.items()}}
 
 

@@ -25,6 +25,8 @@ from .child_variables import COMPUTING, passed_on
 
 PROGRAM = "primdiffusion"
 """The backend's package, and its command line."""
+PATIENCE_S = 2.0
+"""How long a child that was asked to end may take."""
 SILENCE_S = 20.0
 """The child sends a heartbeat every 0.5 s; importing torch from a cold disk can hold it up for seconds."""
 LONGEST_POLL_GAP_S = 1.0
@@ -254,10 +256,10 @@ class BackendClient:
             self.request("shutdown", {})
             self._input.close()
 
-    def shutdown(self, timeout_s: float = 2.0) -> None:
-        """Ends the child politely, or by force after `timeout_s`; waits no longer than that. Safe to call twice."""
+    def shutdown(self) -> None:
+        """Ends the child politely, or by force after PATIENCE_S; waits no longer than that. Safe to call twice."""
         self.end()
-        if not self.gone_within(timeout_s):
+        if not self.gone_within(PATIENCE_S):
             self.kill()
 
     def kill(self, patience_s: float = 1.0) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from ..formats.json_files import parse_json
-from ..formats.regular_files import TooLargeError, open_regular
+from ..formats.regular_files import as_file_error, open_regular
 from ..formats.tensor_layout import check_limits, read_layout
 
 _LARGEST_FILE = 16 << 30
@@ -30,7 +30,7 @@ def read_vocabulary(path: Path) -> Vocabulary:
 
     Raises OSError for a file that cannot be read and ValueError for one that is no checkpoint.
     """
-    try:
+    with as_file_error(path, "is damaged or no checkpoint of a diffusion model", "choose another file"):
         with open_regular(path, _LARGEST_FILE) as file:
             layout = read_layout(file)
         check_limits(layout)
@@ -39,8 +39,4 @@ def read_vocabulary(path: Path) -> Vocabulary:
         scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree.get("scalars", {}).items()}
         if not all(abs(mean) <= _LARGEST_NUMBER and 0 < std <= _LARGEST_NUMBER for mean, std in scalars.values()):
             raise ValueError("a mean or standard deviation that no quantity has")
-    except TooLargeError:
-        raise
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is damaged or no checkpoint of a diffusion model: choose another file") from error
     return Vocabulary(categories, scalars)

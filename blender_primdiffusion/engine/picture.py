@@ -93,14 +93,12 @@ def scene_content(
     )
 
 
-def solids_file(
-    depsgraph: bpy.types.Depsgraph, folder: Path, space: bpy.types.SpaceView3D | None = None
-) -> Path | None:
+def solids_file(depsgraph: bpy.types.Depsgraph, folder: Path) -> Path | None:
     """The scene's solid objects as a file in `folder`; None where there are none or they are ignored."""
     mode = depsgraph.scene.primdiffusion_render.solids
     if mode == "IGNORED":
         return None
-    return stored(scene_solids(depsgraph, mode == "HOLDOUT", space), folder)
+    return stored(scene_solids(depsgraph, mode == "HOLDOUT"), folder)
 
 
 def world_colour(depsgraph: bpy.types.Depsgraph) -> tuple[float, float, float]:

@@ -169,6 +169,25 @@ class Reporting:
     """
 
     bl_options: set[str] = set()
+    described_by: tuple[str, ...] = ()
+    """Properties that say what a button does: of the first flag that is set, or of the enum, the description is the
+    tooltip; otherwise the docstring is."""
+
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        for name in cls.described_by:
+            value, prop = getattr(properties, name), properties.bl_rna.properties[name]
+            if value:
+                return (prop.enum_items[value] if isinstance(value, str) else prop).description
+        return str(cls.__doc__)
+
+    def given(self, name: str) -> bool:
+        """Whether a script or a button has set the property."""
+        return self.properties.is_property_set(name)
+
+    def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
+        """The operator's property if it is set, else the panel's."""
+        return getattr(self if self.given(name) else settings, name)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

@@ -18,6 +18,7 @@ from ..capture.picture_camera import aim_at_picture, picture_of, picture_view
 from ..formats.answers import FitPostureAnswer, ReconstructAnswer
 from ..formats.camera_rig import View
 from ..formats.json_files import read_json
+from ..formats.regular_files import as_file_error
 from ..motion.pose_library import check_posable
 from ..motion.posture import take_world_posture, world_posture
 from ..scene.blend_values import file_path
@@ -116,7 +117,7 @@ class Fitted:
 def read_fitted(path: Path, size: tuple[int, int]) -> Fitted:
     """Read the posture of one picture of `size`. Raises ValueError and OSError."""
     content = read_json(path)
-    try:
+    with as_file_error(f"the fitted pose {str(path)!r}", "cannot be read", "fit again"):
         camera = content["cameras"]["camera0000"]
         k, r, t = (np.asarray(camera[name], np.float64) for name in ("K", "R", "T"))
         return Fitted(
@@ -125,8 +126,6 @@ def read_fitted(path: Path, size: tuple[int, int]) -> Fitted:
             np.asarray(content["betas"], np.float64),
             View(k.reshape(3, 3), r.reshape(3, 3), t.reshape(3), *size),
         )
-    except (LookupError, TypeError, ValueError) as error:
-        raise ValueError(f"the fitted pose {str(path)!r} cannot be read ({error!s:.120}): fit again") from error
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..formats.arrays import MOST_BODY_VALUES, check_shapes, read_arrays
 from ..formats.body_layout import body_data, half_extents, read_layout, stencils
-from ..formats.regular_files import exists_in_its_folder
+from ..formats.regular_files import as_file_error, exists_in_its_folder
 from .human import BODY_FILE, person_file
 from .human_file import FileVersion, body_arrays, file_version, read_sizes
 from .shape import FIELDS, OPTIONAL_FIELDS, ShapeModel, faulty_field
@@ -40,7 +40,7 @@ def body_of_file(person: Path) -> ShapeModel:
 @functools.lru_cache(maxsize=4)
 def _read_body(file: FileVersion) -> ShapeModel:
     path = file.path
-    try:
+    with as_file_error(f"the body's file {str(path)!r}", "is damaged", "generate the human again"):
         arrays = body_arrays(path)
         if sum(values.size for values in arrays.values()) > MOST_BODY_VALUES:
             raise ValueError(f"it holds more than {MOST_BODY_VALUES} values")
@@ -49,10 +49,6 @@ def _read_body(file: FileVersion) -> ShapeModel:
         model = ShapeModel.from_arrays(arrays)
         if fault := faulty_field(model):
             raise ValueError(f"the field {fault!r} holds impossible values")
-    except (ValueError, KeyError, IndexError, OverflowError) as error:
-        raise ValueError(
-            f"the body's file {str(path)!r} is damaged ({error!s:.160}); generate the human again"
-        ) from error
     return model
 
 

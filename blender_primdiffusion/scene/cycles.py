@@ -13,7 +13,7 @@ from .blend_values import stored_text
 from .human import MARK, armature_of, humans, provenance_of, volumes_of
 from .shape import betas_of, has_custom_shape
 
-_SENSOR_MM = 36.0
+_FOCAL_MM, _SENSOR_MM = 70.0, 36.0
 _MARGIN = 1.05
 _FLESH_M = 0.08
 
@@ -24,7 +24,6 @@ def setup_cycles_preview(
     size: int = 384,
     samples: int = 1,
     yaw: float = 0.0,
-    focal_mm: float = 70.0,
     world: float | None = None,
 ) -> bpy.types.Object:
     """Make `scene` ready to render its humans as they are posed now, and return the camera, which frames them.
@@ -45,7 +44,7 @@ def setup_cycles_preview(
     scene.view_settings.view_transform = "Standard"
     scene.view_settings.look = "None"
     scene.world = _flat_world(0.0 if world is None else world)
-    scene.camera = new_camera(scene, focal_mm)
+    scene.camera = new_camera(scene)
     frame_box(scene.camera, extent, yaw)
     return scene.camera
 
@@ -91,10 +90,10 @@ def _flat_world(grey: float) -> bpy.types.World:
     return world
 
 
-def new_camera(scene: bpy.types.Scene, focal_mm: float = 70.0) -> bpy.types.Object:
+def new_camera(scene: bpy.types.Scene) -> bpy.types.Object:
     """A camera in the scene, at the origin until `frame_box` places it."""
     data = bpy.data.cameras.new("Preview Camera")
-    data.lens, data.sensor_width = focal_mm, _SENSOR_MM
+    data.lens, data.sensor_width = _FOCAL_MM, _SENSOR_MM
     camera = bpy.data.objects.new("Preview Camera", data)
     scene.collection.objects.link(camera)
     return camera

@@ -124,13 +124,13 @@ def state_of(collection: bpy.types.Collection) -> str:
     return hashlib.sha256((stored_text(collection, MARK) or "").encode()).hexdigest()[:12]
 
 
-def is_own(folder: Path, blend_path: str | None = None) -> bool:
-    """Whether a folder is one of a .blend's own: inside its `humans_folder`, or that of the unsaved one.
+def is_own(folder: Path) -> bool:
+    """Whether a folder is one of the .blend's own: inside its `humans_folder`, or that of the unsaved one.
 
     Volumes are written in these alone, wherever a .blend says that they are.
     """
     inner = real_path(folder)
-    return any(inner.is_relative_to(real_path(own)) for own in (humans_folder(blend_path), humans_folder("")))
+    return any(inner.is_relative_to(real_path(own)) for own in (humans_folder(), humans_folder("")))
 
 
 def home_of(collection: bpy.types.Collection) -> Path:

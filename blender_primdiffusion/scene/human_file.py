@@ -20,7 +20,7 @@ from ..formats import compact_human
 from ..formats.arrays import all_finite, check_shapes
 from ..formats.human_metadata import version_fault
 from ..formats.json_files import parse_json
-from ..formats.regular_files import read_regular
+from ..formats.regular_files import as_file_error, read_regular
 from ..formats.rotations import first_improper, improper_text
 from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, check_limits, read_layout
 from ..formats.whole_files import written_whole
@@ -66,11 +66,9 @@ class HumanTensors:
 def read_tensors(path: Path, remedy: str = GENERATE_AGAIN) -> HumanTensors:
     """Read a .human file. Raises ValueError, with this remedy, for a file of another kind or a damaged one, OSError."""
     data = read_regular(path, LARGEST_PERSON)
-    try:
+    with as_file_error(repr(path.name), "contains no human", remedy):
         layout = read_layout(io.BytesIO(data))
         check_limits(layout)
-    except ValueError as error:
-        raise ValueError(f"{path.name!r} contains no human ({error!s:.120}); {remedy}") from error
     if layout.metadata.get("format") != "primdiffusion.human":
         raise ValueError(f"{path.name!r} contains no human but something else; {remedy}")
     arrays = {name: (one.dtype, one.shape, layout.raw(data, name)) for name, one in layout.tensors.items()}
@@ -128,7 +126,7 @@ def payload_in(human: HumanTensors, name: str, remedy: str = GENERATE_AGAIN) -> 
     if fault := version_fault(human.metadata):
         raise ValueError(f"{name!r} {fault}")
     shapes = {field: shape for field, shape in _PAYLOAD.items() if field in human.arrays or field != "rest_half_extent"}
-    try:
+    with as_file_error(repr(name), "is damaged", remedy):
         stored = expanded(human).arrays
         if wrong := [field for field in shapes if stored[field][0] not in _FLOATS]:
             raise ValueError(f"{wrong[0]!r} holds no numbers")
@@ -140,8 +138,6 @@ def payload_in(human: HumanTensors, name: str, remedy: str = GENERATE_AGAIN) -> 
             raise ValueError(f"{wrong[0]!r} holds impossible values")
         if arrays["density"].min(initial=0) < 0:
             raise ValueError("'density' holds impossible values")
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{name!r} is damaged ({error!s:.120}); {remedy}") from error
     return HumanPayload(**{"rest_half_extent": None, **arrays})
 
 
@@ -179,10 +175,8 @@ def compacted(human: HumanTensors) -> HumanTensors:
     """The human with 8-bit colours and densities, a quarter of the size. Raises ValueError for a damaged file."""
     if compact_human.METADATA in human.metadata:
         return human
-    try:
+    with as_file_error("the human's file", "is damaged", GENERATE_AGAIN):
         rgb, density, scales = compact_human.compact(*(_loaded(*human.arrays[name]) for name in _EIGHT_BIT))
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"the human's file is damaged ({error!s:.160}); {GENERATE_AGAIN}") from error
     arrays = {
         name: ("U8", array.shape, array.tobytes()) for name, array in zip(_EIGHT_BIT, (rgb, density), strict=True)
     }
@@ -217,11 +211,9 @@ def motion_in(human: HumanTensors, name: str) -> HumanMotion | None:
     """The motion in a file of this name, if any. Raises ValueError where it is damaged."""
     if "motion" not in human.metadata:
         return None
-    try:
+    with as_file_error(f"the motion in {name!r}", "is damaged", CHOOSE_ANOTHER):
         fps = float(parse_json(human.metadata["motion"])["fps"])
         arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise ValueError(f"the motion in {name!r} is damaged ({error!s:.80}); {CHOOSE_ANOTHER}") from error
     frames = len(arrays[0]) if arrays[0].ndim else 0
     for array, shape in zip(arrays, _MOTION.values(), strict=True):
         if array.shape != tuple(frames if s == "F" else s for s in shape) or not all_finite(array):

@@ -10,11 +10,11 @@ MATERIAL_NAME = "PrimDiffusion Volume"
 GAIN_NODE = "Density Gain"
 
 
-def volume_material(gain: float = DENSITY_GAIN) -> bpy.types.Material:
+def volume_material() -> bpy.types.Material:
     """The shared material, made on first use.
 
-    With s = gain * density: emission of strength s and colour Cd, absorption of density s in black, so that a ray
-    integrates Cd s exp(-integral of s): premultiplied colour.
+    With s = gain * density, at first DENSITY_GAIN: emission of strength s and colour Cd, absorption of density s in
+    black, so that a ray integrates Cd s exp(-integral of s): premultiplied colour.
     """
     existing = bpy.data.materials.get(MATERIAL_NAME)
     if existing is not None and existing.node_tree is not None and GAIN_NODE in existing.node_tree.nodes:
@@ -35,7 +35,7 @@ def volume_material(gain: float = DENSITY_GAIN) -> bpy.types.Material:
     colour = node("ShaderNodeAttribute", -600, 200, attribute_name="Cd")
     density = node("ShaderNodeAttribute", -600, 0, attribute_name="density")
     factor = node("ShaderNodeValue", -600, -200, name=GAIN_NODE, label=GAIN_NODE)
-    factor.outputs[0].default_value = gain
+    factor.outputs[0].default_value = DENSITY_GAIN
     strength = node("ShaderNodeMath", -400, 0, operation="MULTIPLY")
     emission = node("ShaderNodeEmission", -200, 100)
     absorption = node("ShaderNodeVolumeAbsorption", -200, -100)

@@ -12,7 +12,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
+from ..formats.arrays import all_finite, check_shapes, read_arrays
+from ..formats.regular_files import as_file_error
 from ..formats.removing import OutsideFolderError, remove_file
 from .blend_values import stored_record
 from .human import VolumeWriteError, armature_of, copy_file, home_of, link_error, state_of, stored_path
@@ -58,14 +59,12 @@ class MergedState:
 
 def read_grid(path: Path) -> MergedGrid:
     """Read the child's file. Raises ValueError for a damaged one, OSError."""
-    try:
+    with as_file_error(f"the merged grid {path.name!r}", "is damaged", "merge again"):
         stored = read_arrays(path, tuple(_SHAPES))
         check_shapes(path, stored, _SHAPES, {})
         faulty = [name for name, values in stored.items() if not all_finite(values)]
         if faulty or not stored["voxel"] > 0:
-            raise ArrayFileError(f"{(faulty or ['voxel'])[0]!r} holds NaN or impossible numbers")
-    except ArrayFileError as error:
-        raise ValueError(f"the merged grid {path.name!r} is damaged ({error!s:.160}); merge again") from error
+            raise ValueError(f"{(faulty or ['voxel'])[0]!r} holds NaN or impossible numbers")
     return MergedGrid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
 
 

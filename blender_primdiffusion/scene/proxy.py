@@ -20,9 +20,9 @@ from mathutils import Color
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, all_finite, check_shapes, read_arrays
+from ..formats.arrays import all_finite, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
-from ..formats.regular_files import portable_name
+from ..formats.regular_files import as_file_error, portable_name
 from .armature import model_origin
 from .blend_values import as_numbers, stored_record
 from .body import shape_model_of
@@ -60,11 +60,9 @@ class ProxyMesh:
 def read_proxy(path: Path) -> ProxyMesh:
     """Read the child's proxy.npz. Raises ValueError for a damaged one, OSError."""
     sizes: dict[str, int] = {}
-    try:
+    with as_file_error(f"the mesh {path.name!r}", "is damaged", "export again"):
         arrays = read_arrays(path, ("format_version", "joint_names", *_SHAPES))
         check_shapes(path, arrays, _SHAPES, sizes)
-    except ArrayFileError as error:
-        raise ValueError(f"the mesh {path.name!r} is damaged ({error!s:.160}); export again") from error
     names = tuple(str(name) for name in arrays["joint_names"].ravel())
     if str(arrays["format_version"]) != str(_FORMAT_VERSION) or names != JOINT_NAMES:
         raise ValueError(f"the mesh {path.name!r} is of another version: use an add-on and a backend of one release")

@@ -27,7 +27,6 @@ from . import (
     export_panel,
     gallery,
     generate_panel,
-    handle_operators,
     human_panel,
     import_motion,
     jobs_panel,
@@ -37,19 +36,17 @@ from . import (
     pose_panel,
     preferences,
     reconstruct_panel,
-    render_operators,
     render_panel,
     shape_panel,
-    shape_settings,
     variations_panel,
     viewport_humans,
 )
 
 MODULES = (
     *backend_state.MODULES, preferences, windows, follow, jobs_panel, attributes,
-    generate_panel, variations_panel, human_panel, shape_settings, edit_panel, shape_panel, missing_files, copies,
-    deferred_volumes, import_motion, motion_panel, handle_operators, pose_panel, picture_panel, asset_operators,
-    render_operators, render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
+    generate_panel, variations_panel, human_panel, shape_panel, edit_panel, missing_files, copies,
+    deferred_volumes, import_motion, motion_panel, pose_panel, picture_panel, asset_operators,
+    render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
     captures_panel, reconstruct_panel, viewport_humans, picture_in_view, batch, manual, stand_in,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""

@@ -29,6 +29,7 @@ class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.mark_as_asset"
     bl_label = "Mark as Asset"
+    described_by = ("what",)
 
     what: bpy.props.EnumProperty(
         name="Mark",
@@ -43,10 +44,6 @@ class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
         subtype="FILE_PATH",
         options=SKIP,
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(text for name, _, text in _ITEMS if name == properties.what)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
         if self.what == "POSE":

@@ -24,12 +24,12 @@ def found() -> tuple[bool, str]:
     return (False, sentence(NOT_INSTALLED)) if named is None else (True, f"Uses {named[1]}, named by {named[0]}")
 
 
-def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
+def draw_set_up(layout: bpy.types.UILayout) -> bool:
     """For panels that need the backend: what to do where there is none. Returns whether there is one."""
     usable, line = found()
     if not usable:
         box = layout.box()
-        draw_lines(box, line, "ERROR", width)
+        draw_lines(box, line, "ERROR", _SIDEBAR)
         box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
     return usable
 

@@ -93,14 +93,11 @@ class PRIMDIFFUSION_OT_paint_region(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.paint_region"
     bl_label = "Paint Region"
     bl_options = {"UNDO"}
+    described_by = ("finish",)
 
     finish: bpy.props.BoolProperty(
         name="Finish", description="Return to Object mode and hide the body mesh; its vertex group stays", options=SKIP
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return properties.rna_type.properties["finish"].description if properties.finish else str(cls.__doc__)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.primdiffusion_edit
@@ -140,10 +137,6 @@ class _Edit(OnPerson):
         """The edit's parameters of the child's method: see `EditJob.asked`."""
         raise NotImplementedError
 
-    def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
-        """The operator's property if set, else the panel's."""
-        return getattr(self if self.properties.is_property_set(name) else settings, name)
-
 
 class _Region:
     """Operators with a region."""
@@ -157,8 +150,7 @@ class _Region:
         self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
     ) -> list[str] | dict[str, list[float]]:
         """Names of parts, or painted weights [V]."""
-        given = self.properties.is_property_set
-        if given("vertex_group") or (not given("parts") and settings.region == "PAINTED"):
+        if self.given("vertex_group") or (not self.given("parts") and settings.region == "PAINTED"):
             body = body_of(person)
             if body is None:
                 raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
@@ -206,8 +198,7 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         params: dict[str, Any] = {"region": self.region(settings, person), "seed": self.chosen("seed", settings)}
-        given = self.properties.is_property_set("attributes")
-        wanted = parsed(self.attributes) if given else asked(settings.attributes)
+        wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
         if wanted:
             params |= {"attributes": wanted, "guidance": self.chosen("guidance", context.scene.primdiffusion)}
         return params

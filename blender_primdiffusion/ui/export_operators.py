@@ -138,16 +138,7 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
 
 
-class _Export(OnPerson):
-    """Base of the exports; not redoable, since a redo slider must not start the job again."""
-
-    def chosen(self, context: bpy.types.Context, name: str):
-        """The operator's property if set, else the panel's."""
-        given = self.properties.is_property_set(name)
-        return getattr(self if given else context.scene.primdiffusion_export, name)
-
-
-class PRIMDIFFUSION_OT_export(_Export, bpy.types.Operator):
+class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
     """Export the selected human: for another scene, as a textured mesh, as Gaussians, as volumes"""
 
     bl_idname = "primdiffusion.export"
@@ -179,9 +170,10 @@ class PRIMDIFFUSION_OT_export(_Export, bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        self.format = self.chosen(context, "format")
+        settings = context.scene.primdiffusion_export
+        self.format = self.chosen("format", settings)
         for name in OPTIONS[self.format]:
-            value = self.chosen(context, name)
+            value = self.chosen(name, settings)
             setattr(self, name, int(value) if name == "texture_px" else value)
         if not self.filepath:
             self.filepath = bpy.path.clean_name(person.name) + ENDINGS[self.format][0]
@@ -213,39 +205,39 @@ class PRIMDIFFUSION_OT_export(_Export, bpy.types.Operator):
     def _format(self, context: bpy.types.Context) -> str:
         ending = Path(self.filepath).suffix.lower()
         by_ending = next((kind for kind, endings in ENDINGS.items() if ending in endings), None)
-        given = self.properties.is_property_set("format")
-        return self.format if given else by_ending or self.chosen(context, "format")
+        panel = context.scene.primdiffusion_export
+        return self.format if self.given("format") else by_ending or panel.format
 
     def _write_human(self, context: bpy.types.Context, person: bpy.types.Collection, path: Path) -> set[str]:
-        frames = scene_frames(context.scene, True) if self.chosen(context, "motion") else None
-        write_human(context, person, path, frames, compact=self.chosen(context, "compact"))
+        settings = context.scene.primdiffusion_export
+        frames = scene_frames(context.scene, True) if self.chosen("motion", settings) else None
+        write_human(context, person, path, frames, compact=self.chosen("compact", settings))
         self.report({"INFO"}, f"Exported {person.name} to {path.name}")
         return {"FINISHED"}
 
     def _job(self, context: bpy.types.Context, person: bpy.types.Collection, kind: str, path: Path) -> Job:
         """What writes a mesh, Gaussians or volumes. Raises ValueError."""
-        target = HumanTarget.of(person)
+        target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
         if kind == "PLY":
-            return ExportGaussiansJob(target, path, posed_now(context, person), self.chosen(context, "gaussians"))
+            return ExportGaussiansJob(target, path, posed_now(context, person), self.chosen("gaussians", settings))
         if kind == "VDB":
             first, last = self._frames(context.scene)
             people = posed_frames(context, person, range(first, last + 1))
-            return ExportVdbSequenceJob(target, path.parent, path.stem, people, first, self.chosen(context, "voxel"))
+            return ExportVdbSequenceJob(target, path.parent, path.stem, people, first, self.chosen("voxel", settings))
         check_ready(armature_of(person))
-        px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
-        frames = scene_frames(context.scene, self.chosen(context, "animation"))
+        px, triangles = int(self.chosen("texture_px", settings)), self.chosen("triangles", settings)
+        frames = scene_frames(context.scene, self.chosen("animation", settings))
         return ExportMeshJob(target, px, triangles, path, kind, frames)
 
     def _frames(self, scene: bpy.types.Scene) -> tuple[int, int]:
-        given = self.properties.is_property_set
-        first = self.first if given("first") else scene.frame_start
-        last = self.last if given("last") else scene.frame_end
+        first = self.first if self.given("first") else scene.frame_start
+        last = self.last if self.given("last") else scene.frame_end
         if last < first:
             raise ValueError(f"the last frame {last} is before the first, {first}: swap them")
         return first, last
 
 
-class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
+class PRIMDIFFUSION_OT_add_proxy(OnPerson, bpy.types.Operator):
     """Add a textured mesh of the selected human that follows the armature: fast in any viewport and engine"""
 
     bl_idname = "primdiffusion.add_proxy"
@@ -255,13 +247,13 @@ class PRIMDIFFUSION_OT_add_proxy(_Export, bpy.types.Operator):
     triangles: not_given(ProxyRequest, "triangles")
 
     def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
-        target = HumanTarget.of(person)
+        target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
         check_ready(armature_of(person))
-        px, triangles = int(self.chosen(context, "texture_px")), self.chosen(context, "triangles")
+        px, triangles = int(self.chosen("texture_px", settings)), self.chosen("triangles", settings)
         return submit(self, context, AddProxyJob(target, px, triangles))
 
 
-class PRIMDIFFUSION_OT_show_proxy(_Export, bpy.types.Operator):
+class PRIMDIFFUSION_OT_show_proxy(OnPerson, bpy.types.Operator):
     """Choose how the selected human is shown: as volumes or as the mesh proxy; or remove the mesh proxy"""
 
     bl_idname = "primdiffusion.show_proxy"
@@ -307,7 +299,7 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
         if not self.filepath or not path.is_file():
             raise FileNotFoundError(f"there is no file {str(path)!r}: choose a .human file")
         motion_in(read_tensors(path, CHOOSE_ANOTHER), path.name)
-        at = tuple(self.location) if self.properties.is_property_set("location") else None
+        at = tuple(self.location) if self.given("location") else None
         return submit(self, context, ImportHumanJob(str(path), at))
 
 

@@ -121,18 +121,13 @@ class GenerateOptions(Reporting):
         options=SKIP,
     )
 
-    def given(self, name: str) -> bool:
-        """Whether a script or a button has set the property."""
-        return self.properties.is_property_set(name)
-
     def sampling(self, settings: bpy.types.PropertyGroup) -> dict[str, Any]:
         """Fields of `GenerateRequest` besides the seed. Raises ValueError for attributes that are not name=value."""
         wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
-        guidance = self.guidance if self.given("guidance") else settings.guidance
         return {
             "steps": self.steps or settings.steps,
-            "sampler": self.sampler if self.given("sampler") else settings.sampler,
-            "guidance": guidance,
+            "sampler": self.chosen("sampler", settings),
+            "guidance": self.chosen("guidance", settings),
             **({"attributes": wanted} if wanted else {}),
         }
 

@@ -22,6 +22,7 @@ from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
 from .backend_state import being_set_up, cancel_set_up
 from .captures_session import captures
+from .declared import SKIP
 from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
 
 TEXT = "PrimDiffusion Diagnostics"
@@ -143,34 +144,26 @@ class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
         return {"FINISHED"}
 
 
-_SKIP = {"SKIP_SAVE"}
-_CAPTURES = "Stop rendering; finished pictures stay, and the next run resumes from them"
-_SET_UP = "Stop; the next Set Up Backend uses what was downloaded"
-
-
 class PRIMDIFFUSION_OT_cancel(Reporting, bpy.types.Operator):
     """Stop this job, or remove it from the queue; nothing is added to the scene"""
 
     bl_idname = "primdiffusion.cancel"
     bl_label = "Cancel"
+    described_by = ("what",)
 
     what: bpy.props.EnumProperty(
         name="Cancel",
         description="What to stop",
         items=[
             ("JOB", "Job", "Stop this job, or remove it from the queue; nothing is added to the scene"),
-            ("CAPTURES", "Captures", _CAPTURES),
-            ("SET_UP", "Set-Up", _SET_UP),
+            ("CAPTURES", "Captures", "Stop rendering; finished pictures stay, and the next run resumes from them"),
+            ("SET_UP", "Set-Up", "Stop; the next Set Up Backend uses what was downloaded"),
         ],
-        options=_SKIP,
+        options=SKIP,
     )
     number: bpy.props.IntProperty(
-        name="Number", description="Number of the queued job; 0 is the running one", min=0, options=_SKIP
+        name="Number", description="Number of the queued job; 0 is the running one", min=0, options=SKIP
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return {"CAPTURES": _CAPTURES, "SET_UP": _SET_UP}.get(properties.what, str(cls.__doc__))
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:
@@ -200,7 +193,7 @@ class PRIMDIFFUSION_OT_try_again(Reporting, bpy.types.Operator):
     bl_label = "Try Again"
 
     kind: bpy.props.StringProperty(
-        name="Kind", description="Kind of job, such as generate; empty: the last one that ended", options=_SKIP
+        name="Kind", description="Kind of job, such as generate; empty: the last one that ended", options=SKIP
     )
 
     @classmethod

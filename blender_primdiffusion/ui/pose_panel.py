@@ -28,10 +28,10 @@ from ..motion.pose_library import (
 )
 from ..motion.poses import LIBRARY
 from ..places import own_folder
-from ..scene.handles import handles_from_joints, joints_from_handles
+from ..scene.handles import add_handles, bake_handles, handles_from_joints, has_handles, joints_from_handles
+from .declared import SKIP
 from .drawing import SidebarPanel, property_columns
-from .handle_operators import draw_handles
-from .on_person import OnArmature, may_have_joints, warn_of_rest
+from .on_person import OnArmature, may_have_joints, target_armature, warn_of_rest
 
 _PICTURES = Path(__file__).parents[1] / "motion" / "data" / "thumbnails"
 _collections: list = []
@@ -97,36 +97,29 @@ def free() -> None:
         previews.remove(_collections.pop())
 
 
+_AMOUNT = bpy.props.FloatProperty(
+    name="Amount", description="Strength of the pose: 0 none, 1 full", default=1.0, min=0.0, max=1.0, subtype="FACTOR"
+)
+_MIRROR = bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
+_ONLY_SELECTED = bpy.props.BoolProperty(
+    name="Only Selected Bones", description="Change only the selected bones", default=False
+)
+
+
 class PRIMDIFFUSION_PG_motion(bpy.types.PropertyGroup):
     """Motion settings of a scene."""
 
     pose: bpy.props.EnumProperty(name="Pose", description="The pose to apply", items=pose_items)
-    amount: bpy.props.FloatProperty(
-        name="Amount",
-        description="Strength of the pose: 0 none, 1 full",
-        default=1.0,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
-    mirror: bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
-    only_selected: bpy.props.BoolProperty(
-        name="Only Selected Bones",
-        description="Change only the selected bones",
-        default=False,
-    )
-
-
-_SKIP = {"SKIP_SAVE"}
+    amount: _AMOUNT
+    mirror: _MIRROR
+    only_selected: _ONLY_SELECTED
 
 
 class _Posing(OnArmature):
     """Base of the operators that change a pose."""
 
     bl_options = {"REGISTER", "UNDO"}
-    only_selected: bpy.props.BoolProperty(
-        name="Only Selected Bones", description="Change only the selected bones", default=False
-    )
+    only_selected: _ONLY_SELECTED
 
     def joints(self, armature: bpy.types.Object) -> list[str]:
         """Which to change. Raises ValueError where none is selected."""
@@ -173,27 +166,17 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
 
     bl_idname = "primdiffusion.apply_pose"
     bl_label = "Apply Pose"
+    described_by = ("what",)
 
-    what: bpy.props.EnumProperty(name="Pose To Apply", description="Which pose", items=_POSES, options=_SKIP)
+    what: bpy.props.EnumProperty(name="Pose To Apply", description="Which pose", items=_POSES, options=SKIP)
     pose_name: bpy.props.StringProperty(
-        name="Pose", description="Name of the pose in the library; empty: the panel's", options=_SKIP
+        name="Pose", description="Name of the pose in the library; empty: the panel's", options=SKIP
     )
-    amount: bpy.props.FloatProperty(
-        name="Amount",
-        description="Strength of the pose: 0 none, 1 full",
-        default=1.0,
-        min=0.0,
-        max=1.0,
-        subtype="FACTOR",
-    )
-    mirror: bpy.props.BoolProperty(name="Mirror", description="Swap left and right", default=False)
+    amount: _AMOUNT
+    mirror: _MIRROR
     ground: bpy.props.BoolProperty(
         name="Feet on the Floor", description="Move the body down until the feet are on the floor", default=True
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(text for name, _, text in _POSES if name == properties.what)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         if self.what != "LIBRARY":
@@ -202,8 +185,7 @@ class PRIMDIFFUSION_OT_apply_pose(_Posing, bpy.types.Operator):
         if not self.pose_name:
             self.pose_name = settings.pose
         for name in ("amount", "mirror", "only_selected"):
-            if not self.properties.is_property_set(name):
-                setattr(self, name, getattr(settings, name))
+            setattr(self, name, self.chosen(name, settings))
         return self.execute(context)
 
     def draw(self, _context: bpy.types.Context) -> None:
@@ -259,20 +241,16 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
 
     bl_idname = "primdiffusion.save_pose"
     bl_label = "Save Pose"
+    described_by = ("delete",)
 
     pose_name: bpy.props.StringProperty(
-        name="Name", description="Name of the new pose, or of the one to delete", default="My Pose", options=_SKIP
+        name="Name", description="Name of the new pose, or of the one to delete", default="My Pose", options=SKIP
     )
     delete: bpy.props.BoolProperty(
         name="Delete",
         description="Delete the chosen pose from your own poses in the library, for all .blend files",
-        options=_SKIP,
+        options=SKIP,
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        told = properties.rna_type.properties["delete"].description if properties.delete else str(cls.__doc__)
-        return told
 
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         if self.delete:
@@ -303,7 +281,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
 
     def _delete(self, settings: PRIMDIFFUSION_PG_motion) -> set[str]:
         """One of the user's own poses: the one named, else the panel's. A file cannot be undone."""
-        name = self.pose_name if self.properties.is_property_set("pose_name") else settings.pose
+        name = self.pose_name if self.given("pose_name") else settings.pose
         own = own_poses(poses_folder())
         if name not in own:
             raise ValueError(f"{name!r} is not one of your own poses: only those can be deleted")
@@ -314,6 +292,43 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
             raise OSError(f"{str(own[name])!r} could not be deleted ({error.strerror or error})") from error
         settings.property_unset("pose")
         return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_add_handles(OnArmature, bpy.types.Operator):
+    """Add handles that hold hands and feet where they are (IK), and poles that elbows and knees point to"""
+
+    bl_idname = "primdiffusion.add_handles"
+    bl_label = "Add IK Handles"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        check_posable(armature)
+        add_handles(context, armature)
+        warn_of_rest(self, armature)
+        return {"FINISHED"}
+
+
+class PRIMDIFFUSION_OT_bake_handles(OnArmature, bpy.types.Operator):
+    """Turn the joints as the IK handles show, on every frame where the pose is animated, and remove the handles"""
+
+    bl_idname = "primdiffusion.bake_handles"
+    bl_label = "Bake and Remove Handles"
+    bl_options = {"REGISTER", "UNDO"}
+
+    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+        check_posable(armature)
+        bake_handles(context, armature)
+        return {"FINISHED"}
+
+
+def draw_handles(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """The button that adds handles, or the one that bakes them."""
+    try:
+        armature = target_armature(context)
+    except ValueError:
+        return
+    name = "bake_handles" if has_handles(armature) else "add_handles"
+    layout.operator(f"primdiffusion.{name}", icon="CON_KINEMATIC")
 
 
 class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):

@@ -111,14 +111,11 @@ class PRIMDIFFUSION_OT_set_up_engine(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.set_up_engine"
     bl_label = "Set Up Engine"
     bl_options = {"UNDO"}
+    described_by = ("engine",)
 
     engine: bpy.props.EnumProperty(
         name="Engine", description="What renders humans", items=_ENGINES, options={"SKIP_SAVE"}
     )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return next(text for name, _, text in _ENGINES if name == properties.engine)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         """Camera, world, film and bounces of light between other objects stay as they are."""

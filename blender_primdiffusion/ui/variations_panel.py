@@ -77,6 +77,7 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
 
     bl_idname = "primdiffusion.variations"
     bl_label = "Show Variations"
+    described_by = ("clear", "like")
 
     count: bpy.props.IntProperty(
         name="Count", default=0, min=0, max=64, description="How many humans; 0: the panel's", options=SKIP
@@ -92,12 +93,6 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
         name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=SKIP
     )
 
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        told = "clear" if properties.clear else "like" if properties.like else ""
-        text = properties.rna_type.properties[told].description if told else str(cls.__doc__)
-        return text
-
     def act(self, context: bpy.types.Context) -> set[str]:
         """A seed given by a script is the first of `count`."""
         if self.clear:
@@ -107,7 +102,7 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
         sampling, like = self._sampling_of_sheet(context), {}
         if self.like:
             around = _only(_targets(self.index), "select only the one to vary")
-            amount = self.amount if self.given("amount") else context.scene.primdiffusion_variations.amount
+            amount = self.chosen("amount", context.scene.primdiffusion_variations)
             like = {"person": str(around.person), "amount": amount, "title": f"Like seed {around.seed}"}
         from_panel = context.scene.primdiffusion_variations.seeds != "RANDOM" and not self.like
         first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
@@ -180,6 +175,7 @@ class PRIMDIFFUSION_OT_set_seed(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.set_seed"
     bl_label = "Set Seed"
     bl_options = {"UNDO"}
+    described_by = ("to",)
 
     to: bpy.props.EnumProperty(
         name="To",
@@ -191,10 +187,6 @@ class PRIMDIFFUSION_OT_set_seed(Reporting, bpy.types.Operator):
         options=SKIP,
     )
     index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return _OF_VARIATION if properties.to == "VARIATION" else str(cls.__doc__)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.primdiffusion

@@ -2,7 +2,6 @@
 
 import functools
 import json
-import os
 import sys
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from primdiffusion.diffusion.unet import UNetConfig
 from primdiffusion.training import diffusion_task, losses, slabs
 from primdiffusion.training.config import CodecConfig, PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import train
-from primdiffusion.training.run_folder import METRICS
+from support.runs import rows
 
 TINY_UNET = UNetConfig(width=32, multipliers=(1, 1, 1, 1, 1), blocks=1, heads=2)
 DEFAULT_FILES = {".lock", "config.json", "run.json", "metrics.jsonl", "pictures", "model.safetensors",
@@ -48,21 +47,9 @@ def settings(people: Path, run: Path, **changes) -> TrainingConfig:
     return TrainingConfig(data=people, run=run, **{**quick, **changes})
 
 
-def rows(run: Path) -> list[dict]:
-    """Of metrics.jsonl."""
-    return [json.loads(line) for line in (run / METRICS).read_text().splitlines()]
-
-
 def logged(run: Path) -> list[tuple[str, int]]:
     """Phases and steps of the lines that tell the loss."""
     return [(row["phase"], row["step"]) for row in rows(run) if "loss" in row]
-
-
-def child_environment() -> dict[str, str]:
-    """For processes that import this file."""
-    folder = Path(__file__).parent
-    paths = (folder, folder.parent, os.environ.get("PYTHONPATH", ""))
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
 
 
 if __name__ == "__main__":  # a run in a process of its own

@@ -4,8 +4,6 @@ import contextlib
 import dataclasses
 import functools
 import itertools
-import json
-import os
 from pathlib import Path
 from unittest import mock
 
@@ -17,14 +15,13 @@ from PIL import Image
 from primdiffusion.body.model import default_body
 from primdiffusion.cli import main
 from primdiffusion.encoder.config import PRESETS
-from primdiffusion.failures import describe
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.training import fit as fit_module
 from primdiffusion.training.fit import MODEL
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.loop import Interrupt
 from primdiffusion.training.run_folder import METRICS
-from safetensors.torch import load_file
+from support.runs import rows
 from tiny_encoder import TINY
 
 STATE = "state.safetensors"
@@ -57,27 +54,9 @@ def settings(data: Path, run: Path, **changes) -> FitConfig:
     return FitConfig(data=data, run=run, **{**FEW, "threads": 1, "learning_rate": 1e-4, **changes})
 
 
-def rows(run: Path) -> list[dict]:
-    """Of metrics.jsonl."""
-    return [json.loads(line) for line in (run / METRICS).read_text().splitlines()]
-
-
 def logged(run: Path) -> list[int]:
     """Steps of the lines that tell the loss."""
     return [row["step"] for row in rows(run) if "rgb" in row]
-
-
-def same_tensors(one: Path, other: Path) -> bool:
-    """Whether two safetensors files hold the same, bit for bit."""
-    a, b = load_file(one), load_file(other)
-    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
-
-
-def child_environment() -> dict[str, str]:
-    """For processes that import this file."""
-    folder = Path(__file__).parent
-    paths = (folder, folder.parent, os.environ.get("PYTHONPATH", ""))
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths)), "OMP_NUM_THREADS": "1"}
 
 
 def files(run: Path) -> set[str]:
@@ -89,14 +68,6 @@ def flags(config: FitConfig) -> list[str]:
     """A command line for it, as far as it is of `settings`."""
     names = ("data", "run", *FEW, "threads", "learning_rate", "save_every")
     return [f"--{name.replace('_', '-')}={getattr(config, name)}" for name in names]
-
-
-def sentence(error: BaseException) -> str:
-    """What the command line would print; a defect has none."""
-    failure = describe(error)
-    assert failure is not None
-    assert "\n" not in str(failure)
-    return str(failure)
 
 
 def patched_person() -> TexturedMesh:

@@ -4,7 +4,8 @@ import chain
 import numpy as np
 import pytest
 import torch
-from primdiffusion.evaluation.image_metrics import compare_detail, detail_energy, figure_psnr, overlap
+from figure_metrics import compare_detail, detail_energy, figure_psnr
+from primdiffusion.evaluation.image_metrics import overlap
 from primdiffusion.primitives.primitives import K, Payload
 from scipy import ndimage
 

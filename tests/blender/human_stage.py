@@ -42,6 +42,12 @@ def make_earlier(person) -> None:
     bpy.context.view_layer.update()
 
 
+def strong_pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations [24, 3, 3] far from rest, and a translation [3]."""
+    rng = np.random.default_rng(seed)
+    return synthetic.axis_angle(rng.normal(0, 0.7, (24, 3))), rng.normal(0, 0.5, 3)
+
+
 def named(name="Anna"):
     return bpy.data.collections[name]
 

@@ -52,7 +52,8 @@ def test_each_thing_that_an_operator_does_has_its_own_tooltip(addon):
     several = 0
     for cls in classes(bpy.types.Operator):
         told = []
-        for given in ways(cls.bl_idname.partition(".")[2]) if hasattr(cls, "description") else ():
+        differ = getattr(cls, "described_by", ()) or "description" in vars(cls)
+        for given in ways(cls.bl_idname.partition(".")[2]) if differ else ():
             properties = bpy.context.window_manager.operator_properties_last(cls.bl_idname)
             for name, value in given.items():
                 setattr(properties, name, value)

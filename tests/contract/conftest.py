@@ -4,6 +4,7 @@ import textwrap
 from pathlib import Path
 
 import pytest
+from conversation import Conversation
 from tiny_model import SLOW, save_tiny_checkpoint
 from waiting import PYTHON
 
@@ -19,6 +20,14 @@ def checkpoint(tmp_path_factory) -> Path:
 def slow_checkpoint(tmp_path_factory) -> Path:
     """The same people, in steps that take long enough to interrupt `BUSY_STEPS` of them on any machine."""
     return save_tiny_checkpoint(tmp_path_factory.mktemp("slow_checkpoint") / "slow.safetensors", SLOW)
+
+
+@pytest.fixture(scope="module")
+def child():
+    """A real child, which is asked line by line."""
+    child = Conversation()
+    yield child
+    child.close()
 
 
 @pytest.fixture

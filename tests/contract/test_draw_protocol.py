@@ -17,13 +17,6 @@ ids = itertools.count(1)
 
 
 @pytest.fixture(scope="module")
-def child():
-    child = Conversation()
-    yield child
-    child.close()
-
-
-@pytest.fixture(scope="module")
 def person(tmp_path_factory) -> tuple[str, Human]:
     human = generate(tiny_model(), seed=3, steps=2)
     path = tmp_path_factory.mktemp("person") / "a ü.human.safetensors"

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from conversation import BUSY_STEPS, Conversation
+from conversation import BUSY_STEPS
 from editing_people import anybody
 from primdiffusion.editing.regions import region_from_weights, region_of
 from primdiffusion.human_file import load_human, save_human
@@ -13,13 +13,6 @@ from tiny_model import VOCABULARY
 
 CANCELLED, DOMAIN_ERROR, INVALID_PARAMS = -32001, -32002, -32602
 RESULTS = ("person", "preview", "side", "depth")
-
-
-@pytest.fixture(scope="module")
-def child():
-    child = Conversation()
-    yield child
-    child.close()
 
 
 @pytest.fixture(scope="module")

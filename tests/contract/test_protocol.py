@@ -13,13 +13,6 @@ from primdiffusion.human_file import load_human
 CANCELLED, DOMAIN_ERROR = -32001, -32002
 
 
-@pytest.fixture(scope="module")
-def child():
-    child = Conversation()
-    yield child
-    child.close()
-
-
 @pytest.fixture
 def own_child():
     child = Conversation()

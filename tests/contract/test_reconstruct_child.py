@@ -4,7 +4,6 @@ from pathlib import Path
 
 import pytest
 from capture_scenes import captured
-from conversation import Conversation
 from primdiffusion.human_file import load_human
 from tiny_encoder import save_tiny_encoder
 
@@ -20,13 +19,6 @@ def encoder(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def captures(tmp_path_factory) -> Path:
     return captured(tmp_path_factory.mktemp("captures"), frames=2, passes=("img", "mask"))
-
-
-@pytest.fixture(scope="module")
-def child():
-    child = Conversation()
-    yield child
-    child.close()
 
 
 @pytest.fixture

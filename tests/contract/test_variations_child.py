@@ -2,15 +2,7 @@
 
 from pathlib import Path
 
-import pytest
-from conversation import BUSY_STEPS, Conversation
-
-
-@pytest.fixture(scope="module")
-def child():
-    child = Conversation()
-    yield child
-    child.close()
+from conversation import BUSY_STEPS
 
 
 def test_variations_name_each_picture_as_it_appears_and_whom_it_shows(child, checkpoint, tmp_path):

@@ -6,7 +6,7 @@ import dataclasses
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 from tqdm import tqdm
@@ -29,7 +29,8 @@ from primdiffusion.evaluation.gallery import (
 from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real
 from primdiffusion.evaluation.image_metrics import load_lpips
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary
-from primdiffusion.formats.requests import Sampling
+from primdiffusion.formats.requests import Count, Sampling
+from primdiffusion.formats.schema import Range, check
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.human import generate, place
 from primdiffusion.people.assets import open_assets
@@ -51,7 +52,7 @@ class EvaluateReconstruction:
     """Folder of captures."""
     checkpoint: Path | None = None
     """Trained encoder (.safetensors); the default one if omitted."""
-    people: int = 0
+    people: Annotated[int, Range(0)] = 0
     """Number of humans, in the order of their names; 0: all."""
     views: int = 8
     """Number of cameras given to the encoder, spread around the human."""
@@ -70,8 +71,7 @@ class EvaluateReconstruction:
         Raises:
             ValueError, FileNotFoundError: captures, checkpoint or weights are missing, damaged or do not fit.
         """
-        if self.people < 0:
-            raise ValueError(f"people is {self.people}: choose 1 or more, or 0 for all")
+        check(self)
         captures = open_captures(self.captures)
         names = captures.subjects[: self.people or None]
         settings = EvaluationSettings(names, given_views=self.views, given_frame=self.frame, size=self.size)
@@ -112,7 +112,7 @@ class EvaluateGeneration:
     detail which payloads lack counts too. Without them it is renders of the payloads."""
     checkpoint: Path | None = None
     """Model (.safetensors); the default one if omitted."""
-    count: int = 256
+    count: Count = 256
     """Number of humans to generate, from successive seeds."""
     first_seed: int = 0
     """The first seed."""
@@ -132,6 +132,7 @@ class EvaluateGeneration:
         Raises:
             ValueError, FileNotFoundError: people or checkpoint are missing, damaged or too few.
         """
+        check(self)
         if self.tables.table is not None:
             generated = Generated(self.checkpoint, self.first_seed, self.count, self.steps)
             record, text = measure(self.tables, generated, self.assets)

@@ -54,6 +54,7 @@ from primdiffusion.evaluation.tables import (
     remarks,
     table,
 )
+from primdiffusion.formats.requests import Count
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
@@ -75,9 +76,9 @@ class TableOptions:
     """Folder of generated pictures of anybody, instead of a checkpoint's: square, over white or with alpha."""
     real: Path | None = None
     """Folder of real pictures; without it, renders of the meshes of MakeHuman's --assets."""
-    poses: int = 5
+    poses: Count = 5
     """Number of poses of each human: near T, then those of --motion, or built-in ones."""
-    views: int = 4
+    views: Count = 4
     """Number of views of each pose, evenly around the human."""
     motion: tuple[Path, ...] = ()
     """Pose files (AMASS and others) to choose poses from."""
@@ -97,9 +98,9 @@ class TableOptions:
     """What the depth network predicts."""
     resize: Resize = "torch-fidelity"
     """How pictures reach the size of Inception and CLIP."""
-    kid_subsets: int = 100
+    kid_subsets: Count = 100
     """Number of random subsets for KID."""
-    kid_subset_size: int = 1000
+    kid_subset_size: Count = 1000
     """Pictures of each subset."""
     kid_seed: int = 2020
     """Seed of the subsets; torch-fidelity's default."""
@@ -122,11 +123,6 @@ def measure(options: TableOptions, generated: Generated, assets: Path | None) ->
         ValueError, FileNotFoundError: files are missing, damaged or of other networks, or there are too few pictures.
         ImportError: an ONNX file is named and onnxruntime is not installed.
     """
-    for name in ("poses", "views", "kid_subsets", "kid_subset_size"):
-        if getattr(options, name) < 1:
-            raise ValueError(f"--{name.replace('_', '-')} is {getattr(options, name)}: give 1 or more")
-    if generated.count < 1:
-        raise ValueError(f"--count is {generated.count}: give 1 or more")
     poses = choose_poses([read_motion(path) for path in options.motion], options.poses, 0)
     grid = generated.count * options.poses * options.views
     check_counts(

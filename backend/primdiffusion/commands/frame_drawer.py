@@ -19,6 +19,7 @@ from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.formats.answers import DrawAnswer
 from primdiffusion.formats.arrays import read_numbers
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.requests import DrawRequest
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.human import Human, place_skinned
@@ -197,14 +198,10 @@ def _frozen(value: Any) -> Any:
 def _load_solids(file: Stamp) -> Solids:
     """Raise ValueError, naming the file, for an invalid file."""
     path = file[0]
-    try:
+    with as_file_error(path, "holds no solids", "it needs corners [F, 3, 3], colour [F, 3], holdout [F]"):
         arrays = read_numbers(path, ("corners", "colour", "holdout"))
         return Solids(
             np.ascontiguousarray(arrays["corners"], np.float32),
             np.ascontiguousarray(arrays["colour"], np.float32),
             np.ascontiguousarray(arrays["holdout"], np.bool_),
         )
-    except ValueError as e:
-        raise ValueError(
-            f"{path} holds no solids ({e!s:.160}): it needs corners [F, 3, 3], colour [F, 3], holdout [F]"
-        ) from e

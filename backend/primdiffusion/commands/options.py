@@ -212,11 +212,9 @@ class ServeCommand:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PeopleCommand:
-    """Make dressed, rigged humans as glTF files, from which captures are rendered."""
+class MadePeople:
+    """Fields of commands that make humans from assets."""
 
-    out: Path
-    """Folder to write person_NNNNNN/person.glb and manifest.json into; complete ones are skipped."""
     assets: Path | None = None
     """MakeHuman asset folder (CC0); the default is the environment variable PRIMDIFFUSION_ASSETS."""
     count: Count = 100
@@ -224,11 +222,19 @@ class PeopleCommand:
     seed: Seed = 0
     """Seed of the first human; the others have the following seeds."""
     workers: Count = os.cpu_count() or 1
-    """Processes; each needs a core and about 1 GB."""
+    """Processes; each needs a core and about 1.5 GB."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class PayloadsCommand:
+class PeopleCommand(MadePeople):
+    """Make dressed, rigged humans as glTF files, from which captures are rendered."""
+
+    out: Path
+    """Folder to write person_NNNNNN/person.glb and manifest.json into; complete ones are skipped."""
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class PayloadsCommand(MadePeople):
     """Make dressed humans as primitives: the training set of the diffusion model.
 
     `payloads encode` makes them from captures instead; `payloads pack` stores either in few files, whose checksums
@@ -237,19 +243,11 @@ class PayloadsCommand:
 
     out: Path
     """Folder to write person_NNNNNN.npz into; complete ones are skipped."""
-    assets: Path | None = None
-    """MakeHuman asset folder (CC0); the default is the environment variable PRIMDIFFUSION_ASSETS."""
-    count: Count = 100
-    """Number of humans."""
     variants: Count = 4
     """Colourings of each human."""
-    seed: Seed = 0
-    """Seed of the first human; the others have the following seeds."""
     making: Making = "fitted"
     """fitted: the primitives are fitted to renders of the mesh, about 30 s per human and core; from_mesh: each voxel
     takes the colour of the nearest surface point, 2 s, blurred."""
-    workers: Count = os.cpu_count() or 1
-    """Processes; each needs a core and about 1.5 GB."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

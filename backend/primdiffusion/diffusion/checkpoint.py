@@ -28,7 +28,7 @@ from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import JsonError, parse_json
-from primdiffusion.formats.regular_files import FileError, TooLargeError, open_regular, read_regular
+from primdiffusion.formats.regular_files import FileError, as_file_error, open_regular, read_regular
 from primdiffusion.formats.schema import FieldError, Open, Range, read
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
@@ -359,16 +359,8 @@ def _check_format(path: Path, metadata: Mapping[str, str], formats: Sequence[str
         )
 
 
-@contextlib.contextmanager
-def _damage_named(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except TooLargeError:
-        raise
-    except (ValueError, OSError) as error:
-        raise FileError(
-            path, f"is damaged or no safetensors file ({error!s:.160})", "download or train it again"
-        ) from error
+def _damage_named(path: Path) -> contextlib.AbstractContextManager[None]:
+    return as_file_error(path, "is damaged or no safetensors file", "download or train it again", OSError)
 
 
 def check_finite(path: Path, tensors: Mapping[str, Tensor]) -> None:

@@ -37,10 +37,10 @@ class TimeEmbedding(nn.Sequential):
         return super().forward(step_features(t, self.features).to(next(self.parameters()).dtype))
 
 
-def step_features(t: Int[Tensor, "b"], features: int, longest: float = 10_000.0) -> Float[Tensor, "b features"]:
-    """cos and sin of t at `features` / 2 frequencies falling geometrically from 1 to 1 / `longest`."""
+def step_features(t: Int[Tensor, "b"], features: int) -> Float[Tensor, "b features"]:
+    """cos and sin of t at `features` / 2 frequencies falling geometrically from 1 to 1 / 10,000."""
     half = features // 2
-    frequency = torch.exp(-math.log(longest) * torch.arange(half, device=t.device) / half)
+    frequency = torch.exp(-math.log(10_000.0) * torch.arange(half, device=t.device) / half)
     phase = t[:, None].float() * frequency
     return torch.cat([phase.cos(), phase.sin()], dim=-1)
 

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from typing import Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal
 
+from primdiffusion.formats.requests import Count
+from primdiffusion.formats.schema import Checked, Length, Range, read
 from primdiffusion.primitives.primitives import GRID, S
 
 MOST_BLOCKS = 16
@@ -13,7 +15,7 @@ MOST_BLOCKS = 16
 
 
 @dataclasses.dataclass(frozen=True)
-class EncoderConfig:
+class EncoderConfig(Checked):
     """Architecture of the encoder (paper sec. 3.2; SPEC 2)."""
 
     appearance: Literal["voxels", "texels", "texture"] = "voxels"
@@ -41,8 +43,8 @@ class EncoderConfig:
     and order of branches of SPEC 2, boxes with B = T x N whose sizes are divided by the scale (SPEC 1.1, 1.8)."""
     stem: tuple[int, int, int] = (24, 48, 64)
     """Channels of the image encoder at 128, 64 and 32 squared."""
-    grid: tuple[int, ...] = (64, 96, 96, 96)
-    """Channels of its U-Net at 32, 16, 8, ... squared."""
+    grid: Annotated[tuple[int, ...], Length(1, GRID.bit_length())] = (64, 96, 96, 96)
+    """Channels of its U-Net at 32, 16, 8, ... squared, at most down to one texel."""
     grid_entry: Literal["residual", "halving"] = "residual"
     """residual: starts with a residual block at 32 squared; halving: starts with the downsampling to 16 squared, and
     concatenates the input at the end (SPEC 2)."""
@@ -54,9 +56,9 @@ class EncoderConfig:
     """Channels of the motion branch."""
     attention_width: int = 128
     """Channels over all heads."""
-    attention_heads: int = 4
+    attention_heads: Count = 4
     """Heads."""
-    attention_blocks: int = 1
+    attention_blocks: Annotated[int, Range(1, MOST_BLOCKS)] = 1
     """Consecutive blocks."""
     fused: int = 64
     """Input channels of the mapping networks."""
@@ -68,7 +70,7 @@ class EncoderConfig:
     """Channels of both at 256 squared, before concatenation with the sampled input."""
     scale: tuple[int, ...] = (64, 64)
     """Channels of the delta-scale network."""
-    scale_outputs: int = 3
+    scale_outputs: Annotated[int, Range(3)] = 3
     """Its output channels; only the last three are used: the released code has six unused ones before (SPEC 1.7)."""
     extent: tuple[float, float, float] = (0.85, 0.85, 0.6)
     """Initial delta scales along T, B, N: the anchors' boxes are large enough for loose clothing, and most of a human
@@ -102,14 +104,7 @@ class EncoderConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for invalid settings."""
-        for name, hint in get_type_hints(EncoderConfig).items():
-            value = getattr(self, name)
-            if get_origin(hint) is Literal and value not in get_args(hint):
-                raise ValueError(f"{name} is {value!r}: choose one of {', '.join(map(repr, get_args(hint)))}")
-        if not 1 <= len(self.grid) <= GRID.bit_length():
-            raise ValueError(f"grid has {len(self.grid)} levels: give 1 to {GRID.bit_length()}, down to one texel")
-        if not 1 <= self.attention_blocks <= MOST_BLOCKS:
-            raise ValueError(f"attention_blocks is {self.attention_blocks}: give 1 to {MOST_BLOCKS}")
+        super().__post_init__()
         if self.attention_width % self.attention_heads:
             raise ValueError(
                 f"attention_width {self.attention_width} is not a multiple of attention_heads {self.attention_heads}"
@@ -119,8 +114,6 @@ class EncoderConfig:
                 f"compat 'released' has no layers for detail {self.detail!r} with grid_entry {self.grid_entry!r}: "
                 "choose 'bottleneck' and 'halving'"
             )
-        if self.scale_outputs < 3:
-            raise ValueError(f"scale_outputs is {self.scale_outputs}: delta scales are 3 numbers")
 
 
 DEFAULT = EncoderConfig()
@@ -185,5 +178,4 @@ def config_from_json(tree: Mapping[str, Any]) -> EncoderConfig:
     if set(tree) != names:
         differing = ", ".join(sorted(set(tree) ^ names))
         raise ValueError(f"the encoder's configuration differs in {differing}: use the release that trained it")
-    settings: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in tree.items()}
-    return EncoderConfig(**settings)
+    return read(EncoderConfig, tree)

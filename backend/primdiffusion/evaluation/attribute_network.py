@@ -21,6 +21,7 @@ from torch.nn import functional
 from primdiffusion import tensor_file
 from primdiffusion.evaluation.portraits import PORTRAITS
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import written_whole
 
 CATEGORIES = ("sex", "age", "outfit", "pattern", "shoes", "hair", "hair_colour", "hat")
@@ -31,6 +32,7 @@ FEATURES = 96
 WIDTHS = (16, 32, 64, 96, 96)
 POOLED = 3
 """Side of the last feature map after pooling."""
+LEARNING_RATE = 2e-3
 SHIFT = 8
 """Largest random shift of portraits in training, pixels."""
 BANDS = (1.0, 2.0, 4.0)
@@ -43,6 +45,19 @@ class AttributeSpace:
 
     categories: dict[str, tuple[str, ...]]
     scalars: dict[str, tuple[float, float]]
+
+    @classmethod
+    def from_json(cls, text: str) -> AttributeSpace:
+        """Undo `to_json`. Raises JsonError, KeyError, TypeError, ValueError, AttributeError."""
+        stated = parse_json(text)
+        return cls(
+            {name: tuple(values) for name, values in stated["categories"].items()},
+            {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
+        )
+
+    def to_json(self) -> str:
+        """As a text for a file's metadata."""
+        return json.dumps(dataclasses.asdict(self))
 
     def labels(self, attributes: Sequence[Mapping[str, Any]]) -> dict[str, Tensor]:
         """Class indices and standardised scalars of samples; UNKNOWN or NaN where an attribute is missing."""
@@ -162,20 +177,18 @@ def fit_attribute_network(
     *,
     epochs: int = 20,
     batch: int = 64,
-    learning_rate: float = 2e-3,
-    seed: int = 0,
     report: Callable[[int, float], None] = lambda epoch, loss: None,
 ) -> AttributeNetwork:
-    """Train a network; `report` receives each epoch and its mean loss. Deterministic for a seed and device."""
+    """Train a network; `report` receives each epoch and its mean loss. Deterministic on a device."""
     space = attribute_space(attributes)
     labels = space.labels(attributes)
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+        torch.manual_seed(0)
         network = AttributeNetwork(space)
-        optimiser = torch.optim.AdamW(network.parameters(), lr=learning_rate, weight_decay=0.05)
+        optimiser = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, weight_decay=0.05)
         steps = epochs * -(-len(attributes) // batch)
-        scheduler = torch.optim.lr_scheduler.OneCycleLR(optimiser, learning_rate, total_steps=steps + 1, pct_start=0.1)
+        scheduler = torch.optim.lr_scheduler.OneCycleLR(optimiser, LEARNING_RATE, total_steps=steps + 1, pct_start=0.1)
         for epoch in range(epochs):
             losses = []
             for chosen in torch.randperm(len(attributes), generator=generator).split(batch):
@@ -237,26 +250,16 @@ def save_attribute_network(path: Path, network: AttributeNetwork) -> None:
     tensors = {k: v.half() if k in halved else v for k, v in network.state_dict().items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as unfinished:
-        unfinished.write_bytes(
-            tensor_file.save(tensors, metadata={"answers": json.dumps(dataclasses.asdict(network.space))})
-        )
+        unfinished.write_bytes(tensor_file.save(tensors, metadata={"answers": network.space.to_json()}))
 
 
 def load_attribute_network(path: Path) -> AttributeNetwork:
     """Load what `save_attribute_network` wrote. Raises FileNotFoundError, and ValueError for an unreadable file."""
     if not path.is_file():
         raise FileNotFoundError(f"no feature network at {path}: choose a folder to train one in")
-    try:
+    reason = "is not a feature network of this version"
+    with as_file_error(path, reason, "delete it to train a new one", OSError, RuntimeError):
         tensors, metadata = tensor_file.read(path)
-        stated = parse_json(metadata["answers"])
-        space = AttributeSpace(
-            {name: tuple(values) for name, values in stated["categories"].items()},
-            {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
-        )
+        space = AttributeSpace.from_json(metadata["answers"])
         network = tensor_file.load_network(lambda: AttributeNetwork(space), tensors)
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(
-            f"{path} is not a feature network of this version ({reason}): delete it to train a new one"
-        ) from error
     return network.eval().requires_grad_(False)

@@ -104,22 +104,20 @@ class PrecisionRecall(NamedTuple):
     """Fraction of real samples within the generated set."""
 
 
-def precision_recall(
-    made: Float[Tensor, "n d"], real: Float[Tensor, "m d"], neighbours: int = NEIGHBOURS
-) -> PrecisionRecall:
+def precision_recall(made: Float[Tensor, "n d"], real: Float[Tensor, "m d"]) -> PrecisionRecall:
     """Improved precision and recall (Kynkäänniemi et al. 2019, eq. 1-2).
 
-    A set is the union of balls around its samples, each reaching to the k-th nearest neighbour in that set. Raises
-    ValueError for sets of k or fewer.
+    A set is the union of balls around its samples, each reaching to the nearest neighbour of number NEIGHBOURS in that
+    set. Raises ValueError for sets of as many or fewer.
     """
     _check(made, real)
-    if min(len(made), len(real)) <= neighbours:
+    if min(len(made), len(real)) <= NEIGHBOURS:
         raise ValueError(
-            f"sets of {len(made)} and {len(real)} samples are too small for {neighbours} neighbours: use larger sets"
+            f"sets of {len(made)} and {len(real)} samples are too small for {NEIGHBOURS} neighbours: use larger sets"
         )
 
     def covered(points: Tensor, centres: Tensor) -> float:
-        own = torch.cdist(centres, centres).kthvalue(neighbours + 1, dim=1).values  # the nearest is the sample itself
+        own = torch.cdist(centres, centres).kthvalue(NEIGHBOURS + 1, dim=1).values  # the nearest is the sample itself
         return float((torch.cdist(points, centres) <= own).any(1).double().mean())
 
     made, real = made.double(), real.double()

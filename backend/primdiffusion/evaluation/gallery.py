@@ -17,6 +17,7 @@ from torch import Tensor
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, mesh_portraits, portraits
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.assets import Assets
@@ -148,11 +149,9 @@ def _cached(path: Path) -> tuple[Tensor, list[dict[str, Any]]] | None:
 def read_attributes(path: Path) -> list[dict[str, Any]]:
     """Read the attributes of each colouring in a payload file. Raises ValueError if they are unreadable."""
     arrays = read_arrays(path, ("attributes", "voxels"))
-    try:
+    with as_file_error(path, "has damaged attributes", "make it again"):
         stored = parse_json(str(arrays["attributes"]))
         return list(stored.get("variants", [stored] * len(arrays["voxels"])))
-    except (ValueError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: its attributes are damaged ({error!s:.160}): make it again") from error
 
 
 def read_seed(path: Path) -> int:

@@ -27,6 +27,8 @@ from primdiffusion.evaluation.gallery import Gallery, Report, Source, open_galle
 
 NETWORK_FILE = "features.safetensors"
 PORTRAITS_FOLDER = "portraits"
+DRAWS = 8
+"""Random subsets of the training set that are compared with held-out samples."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,21 +96,21 @@ def compare(reference: ReferenceSet, made: Float[Tensor, "n f"]) -> Comparison:
     )
 
 
-def real_vs_real(reference: ReferenceSet, count: int, draws: int = 8, seed: int = 0) -> Comparison:
-    """Training samples compared with held-out ones: the mean over `draws` random subsets of `count`.
+def real_vs_real(reference: ReferenceSet, count: int) -> Comparison:
+    """Training samples compared with held-out ones: the mean over DRAWS random subsets of `count`.
 
     Nearest training samples are searched among other geometries only.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     found = []
     others = nearest_other(reference.train_features, reference.train.geometry)
     to_train = nearest(reference.held_features, reference.train_features).distance.median()
-    for _ in range(draws):
+    for _ in range(DRAWS):
         chosen = torch.randperm(len(reference.train_features), generator=generator)[:count]
         comparison = compare(reference, reference.train_features[chosen])
         ratio = float(others.distance[chosen].median() / to_train.clamp_min(1e-12))
         found.append(dataclasses.astuple(dataclasses.replace(comparison, nearest_ratio=ratio)))
-    people, *means = (sum(values) / draws for values in zip(*found, strict=True))
+    people, *means = (sum(values) / DRAWS for values in zip(*found, strict=True))
     return Comparison(round(people), *means)
 
 

@@ -21,6 +21,7 @@ from primdiffusion import tensor_file
 from primdiffusion.evaluation.attribute_network import AttributeSpace, detail_energies
 from primdiffusion.evaluation.shots import JOINTS
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import write_atomically
 
 INPUT = 128
@@ -140,8 +141,7 @@ def cell_means(values: Float[Tensor, "h w"], mask: Tensor) -> Float[Tensor, "32 
 def save_pose_depth_network(path: Path, network: PoseDepthNetwork) -> None:
     """Write the network in half precision with its card, atomically."""
     tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
-    space = {"categories": network.space.categories, "scalars": network.space.scalars}
-    metadata = {"space": json.dumps(space), "card": json.dumps(network.card)}
+    metadata = {"space": network.space.to_json(), "card": json.dumps(network.card)}
     write_atomically(path, tensor_file.save(tensors, metadata=metadata))
 
 
@@ -156,16 +156,10 @@ def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
             return load_pose_depth_network(found)
     if not path.is_file():
         raise FileNotFoundError(f"no network of joints and depth at {path}: install the package again")
-    try:
+    reason = "is not a network of joints and depth of this version"
+    with as_file_error(path, reason, "install the package again", OSError, RuntimeError):
         tensors, metadata = tensor_file.read(path)
-        stated = parse_json(metadata["space"])
-        space = AttributeSpace(
-            {name: tuple(values) for name, values in stated["categories"].items()},
-            {name: (mean, std) for name, (mean, std) in stated["scalars"].items()},
-        )
+        space = AttributeSpace.from_json(metadata["space"])
         network = tensor_file.load_network(lambda: PoseDepthNetwork(space), tensors)
         network.card = dict(parse_json(metadata["card"]))
-    except (OSError, KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ValueError(f"{path} is not a network of joints and depth of this version ({reason})") from error
     return network.eval().requires_grad_(False)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping
-from typing import Protocol
+from typing import Annotated, Protocol
 
 import torch
 from jaxtyping import Float, UInt8
@@ -19,6 +19,8 @@ from primdiffusion.capture.conditioning import body_betas, conditioning_views, s
 from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.reader import Captures
 from primdiffusion.evaluation.image_metrics import Lpips, bounding_box, overlap, psnr, ssim
+from primdiffusion.formats.requests import Count
+from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
@@ -42,7 +44,7 @@ class Reconstructor(Protocol):
 
 
 @dataclasses.dataclass(frozen=True)
-class EvaluationSettings:
+class EvaluationSettings(Checked):
     """Which images are compared, and the input of the encoder."""
 
     subjects: tuple[str, ...] = ()
@@ -51,19 +53,13 @@ class EvaluationSettings:
     """Evaluated poses; empty: all."""
     cameras: tuple[int, ...] = ()
     """Evaluated views; empty: all."""
-    given_views: int = 8
+    given_views: Count = 8
     """Number of input views, spread around the subject."""
     given_frame: int = 0
     """Pose of the input views."""
-    size: int = 512
-    """Image width and height, pixels; larger captures are downsampled."""
+    size: Annotated[int, Range(11)] = 512
+    """Image width and height, pixels; larger captures are downsampled, and SSIM needs its window of 11."""
     march: MarchSettings = MarchSettings()  # noqa: RUF009  frozen
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for no input views or images too small for SSIM."""
-        for name, least in (("given_views", 1), ("size", 11)):
-            if getattr(self, name) < least:
-                raise ValueError(f"{name} of the evaluation is {getattr(self, name)}: it must be {least} or more")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -19,8 +19,9 @@ from primdiffusion.body.model import BodyPose, PosedBody, default_body
 from primdiffusion.formats.arrays import read_npy
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.pictures import PictureError, opened_picture, strips
+from primdiffusion.geometry.pictures import opened_picture, strips
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
 from primdiffusion.people.person import Person
@@ -147,10 +148,8 @@ def folder_shots(folder: Path) -> Iterator[Shot]:
     Raises ValueError for an empty folder, pictures that are not square or unreadable, and truth that does not fit.
     """
     paths = folder_pictures(folder)
-    try:
+    with as_file_error(folder / JOINTS_FILE, "is damaged", "write it again"):
         truth = read_json(folder / JOINTS_FILE) if (folder / JOINTS_FILE).is_file() else {}
-    except ValueError as error:
-        raise ValueError(f"{folder / JOINTS_FILE} is damaged ({error!s:.160}): write it again") from error
     if not isinstance(truth, dict):
         raise ValueError(f"{folder / JOINTS_FILE} is not an object of picture names: see docs/design/evaluation.md")
     for path in paths:
@@ -164,14 +163,12 @@ def folder_shots(folder: Path) -> Iterator[Shot]:
 
 def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], int, bool]:
     """Colour over white and alpha, resized to SIDE; the picture's own side; whether any of it is transparent."""
-    try:
-        with opened_picture(path, FORMATS) as picture:
-            width, height = picture.size
-            if width == height:
-                shrunk, has_alpha = _over_white(picture)
-                return shrunk, width, has_alpha
-    except (PictureError, OSError) as error:
-        raise ValueError(f"{path} is not a readable picture ({error!s:.160}): write it again or remove it") from error
+    damaged = as_file_error(path, "is not a readable picture", "write it again or remove it", OSError)
+    with damaged, opened_picture(path, FORMATS) as picture:
+        width, height = picture.size
+        if width == height:
+            shrunk, has_alpha = _over_white(picture)
+            return shrunk, width, has_alpha
     raise ValueError(f"{path} has {width} x {height} pixels: pad it with white to a square")
 
 
@@ -206,10 +203,8 @@ def _nearest(values: Float[Tensor, "h w"]) -> Float[Tensor, "s s"]:
 def _joints(given: Any, size: int, source: Path, name: str) -> tuple[Tensor | None, float | None]:
     if given is None:
         return None, None
-    try:
+    with as_file_error(source, f"has joints of {name} that are not numbers", "give 24 rows x, y"):
         pixels = torch.tensor(given, dtype=torch.float32) * (SIDE / size)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{source}: the joints of {name} are not numbers ({error!s:.160})") from error
     if pixels.shape != (len(JOINT_NAMES), 2) or not torch.isfinite(pixels).all():
         raise ValueError(f"{source}: the joints of {name} have shape {tuple(pixels.shape)}: give 24 finite rows x, y")
     if pixels.abs().max() > FAR_OUTSIDE * SIDE:
@@ -221,10 +216,8 @@ def _joints(given: Any, size: int, source: Path, name: str) -> tuple[Tensor | No
 def _depth(path: Path, size: int) -> Float[Tensor, "s s"] | None:
     if not path.is_file():
         return None
-    try:
+    with as_file_error(path, "holds no depth", "write it again"):
         depth = torch.from_numpy(np.asarray(read_npy(path), np.float32))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path} holds no depth ({error!s:.160}): write it again") from error
     if depth.shape != (size, size):
         raise ValueError(f"{path} has shape {tuple(depth.shape)}, its picture {size} x {size} pixels: give one size")
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.inf)

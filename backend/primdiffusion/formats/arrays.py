@@ -218,16 +218,8 @@ def stored_archive(members: Iterable[tuple[str, bytes | memoryview]]) -> io.Byte
 
 
 def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
-    """Write an .npz at the fastest level: higher ones take long and gain little. Raises OSError."""
-    _write(zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1), arrays)
-
-
-def write_stored(path: Path, arrays: Mapping[str, NDArray]) -> None:
-    """Write an uncompressed .npz, as numpy.savez does, but with one OSError where the disk is full."""
-    _write(zipfile.ZipFile(path, "w", zipfile.ZIP_STORED), arrays)
-
-
-def _write(archive: zipfile.ZipFile, arrays: Mapping[str, NDArray]) -> None:
+    """Write an .npz at the fastest level: higher ones take long and gain little. Raises one OSError for a full disk."""
+    archive = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=1)
     try:
         for name, values in arrays.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import errno
 import hashlib
@@ -10,6 +11,7 @@ import mmap
 import os
 import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
@@ -32,6 +34,18 @@ class FileError(ValueError):
 
 class TooLargeError(ValueError):
     """A file is larger than its kind may be; the message names it."""
+
+
+@contextlib.contextmanager
+def as_file_error(path: Path | str, reason: str, remedy: str, *also: type[Exception]) -> Iterator[None]:
+    """Raise FileError, with the words of the error in brackets, for what damaged content raises, and for `also`."""
+    try:
+        yield
+    except TooLargeError:
+        raise
+    except (ValueError, TypeError, LookupError, AttributeError, OverflowError, *also) as error:
+        words = " ".join(str(error).removeprefix(f"{path}: ").split())
+        raise FileError(path, f"{reason} ({words:.160})", remedy) from error
 
 
 def real_path(path: str | Path) -> Path:

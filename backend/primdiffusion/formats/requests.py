@@ -58,6 +58,8 @@ Voxel = Annotated[float, Range(1e-4, 10.0)]
 RayStep = Annotated[float, Range(1e-4, 1.0)]
 """Finer steps take hours without visible gain."""
 Count = Annotated[int, Range(1)]
+NotNegative = Annotated[float, Range(0, 1e30)]
+Positive = Annotated[float, Range(1e-12, 1e30)]
 Text = Annotated[str, Length(1, 200)]
 Attributes = dict[Text, Text | float]
 OutDir = Annotated[Path, Option(name="out")]

@@ -176,6 +176,13 @@ def check(record: Any) -> None:
         _value(kind, getattr(record, name), (name,))
 
 
+class Checked:
+    """Base of records that make sure of their fields themselves, as `check` does."""
+
+    def __post_init__(self) -> None:
+        check(self)
+
+
 def written(value: Any) -> Any:
     """The JSON of a record or of a field's value."""
     if dataclasses.is_dataclass(value):

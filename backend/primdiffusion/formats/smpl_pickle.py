@@ -30,7 +30,7 @@ MOST_LISTED = 2_000_000
 MAX_NESTING = 8
 """Limit on nested chumpy selections; body models nest less."""
 _DAMAGED = (
-    pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, MemoryError, EOFError,
+    pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, EOFError,
 )  # fmt: skip
 """What the unpickler raises where operations do not fit their values."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
@@ -183,15 +183,7 @@ def load_restricted(data: bytes, name: str) -> object:
         return _Unpickler(io.BytesIO(data), encoding="latin1").load()
     except UnsafePickleError as error:
         raise UnsafePickleError(f"{name}: {error}") from None
-    except (
-        pickle.UnpicklingError,
-        ValueError,
-        TypeError,
-        LookupError,
-        AttributeError,
-        OverflowError,
-        EOFError,
-    ) as error:
+    except _DAMAGED as error:
         reason = " ".join(str(error).split())
         raise BodyFileError(f"{name} is not a whole pickle file ({reason:.80}); download it again.") from error
 

@@ -25,9 +25,10 @@ from primdiffusion.body.model import default_body
 from primdiffusion.capture.people_files import LARGEST_GLB
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import TooLargeError, read_regular
+from primdiffusion.formats.regular_files import TooLargeError, as_file_error, read_regular
 from primdiffusion.formats.removing import remove_folder
-from primdiffusion.formats.requests import check_seed
+from primdiffusion.formats.requests import Count, Seed, check_seed
+from primdiffusion.formats.schema import Checked
 from primdiffusion.formats.whole_files import remove_abandoned, temporary_name, write_atomically
 from primdiffusion.people.assets import UNKNOWN, Assets, licence_of
 from primdiffusion.people.base_mesh import load_base_mesh
@@ -44,18 +45,16 @@ PERSON = re.compile(r"person_\d{6,}")
 
 
 @dataclasses.dataclass(frozen=True)
-class PeopleSet:
+class PeopleSet(Checked):
     """The samples of a folder: seeds seed ... seed + count - 1."""
 
     root: Path
-    seed: int
-    count: int
+    seed: Seed
+    count: Count
 
     def __post_init__(self) -> None:
         """Raise ValueError if count is not positive, or a seed is outside 0 ... 2^63-1."""
-        if self.count < 1:
-            raise ValueError(f"count is {self.count}: give 1 or more")
-        check_seed(self.seed)
+        super().__post_init__()
         check_seed(self.seed + self.count - 1)
 
     @property
@@ -147,11 +146,9 @@ def is_whole(folder: Path, seed: int) -> bool:
 
 def unknown_licences(root: Path) -> list[str]:
     """Assets in a folder's manifest whose licence is unknown. Raises ValueError for a damaged one, OSError."""
-    try:
+    with as_file_error(root / MANIFEST, "is damaged", "make the humans again"):
         manifest = read_json(root / MANIFEST)
         return [str(asset["path"]) for asset in manifest["assets"] if asset["licence"] == UNKNOWN]
-    except (ValueError, TypeError, LookupError) as error:
-        raise ValueError(f"{root / MANIFEST} is damaged ({error!s:.80}): make the humans again") from error
 
 
 def _identity(person: Person, seed: int) -> dict[str, Any]:

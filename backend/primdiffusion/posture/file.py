@@ -22,7 +22,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.reader import views_in
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.formats.regular_files import FileError, as_file_error
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.pose_file import read_motion
@@ -52,10 +52,8 @@ def read_posture(path: Path, sizes: Sequence[tuple[int, int]]) -> PostureFile:
     content = read_json(path) if path.suffix.lower() == ".json" else None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         return PostureFile(pose)
-    try:
+    with as_file_error(path, "has no betas", "fit the pose again"):
         betas = torch.from_numpy(np.asarray(content["betas"], np.float32))
-    except (LookupError, TypeError, ValueError, OverflowError) as e:
-        raise FileError(path, f"has no betas ({e!s:.80})", "fit the pose again") from e
     if betas.shape != (BETAS,) or not (betas.abs() <= LARGEST_BETA).all():
         raise FileError(path, f"has other betas than {BETAS} up to {LARGEST_BETA:g}", "fit the pose again")
     return PostureFile(pose, betas, _views(content.get("cameras"), path, sizes))

@@ -70,12 +70,7 @@ VOXELS = 512
 """Voxels of a box; indices have 16 bits."""
 
 
-def linearise(
-    primitives: Primitives,
-    camera: Camera,
-    background: float,
-    settings: MarchSettings = MarchSettings(),  # noqa: B008
-) -> tuple[Rendering, PictureJacobian]:
+def linearise(primitives: Primitives, camera: Camera, background: float) -> tuple[Rendering, PictureJacobian]:
     """The image of `march_cpu` over black, and its derivative when composited over a grey `background`.
 
     `background` is linear. Raises ValueError as `march_reference` does, and for boxes of other than 8^3 voxels.
@@ -83,7 +78,7 @@ def linearise(
     boxes, size = primitives.density.shape[0], primitives.density.shape[-1]
     if size**3 != VOXELS:
         raise ValueError(f"boxes of {size}^3 voxels cannot be linearised: give boxes of 8^3")
-    rendering, view, scene, ends = draw_with_ends(primitives, camera, settings)
+    rendering, view, scene, ends = draw_with_ends(primitives, camera, MarchSettings())
     saturates = ends.index != NEVER
     share = np.where(saturates, ends.share, np.float32(1))
     behind = np.where(saturates[:, None], ends.rgb, np.float32(background)).astype(np.float32)

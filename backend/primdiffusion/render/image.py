@@ -47,18 +47,14 @@ def _over(rgb: Float[Tensor, "*r 3"], alpha: Float[Tensor, "*r"], background: Ba
     return rgb + (1 - alpha)[..., None] * torch.tensor(background).to(rgb)
 
 
-def depth_to_png(
-    path: str | Path, rendering: Rendering, *, near: float | None = None, far: float | None = None
-) -> None:
+def depth_to_png(path: str | Path, rendering: Rendering) -> None:
     """Write the expected depth in false colours, bright for near, black for background.
 
-    The ramp spans `near` to `far` (metres), by default the range of depth of pixels with alpha of at least 0.5.
+    The ramp spans the range of depth of pixels with alpha of at least 0.5.
     """
     depth = rendering.depth.detach().double().cpu().numpy()
     solid = depth[(rendering.alpha >= 0.5).cpu().numpy()]
-    near = near if near is not None else float(solid.min(initial=np.inf))
-    far = far if far is not None else float(solid.max(initial=-np.inf))
-    colour = depth_colours(depth, near, far)
+    colour = depth_colours(depth, float(solid.min(initial=np.inf)), float(solid.max(initial=-np.inf)))
     alpha = rendering.alpha.detach().double().cpu().numpy()[..., None]
     _save(path, _to_bytes(torch.from_numpy(colour * alpha)))
 

@@ -14,7 +14,6 @@ voxels. Results are deterministic on one machine.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -22,6 +21,8 @@ import torch
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
+from primdiffusion.formats.requests import Count, NotNegative
+from primdiffusion.formats.schema import Checked
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives, S
@@ -59,31 +60,23 @@ class TargetImage:
 
 
 @dataclasses.dataclass(frozen=True)
-class InverseSettings:
+class InverseSettings(Checked):
     """Iterations and penalties of the fit."""
 
-    steps: int = 3
+    steps: Count = 3
     """Gauss-Newton steps. The last uses all images, earlier ones every other image in turn."""
-    iterations: int = 6
+    iterations: Count = 6
     """Iterations of conjugate gradients per step; more would fit noise."""
-    colour_iterations: int = 10
+    colour_iterations: Count = 10
     """Iterations of conjugate gradients for colours alone, which take one step."""
-    pull: float = 0.03
+    pull: NotNegative = 0.03
     """Weight of the distance from the start, in units of the mean diagonal of J^T W J."""
-    smoothness: float = 0.1
+    smoothness: NotNegative = 0.1
     """Weight of differences between neighbouring voxels of a box, in the same units."""
-    opacity_weight: float = 0.3
+    opacity_weight: NotNegative = 0.3
     """Weight of square errors of alpha relative to those of encoded colours."""
-    darkest: float = 0.02
+    darkest: NotNegative = 0.02
     """Linear intensity below which the slope of sRGB is constant; it is steepest at black."""
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "iterations", "colour_iterations"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} is {getattr(self, name)}: give 1 or more")
-        for name in ("pull", "smoothness", "opacity_weight", "darkest"):
-            if not 0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"{name} is {getattr(self, name)}: give 0 or more")
 
 
 def fit_payload(

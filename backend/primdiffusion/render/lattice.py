@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from typing import Literal, get_args
+from itertools import pairwise
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from primdiffusion.formats.requests import RAY_STEP
+from primdiffusion.formats.requests import RAY_STEP, Positive
+from primdiffusion.formats.schema import Checked, Length, Range
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
@@ -29,7 +30,7 @@ MOST_POINTS = 2**24
 
 
 @dataclasses.dataclass(frozen=True)
-class MarchSettings:
+class MarchSettings(Checked):
     """Sampling of rays.
 
     The lattice is t_n = n * spacing, n = 1, 2, ..., metres along the ray, the same for all rays and boxes. A box of
@@ -38,11 +39,11 @@ class MarchSettings:
     the smallest stride for finer boxes.
     """
 
-    step: float = RAY_STEP
+    step: Positive = RAY_STEP
     """Distance between the samples of the largest boxes, metres: the largest stride times the spacing."""
-    strides: tuple[int, ...] = (4, 2, 1)
+    strides: Annotated[tuple[Annotated[int, Range(1, LARGEST_STRIDE)], ...], Length(1)] = (4, 2, 1)
     """In descending order; each divides the previous one."""
-    samples_per_voxel: float = 2.0
+    samples_per_voxel: Positive = 2.0
     """Smallest number of samples along the shortest edge of a voxel."""
     compositing: Compositing = "mixed"
     """"mixed" is independent of the order of the boxes; the released code uses "index_order"."""
@@ -50,20 +51,11 @@ class MarchSettings:
     """Position of the ray within the pixel; 0 in the released code. Applied by `march`, not by the back ends."""
 
     def __post_init__(self) -> None:
-        if not (self.step > 0 and math.isfinite(self.step)):
-            raise ValueError(f"the step is {self.step} m; it must be positive and finite")
-        if self.compositing not in get_args(Compositing):
-            raise ValueError(f"compositing is {self.compositing!r}; choose from {get_args(Compositing)}")
-        if not self.samples_per_voxel > 0:
-            raise ValueError(f"samples_per_voxel is {self.samples_per_voxel}; it must be positive")
-        if not math.isfinite(self.pixel_centre):
-            raise ValueError(f"pixel_centre is {self.pixel_centre}; 0.5 is the middle of a pixel, 0 its corner")
-        whole = all(isinstance(stride, int) and 1 <= stride <= LARGEST_STRIDE for stride in self.strides)
-        pairs = zip(self.strides, self.strides[1:], strict=False)
-        if not self.strides or not whole or any(a <= b or a % b for a, b in pairs):
+        super().__post_init__()
+        if any(a <= b or a % b for a, b in pairwise(self.strides)):
             raise ValueError(
-                f"strides are {self.strides}: give integers from 1 to {LARGEST_STRIDE}, in descending order and each a "
-                "divisor of the previous one, such as (4, 2, 1)"
+                f"strides are {self.strides}: give them in descending order, each a divisor of the previous one, such "
+                "as (4, 2, 1)"
             )
 
     @property

@@ -24,14 +24,11 @@ INDICES = 16
 """Integers of a box as one view sees it: n0 0, first and last lattice point of its content 1-2, stride 3, tile
 columns and rows that its content touches 4-7, pixel columns and rows that all of it touches 8-11, blocks in them 12."""
 
-# Errors of a scene, as bits; `check_scene` produces the message.
-BAD_CONTENT = tl.constexpr(1)
-BAD_PLACE = tl.constexpr(2)
-BAD_CAMERA = tl.constexpr(4)
 ORTHOGONAL = tl.constexpr(1e-2)
 NEARLY_ORTHOGONAL = tl.constexpr(0.045)  # of a camera, the rows of whose matrix are compared here, not its columns
-# Totals: 0 errors, 1 pairs of boxes and bins, 2 pairs of boxes and tiles, 3 units of the adjoint, 4-5 written so
-# far, 6 spans with NaN, 7 whether a stride is odd (1), or even and no multiple of 4 (2).
+# Totals: 0 errors, as bits (content 1, place 2, camera 4; `check_scene` produces the message), 1 pairs of boxes and
+# bins, 2 pairs of boxes and tiles, 3 units of the adjoint, 4-5 written so far, 6 spans with NaN, 7 whether a stride is
+# odd (1), or even and no multiple of 4 (2).
 TOTALS = 8
 
 OPTICAL = tl.constexpr(1e-2)  # a centre further off the optical axis than arccos of this has no pixel to refer to

@@ -22,8 +22,9 @@ from primdiffusion.encoder.model import EncoderModel, betas_of_frames
 from primdiffusion.failures import describe
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.json_files import parse_json, read_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.requests import Count, Seed
-from primdiffusion.formats.schema import Range, check
+from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD
 from primdiffusion.people.payloads import store_person, voxels_from_payload
@@ -33,7 +34,7 @@ from primdiffusion.training.stored_people import read_person
 
 
 @dataclasses.dataclass(frozen=True)
-class EncodeSettings:
+class EncodeSettings(Checked):
     """Settings of encoding."""
 
     views: Count = 8
@@ -46,10 +47,6 @@ class EncodeSettings:
     """Largest side of the images used in refinement, pixels."""
     seed: Seed = 0
     """Seed of the order of images in refinement."""
-
-    def __post_init__(self) -> None:
-        """Raise FieldError for values out of range."""
-        check(self)
 
 
 def encode_people(
@@ -133,10 +130,8 @@ def read_cards(people: Path) -> dict[str, Mapping[str, Any]]:
     for name, path in find_people(people).items():
         card = path.parent / CARD
         if path.name != f"{name}.glb" and card.is_file():
-            try:
+            with as_file_error(card, "is damaged", "make the human again"):
                 cards[name] = dict(read_json(card))
-            except (ValueError, TypeError) as error:
-                raise ValueError(f"{card} is damaged ({error!s:.160}): make the human again") from error
     return cards
 
 

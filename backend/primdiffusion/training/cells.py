@@ -20,6 +20,7 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
@@ -219,7 +220,7 @@ def _save_prepared(path: Path, prepared: Prepared) -> None:
 
 
 def _load_prepared(path: Path) -> Prepared:
-    try:
+    with as_file_error(path, "is damaged", "remove it to compute it again"):
         tensors, about = tensor_file.read(path)
 
         def part(name: str) -> dict[str, Tensor]:
@@ -234,5 +235,3 @@ def _load_prepared(path: Path) -> Prepared:
             AttributeVocabulary.from_json(parse_json(about["vocabulary"])),
             float(about["full_density"]),
         )
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error!s:.100}): remove it to compute it again") from error

@@ -12,14 +12,13 @@ import tyro
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.requests import Count, Share
-from primdiffusion.formats.schema import Range, check
+from primdiffusion.formats.regular_files import as_file_error
+from primdiffusion.formats.requests import Count, NotNegative, Positive, Share
+from primdiffusion.formats.schema import Checked, Range
 
 Weighting = Literal["whitened", "plain", "min_snr"]
 Tracker = Literal["tensorboard", "wandb"]
 Levels = Literal["uniform", "log_uniform", "log_normal"]
-NotNegative = Annotated[float, Range(0, 1e30)]
-Positive = Annotated[float, Range(1e-12, 1e30)]
 Decay = Annotated[float, Range(0, 0.999999)]
 
 
@@ -52,7 +51,7 @@ class PriorConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class PhaseConfig:
+class PhaseConfig(Checked):
     """Training of one network."""
 
     steps: Count
@@ -93,13 +92,9 @@ class PhaseConfig:
     bfloat16: bool = False
     """Run the network in bfloat16 where the device multiplies it faster than float32."""
 
-    def __post_init__(self) -> None:
-        """Raise FieldError for values out of range."""
-        check(self)
-
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RunSettings:
+class RunSettings(Checked):
     """Where a run is, and how it is stopped, measured and saved: the same for every task."""
 
     data: Path
@@ -121,10 +116,6 @@ class RunSettings:
     """Steps between images made with the averaged weights."""
     tracker: Tracker | None = None
     """Where metrics go besides metrics.jsonl: tensorboard or wandb, of pip install "primdiffusion[tracking]"."""
-
-    def __post_init__(self) -> None:
-        """Raise FieldError for values out of range."""
-        check(self)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -224,10 +215,8 @@ _ADDED = {"unet.attention_context": "input", "slab.optimiser": "adamw"}
 
 def check_resumable(saved: str, config: RunSettings) -> None:
     """Raise ValueError, naming the settings in which a saved run differs from `config`, except those allowed to."""
-    try:
+    with as_file_error(config.run, "has damaged settings", "give a new folder"):
         before = _comparable(parse_json(saved))
-    except (ValueError, AttributeError) as error:
-        raise ValueError(f"the settings in {config.run} are damaged ({error!s:.160}): give a new folder") from error
     now = _comparable(parse_json(to_json(config)))
     for name, value in _ADDED.items():
         if name in now and name not in before:

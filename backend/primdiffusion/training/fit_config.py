@@ -6,9 +6,9 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
-from primdiffusion.formats.requests import Count
-from primdiffusion.formats.schema import Range, check
-from primdiffusion.training.config import Decay, NotNegative, Positive, RunSettings
+from primdiffusion.formats.requests import Count, NotNegative, Positive
+from primdiffusion.formats.schema import Checked, Range
+from primdiffusion.training.config import Decay, RunSettings
 
 Preset = Literal[
     "default",
@@ -24,7 +24,7 @@ Preset = Literal[
 
 
 @dataclasses.dataclass(frozen=True)
-class LossConfig:
+class LossConfig(Checked):
     """Weights of the terms of the objective, for colours in 0 ... 255 (SPEC 2); 0 disables a term."""
 
     rgb: NotNegative = 1.0
@@ -43,7 +43,7 @@ class LossConfig:
 
     def __post_init__(self) -> None:
         """Raise ValueError for weights that are negative or not finite, and without a weight of colours."""
-        check(self)
+        super().__post_init__()
         if not (self.rgb or self.perceptual):
             raise ValueError("neither loss.rgb nor loss.perceptual has a weight: nothing would teach colours")
 

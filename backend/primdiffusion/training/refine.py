@@ -22,13 +22,12 @@ import torch
 from torch import Tensor
 
 from primdiffusion.capture.dataset import Views
-from primdiffusion.formats.requests import Count, RayStep
-from primdiffusion.formats.schema import Range, check
+from primdiffusion.formats.requests import Count, NotNegative, RayStep
+from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.training.config import NotNegative
 from primdiffusion.training.refine_views import PosedView, psnr_of, render_view, scenes_of
 from primdiffusion.version import __version__
 
@@ -43,7 +42,7 @@ MEASURED = 32
 
 
 @dataclasses.dataclass(frozen=True)
-class RefineSettings:
+class RefineSettings(Checked):
     """Settings of refinement. The rates were tuned on humans in detailed clothes."""
 
     steps: Count = 300
@@ -68,10 +67,6 @@ class RefineSettings:
     """Time limit, checked after each step; the decay of the rates does not adapt to it."""
     seed: int = 0
     """Seed of the order of views."""
-
-    def __post_init__(self) -> None:
-        """Raise FieldError for values out of range."""
-        check(self)
 
 
 class RefineStep(NamedTuple):

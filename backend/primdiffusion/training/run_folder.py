@@ -23,16 +23,23 @@ from typing import Any
 import accelerate
 import torch
 from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
+from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
 from primdiffusion.failures import optional_package
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import read_regular
-from primdiffusion.formats.whole_files import remove_abandoned, write_atomically, written_whole
+from primdiffusion.formats.regular_files import as_file_error, read_regular
+from primdiffusion.formats.removing import remove_file
+from primdiffusion.formats.whole_files import (
+    create_folders,
+    remove_abandoned,
+    remove_empty,
+    write_atomically,
+    written_whole,
+)
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
-from primdiffusion.training.folder_lock import lock_folder
 from primdiffusion.training.state import accelerator_of, saved_step
 from primdiffusion.version import __version__
 
@@ -43,6 +50,8 @@ LARGEST_TEXT = 2**30
 """Bytes of any of them."""
 PROJECT = "primdiffusion"
 """Name in Weights & Biases."""
+LOCK = ".lock"
+"""The lock file in the folder. It stays there: removing it while another process opens it would let two in."""
 
 
 @contextlib.contextmanager
@@ -166,12 +175,10 @@ def versions() -> dict[str, str]:
 
 def _earlier(config: RunSettings, people: Sequence[str], saved: str, processes: int) -> list[Mapping[str, Any]]:
     """Return the earlier starts of the run. Raises ValueError for another training set."""
-    try:
+    with as_file_error(config.run / RUN, "is damaged", "give a new folder"):
         before = parse_json(saved)
         known, starts = before["people"], before.get("starts", [])
         were = starts[-1]["processes"] if starts else processes
-    except (ValueError, LookupError, TypeError, AttributeError) as error:
-        raise ValueError(f"{config.run / RUN} is damaged ({error!s:.160}): give a new folder") from error
     if known != list(people):
         raise ValueError(
             f"the run in {config.run} has another training set than {config.data} ({len(known)} and {len(people)} "
@@ -206,3 +213,46 @@ def _git(folder: Path, *arguments: str) -> str:
 
 def _text(path: Path) -> str:
     return read_regular(path, LARGEST_TEXT).decode("utf-8", "replace")
+
+
+@contextlib.contextmanager
+def lock_folder(folder: Path) -> Iterator[None]:
+    """Hold a folder, created if need be, for one process at a time. Raises ValueError, OSError.
+
+    The system releases the lock when the process ends, however it ends. On a disk without locks the file itself is the
+    lock: it names its process, and counts for nothing once that has ended. A created folder that holds nothing else in
+    the end is removed.
+    """
+    made = create_folders(folder)
+    lock: BaseFileLock | None = None
+    try:
+        lock = _acquired(folder)
+        yield
+    finally:
+        if lock is not None:
+            if made:
+                _remove_if_alone(folder / LOCK)  # while it is held: the next process then makes a new one
+            lock.release()
+            if made:
+                _remove_if_alone(folder / LOCK)  # Windows removes no open files
+        remove_empty(made)
+
+
+def _acquired(folder: Path) -> BaseFileLock:
+    for kind in (FileLock, SoftFileLock):
+        lock = kind(folder / LOCK)
+        try:
+            lock.acquire(timeout=0)
+            return lock
+        except Timeout:
+            raise ValueError(f"another process works in {folder}: wait for it, or give another folder") from None
+        except (OSError, NotImplementedError):
+            if kind is SoftFileLock:
+                raise
+    raise AssertionError("one of the two returns or raises")
+
+
+def _remove_if_alone(path: Path) -> None:
+    with contextlib.suppress(OSError):
+        if list(path.parent.iterdir()) == [path]:
+            remove_file(path, path.parent)

@@ -29,7 +29,7 @@ from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import FileError, is_plain_path, open_regular
+from primdiffusion.formats.regular_files import FileError, as_file_error, is_plain_path, open_regular
 from primdiffusion.formats.whole_files import remove_abandoned, staged, write_atomically, written_whole
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.tensor_file import TensorFile
@@ -123,7 +123,7 @@ class PackedPeople:
         """Read the index. Raises FileNotFoundError, and FileError if it is damaged or of another version."""
         self._index = folder / INDEX
         index = _read_index(self._index)
-        try:
+        with as_file_error(folder / INDEX, "is damaged", "pack the humans again"):
             self.full_density = float(index["full_density"])
             _check_distinct([str(shard["file"]) for shard in index["shards"]])
             self.paths = [folder / _plain_name(shard["file"]) for shard in index["shards"]]
@@ -133,8 +133,6 @@ class PackedPeople:
             self.variants: Sequence[int] = [_count(person["variants"]) for person in people]
             self._stored: Sequence[Mapping[str, Any]] = [dict(person["attributes"]) for person in people]
             self._firsts = [0, *itertools.accumulate(len(shard["people"]) for shard in index["shards"])]
-        except (KeyError, TypeError, ValueError) as error:
-            raise FileError(folder / INDEX, f"is damaged ({error!s:.100})", "pack the humans again") from error
         if len(self.names) < 2:
             raise FileNotFoundError(f"{folder / INDEX} lists {len(self.names)} humans: training needs two or more")
         self._open: dict[int, TensorFile] = {}
@@ -143,12 +141,8 @@ class PackedPeople:
         """Return the attributes of each colouring of a person. Raises as `person`."""
         shard, place, _ = self._rows(index)
         betas = self._slice(shard, "betas")[place]
-        try:
+        with as_file_error(self._index, f"is damaged: the attributes of {self.names[index]!r:.60}", "pack again"):
             return attributes_of(self._stored[index], betas, self.variants[index])
-        except (TypeError, AttributeError, LookupError) as error:
-            raise FileError(
-                self._index, f"is damaged: the attributes of {self.names[index]!r:.60} ({error!s:.80})", "pack again"
-            ) from error
 
     def person(self, index: int) -> PersonVariants:
         """Read a person. Raises FileError, naming a damaged shard, and OSError."""
@@ -210,14 +204,12 @@ class PackedPeople:
 
     def _shard(self, number: int) -> TensorFile:
         if number not in self._open:
-            with self._checked(number) as opened:
-                try:
-                    file = TensorFile(opened)
-                    self._check_content(number, file)
-                except ValueError as error:
-                    raise FileError(
-                        self.paths[number], f"is no shard ({error!s:.100})", "pack the humans again"
-                    ) from error
+            with (
+                self._checked(number) as opened,
+                as_file_error(self.paths[number], "is no shard", "pack the humans again"),
+            ):
+                file = TensorFile(opened)
+                self._check_content(number, file)
             self._open[number] = file
         return self._open[number]
 

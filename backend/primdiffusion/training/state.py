@@ -16,6 +16,7 @@ from torch import Tensor, nn
 
 from primdiffusion import tensor_file
 from primdiffusion.device import best_device
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.training.muon import BETAS, MuonAdamW
 
@@ -111,17 +112,14 @@ class TrainingState:
 
     def load(self, path: Path) -> None:
         """Restore a saved state; ValueError if it belongs to another network or optimiser, or is damaged."""
-        try:
+        with as_file_error(
+            path, "does not fit this network or is damaged", "start a new run folder", OSError, RuntimeError
+        ):
             tensors, place = tensor_file.read(path)
             step, seconds = int(place.pop("step")), float(place.pop("seconds"))
             for name, module in (("network", self.network), ("average", self.average)):
                 module.load_state_dict(_under(tensors, name))
             self._load_moments(_under(tensors, "optimiser"))
-        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:
-            reason = " ".join(str(error).split())[:200]
-            raise ValueError(
-                f"{path} does not fit this network or is damaged ({reason}): start a new run folder"
-            ) from error
         if (before := place.get("optimiser", self._kind)) != self._kind:
             raise ValueError(
                 f"{path} was trained with {before}, but this device trains with {self._kind} (Muon needs "
@@ -149,16 +147,14 @@ def saved_step(path: Path) -> int:
     """The step of a saved state; 0 without one. Raises ValueError for a damaged file."""
     if not path.exists():
         return 0
-    try:
+    with as_file_error(path, "is damaged", "start a new run folder", OSError):
         return int(tensor_file.read_metadata(path)["step"])
-    except (OSError, KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"{path} is damaged ({error!s:.100}): start a new run folder") from error
 
 
-def learning_rate_factor(step: int, steps: int, warm_up: int = 100, last: float = 0.1) -> float:
-    """A linear rise over `warm_up` steps times a cosine from 1 to `last` over `steps`."""
+def learning_rate_factor(step: int, steps: int) -> float:
+    """A linear rise over 100 steps times a cosine from 1 to 0.1 over `steps`."""
     cosine = 0.5 + 0.5 * math.cos(math.pi * min(1.0, step / steps))
-    return min(1.0, (step + 1) / warm_up) * (last + (1 - last) * cosine)
+    return min(1.0, (step + 1) / 100) * (0.1 + 0.9 * cosine)
 
 
 def _not_finite(tensors: Mapping[str, Tensor]) -> str | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -18,13 +19,12 @@ from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.formats.arrays import LARGEST_NUMBER, array_shape, read_arrays
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.wardrobe import words_of
 from primdiffusion.primitives.primitives import K, Payload, S
 
-_DAMAGED = (OSError, KeyError, ValueError, TypeError, OverflowError)
 _ABOUT = ("betas", "attributes", "full_density")
-_NO_PERSON = "{path} is not a payload file or is damaged ({error!s:.160}): write it again with `primdiffusion payloads`"
 _VOXELS = (K, S, S, S, 4)
 
 
@@ -96,13 +96,11 @@ def attributes_of(stored: Mapping[str, Any], betas: Float[Tensor, "10"], count: 
 
 def read_person(path: Path) -> PersonVariants:
     """Read a file. Raises ValueError if it is damaged or of another shape."""
-    try:
+    with _damage_named(path):
         arrays = read_arrays(path, (*_ABOUT, "voxels"), ("delta_scale",))
         outline = _outline_of(arrays, arrays["voxels"].shape)
         voxels = torch.from_numpy(arrays["voxels"])
         scale = torch.from_numpy(arrays["delta_scale"]) if "delta_scale" in arrays else None
-    except _DAMAGED as error:
-        raise ValueError(_NO_PERSON.format(path=path, error=str(error).removeprefix(f"{path}: ")[:150])) from error
     if voxels.dtype != torch.uint8 or tuple(voxels.shape[1:]) != _VOXELS:
         raise ValueError(
             f"{path} holds voxels {voxels.dtype} {tuple(voxels.shape)}; uint8 [n, {K}, {S}, {S}, {S}, 4] is needed"
@@ -130,12 +128,15 @@ class Outline:
         return attributes_of(self.stored, self.betas, self.variants)
 
 
+def _damage_named(path: Path) -> contextlib.AbstractContextManager[None]:
+    remedy = "write it again with `primdiffusion payloads`"
+    return as_file_error(path, "is not a payload file or is damaged", remedy, OSError)
+
+
 def read_outline(path: Path) -> Outline:
     """Read a file without its voxels. Raises ValueError if it is damaged."""
-    try:
+    with _damage_named(path):
         return _outline_of(read_arrays(path, _ABOUT), array_shape(path, "voxels"))
-    except _DAMAGED as error:
-        raise ValueError(_NO_PERSON.format(path=path, error=str(error).removeprefix(f"{path}: ")[:150])) from error
 
 
 def _outline_of(arrays: Mapping[str, NDArray], shape: tuple[int, ...]) -> Outline:

@@ -21,7 +21,7 @@ from ...jobs.queue import chosen_checkpoint
 from ...scene.human import PERSON_FILE
 from ..attributes import Attributes, parsed
 from .people import Movement, movement_of, person_blend
-from .running import Clock, NoBackend, Say, Stopped, ask, backend_of, begun, publish, reason, run, staging
+from .running import Clock, Say, ask, attempt, backend_of, begun, publish, run, staging
 from .words import DECLARED, motion_name, parse_generate
 
 SETTINGS = "settings.json"
@@ -45,14 +45,9 @@ def _generate(options: argparse.Namespace, say: Say, stop: Stop) -> Report:
     with begun(report, options.out / SETTINGS, settings, options.resume), backend_of(options.python) as backend:
         for number in range(options.count):
             seed = options.seed + number
-            if stop.is_set():
-                raise Stopped
-            if _is_there(options.out / person_name(seed), options.blend):
-                report.skipped.append(person_name(seed))
-                clock.piece_skipped()
-                continue
-            job = _Person(options, {**params, "seed": seed}, movement, f"{number + 1}/{options.count}", say, stop)
-            _try(job, backend, report, clock)
+            which = f"{number + 1}/{options.count}"
+            job = _Person(options, {**params, "seed": seed}, movement, which, say, stop)
+            attempt(job.name, "generate", lambda job=job: job.make(backend), report, clock, stop, say, which)
     return report
 
 
@@ -70,10 +65,6 @@ def _params(options: argparse.Namespace, attributes: Attributes) -> dict[str, ob
     return {**params, **({"checkpoint": str(checkpoint)} if checkpoint else {})}
 
 
-def _is_there(folder: Path, blend: str | None) -> bool:
-    return (folder / PERSON_FILE).is_file() and (blend is None or (folder / blend).is_file())
-
-
 class _Person:
     """One of the batch."""
 
@@ -84,11 +75,13 @@ class _Person:
         self._blend, self._params, self._movement, self._stop = options.blend, params, movement, stop
         self._printed = 0.0
 
-    def make(self, backend: Backend) -> None:
+    def make(self, backend: Backend) -> bool:
         """Write the folder, then the .blend; what is there already stays. Raises as `ask`, and ValueError and OSError.
 
-        Where the .blend cannot be made the human stays.
+        Where the .blend cannot be made the human stays. Returns whether anything was missing.
         """
+        if all((self._folder / name).is_file() for name in (PERSON_FILE, self._blend) if name is not None):
+            return False
         check_unlinked(self._folder)
         if not (self._folder / PERSON_FILE).is_file():
             with staging(self._folder) as made:
@@ -98,22 +91,10 @@ class _Person:
             with staging(self._folder) as made:
                 person_blend(self._folder / PERSON_FILE, made / self._blend, self.name, self._movement)
                 publish(made, self._folder, last=self._blend)
+        return True
 
     def _print_progress(self, request: ChildRequest) -> None:
         if not request.finished and time.monotonic() - self._printed > _PRINT_S:
             self._printed = time.monotonic()
             left = f" ({duration(request.eta_s)} left)" if request.eta_s else ""
             self.say(f"{self.which} {self.name}: {request.message}{left}")
-
-
-def _try(person: _Person, backend: Backend, report: Report, clock: Clock) -> None:
-    try:
-        person.make(backend)
-    except (NoBackend, Stopped):
-        raise
-    except Exception as error:  # one human must not end the batch of a night
-        report.fail(person.name, "generate", reason(error))
-        person.say(f"{person.which} {person.name} failed: {reason(error)}{clock.piece_made()}")
-    else:
-        report.done.append(person.name)
-        person.say(f"{person.which} {person.name} done{clock.piece_made()}")

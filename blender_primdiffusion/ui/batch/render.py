@@ -39,15 +39,14 @@ from .people import (
 )
 from .running import (
     Clock,
-    NoBackend,
     Say,
     Stopped,
     ask,
+    attempt,
     backend_of,
     begun,
     check_backend,
     python_for_engine,
-    reason,
     run,
 )
 from .words import ENGINES, motion_name, parse_render
@@ -137,27 +136,8 @@ def _render(options: argparse.Namespace, say: Say, stop: Stop) -> Report:
     ):
         drawing = _Drawing(options, movement, backend, stop, say)
         for source in found:
-            if stop.is_set():
-                raise Stopped
-            _try(drawing, source, report, clock)
+            attempt(source.name, "render", lambda source=source: drawing.draw(source) > 0, report, clock, stop, say)
     return report
-
-
-def _try(drawing: _Drawing, source: RenderSource, report: Report, clock: Clock) -> None:
-    try:
-        count = drawing.draw(source)
-    except (NoBackend, Stopped):
-        raise
-    except Exception as error:  # one human must not end the batch of a night
-        report.fail(source.name, "render", reason(error))
-        drawing.say(f"{source.name} failed: {reason(error)}{clock.piece_made()}")
-        return
-    if count:
-        report.done.append(source.name)
-        drawing.say(f"{source.name} done{clock.piece_made()}")
-    else:
-        report.skipped.append(source.name)
-        clock.piece_skipped()
 
 
 class _Drawing:

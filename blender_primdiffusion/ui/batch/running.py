@@ -32,6 +32,7 @@ from ...console import (
 )
 from ...formats import whole_files
 from ...formats.json_files import parse_json, read_json
+from ...formats.regular_files import as_file_error
 from ...formats.removing import remove_file
 from ...formats.whole_files import remove_abandoned, temporary_folder, write_atomically
 from ...places import EXTENSION, new_backend, preference
@@ -149,10 +150,8 @@ def claim(path: Path, settings: Mapping[str, Any], whatever_is_there: bool) -> N
         raise _unwritable(path.parent, error) from error
     wanted = parse_json(json.dumps(settings))
     if path.is_file() and not whatever_is_there:
-        try:
+        with as_file_error(path, "is damaged", "choose another folder, or add --resume"):
             there = dict(read_json(path))
-        except (ValueError, TypeError) as error:
-            raise ValueError(f"{path} is damaged ({error!s:.160}): choose another folder, or add --resume") from error
         for name in sorted({*wanted, *there}):
             if there.get(name) != wanted.get(name):
                 raise ValueError(
@@ -259,3 +258,29 @@ class Clock:
     def piece_skipped(self) -> None:
         """Count a piece that existed before."""
         self._left -= 1
+
+
+def attempt(
+    name: str, what: str, make: Callable[[], bool], report: Report, clock: Clock, stop: Stop, say: Say, which: str = ""
+) -> None:
+    """Make a piece of a batch, and report it: one that fails must not end the batch of a night.
+
+    `make` returns whether anything was missing. Raises Stopped and NoBackend.
+    """
+    if stop.is_set():
+        raise Stopped
+    label = f"{which} {name}".strip()
+    try:
+        made = make()
+    except (NoBackend, Stopped):
+        raise
+    except Exception as error:
+        report.fail(name, what, reason(error))
+        say(f"{label} failed: {reason(error)}{clock.piece_made()}")
+        return
+    if made:
+        report.done.append(name)
+        say(f"{label} done{clock.piece_made()}")
+    else:
+        report.skipped.append(name)
+        clock.piece_skipped()

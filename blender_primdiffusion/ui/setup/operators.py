@@ -16,10 +16,10 @@ from ...backend.setup import Steps
 from ...engine import studio
 from ...jobs.queue import queue
 from ...places import CACHE_VARIABLE, backend_module_path, cache_folder, preference, set_up_folder
+from ..declared import SKIP
 from ..preferences import NOTHING_TO_CANCEL
 from . import known
 
-_SKIP = {"SKIP_SAVE"}
 TICK_S = 0.2
 _PRINT_S = 2.0
 """Between lines of progress on the console in background mode."""
@@ -191,15 +191,15 @@ class PRIMDIFFUSION_OT_set_up_backend(bpy.types.Operator):
     bl_label = "Set Up Backend"
     bl_options: set[str] = set()
 
-    repair: bpy.props.BoolProperty(name="Repair", description="Reinstall the backend", options=_SKIP)
+    repair: bpy.props.BoolProperty(name="Repair", description="Reinstall the backend", options=SKIP)
     choose: bpy.props.BoolProperty(
         name="Install from Folder",
         description="Set up the backend from a folder of wheels, without a network; every file is checked against its "
         "known hash",
-        options=_SKIP,
+        options=SKIP,
     )
     directory: bpy.props.StringProperty(
-        name="Folder", description="Folder of wheels; empty: they are downloaded", subtype="DIR_PATH", options=_SKIP
+        name="Folder", description="Folder of wheels; empty: they are downloaded", subtype="DIR_PATH", options=SKIP
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 

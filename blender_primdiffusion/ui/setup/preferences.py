@@ -16,27 +16,27 @@ _SIDEBAR = 30
 ONLINE = "Blender may not use the network: allow it in System > Network > Allow Online Access, or install from a folder"
 
 
-def draw_set_up(layout: bpy.types.UILayout, width: int = _SIDEBAR) -> bool:
+def draw_set_up(layout: bpy.types.UILayout) -> bool:
     """For panels that need the backend: the progress of a set-up, or its button; nothing where a backend is ready.
 
     Returns whether it is.
     """
     if session.busy:
-        draw_progress(layout, width)
+        draw_progress(layout, _SIDEBAR)
         return False
     now = known()
     if now.usable:
         return True
     box = layout.box()
-    draw_lines(box, now.line, "ERROR", width)
-    if now.state == "named" or not draw_cost(box, width):
+    draw_lines(box, now.line, "ERROR", _SIDEBAR)
+    if now.state == "named" or not draw_cost(box, _SIDEBAR):
         props = box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES")
         props.module = EXTENSION
     elif now.state == "broken":
         box.operator("primdiffusion.set_up_backend", text="Repair", icon="TOOL_SETTINGS").repair = True
     else:
         box.operator("primdiffusion.set_up_backend", icon="IMPORT")
-    draw_result(box, width)
+    draw_result(box, _SIDEBAR)
     return False
 
 

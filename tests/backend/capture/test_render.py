@@ -20,6 +20,7 @@ from primdiffusion.commands.captures import parse_shard
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.capture_repair import verify
 from support.errors import refused
+from support.runs import within
 
 NAMES = ["person_000000", "person_000001"]
 
@@ -206,13 +207,6 @@ def test_workers_end_when_the_command_is_killed(tmp_path):
         process.kill()
         process.wait()
     assert within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
-
-
-def within(seconds: float, reached) -> bool:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline and not reached():
-        time.sleep(0.1)
-    return bool(reached())
 
 
 def test_files_of_poses_that_cannot_be_read_are_left_out_and_reported(tmp_path, capsys):

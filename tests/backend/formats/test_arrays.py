@@ -21,7 +21,6 @@ from primdiffusion.formats.arrays import (
     read_npy,
     read_numbers,
     write_deflated,
-    write_stored,
 )
 from support.errors import refused
 
@@ -136,10 +135,9 @@ def test_numbers_fit_float32(tmp_path, value):
         read_numbers(tmp_path / "a.npz", ("uv",))
 
 
-@pytest.mark.parametrize("write", [write_deflated, write_stored])
-def test_what_is_written_is_read(tmp_path, write):
+def test_what_is_written_is_read(tmp_path):
     arrays = {"a": np.arange(6.0).reshape(2, 3).T, "b": np.array("text"), "c": np.zeros((0, 3), np.uint8)}
-    write(tmp_path / "a.npz", arrays)
+    write_deflated(tmp_path / "a.npz", arrays)
     found = read_arrays(tmp_path / "a.npz", tuple(arrays))
     assert all(np.array_equal(found[name], values) for name, values in arrays.items())
     assert array_shape(tmp_path / "a.npz", "a") == (3, 2)
@@ -151,12 +149,11 @@ def test_a_shape_beyond_the_file_is_rejected_without_reading(tmp_path):
         array_shape(path, "pose")
 
 
-@pytest.mark.parametrize("write", [write_deflated, write_stored])
-def test_a_full_disk_is_one_error(write):
+def test_a_full_disk_is_one_error():
     if not os.path.exists("/dev/full"):
         pytest.skip("no device that is always full")
     with refused(OSError, "space") as raised:
-        write("/dev/full", {"a": np.random.default_rng(0).random(100_000)})
+        write_deflated("/dev/full", {"a": np.random.default_rng(0).random(100_000)})
     assert raised.value.__context__ is None or isinstance(raised.value.__context__, (OSError, ValueError))
 
 

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -23,6 +22,7 @@ from primdiffusion.people.fitting import cover
 from primdiffusion.people.folder import PeopleSet, is_whole, make_people
 from primdiffusion.people.wardrobe import SKIRTS
 from support.errors import refused
+from support.runs import within
 
 OTHER_PROCESSOR = {
     "OPENBLAS_CORETYPE": "Prescott",
@@ -78,11 +78,9 @@ def test_other_sets_of_people_are_rejected(assets, two):
         list(make_people(assets, PeopleSet(two, 3, 1), 1))
 
 
-@pytest.mark.parametrize(
-    ("seed", "count", "word"), [(0, 0, "count is 0"), (-1, 2, "seed -1 is outside"), (2**63 - 1, 2, "is outside 0 ")]
-)
-def test_sets_without_people_are_rejected(tmp_path, seed, count, word):
-    with pytest.raises(ValueError, match=word):
+@pytest.mark.parametrize(("seed", "count", "name"), [(0, 0, "count"), (-1, 2, "seed"), (2**63 - 1, 2, "seed")])
+def test_sets_without_people_are_rejected(tmp_path, seed, count, name):
+    with refused(ValueError, name):
         PeopleSet(tmp_path, seed, count)
 
 
@@ -168,7 +166,7 @@ def test_stopped_runs_leave_whole_people_and_no_workers(assets, tmp_path, blow):
     options = ("--count", "60", "--workers", "2")
     process = subprocess.Popen(command(assets, tmp_path, *options), stderr=subprocess.DEVNULL)
     try:
-        assert _within(120, lambda: len(list(tmp_path.glob("person_*"))) >= 2)
+        assert within(120, lambda: len(list(tmp_path.glob("person_*"))) >= 2)
         workers = psutil.Process(process.pid).children(recursive=True)
         assert len(workers) >= 2
         process.send_signal(blow)
@@ -176,17 +174,10 @@ def test_stopped_runs_leave_whole_people_and_no_workers(assets, tmp_path, blow):
     finally:
         process.kill()
         process.wait()
-    assert _within(15, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
+    assert within(15, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
     for folder in tmp_path.glob("person_*"):
         assert is_whole(folder, int(folder.name[-6:]))
     assert not (tmp_path / "manifest.json").exists()
-
-
-def _within(seconds, reached):
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline and not reached():
-        time.sleep(0.2)
-    return reached()
 
 
 def test_links_in_place_of_a_sample_and_in_it_are_not_followed(monkeypatch, tmp_path):

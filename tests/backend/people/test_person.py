@@ -5,8 +5,6 @@ import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable
 
 import numpy as np
 import psutil
@@ -29,6 +27,7 @@ from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.inverse import InverseSettings
 from primdiffusion.render.march import march
 from support.errors import refused
+from support.runs import within
 
 SEEDS = range(6)
 
@@ -304,17 +303,10 @@ def test_workers_end_when_the_command_is_killed(assets, tmp_path):
     options = ["--out", str(tmp_path), "--count", "50", "--workers", "2", "--making", "from_mesh"]
     process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL)
     try:
-        assert _within(60, lambda: any(tmp_path.glob("*.npz")))
+        assert within(60, lambda: any(tmp_path.glob("*.npz")))
         workers = psutil.Process(process.pid).children(recursive=True)
         assert len(workers) >= 2
     finally:
         process.kill()
         process.wait()
-    assert _within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
-
-
-def _within(seconds: float, reached: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline and not reached():
-        time.sleep(0.2)
-    return reached()
+    assert within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))

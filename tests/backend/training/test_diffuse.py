@@ -13,13 +13,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from diffuse_runs import DEFAULT_FILES, TINY_UNET, child_environment, logged, make_small, rows, settings
+from diffuse_runs import DEFAULT_FILES, TINY_UNET, logged, make_small, settings
 from diffusion_people import write_people
 from PIL import Image
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import codec_regions
 from primdiffusion.diffusion.model_card import model_card
-from primdiffusion.failures import describe
 from primdiffusion.human import generate
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import S
@@ -32,8 +31,8 @@ from primdiffusion.training.losses import LEVELS
 from primdiffusion.training.shards import INDEX, pack_people
 from primdiffusion.training.slabs import SlabTask
 from primdiffusion.training.stored_people import PersonFolder
-from safetensors.torch import load_file
 from support.errors import refused
+from support.runs import child_environment, rows, same_tensors, sentence, timeless
 
 DIES_IN_THE_FIFTH_SAVE = """
 import os, signal, sys
@@ -90,27 +89,10 @@ def run(whole, tmp_path):
     return folder
 
 
-def timeless(run):
-    """Lines of metrics.jsonl without what a clock says."""
-    return [{name: value for name, value in row.items() if not name.startswith("seconds")} for row in rows(run)]
-
-
 def after(steps):
     """An interrupt that comes after so many steps."""
     asked = []
     return lambda self: asked.append(0) or len(asked) > steps
-
-
-def same_tensors(one, other):
-    a, b = load_file(one), load_file(other)
-    return a.keys() == b.keys() and all(torch.equal(a[key], b[key]) for key in a)
-
-
-def sentence(error):
-    failure = describe(error)
-    assert failure is not None
-    assert "\n" not in str(failure)
-    return str(failure)
 
 
 def first_step(phase):

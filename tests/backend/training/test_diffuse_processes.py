@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from diffuse_runs import DEFAULT_FILES, child_environment, logged, make_small, settings
+from diffuse_runs import DEFAULT_FILES, logged, make_small, settings
 from diffusion_people import write_people
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.training.cells import CellTask
@@ -16,6 +16,7 @@ from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.diffuse import MODEL, train
 from primdiffusion.training.loop import step_seed
 from safetensors.torch import load_file
+from support.runs import child_environment
 
 SCRIPT = Path(__file__).parents[1] / "diffuse_runs.py"
 PHASES = {"person": {"steps": 2, "batch": 8, "evaluate_every": 2}, "local": {"steps": 1, "batch": 2}}

@@ -9,7 +9,7 @@ import pytest
 import torch
 from accelerate import Accelerator
 from capture_scenes import captured
-from fit_scenes import STATE, WHOLE, files, flags, make_small, rows, sentence, settings, stop_after
+from fit_scenes import STATE, WHOLE, files, flags, make_small, settings, stop_after
 from PIL import Image
 from primdiffusion.capture.dataset import FIRST, SINGLE_PROCESS
 from primdiffusion.capture.reader import open_captures
@@ -24,6 +24,7 @@ from primdiffusion.training.loop import StepTimer, begin_phase
 from primdiffusion.training.run_folder import METRICS, PICTURES, Metrics
 from safetensors.torch import load_file
 from support.errors import refused
+from support.runs import rows, sentence
 
 ROOT = Path(__file__).parents[3]
 

@@ -3,12 +3,13 @@
 import pytest
 import torch
 from capture_scenes import save_person
-from fit_scenes import forget_processes, patched_person, rows
+from fit_scenes import forget_processes, patched_person
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.training.fit import fit
 from primdiffusion.training.fit_config import FitConfig
+from support.runs import rows
 
 
 @pytest.mark.slow

@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 from capture_scenes import captured
-from fit_scenes import STATE, WHOLE, child_environment, files, flags, logged, make_small, settings
+from fit_scenes import STATE, WHOLE, files, flags, logged, make_small, settings
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.training.fit import MODEL, fit
 from safetensors.torch import load_file
+from support.runs import child_environment
 
 SCRIPT = Path(__file__).parents[1] / "fit_scenes.py"
 

@@ -11,18 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from capture_scenes import captured
-from fit_scenes import (
-    STATE,
-    WHOLE,
-    files,
-    logged,
-    make_small,
-    rows,
-    same_tensors,
-    sentence,
-    settings,
-    stop_after,
-)
+from fit_scenes import STATE, WHOLE, files, logged, make_small, settings, stop_after
 from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.training import loop
@@ -33,6 +22,7 @@ from primdiffusion.training.run_folder import CONFIG, METRICS, RUN
 from primdiffusion.training.state import TrainingState
 from safetensors import safe_open
 from support.errors import refused
+from support.runs import same_tensors, sentence, timeless
 from tiny_encoder import TINY
 
 
@@ -72,11 +62,6 @@ def begun(captures, one_step, tmp_path):
     """The settings of a run that took one step."""
     shutil.copytree(one_step, tmp_path / "run")
     return settings(captures, tmp_path / "run")
-
-
-def timeless(run: Path) -> list[dict]:
-    """Lines of metrics.jsonl without what a clock says."""
-    return [{name: value for name, value in row.items() if not name.startswith("seconds")} for row in rows(run)]
 
 
 def place(run: Path) -> dict[str, str]:

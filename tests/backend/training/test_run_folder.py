@@ -5,7 +5,7 @@ import fit_scenes
 import pytest
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
-from primdiffusion.training.folder_lock import lock_folder
+from primdiffusion.training.run_folder import lock_folder
 from support.errors import refused
 
 

@@ -5,11 +5,12 @@ import types
 
 import pytest
 from accelerate import PartialState
-from diffuse_runs import make_small, rows, settings
+from diffuse_runs import make_small, settings
 from primdiffusion.failures import MissingPackageError, describe
 from primdiffusion.training.config import check_resumable, to_json
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.run_folder import open_metrics
+from support.runs import rows
 
 
 class Wandb(types.ModuleType):

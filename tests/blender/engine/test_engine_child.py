@@ -22,7 +22,8 @@ from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.backend.environment import BackendPython
-from blender_primdiffusion.engine import final, studio
+from blender_primdiffusion.engine import studio
+from blender_primdiffusion.engine.engine import render_layer
 from blender_primdiffusion.engine.frames import CHANNELS, SharedFrames
 
 pytestmark = pytest.mark.any_blender
@@ -91,7 +92,7 @@ def test_a_second_picture_uses_the_same_child_and_the_same_file(stage):
 def test_progress_and_seconds_left_are_reported_band_by_band(stage, monkeypatch):
     monkeypatch.setenv("FAKE_STEP_S", "0.15")
     engine = Engine()
-    drawing = final.render_layer(engine, bpy.context.evaluated_depsgraph_get())
+    drawing = render_layer(engine, bpy.context.evaluated_depsgraph_get())
     assert drawing.state == "done"
     assert engine.progress[-1] >= 0.75
     assert engine.progress == sorted(engine.progress)
@@ -103,7 +104,7 @@ def test_a_cancel_ends_the_picture_within_a_band(stage, monkeypatch):
     monkeypatch.setenv("FAKE_STEP_S", "0.3")
     render()
     engine = Engine(stop_after_s=0.1)
-    drawing = final.render_layer(engine, bpy.context.evaluated_depsgraph_get())
+    drawing = render_layer(engine, bpy.context.evaluated_depsgraph_get())
     assert drawing.state == "cancelled"
     assert max(engine.progress, default=0.0) < 1.0
 
@@ -114,7 +115,7 @@ def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, m
             yield
 
     monkeypatch.setattr("blender_primdiffusion.backend.environment.search", forever)
-    drawing = final.render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
+    drawing = render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
     assert drawing.state in ("starting", "cancelled")
 
 
@@ -122,7 +123,7 @@ def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
     monkeypatch.setenv("FAKE_STEP_S", "0.2")
     render()
     began, busy = time.monotonic(), time.thread_time()
-    final.render_layer(Engine(), bpy.context.evaluated_depsgraph_get())
+    render_layer(Engine(), bpy.context.evaluated_depsgraph_get())
     assert time.thread_time() - busy < 0.5 * (time.monotonic() - began)
 
 

@@ -75,7 +75,7 @@ def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_j
     [
         (DIES, "ended by itself"),
         (FAILS, "checkpoint is damaged"),
-        (GIVES_GARBAGE, r"contains no human \([^)]*\); generate the human again"),
+        (GIVES_GARBAGE, "contains no human .*generate the human again"),
     ],
 )
 def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed, sentence):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from human_stage import strong_pose
 from oracle import Z_UP, blended_frames, blended_vertices, evaluated_matrices, world_from_model
 from support.errors import refused
 
@@ -29,11 +30,6 @@ def person(saved_scene, tmp_path):
     """A synthetic person of format version 2 in shot.blend, as (collection, arrays)."""
     arrays = synthetic_shape.arrays(COUNT)
     return build_human(saved_scene, synthetic_shape.write(tmp_path / "human", COUNT)), arrays
-
-
-def strong_pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return synthetic.axis_angle(rng.normal(0, 0.7, (24, 3))), rng.normal(0, 0.5, 3)
 
 
 def shown() -> dict[str, np.ndarray]:

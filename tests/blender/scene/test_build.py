@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from human_stage import strong_pose
 from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
 from support.errors import refused
@@ -47,11 +48,6 @@ def volume_files() -> list[str]:
 def person(saved_scene, tmp_path):
     """The synthetic person in shot.blend, as (collection, arrays)."""
     return build_human(saved_scene, synthetic.write(tmp_path / "human", 48)), synthetic.arrays(48)
-
-
-def strong_pose(seed: int) -> tuple[np.ndarray, np.ndarray]:
-    rng = np.random.default_rng(seed)
-    return synthetic.axis_angle(rng.normal(0, 0.7, (24, 3))), rng.normal(0, 0.5, 3)
 
 
 def expected_matrices(collection, arrays, rotations, translation) -> np.ndarray:

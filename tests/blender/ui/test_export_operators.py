@@ -231,7 +231,7 @@ def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, dam
     whole = path.read_bytes()
     path.write_bytes({"short": b"abc", "text": b"not a person at all", "cut": whole[:-8], "other": whole.replace(
         b"primdiffusion.human", b"primdiffusion.model")}[damage])  # fmt: skip
-    assert_rejected("contains no human .*; choose a .human file", OPERATORS.import_human, filepath=str(path))
+    assert_rejected("contains no human .*choose a .human file", OPERATORS.import_human, filepath=str(path))
     assert not humans(bpy.context.scene)
 
 
@@ -245,8 +245,8 @@ class Dialog:
     """An export in the file browser, which calls `check` after each change."""
 
     def __init__(self, **given):
-        self.given, self.filepath, self.reported = given, "", []
-        self.properties = SimpleNamespace(is_property_set=lambda name: name in self.given)
+        self.filepath, self.reported = "", []
+        self.properties = SimpleNamespace(is_property_set=lambda name: name in given)
         vars(self).update(given)
 
     def __getattr__(self, name):

@@ -151,9 +151,8 @@ def test_a_random_shape_is_the_same_for_the_same_seed(person):
 
 
 def test_each_press_of_random_is_another_body(person, addon):
-    ungiven = SimpleNamespace(is_property_set=lambda _: False)
     pressed = [
-        SimpleNamespace(to="RANDOM", seed=0, properties=ungiven, execute=lambda _: {"FINISHED"}) for _ in range(2)
+        SimpleNamespace(to="RANDOM", seed=0, given=lambda _: False, execute=lambda _: {"FINISHED"}) for _ in range(2)
     ]
     for press in pressed:  # background mode has no window to press a button in
         assert PRIMDIFFUSION_OT_reshape.invoke(press, addon, None) == {"FINISHED"}

@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 
 from filelock import FileLock
-from primdiffusion.training.folder_lock import LOCK, lock_folder
+from primdiffusion.training.run_folder import LOCK, lock_folder
 from support.errors import refused
 
 HOLD = """
 import sys
 from pathlib import Path
-from primdiffusion.training.folder_lock import lock_folder
+from primdiffusion.training.run_folder import lock_folder
 with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
