@@ -115,7 +115,7 @@ def generate_batch(
         final = step.x0
     assert final is not None, "a sampler yields at least one step"
     numbers = {name: float(attributes[name]) for name in model.vocabulary.scalars if name in attributes}
-    conditioning = {"attributes": {**attributes, **numbers}} if attributes else {}
+    conditioning: dict[str, Any] = {"attributes": {**attributes, **numbers}} if attributes else {}
     if model.vocabulary.width:
         conditioning["guidance"] = guidance
     shared = {"steps": steps, "sampler": sampler, **conditioning, **made_by(model)}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import view_seed
 from ..formats.group_places import extent, first_frames, stand_together
-from ..motion.motion import Motion
+from ..formats.poses.motion import Motion
 from .body import Body
 from .scan import Scan, ScanFile
 from .settings import CaptureSettings

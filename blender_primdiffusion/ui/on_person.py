@@ -117,9 +117,7 @@ class OnArmature(Reporting):
     def poll(cls, context: bpy.types.Context) -> bool:
         found = may_have_joints(context)
         if not found:
-            cls.poll_message_set(
-                "There is no human in the scene: add one, or select an armature with SMPL's joints"
-            )
+            cls.poll_message_set("There is no human in the scene: add one, or select an armature with SMPL's joints")
         return found
 
     def act(self, context: bpy.types.Context) -> set[str]:

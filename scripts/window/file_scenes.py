@@ -76,13 +76,13 @@ def copies(module: str, python: str) -> Steps:
     bpy.ops.wm.save_as_mainfile(filepath=str(first))
     yield from sidebar()
     window, area = view()
+    humans = import_module(f"{module}.scene.human").humans
     for key, count, aside in (("shift+d", 2, 1.0), ("alt+d", 3, -1.0)):
         select(armatures()[0])
         yield {"point": [area.x + area.width // 2, window.height - area.y - area.height // 2]}
         yield {"key": key}
         yield 0.5
         yield {"key": "Return"}
-        humans = import_module(f"{module}.scene.human").humans
         yield from wait(lambda count=count: len(humans(bpy.context.scene)) == count, 20)
         bpy.context.view_layer.objects.active.location.x += aside
         expect(module, count)

@@ -134,7 +134,8 @@ def _started(farm: Farm) -> Any:
 
 def _die_with_parent() -> None:
     """End the renderer with its worker, because another worker takes over the subject. Linux only."""
-    ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_SET_PARENT_DEATH_SIGNAL, signal.SIGKILL)
 
 
 def _tail(text: str) -> str:

@@ -89,11 +89,11 @@ def _rest() -> dict[str, tuple[str, NDArray[np.float64]]]:
 
 
 REST: dict[str, tuple[str, NDArray[np.float64]]] = _rest()
-"""Joint -> its parent and its orientation [3, 3] where all angles are zero: arms 45 degrees down, y up, facing +z.
+"""Joint -> its parent and its orientation [3, 3] at rest: arms 45 degrees down, y up, facing +z.
 
-Only those between the pelvis and SMPL's joints. A right joint is its left one mirrored, its axes reversed. Measured on
-the skeleton of MHR's published rig (Meta, Apache-2.0): its bones lie along their first axis, and both sides mirror each
-other within 1e-5. Any pose of the rig could stand here, since places at rest are derived from it.
+Only those between the pelvis and SMPL's joints. A right joint is its left one mirrored, its axes reversed. Taken from
+an extraction that others published of MHR's rig (Meta, Apache-2.0): bones lie along their first axis, and both sides
+mirror each other within 1e-4. Any pose of the rig could stand here, since places at rest are derived from it.
 """
 _TURNS = {f"{side}_foot": f"{side}_transversetarsal" for side in "lr"}
 """The ankle has its place at one joint; the foot turns with the last of the joints behind it."""
@@ -172,7 +172,7 @@ def _frames(values: NDArray, shape: tuple[int, ...], key: str, path: Path) -> ND
 
 
 def _places_at_rest(world: Mapping[str, NDArray], at: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
-    """Places of the joints [3] where all angles are zero: each is fixed to its parent, on average over the frames."""
+    """Places of the joints [3] at rest: each is fixed to its parent, on average over the frames."""
     places: dict[str, NDArray[np.float64]] = {}
     for name, (parent, _) in REST.items():
         if not parent:

@@ -112,7 +112,7 @@ def slerp(a: NDArray, b: NDArray, share: NDArray | float) -> NDArray[np.float64]
     sine = np.sin(angle)
     near = sine < 1e-6
     safe = np.where(near, 1.0, sine)
-    first = np.where(near, 1 - share, np.sin((1 - share) * angle) / safe)
+    first: NDArray[np.float64] = np.where(near, 1 - share, np.sin((1 - share) * angle) / safe)
     second = np.where(near, share, np.sin(share * angle) / safe)
     return first * a + second * b
 
