@@ -67,8 +67,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     keyframed = time.perf_counter() - start
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, arguments.frames
 
-    human_file = next(arguments.blend.parent.rglob("*.human.safetensors"))
-    shutil.copyfile(human_file, arguments.human)
+    shutil.copyfile(scene_human.person_file(collection), arguments.human)
     checked = [1, 1 + arguments.frames // 3, arguments.shown + 1, arguments.frames]
     bpy.ops.primdiffusion.volumes_in_viewport()  # others are not evaluated
     error = max(lbs_error_mm(armature, arguments.human, rotations[number - 1], number) for number in checked)
