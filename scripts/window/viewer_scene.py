@@ -14,7 +14,7 @@ _MOST_S = 120.0
 
 
 def viewer(module: str, _python: str) -> Steps:
-    """The panels as they open, the sample human, a pose, material preview, a render with Cycles."""
+    """The panels as they open, the sample human, a pose, material preview, the view rendered with Cycles."""
     yield from begin(module, "")
     yield from sidebar()
     yield "viewer_sidebar"
@@ -31,7 +31,7 @@ def viewer(module: str, _python: str) -> Steps:
     yield from at_rest(module)
     yield "viewer_posed"
     bpy.context.scene.render.engine = "CYCLES"
-    bpy.context.scene.cycles.samples = 8
+    bpy.context.scene.cycles.preview_samples = 8
     area.spaces.active.shading.type = "RENDERED"
     yield 40.0
     yield "viewer_cycles"

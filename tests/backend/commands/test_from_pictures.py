@@ -129,6 +129,7 @@ def test_a_fit_alone_writes_the_posture_and_can_be_cancelled_at_every_report(pic
     answer = fit_posture(request, Session(), lambda *report: reports.append(report[:3]))
     assert answer.posture == tmp_path / "out" / "posture.json"
     assert answer.posture.is_file()
+    assert not any("sides" in warning for warning in answer.warnings)  # a fit makes none
     assert [report[0] for report in reports[:2]] == ["read", "load"]
     shutil.rmtree(tmp_path / "out")
     for end in range(len(reports)):
