@@ -249,6 +249,8 @@ def captures(module: str, python: str) -> Steps:
     yield 1.0
     yield "captures_cameras"
     press("primdiffusion.preview_rig")
+    settings = bpy.context.scene.primdiffusion_captures
+    settings.light, settings.hdri, settings.background = "hdri", str(Path(tempfile.gettempdir()) / "skies"), "hdri"
     yield from show(*(f"PRIMDIFFUSION_PT_captures/captures_{name}" for name in ("input", "cycles", "output")))
     yield "captures_output"
     yield from show("PRIMDIFFUSION_PT_captures", "PRIMDIFFUSION_PT_human_from_captures")
