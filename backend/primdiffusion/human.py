@@ -26,6 +26,7 @@ from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.fixed_threads import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.samplers import SamplerStep
+from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.formats import requests
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
@@ -56,8 +57,8 @@ class Human(TensorRecord):
     betas: Float[Tensor, "n"]
     """Shape coefficients of the body."""
     provenance: Mapping[str, Any]
-    """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, attributes and guidance if
-    requested, checkpoint, checkpoint_sha256, full_density, version."""
+    """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
+    sample, attributes and guidance if requested, checkpoint, checkpoint_sha256, full_density, version."""
     body_setup: BodySetup | None = None
     """Body and anchors; None is the default body."""
 
@@ -81,6 +82,7 @@ def generate(
     on_step: Callable[[SamplerStep], None] | None = None,
     attributes: Attributes = MappingProxyType({}),
     guidance: float = requests.Conditioning.guidance,
+    end: int = CLEAN,
 ) -> Human:
     """A new human, on the CPU, determined by model, seed, steps, sampler, attributes and guidance.
 
@@ -89,10 +91,11 @@ def generate(
 
     `attributes` condition the sample on attributes in `model.vocabulary`; those left open are drawn from the seed.
     `on_step` is called after each step; raise an exception from it to cancel.
+    `end` is the level at which the sampler ddim ends: `samplers.RELEASED_END` as in the released code.
     Raises ValueError for an unknown sampler or attribute, a number of steps outside 1 ... T, or a seed outside
     0 ... 2^63-1.
     """
-    return generate_batch(model, [seed], steps, sampler, on_step, attributes, guidance)[0]
+    return generate_batch(model, [seed], steps, sampler, on_step, attributes, guidance, end)[0]
 
 
 def generate_batch(
@@ -103,22 +106,24 @@ def generate_batch(
     on_step: Callable[[SamplerStep], None] | None = None,
     attributes: Attributes = MappingProxyType({}),
     guidance: float = requests.Conditioning.guidance,
+    end: int = CLEAN,
 ) -> list[Human]:
     """One human per seed, sampled as a batch; equal to `generate` up to rounding. Raises the same errors."""
     condition = model.condition(attributes)
     if not math.isfinite(guidance):
         raise ValueError(f"guidance is {guidance}: give a finite number, 1 for none")
     final = None
-    for step in sample(model, seeds, steps, sampler, condition, guidance):
+    for step in sample(model, seeds, steps, sampler, condition, guidance, end):
         if on_step is not None:
             on_step(step)
-        final = step.x0
+        final = step.x
     assert final is not None, "a sampler yields at least one step"
     numbers = {name: float(attributes[name]) for name in model.vocabulary.scalars if name in attributes}
     conditioning: dict[str, Any] = {"attributes": {**attributes, **numbers}} if attributes else {}
     if model.vocabulary.width:
         conditioning["guidance"] = guidance
-    shared = {"steps": steps, "sampler": sampler, **conditioning, **made_by(model)}
+    ending = {} if end == CLEAN else {"end": end}
+    shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **made_by(model)}
     people = people_of(model, final, seeds, attributes)
     return [
         dataclasses.replace(human, provenance={"seed": seed, **shared}).validate()

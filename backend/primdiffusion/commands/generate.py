@@ -23,7 +23,8 @@ from primdiffusion.commands.output import (
 from primdiffusion.commands.progress import Pace, ReportProgress, progress_bar, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.diffusion.samplers import SamplerStep
+from primdiffusion.diffusion.samplers import RELEASED_END, SamplerStep
+from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.editing.edit import with_payload
 from primdiffusion.editing.vary import vary_batch
 from primdiffusion.formats.answers import HumanAnswer, VariationFiles, VariationsAnswer
@@ -71,13 +72,23 @@ def generate_humans(
         def decode(x0: Tensor) -> Human:
             return people_of(model, x0[:1], seeds[:1], request.attributes)[0]
 
-        with step_previews(unfinished[0], request.picture_px, decode) as preview:
+        released = request.compositing == "released" and request.sampler == "ddim"
+        with step_previews(unfinished[0], request.picture_px, decode, request.compositing) as preview:
             on_step = step_reporter(report, preview)
-            humans = generate_batch(model, seeds, steps, request.sampler, on_step, request.attributes, request.guidance)
+            humans = generate_batch(
+                model,
+                seeds,
+                steps,
+                request.sampler,
+                on_step,
+                request.attributes,
+                request.guidance,
+                RELEASED_END if released else CLEAN,
+            )
         sampled = time.perf_counter()
         report("write", steps, steps, None)
         for folder, human in zip(unfinished, humans, strict=True):
-            write_human(folder, human, request.size, compact=compact)
+            write_human(folder, human, request.size, compact=compact, compositing=request.compositing)
         report("write", steps, steps, 0.0)  # the last chance to cancel
     return sampled
 

@@ -12,6 +12,7 @@ from primdiffusion.formats.requests import (
     LARGEST_SEED,
     RAY_STEP,
     VOXEL,
+    Compositing,
     Count,
     GaussiansRequest,
     GenerateRequest,
@@ -90,7 +91,7 @@ class RenderCommand(PoseOptions):
     """colour; depth in false colours, bright where near; alpha in grey; boxes: the primitives."""
     step: RayStep = RAY_STEP
     """Metres between samples of a ray; finer is slower and more accurate."""
-    compositing: Literal["linear", "released"] = "linear"
+    compositing: Compositing = "linear"
     """linear, as in Blender; released, as the authors' code: sRGB-encoded colours, boxes in index order, a sample each
     millimetre, rays through pixel corners."""
     background: Literal["black", "white", "transparent"] = "black"

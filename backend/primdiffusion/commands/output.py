@@ -11,16 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.removing import remove_file
+from primdiffusion.formats.requests import Compositing
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import save_body, save_human
-from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
-from primdiffusion.render.march import march
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.render.image import Background, depth_to_png, rgba_to_png, to_png
+from primdiffusion.render.march import RELEASED, Rendering, march
 
 INTERVAL_S = 0.4
 """Seconds between two previews."""
@@ -30,6 +35,7 @@ PREVIEWS = 2
 """Files at a time: one may still be being read when the next one appears."""
 THREE_QUARTERS = math.radians(20)
 ARMS_DOWN = math.radians(62)
+BLACK = (0.0, 0.0, 0.0)
 
 Decode = Callable[[Tensor], Human | None]
 """Decodes an x0 guess [b, ...] of a sampler to a human; None if there is nothing to show yet."""
@@ -55,17 +61,18 @@ class OutputFiles:
 FILES = OutputFiles()
 
 
-def write_human(folder: Path, human: Human, size: int, *, compact: bool = False) -> None:
+def write_human(
+    folder: Path, human: Human, size: int, *, compact: bool = False, compositing: Compositing = "linear"
+) -> None:
     """Write all FILES: the human, and previews of size x size pixels in the T pose.
 
     The first preview on a machine takes some seconds longer: the marcher is compiled, and cached. Raises OSError.
     """
     write_files(folder / FILES.human, human, compact=compact)
     primitives = place(human)
-    front = march(primitives, framing(primitives, 0.0, size, size))
-    to_png(folder / FILES.front, front)
+    front = draw(folder / FILES.front, primitives, framing(primitives, 0.0, size, size), BLACK, compositing)
     depth_to_png(folder / FILES.depth, front)
-    to_png(folder / FILES.side, march(primitives, framing(primitives, math.pi / 2, size, size)))
+    draw(folder / FILES.side, primitives, framing(primitives, math.pi / 2, size, size), BLACK, compositing)
 
 
 def write_files(path: Path, human: Human, *, compact: bool = False) -> None:
@@ -128,7 +135,9 @@ class PreviewFiles(contextlib.AbstractContextManager):
 
 
 @contextlib.contextmanager
-def step_previews(folder: Path, px: int, decode: Decode) -> Iterator[Callable[[SamplerStep], Path | None]]:
+def step_previews(
+    folder: Path, px: int, decode: Decode, compositing: Compositing = "linear"
+) -> Iterator[Callable[[SamplerStep], Path | None]]:
     """Yield a function to call after each step: it may draw a preview of px x px pixels and returns its path, or None.
 
     Earlier previews are removed. px = 0 draws none.
@@ -146,17 +155,51 @@ def step_previews(folder: Path, px: int, decode: Decode) -> Iterator[Callable[[S
             if human is None:
                 return None
             path = files.next()
-            draw_front(path, human, px)
+            draw_front(path, human, px, compositing)
         return path
 
     with PreviewFiles(folder, PREVIEWS) as files:
         yield preview
 
 
-def draw_front(path: Path, human: Human, px: int) -> None:
+def draw(
+    path: Path, primitives: Primitives, camera: Camera, background: Background | None, compositing: Compositing
+) -> Rendering:
+    """Write a PNG over `background` (linear RGB), transparent if it is None, and return what was rendered.
+
+    With released compositing its colours are sRGB-encoded.
+    """
+    if compositing == "released":
+        rendering = march_encoded(primitives, camera)
+        rgba_to_png(path, decoded(rendering, background), background)
+    else:
+        rendering = march(primitives, camera)
+        to_png(path, rendering, background)
+    return rendering
+
+
+def march_encoded(primitives: Primitives, camera: Camera) -> Rendering:
+    """The rendering of the authors' code, which interpolates and composites colours in sRGB's encoding (SPEC 4)."""
+    return march(dataclasses.replace(primitives, rgb=encode_srgb(primitives.rgb)), camera, RELEASED)
+
+
+def decoded(rendering: Rendering, background: Background | None) -> Float[Tensor, "h w 4"]:
+    """Linear premultiplied RGB and alpha of sRGB-encoded colours, put over the background (linear RGB) while encoded.
+
+    Over a background the result is opaque.
+    """
+    alpha = rendering.alpha[..., None]
+    if background is None:
+        straight = rendering.rgb / alpha.clamp_min(1e-6)
+        return torch.cat([decode_srgb(straight) * alpha, alpha], dim=-1)
+    behind = encode_srgb(torch.tensor(background).to(rendering.rgb))
+    return torch.cat([decode_srgb(rendering.rgb + (1 - alpha) * behind), torch.ones_like(alpha)], dim=-1)
+
+
+def draw_front(path: Path, human: Human, px: int, compositing: Compositing = "linear") -> None:
     """Draw the human in the T pose from the front, px x px pixels with a transparent background."""
     primitives = place(human)
-    to_png(path, march(primitives, framing(primitives, 0.0, px, px)), None)
+    draw(path, primitives, framing(primitives, 0.0, px, px), None, compositing)
 
 
 def draw_front_and_back(path: Path, human: Human, px: int) -> None:

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import math
 import time
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from primdiffusion.commands.frame_drawer import FrameDrawer
 from primdiffusion.commands.options import RenderCommand
+from primdiffusion.commands.output import decoded, march_encoded
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.drawing.draw import draw as draw_scene
@@ -21,13 +19,10 @@ from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.formats.answers import DrawAnswer, RenderAnswer
 from primdiffusion.formats.requests import DrawRequest, RenderRequest
 from primdiffusion.formats.whole_files import written_whole
-from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import body_of, framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.pose_file import pose_from_numbers, read_pose
-from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.image import Background, depth_to_png, rgba_to_png, to_png
+from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
 from primdiffusion.render.march import RELEASED, MarchSettings, march
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
@@ -68,7 +63,7 @@ def run(command: RenderCommand) -> None:
     background = BACKGROUNDS[command.background]
     if command.compositing == "released":
         look = ViewSettings(settings=RELEASED)
-        rgba = released_rgba(primitives, camera, background)
+        rgba = decoded(march_encoded(primitives, camera), background)
     else:
         picture = draw_scene(Scene(primitives, chart=body_of(human)[1].chart), camera, look)
         rgba = torch.from_numpy(picture.combined)
@@ -78,18 +73,3 @@ def run(command: RenderCommand) -> None:
             rendering = march(primitives, camera, look.settings)
             depth_to_png(files.enter_context(written_whole(command.depth)), rendering)
     print(command.out)
-
-
-def released_rgba(primitives: Primitives, camera: Camera, background: Background | None) -> Float[Tensor, "h w 4"]:
-    """Linear premultiplied RGB and alpha whose sRGB encoding is the picture of the authors' code (SPEC 4).
-
-    There colours are interpolated, composited and put over the background in sRGB's encoding. Over a background (linear
-    RGB) the result is opaque.
-    """
-    rendering = march(dataclasses.replace(primitives, rgb=encode_srgb(primitives.rgb)), camera, RELEASED)
-    alpha = rendering.alpha[..., None]
-    if background is None:
-        straight = rendering.rgb / alpha.clamp_min(1e-6)
-        return torch.cat([decode_srgb(straight) * alpha, alpha], dim=-1)
-    behind = encode_srgb(torch.tensor(background).to(rendering.rgb))
-    return torch.cat([decode_srgb(rendering.rgb + (1 - alpha) * behind), torch.ones_like(alpha)], dim=-1)

@@ -20,7 +20,7 @@ from primdiffusion.diffusion.fixed_threads import (
     fixed_threads,
 )
 from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
-from primdiffusion.diffusion.schedule import Schedule, trailing_steps
+from primdiffusion.diffusion.schedule import CLEAN, Schedule, trailing_steps
 from primdiffusion.formats import requests
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.body_setup import BodySetup
@@ -184,16 +184,20 @@ def sample(
     sampler: str = requests.GenerateRequest.sampler,
     condition: Float[Tensor, "#b a"] | None = None,
     guidance: float = requests.Conditioning.guidance,
+    end: int = CLEAN,
 ) -> Iterator[SamplerStep]:
-    """Generate a person for each seed, yielding every step; the last step's x0 is the result (default: 30 DDIM steps).
+    """Generate a person for each seed, yielding every step; the last step's x is the result (default: 30 DDIM steps).
 
     The same batch of seeds gives the same bits on one kind of device with one version of torch, on any number of cores.
     A seed's noise is the same in any batch and on any device, so the person is the same up to rounding. Categories that
     `condition` leaves open are drawn (`DiffusionModel.complete`). To cancel, stop iterating.
+    `end` is that of `ddim`; other samplers end at `CLEAN`.
     ValueError for an unknown sampler, no seeds, a seed outside 0 ... 2^63-1 or a number of steps outside 1 ... T.
     """
     if sampler not in SAMPLERS:
         raise ValueError(f"there is no sampler {sampler!r}; choose one of {', '.join(sorted(SAMPLERS))}")
+    if end != CLEAN and sampler != "ddim":
+        raise ValueError(f"the sampler {sampler} ends at the clean sample: choose ddim to end at level {end}")
     if not len(seeds):
         raise ValueError("no seeds were given: give one for each human")
     chain = model.chain(model.schedule.length, steps)
@@ -205,7 +209,8 @@ def sample(
     def denoise(x: Tensor, t: int) -> Tensor:
         return model.denoise(x, t, conditions, guidance)
 
-    steps_taken = SAMPLERS[sampler](denoise, model.schedule, start, chain, generators)
+    ending = {} if end == CLEAN else {"end": end}
+    steps_taken = SAMPLERS[sampler](denoise, model.schedule, start, chain, generators, **ending)
     return each_with_fixed_threads(steps_taken, model.threads)
 
 

@@ -20,6 +20,8 @@ Denoise = Callable[[Tensor, int], Tensor]
 """x0 guess from a batch x [b, ...] that holds noise of step t."""
 Generators = torch.Generator | Sequence[torch.Generator]
 """One for each sample of a batch, or one for the whole batch."""
+RELEASED_END = 0
+"""The level at which the released code's DDIM ends: 0.01 of noise remains (SPEC 1.14)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +36,7 @@ class SamplerStep:
     x0: Tensor
     """The denoiser's guess of the clean sample."""
     x: Tensor
-    """The sample at the next lower level; after the last step equal to x0."""
+    """The sample at the next lower level; after the last step equal to x0, unless `ddim` ends above `CLEAN`."""
 
 
 def ddpm(
@@ -54,16 +56,23 @@ def ddpm_step(schedule: Schedule, x: Tensor, x0: Tensor, t: int, t_prev: int, ge
 
 
 def ddim(
-    denoise: Denoise, schedule: Schedule, x: Tensor, steps: Sequence[int], generators: Generators, eta: float = 0.0
+    denoise: Denoise,
+    schedule: Schedule,
+    x: Tensor,
+    steps: Sequence[int],
+    generators: Generators,
+    eta: float = 0.0,
+    end: int = CLEAN,
 ) -> Iterator[SamplerStep]:
     """Implicit sampling (Song et al. 2021, eq. 12) down the descending `steps`.
 
     `eta` scales the posterior's noise: 0 is deterministic after the start, 1 has the variance of `ddpm`.
-    The last step yields the predicted x0; the released code leaves 0.01 of noise there (SPEC 1.14).
+    The last step reaches level `end`: by default the predicted x0; `RELEASED_END` leaves that level's noise in x.
     """
-    for index, (t, t_prev) in enumerate(pairwise((*steps, CLEAN))):
+    for index, (t, t_prev) in enumerate(pairwise((*steps, end))):
         x0 = denoise(x, t)
-        x = ddim_step(schedule, x, x0, t, t_prev, generators, eta)
+        if not t == t_prev == end:  # a chain that itself ends there is at its end already
+            x = ddim_step(schedule, x, x0, t, t_prev, generators, eta)
         yield SamplerStep(index, len(steps), t, x0, x)
 
 

@@ -17,6 +17,8 @@ SAMPLERS: tuple[Sampler, ...] = get_args(Sampler)
 Transfer = Literal["texture", "garment"]
 TRANSFERS: tuple[Transfer, ...] = get_args(Transfer)
 Masking = Literal["repaint", "released"]
+Compositing = Literal["linear", "released"]
+"""How pictures are drawn: as in Blender, or as the authors' code draws them."""
 View = Literal["colour", "depth", "alpha", "boxes"]
 VIEWS: tuple[View, ...] = get_args(View)
 WHOLE_PARTS = (
@@ -123,6 +125,9 @@ class GenerateRequest(StepPreviews, Conditioning):
     """Another seed gives another human; the same seed gives the same human."""
     sampler: Sampler = "ddim"
     """ddim: few steps; dpmpp_2m: even fewer; ddpm: the paper's, needs hundreds."""
+    compositing: Compositing = "linear"
+    """linear: previews as in Blender; released, as the authors' code: previews of sRGB-encoded colours, boxes in index
+    order, and the sampler ddim stops at the schedule's lowest level of noise instead of at none."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

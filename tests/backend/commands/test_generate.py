@@ -1,16 +1,30 @@
 """Generating for a child, without the child."""
 
+import dataclasses
 import itertools
+import math
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
+from PIL import Image
 from primdiffusion import cli
 from primdiffusion.commands import generate as generate_module
 from primdiffusion.commands import session
 from primdiffusion.commands.generate import generate
 from primdiffusion.commands.session import Session
-from primdiffusion.formats.requests import GenerateRequest
+from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.model import sample
+from primdiffusion.diffusion.samplers import RELEASED_END
+from primdiffusion.formats.requests import Conditioning, GenerateRequest
 from primdiffusion.formats.schema import FieldError
+from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.human import framing, people_of, place
+from primdiffusion.human import generate as generate_human
+from primdiffusion.human_file import load_human
+from primdiffusion.render.march import RELEASED
+from primdiffusion.render.reference import march_reference
 from tiny_model import save_tiny_checkpoint
 
 
@@ -108,3 +122,53 @@ def test_the_command_line_writes_compact_files(checkpoint, tmp_path):
         ]
     )
     assert (tmp_path / "person.human.safetensors").stat().st_size < 2.2e6
+
+
+def test_released_compositing_keeps_the_noise_of_ddims_last_level_and_encodes_previews(checkpoint, tmp_path):
+    """The human by the formula of DDIM, its pictures by the float64 marcher."""
+    for name in ("linear", "released"):
+        cli.run([
+            "generate", "--checkpoint", str(checkpoint), "--seed", "3", "--steps", "4", "--size", "24",
+            "--out", str(tmp_path / name), "--compositing", name,
+        ])  # fmt: skip
+    model = load_checkpoint(checkpoint)
+    schedule = model.schedule
+    *_, before, end = sample(model, [3], 4, "ddim", None, Conditioning.guidance)
+    noise = (before.x - schedule.alpha_bar[end.t].sqrt() * end.x0) / (1 - schedule.alpha_bar[end.t]).sqrt()
+    left = schedule.alpha_bar[0].sqrt() * end.x0 + (1 - schedule.alpha_bar[0]).sqrt() * noise
+    (expected,) = people_of(model, left.to(end.x0), [3])
+    found = {name: load_human(tmp_path / name / "person.human.safetensors") for name in ("linear", "released")}
+    assert (found["released"].payload.rgb - expected.payload.rgb).abs().max() < 1e-4
+    assert (found["released"].payload.rgb - found["linear"].payload.rgb).abs().max() > 1e-3
+    assert found["released"].provenance["end"] == 0
+    assert "end" not in found["linear"].provenance
+    primitives = place(found["released"]).to(dtype=torch.float64)
+    for name, yaw in (("front", 0.0), ("side", math.pi / 2)):
+        camera = framing(place(found["released"]), yaw, 24, 24).to(dtype=torch.float64)
+        camera.intrinsics[:2, 2] += 0.5  # rays through corners of pixels
+        encoded = dataclasses.replace(primitives, rgb=encode_srgb(primitives.rgb))
+        rendering = march_reference(encoded, camera, RELEASED)
+        assert ((rendering.alpha > 0.1) & (rendering.alpha < 0.9)).any()
+        with Image.open(tmp_path / "released" / f"{name}.png") as picture:
+            assert np.abs(np.asarray(picture) / 255 - rendering.rgb.numpy()).max() < 0.006
+    with Image.open(tmp_path / "released" / "depth.png") as picture:
+        assert picture.size == (24, 24)
+        assert np.asarray(picture).max() > 100
+
+
+def test_released_compositing_changes_no_other_sampler(checkpoint, tmp_path):
+    made = []
+    for compositing in ("linear", "released"):
+        request = GenerateRequest(
+            seed=1, out_dir=tmp_path / compositing, steps=2, checkpoint=checkpoint, size=8, sampler="dpmpp_2m",
+            compositing=compositing,
+        )  # fmt: skip
+        generate(request, Session(), lambda *_: None)
+        made.append(load_human(tmp_path / compositing / "person.human.safetensors"))
+    assert torch.equal(made[0].payload.rgb, made[1].payload.rgb)
+    assert made[0].provenance == made[1].provenance
+
+
+def test_only_ddim_ends_above_the_clean_sample(checkpoint):
+    with pytest.raises(ValueError, match="dpmpp_2m ends at the clean sample"):
+        generate_human(load_checkpoint(checkpoint), 1, 2, "dpmpp_2m", end=RELEASED_END)

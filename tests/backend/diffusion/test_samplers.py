@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
-from primdiffusion.diffusion.samplers import SAMPLERS, ddim, ddpm, dpmpp_2m, gaussian_noise
+from primdiffusion.diffusion.samplers import RELEASED_END, SAMPLERS, ddim, ddpm, dpmpp_2m, gaussian_noise
 from primdiffusion.diffusion.schedule import (
     CLEAN,
     Schedule,
@@ -86,6 +86,31 @@ def test_ddim_is_that_of_diffusers(schedule, eta):
     assert chain == leading_steps(1000, 100)
     ours = last(ddim(of_mixture(schedule), schedule, start(), chain, torch.Generator().manual_seed(3), eta))
     assert (ours.x - expected).abs().max() < 1e-5
+
+
+@both_schedules
+@pytest.mark.parametrize(("steps", "chain"), [(100, leading_steps(1000, 100)), (1000, list(range(999, -1, -1)))])
+def test_ddim_that_ends_at_the_released_level_is_that_of_diffusers_without_a_clean_end(schedule, steps, chain):
+    settings = {"clip_sample": False, "timestep_spacing": "leading", "steps_offset": int(steps < 1000)}
+    settings |= {"set_alpha_to_one": False}
+    kind = of_released_levels(schedule)
+    expected, visited = theirs(kind, schedule, start(), steps, 3, **settings)
+    assert visited == chain
+    found = last(ddim(of_mixture(schedule), schedule, start(), chain, [], end=RELEASED_END))
+    assert (found.x - expected).abs().max() < 1e-7
+    assert (found.x - found.x0).abs().max() > 1e-4
+    assert schedule.noise(0) == pytest.approx(0.01)
+
+
+def of_released_levels(schedule):
+    """diffusers' DDIM, whose last level is that of this schedule's step 0."""
+
+    class Scheduler(DDIMScheduler):
+        def set_timesteps(self, *arguments):
+            super().set_timesteps(*arguments)
+            self.final_alpha_cumprod = schedule.alpha_bar[0]
+
+    return Scheduler
 
 
 @both_schedules
