@@ -57,6 +57,10 @@ SOURCES = {
         "benchmarks/attribute_hits.py --people DIR --json docs/results/attribute_hits.json",
     ),
     "faults": ("Faults: hostile files, kills, full disks", "benchmarks/faults.py --json docs/results/faults.json"),
+    "everywhere": (
+        "Other systems, programs and devices",
+        "benchmarks/everywhere.py --json docs/results/everywhere.json",
+    ),
     "layout": ("The grid on the default body", "scripts/bake_layout"),
 }  # fmt: skip
 ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
-import subprocess
-import sys
 import tarfile
 import tomllib
 import zipfile
@@ -14,41 +10,17 @@ from pathlib import Path
 
 import pytest
 from packaging.metadata import Metadata
+from support.wheel import ROOT, build_archives, sources
 
-ROOT = Path(__file__).resolve().parents[2]
-BACKEND = ROOT / "backend"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 LARGEST_ON_PYPI = 100_000_000
 """Bytes of a file on PyPI, unless more is asked for."""
 
 
-def sources() -> set[str]:
-    """The package's files by their names in the wheel."""
-    return {
-        path.relative_to(BACKEND).as_posix()
-        for path in (BACKEND / "primdiffusion").rglob("*")
-        if path.is_file() and "__pycache__" not in path.parts and path.suffix not in {".nbi", ".nbc", ".pyc", ".part"}
-    }
-
-
 @pytest.fixture(scope="module")
 def built(tmp_path_factory) -> Path:
-    """A folder with both archives, built from a copy of the sources as pip does, without its own environment."""
-    folder = tmp_path_factory.mktemp("sources")
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, folder)
-    for name in ("README.md", *sources()):
-        (folder / "backend" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(BACKEND / name, folder / "backend" / name)
-    script = (
-        "import sys; from setuptools import build_meta; out = sys.argv[1]; "
-        "build_meta.build_wheel(out); build_meta.build_sdist(out)"
-    )
-    command = [sys.executable, "-c", script, str(tmp_path_factory.mktemp("dist"))]
-    environment = {name: text for name, text in os.environ.items() if name != "PYTHONPATH"}
-    done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr[-3000:]
-    return Path(command[-1])
+    """A folder with both archives."""
+    return build_archives(tmp_path_factory.mktemp("archives"))
 
 
 @pytest.fixture(scope="module")

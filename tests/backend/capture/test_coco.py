@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
-from capture_scenes import captured, save_person
+from capture_scenes import body_mesh, captured, save_person
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
@@ -22,30 +22,11 @@ from primdiffusion.formats.arrays import ArrayFileError
 from primdiffusion.formats.camera_rig import Rig, View
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.regular_files import FileError
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from scipy import ndimage
 from support.errors import refused
 
 NAME = "person_000000"
 WRITTEN = ("annotations.json", "images.csv")
-
-
-def body_mesh() -> TexturedMesh:
-    """The default body without clothes, each vertex on its four strongest joints."""
-    body = default_body()
-    weight, index = body.skin_weights.topk(4, dim=1)
-    faces = body.faces.numpy().astype(np.int32)
-    return TexturedMesh((
-        TexturedPart(
-            name="body",
-            vertices=body.template.double().numpy(),
-            faces=faces,
-            corner_uv=np.full((len(faces), 3, 2), 0.5, np.float32),
-            texture=np.full((1, 1, 4), 255, np.uint8),
-            skin_index=index.numpy().astype(np.int32),
-            skin_weight=(weight / weight.sum(1, keepdim=True)).double().numpy(),
-        ),
-    ))  # fmt: skip
 
 
 @pytest.fixture(scope="module")
