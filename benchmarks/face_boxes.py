@@ -9,9 +9,9 @@ benchmarks/chain.py) to renders of their meshes in the rest pose, without and wi
 
 `db` is the `psnr` of benchmarks/chain.py, `hf` its fine energy (1 in the mesh): `head` from the chain's camera, `face`
 from one that spans 0.2 m, both 256 x 256, means over humans; `more_head_gain_db_min` is the smallest gain of a human.
-Ratios are processor times over those of `body`: `fit` of whole fits, `march_body` of the chain's front view of 512 x 512
+Ratios are processor times over those of `body`: `fit` of whole fits, `march_body` of the chain's front view (512 x 512)
 and `march_head` of its head view, medians of alternating calls. Megabytes (10^6) of a human: `payload` in memory
-(float32), `human_file` and `compact_human_file` without metadata, `engine_texture` on the GPU (four half floats a voxel).
+(float32), `human_file` and `compact_human_file` without metadata, `engine_texture` on the GPU (half floats, RGBA).
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ from primdiffusion.body.model import default_body
 from primdiffusion.formats import compact_human
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.surface import surface_points
-from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.payloads import HEAD_FOV, SUPERSAMPLE, orbit_camera, rest_frames, views_of
 from primdiffusion.people.person import Person
@@ -41,7 +40,7 @@ from primdiffusion.primitives.anchors import default_texels
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
 from primdiffusion.primitives.primitives import GRID, Frames, K, Payload, Primitives, S
 from primdiffusion.raster.rasterise import rasterise
-from primdiffusion.render.inverse import TargetImage, fit_payload
+from primdiffusion.render.inverse import TargetImage, fit_colours, fit_payload
 from primdiffusion.render.march import march
 from record import command_line, report
 from torch import Tensor
@@ -69,17 +68,16 @@ def main() -> None:
     arguments = parser.parse_args()
     assets = open_assets(arguments.assets, required_meshes())
     measured: dict[str, list[float]] = collections.defaultdict(list)
-    rows = []
+    rows: list[np.ndarray] = []
+    figures: Figures = {"boxes": K, "face_boxes": (CELLS * SPLIT) ** 2}
     for number in range(arguments.people):
-        shown = measure(held_out(assets, number), measured)
-        rows.append(np.concatenate(shown, axis=1))
-        print("humans", number + 1, "of", arguments.people, flush=True)
+        rows.append(np.concatenate(measure(held_out(assets, number), measured), axis=1))
+        gains = np.subtract(measured["more_head_db"], measured["body_head_db"])
+        figures |= {"people": number + 1, "more_head_gain_db_min": round(float(gains.min()), 4)}
+        figures |= {name: round(float(np.mean(values)), 4) for name, values in measured.items()}
+        report(figures, arguments.json)  # what is known so far: the rest takes long
     if arguments.sheet is not None:
         Image.fromarray(np.concatenate(rows)).save(arguments.sheet)
-    figures: Figures = {"people": arguments.people, "boxes": K, "face_boxes": (CELLS * SPLIT) ** 2}
-    gains = np.subtract(measured["more_head_db"], measured["body_head_db"])
-    figures["more_head_gain_db_min"] = round(float(gains.min()), 4)
-    report(figures | {name: round(float(np.mean(values)), 4) for name, values in measured.items()}, arguments.json)
 
 
 def measure(person: Person, measured: dict[str, list[float]]) -> list[np.ndarray]:
@@ -95,11 +93,14 @@ def measure(person: Person, measured: dict[str, list[float]]) -> list[np.ndarray
     views = {"head": head, "face": orbit_camera(middle, FACE_EXTENT, HEAD_YAW, 0, HEAD_FOV, head.width)}
     scene = dataclasses.replace(scene, cameras={**scene.cameras, **views})
     true, shown, boxes, seconds = {view: scene.true(view) for view in views}, [], {}, {}
+    images = images_of(person)
     for name, frames in layouts.items():
-        targets, start = targets_of(person.mesh, frames, person.betas), from_mesh(person.mesh, frames)
+        targets = [TargetImage(frames, *image) for image in images]
+        start = from_mesh(person.mesh, frames)
         fit_payload(start, targets[:1], FULL_DENSITY)  # the first compiles
         begun = time.process_time()
         fitted = fit_payload(start, targets, FULL_DENSITY)
+        (fitted,) = fit_colours([fitted], fitted, [targets])
         seconds[name], boxes[name] = time.process_time() - begun, Primitives.place(frames, fitted)
         for view, camera in views.items():
             drawn = draw(frames, fitted, camera)
@@ -143,18 +144,14 @@ def covered() -> Tensor:
 
 
 def joined(first: Frames, second: Frames) -> Frames:
-    return Frames(
-        *(torch.cat([getattr(part, field.name) for part in (first, second)]) for field in dataclasses.fields(Frames))
-    )
+    names = [field.name for field in dataclasses.fields(Frames)]
+    return Frames(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))
 
 
-def targets_of(mesh: TexturedMesh, frames: Frames, betas: np.ndarray) -> list[TargetImage]:
-    """The images that `payloads` fits to."""
-    targets = []
-    for camera, weight in views_of(mesh, betas):
-        picture = rasterise(mesh, camera, SUPERSAMPLE)
-        targets.append(TargetImage(frames, camera, np.dstack([picture.rgb, picture.alpha]), weight))
-    return targets
+def images_of(person: Person) -> list[tuple[Camera, np.ndarray, float]]:
+    """Cameras, images and weights that `payloads` fits to."""
+    views = [(*view, rasterise(person.mesh, view[0], SUPERSAMPLE)) for view in views_of(person.mesh, person.betas)]
+    return [(camera, np.dstack([picture.rgb, picture.alpha]), weight) for camera, weight, picture in views]
 
 
 def march_ratio(few: Primitives, many: Primitives, camera: Camera) -> float:
@@ -171,13 +168,12 @@ def spent(boxes: Primitives, camera: Camera) -> float:
 def sizes(payload: Payload, betas: np.ndarray) -> Mapping[str, int]:
     """Bytes of a human by where they are."""
     rest = {"delta_scale": payload.delta_scale, "betas": torch.from_numpy(betas).float()}
-    compact = map(torch.from_numpy, compact_human.compact(payload.rgb.numpy(), payload.density.numpy())[:2])
+    rgb, density, _ = compact_human.compact(payload.rgb.numpy(), payload.density.numpy())
+    compact = {"rgb": torch.from_numpy(rgb), "density": torch.from_numpy(density), **rest}
     return {
         "payload": sum(tensor.nbytes for tensor in (payload.rgb, payload.density, payload.delta_scale)),
         "human_file": len(tensor_file.save({"rgb": payload.rgb, "density": payload.density, **rest}, {})),
-        "compact_human_file": len(
-            tensor_file.save({**dict(zip(("rgb", "density"), compact, strict=True)), **rest}, {})
-        ),
+        "compact_human_file": len(tensor_file.save(compact, {})),
         "engine_texture": payload.density.numel() * HALF_FLOAT_VOXEL,
     }
 
