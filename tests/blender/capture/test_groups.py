@@ -73,3 +73,76 @@ def test_people_stand_together_apart_on_the_floor_in_front_of_the_same_cameras(e
     assert all(one[name] == two[name] for name in same)
     with refused(ValueError, "together"):
         settings("three", released_reference=True)
+
+
+def save_low_sun(path, column: int) -> None:
+    """Radiance's format: a dim sky with one bright texel of 16 around the horizon, 11 degrees above it."""
+    texels = [bytes([32, 32, 32, 126])] * (8 * 16)
+    texels[3 * 16 + column] = bytes([200, 200, 200, 133])
+    path.write_bytes(b"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y 8 +X 16\n" + b"".join(texels))
+
+
+def test_a_neighbour_shades_its_group_and_changes_colours_alone(empty_scene, tmp_path):
+    (tmp_path / "suns").mkdir()
+    for column in range(16):
+        save_low_sun(tmp_path / "suns" / f"{column:02d}.hdr", column)
+    people = [NamedPerson(name) for name in ("anna", "bert", "carl")]
+
+    def settings(out, **more):
+        return CaptureSettings(
+            tmp_path / out, rig=Rig(count=6, width=64, height=64), samples=4, device="cpu", together=2, light="hdri",
+            hdri=tmp_path / "suns", background="transparent", **more,
+        )  # fmt: skip
+
+    assert capture(empty_scene, settings("apart"), people).failed == []
+    before = {block.session_uid for block in data_blocks()}
+    assert capture(empty_scene, settings("shaded", shadows=True), people).failed == []
+    added = [block for block in data_blocks() if block.session_uid not in before]
+    assert [block.name for block in added if block.name != "Render Result"] == []
+    apart, shaded = files_of(tmp_path / "apart"), files_of(tmp_path / "shaded")
+    assert apart.keys() == shaded.keys()
+    changed = {name for name in apart if apart[name] != shaded[name]}
+    assert {name.split("/")[1] for name in changed if "/" in name} == {"img", "rgba", "complete.json"}
+    assert [name for name in changed if name.startswith("carl")] == []
+    one, other = (open_captures(tmp_path / name) for name in ("apart", "shaded"))
+    darker = []
+    for name in ("anna", "bert"):
+        for frame in range(len(POSES)):
+            for camera in range(6):
+                inside = one.subject(name).picture("mask", frame, camera) > 250
+                lit, shadowed = (
+                    captures.subject(name).picture("img", frame, camera)[inside] for captures in (one, other)
+                )
+                darker.append(lit.astype(int) - shadowed)
+    darker = np.concatenate(darker).mean(-1)
+    print(np.percentile(darker, [0, 1, 50, 90, 95, 99, 100]), len(darker))
+    print((darker > 30).sum())
+    assert (darker > 20).sum() > 10
+    assert (darker < -20).mean() < 0.01  # light that neighbours reflect, and JPEG
+
+
+def test_resumed_capture_with_shadows_is_the_same(empty_scene, tmp_path):
+    people = [NamedPerson(name) for name in ("anna", "bert")]
+
+    def settings(out, **more):
+        rig = Rig(count=2, width=32, height=32)
+        return CaptureSettings(tmp_path / out, rig=rig, samples=4, device="cpu", together=2, light="dome", **more)
+
+    assert capture(empty_scene, settings("whole", shadows=True), people).failed == []
+    steps = run(empty_scene, settings("cut", shadows=True), people, Report(), poses=POSES, load=load_painted)
+    for _ in range(3):
+        next(steps)
+    steps.close()
+    with refused(ValueError, "shadows"):
+        capture(empty_scene, settings("cut"), people)
+    assert capture(empty_scene, settings("cut", shadows=True), people).failed == []
+    whole, cut = files_of(tmp_path / "whole"), files_of(tmp_path / "cut")
+    pictures = [name for name in whole if name.endswith((".jpg", ".png"))]
+    assert pictures
+    assert all(whole[name] == cut[name] for name in pictures)
+
+
+@pytest.mark.parametrize("more", [{"together": 1, "light": "dome"}, {"together": 2, "light": "uniform"}])
+def test_shadows_without_a_neighbour_or_light_are_refused(tmp_path, more):
+    with refused(ValueError, "shadows between people"):
+        CaptureSettings(tmp_path, shadows=True, **more)
