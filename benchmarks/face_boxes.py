@@ -47,12 +47,10 @@ from torch import Tensor
 
 ROW, COLUMN, CELLS = 22, 12, 8
 """The square of the body's grid from chin to hairline and from temple to temple."""
-SPLIT = 2
-"""Boxes of the face grid along a side of a cell."""
+SPLIT = 2  # boxes along a side of a cell
 THICKNESS = 0.5
 """Half extent along the normal relative to the body's boxes."""
-FACE_EXTENT = 0.2
-"""Metres."""
+FACE_EXTENT = 0.2  # metres
 HALF_FLOAT_VOXEL = 8
 """Bytes of a voxel in the engine's texture."""
 CALLS = 15
