@@ -56,6 +56,10 @@ SOURCES = {
         "Attributes that were asked for",
         "benchmarks/attribute_hits.py --people DIR --json docs/results/attribute_hits.json",
     ),
+    "face_boxes": (
+        "256 more boxes on the face",
+        "benchmarks/face_boxes.py --assets DIR --json docs/results/face_boxes.json",
+    ),
     "faults": ("Faults: hostile files, kills, full disks", "benchmarks/faults.py --json docs/results/faults.json"),
     "everywhere": (
         "Other systems, programs and devices",

@@ -26,7 +26,7 @@ from ..formats.requests import FLOAT_DEPTH
 from ..formats.whole_files import remove_abandoned, temporary_folder
 from ..motion.poses import built_in_poses, pick_poses
 from .body import Body, read_body
-from .group import Placed, groups_of, place_group
+from .group import Placed, groups_of, load_neighbours, place_group
 from .passes import write_passes
 from .report import Report
 from .scan import Scan, ScanFile, load_scan
@@ -210,6 +210,7 @@ def _capture(
             for obj in scan.objects:
                 mark_parts(obj, scan.joint_of_group)
             prepare_materials(scan.objects, unlit=settings.light == "uniform")
+            neighbours = load_neighbours(own, placed, body, load) if settings.shadows else []
             views = placed.views or _views_around(scan, settings, poses)
             joints = np.stack([scan.pose(*pose) for pose in zip(poses.rotations, poses.translations, strict=True)])
         theta = poses.axis_angle().reshape(len(poses), 72)
@@ -223,6 +224,8 @@ def _capture(
             if missing:
                 with stage.entered() as own:
                     scan.pose(poses.rotations[frame], poses.translations[frame])
+                    for neighbour, motion in neighbours:
+                        neighbour.pose(motion.rotations[frame], motion.translations[frame])
                     _check_outside(scan, own, views, frame)
             for camera, view in enumerate(views):
                 if camera in missing:

@@ -38,6 +38,7 @@ def parser() -> argparse.ArgumentParser:
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
     add("--together", type=int, default=1, metavar="N", help="stand N people together on a floor, at most 8")
+    add("--shadows", action="store_true", help="those of --together shade each other under a dome or HDRI light")
     add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
     add("--pose-files", type=Path, nargs="+", default=[], help="poses: .npz, .npy, .json, .pkl, .bvh, or folders")
     add("--poses", type=int, default=20, help="how many; the first is near-T (default %(default)s)")
@@ -107,6 +108,7 @@ def settings_of(options: argparse.Namespace) -> CaptureSettings:
         threads=options.threads,
         shard=options.shard,
         together=options.together,
+        shadows=options.shadows,
         layouts=tuple(options.layouts),
         released_reference=options.released_reference,
         body=options.body,

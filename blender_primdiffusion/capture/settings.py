@@ -57,6 +57,8 @@ class CaptureSettings:
     """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
     together: int = 1
     """Subjects that stand together on a floor, in front of the same cameras; each is rendered alone."""
+    shadows: bool = False
+    """Whether subjects who stand together shade each other; the pictures differ in their colours alone."""
     layouts: tuple[str, ...] = LAYOUTS
     released_reference: bool = False
     """Whether the first subject is also stored under the name that the released code expects."""
@@ -83,6 +85,8 @@ class CaptureSettings:
                 self.together > 1 and self.released_reference,
             "people who stand together are rendered alone: put pictures behind them with captures coco --backgrounds":
                 self.together > 1 and self.background == "hdri",
+            "shadows between people need --together 2 or more, and the light dome or hdri":
+                self.shadows and (self.together < 2 or self.light == "uniform"),
             f"shard {index}/{count}: 0/{count} to {count - 1}/{count}": not 0 <= index < count,
             f"{self.threads} threads: 0 (all) to 1024": not 0 <= self.threads <= 1024,
             f"device {self.device}: choose of {', '.join(get_args(Device))}": self.device not in get_args(Device),
@@ -132,6 +136,7 @@ class CaptureSettings:
             "part_names": list(JOINT_NAMES),
             "released_reference": self.released_reference,
             **({"together": self.together} if self.together > 1 else {}),
+            **({"shadows": True} if self.shadows else {}),
             **({"hdris": [path.name for path in self.hdris]} if self.hdri and self.hdri.is_dir() else {}),
         }
 

@@ -290,6 +290,8 @@ def _draw_cycles(layout: bpy.types.UILayout, asked, _context) -> None:
         layout.prop(asked, "hdri")
     if asked.light != "uniform":
         layout.prop(asked, "denoise")
+        if asked.together > 1:
+            layout.prop(asked, "shadows")
 
 
 def _draw_output(layout: bpy.types.UILayout, asked, _context) -> None:

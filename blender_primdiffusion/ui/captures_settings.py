@@ -116,6 +116,9 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     denoise: bpy.props.BoolProperty(
         name="Denoise", description="Colours under a dome or HDRI light; never masks, depth, normals or parts"
     )
+    shadows: bpy.props.BoolProperty(
+        name="Shadows between People", description="People who stand together shade each other"
+    )
     device: bpy.props.EnumProperty(
         name="Device",
         description="What Cycles renders on",
@@ -202,6 +205,7 @@ def words_of(
     ):
         words += [name, setting_path(path, label)] if path else []
     words += ["--denoise"] if asked.denoise else []
+    words += ["--shadows"] if asked.shadows and asked.together > 1 and asked.light != "uniform" else []
     words += ["--float-depth"] if asked.float_depth else []
     words += ["--released-reference"] if asked.released_reference else []
     words += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]
