@@ -10,8 +10,8 @@ half the colour resolution (the rasteriser's own files have full resolution). `j
 joints that the extension saved from Blender's armature and the joints of the backend's body, computed from the SMPL
 parameters and cameras on disk. `picture_shift_px_max` is the displacement between Cycles' pictures and those drawn from
 the same files. `capture_overhead_ratio` is the time of rendering a view in Cycles and annotating it as COCO, divided
-by that of rendering it. Null: not measured (`--quick` skips the 200 views and people_per_second; without bpy nothing of Cycles
-is measured).
+by that of rendering it. Null: not measured (`--quick` skips the 200 views and people_per_second; without bpy nothing of
+Cycles is measured).
 """
 
 from __future__ import annotations
