@@ -117,7 +117,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         name="Denoise", description="Colours under a dome or HDRI light; never masks, depth, normals or parts"
     )
     shadows: bpy.props.BoolProperty(
-        name="Shadows between People", description="People who stand together shade each other"
+        name="Shadows Between People", description="People who stand together shade each other"
     )
     device: bpy.props.EnumProperty(
         name="Device",
