@@ -244,7 +244,7 @@ def registered(kind: type) -> int:
 
 def measured() -> dict[str, float]:
     """The figures with one synthetic human, as after Generate Human; prints the tabs."""
-    sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "blender")]
+    sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "tests" / "blender")]
     import synthetic_shape
 
     import blender_primdiffusion
