@@ -119,7 +119,7 @@ def overhead(change: Callable[[int], None]) -> dict[str, float]:
     try:
         with (
             timed(engine, "render_layer", whole),
-            timed(engine, "picture_of", gather),
+            timed(engine, "scene_content", gather),
             timed(engine, "solids_file", gather),
             timed(engine, "_fill", fill),
         ):
