@@ -133,13 +133,13 @@ def overhead(change: Callable[[int], None]) -> dict[str, float]:
         child = drawings[frame].result
         parts = {
             "render": whole[frame],
-            "march": child["seconds_march"],
-            "place": child["seconds_place"],
-            "rest_of_child": child["seconds"] - child["seconds_place"] - child["seconds_march"],
+            "march": child.seconds_march,
+            "place": child.seconds_place,
+            "rest_of_child": child.seconds - child.seconds_place - child.seconds_march,
             "gather": gather[2 * frame] + gather[2 * frame + 1],
             "fill": fill[frame],
         }
-        parts["conversation"] = parts["render"] - child["seconds"] - parts["gather"] - parts["fill"]
+        parts["conversation"] = parts["render"] - child.seconds - parts["gather"] - parts["fill"]
         rows.append({"overhead": parts["render"] - parts["march"], **parts})
     best = min(rows, key=lambda row: row["overhead"])
     best["overhead_median"] = float(np.median([row["overhead"] for row in rows]))

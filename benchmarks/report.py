@@ -19,6 +19,10 @@ SOURCES = {
     ),
     "engine": ("The engine in Blender", "benchmarks/engine.py --json docs/results/engine.json"),
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
+    "equal_minutes": (
+        "Settings of the local network's training on equal minutes",
+        "benchmarks/equal_minutes.py --data PEOPLE --minutes 3 --json docs/results/equal_minutes.json",
+    ),
     "faithful": (
         "Faithfulness to the released networks and the paper's metrics",
         "benchmarks/faithful.py --json docs/results/faithful.json",
