@@ -83,7 +83,8 @@ def version(python: Path) -> str:
 def run(python: Path, part: str, folder: Path, *options: str) -> dict[str, float | None]:
     """The figures of one part; ends with the part's output if it fails."""
     command = [str(python), __file__, "part", part, str(folder), *options]
-    environment = {**os.environ, "PRIMDIFFUSION_PYTHON": sys.executable}
+    environment = {**os.environ, "PRIMDIFFUSION_PYTHON": sys.executable, "PYTHONPYCACHEPREFIX": str(folder / "bytes")}
+    environment.pop("PYTHONDONTWRITEBYTECODE", None)  # Blender keeps byte code from its first start on
     print(f"{part} ...", file=sys.stderr, flush=True)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False, encoding="utf-8")
     lines = [line for line in done.stdout.splitlines() if line.startswith("figures ")]

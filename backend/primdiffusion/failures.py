@@ -33,11 +33,11 @@ class PictureOutOfMemory(MemoryError):
 
 
 class MissingPackageError(ImportError):
-    """An optional package that is not installed; the message has the line that installs it."""
+    """An optional package that is not installed; the message says what to do."""
 
 
-def optional_package(module: str, extra: str) -> ModuleType:
-    """Import a module of an optional package, which `extra` of pyproject.toml installs.
+def optional_package(module: str, extra: str = "", missing: str = "") -> ModuleType:
+    """Import a module of an optional package, which `extra` of pyproject.toml installs, or else `missing` explains.
 
     Raises MissingPackageError if it is not installed.
     """
@@ -46,9 +46,8 @@ def optional_package(module: str, extra: str) -> ModuleType:
     except ModuleNotFoundError as error:
         if error.name != module.partition(".")[0]:
             raise
-        raise MissingPackageError(
-            f'this needs {error.name}, which is not installed: run pip install "primdiffusion[{extra}]"'
-        ) from error
+        extras = f'this needs {error.name}, which is not installed: run pip install "primdiffusion[{extra}]"'
+        raise MissingPackageError(missing or extras) from error
 
 
 _LONGEST_NAME, _LONGEST_VALUE = 200, 80

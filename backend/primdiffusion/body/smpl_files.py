@@ -13,6 +13,7 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, J
+from primdiffusion.failures import optional_package
 from primdiffusion.formats.arrays import ArrayFileError, all_finite, array_names, read_arrays, read_npy
 from primdiffusion.formats.regular_files import FileContent, read_regular
 from primdiffusion.formats.smpl_pickle import BodyFileError, as_array, read_pickle
@@ -28,6 +29,10 @@ LARGEST_BODY_M = 1000.0
 SHAPE_COMPONENTS = 10
 """Shape components loaded by default, of the up to 300 in SMPL files."""
 POSE_FEATURES = (J - 1) * 9
+_NO_XATLAS = (
+    "the body has no texture coordinates, and this Python has no xatlas to make some: give them by a second file (uv), "
+    "or install xatlas"
+)
 _ROOT_MARKS = (-1, 2**32 - 1, 2**64 - 1)
 """Encodings of "no parent": -1, or -1 converted to an unsigned integer."""
 
@@ -194,13 +199,7 @@ def _texture_coordinates(
 
 def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Unwrap automatically; return UV faces and coordinates."""
-    try:
-        import xatlas  # optional: it has no wheels for Python 3.14 or Linux on ARM
-    except ModuleNotFoundError as error:
-        raise BodyFileError(
-            "the body has no texture coordinates, and this Python has no xatlas to make some: give them by a second "
-            "file (uv), or install xatlas."
-        ) from error
+    xatlas = optional_package("xatlas", missing=_NO_XATLAS)  # it has no wheels for Python 3.14 or Linux on ARM
     _, coordinate_faces, coordinates = xatlas.parametrize(template, faces.astype(np.uint32))
     return coordinate_faces, coordinates
 

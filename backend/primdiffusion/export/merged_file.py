@@ -8,6 +8,7 @@ from types import ModuleType
 import numpy as np
 import torch
 
+from primdiffusion.failures import optional_package
 from primdiffusion.formats.arrays import write_deflated
 from primdiffusion.formats.requests import VOXEL
 from primdiffusion.primitives.primitives import Primitives
@@ -15,6 +16,10 @@ from primdiffusion.render.merge import Merged, merge
 
 Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Blender's axes from the backend's; applied before voxelising, because a grid cannot be rotated without resampling."""
+_NO_OPENVDB = (
+    "writing .vdb needs the module openvdb: install it (Debian and Ubuntu: python3-openvdb; Blender bundles its own), "
+    "or write an .npz"
+)
 
 
 def upright_grid(primitives: Primitives, voxel: float = VOXEL) -> Merged:
@@ -43,19 +48,15 @@ def write_grid_npz(path: Path, grid: Merged) -> None:
 
 
 def load_openvdb() -> ModuleType:
-    """Return the module `openvdb`, an optional dependency. Raises ValueError if it is missing."""
-    try:
-        import openvdb
-    except ImportError as error:
-        raise ValueError(
-            "writing .vdb needs the module openvdb: install it (Debian and Ubuntu: python3-openvdb; Blender bundles "
-            "its own), or write an .npz"
-        ) from error
-    return openvdb
+    """Return the module `openvdb`, an optional dependency. Raises MissingPackageError."""
+    return optional_package("openvdb", missing=_NO_OPENVDB)
 
 
 def write_grid_vdb(path: Path, grid: Merged) -> None:
-    """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) in float16. Raises ValueError, OSError."""
+    """Write the grids `density` (1/m, a fog volume) and `Cd` (linear RGB) in float16.
+
+    Raises MissingPackageError, OSError.
+    """
     openvdb = load_openvdb()
     index_to_world = np.diag([grid.voxel] * 3 + [1.0])  # row vectors
     index_to_world[3, :3] = grid.origin

@@ -7,8 +7,14 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray as Array
 
+from primdiffusion.failures import optional_package
+
 SEAM = 4
 """Texels between charts."""
+NO_XATLAS = (
+    "textured meshes need xatlas, which has no package for this Python and machine: use Python 3.11 or 3.13 on x86-64 "
+    "or Apple Silicon, or export Gaussians or VDB"
+)
 CHART_COST = 8.0
 """Maximum cost of a chart; xatlas's default of 2 cuts noisy surfaces into many more charts."""
 
@@ -32,15 +38,8 @@ def simplified(
 
 
 def unwrapped(vertices: Float64[Array, "v 3"], faces: Int64[Array, "f 3"], texture_px: int) -> Float64[Array, "f 3 2"]:
-    """Compute texture coordinates of every corner in non-overlapping charts (xatlas). Raises ValueError."""
-    try:
-        import xatlas  # optional dependency
-    except ModuleNotFoundError as error:  # it has no package for Python 3.14 or Linux on ARM
-        raise ValueError(
-            "textured meshes need xatlas, which has no package for this Python and machine: use Python 3.11 or 3.13 "
-            "on x86-64 or Apple Silicon, or export Gaussians or VDB"
-        ) from error
-
+    """Compute texture coordinates of every corner in non-overlapping charts (xatlas). Raises MissingPackageError."""
+    xatlas = optional_package("xatlas", missing=NO_XATLAS)
     atlas, charts, packing = xatlas.Atlas(), xatlas.ChartOptions(), xatlas.PackOptions()
     charts.max_cost = CHART_COST
     packing.resolution, packing.padding, packing.bilinear = texture_px, SEAM, True

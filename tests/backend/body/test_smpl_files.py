@@ -13,6 +13,7 @@ import scipy.sparse
 import torch
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.body.smpl_files import load_body
+from primdiffusion.failures import MissingPackageError
 from primdiffusion.formats.smpl_pickle import BodyFileError, UnsafePickleError
 from smplx.lbs import lbs
 from support.errors import refused
@@ -142,7 +143,7 @@ def test_without_texture_coordinates_the_body_is_unwrapped(tmp_path):
 
 def test_without_xatlas_a_body_without_texture_coordinates_is_rejected_with_what_to_do(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
-    with refused(BodyFileError):
+    with refused(MissingPackageError, "uv"):
         load_body(pickled(tmp_path, smpl_arrays()))
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from primdiffusion import cli
+from primdiffusion.failures import MissingPackageError
 from primdiffusion.human import generate
 from primdiffusion.human_file import save_human
 from tiny_model import tiny_model
@@ -75,7 +76,7 @@ def test_a_vdb_holds_the_same_numbers_where_they_belong(saved, tmp_path, blender
 
 def test_without_openvdb_a_vdb_is_rejected_before_any_work(saved, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "openvdb", None)
-    with pytest.raises(ValueError, match=r"or write an \.npz"):
+    with pytest.raises(MissingPackageError, match=r"or write an \.npz"):
         cli.run(["merge", str(saved), "--out", str(tmp_path / "anna.vdb")])
     assert not list(tmp_path.iterdir())
 

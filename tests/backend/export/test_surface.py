@@ -9,6 +9,7 @@ import trimesh
 from export_people import ball, person
 from primdiffusion.export.simplify import simplified, unwrapped
 from primdiffusion.export.surface import NoSurface, depth_below, outside_surface
+from primdiffusion.failures import MissingPackageError
 from primdiffusion.human import place
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.merge import merge
@@ -64,5 +65,5 @@ def test_a_person_of_nothing_is_rejected_with_a_sentence():
 
 def test_without_xatlas_unwrapping_is_rejected_with_what_to_do(monkeypatch):
     monkeypatch.setitem(sys.modules, "xatlas", None)
-    with refused(ValueError, "xatlas"):
+    with refused(MissingPackageError, "xatlas"):
         unwrapped(np.zeros((3, 3)), np.array([[0, 1, 2]]), 64)
