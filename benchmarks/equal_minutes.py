@@ -1,6 +1,6 @@
 """Compares settings of the local network's training: what each reaches in the same time, from the same start.
 
-    python benchmarks/equal_minutes.py --data PEOPLE --minutes 20 --json docs/results/equal_minutes.json
+    python benchmarks/equal_minutes.py --data PEOPLE --minutes 18 --json docs/results/equal_minutes.json
 
 PEOPLE is a training set of `primdiffusion payloads`. Codec, closed form and latents are the default checkpoint's; the
 local network starts untrained and learns on one processor core, two variants at a time. Minutes are processor time.

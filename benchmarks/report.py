@@ -21,7 +21,7 @@ SOURCES = {
     "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
     "equal_minutes": (
         "Settings of the local network's training on equal minutes",
-        "benchmarks/equal_minutes.py --data PEOPLE --minutes 3 --json docs/results/equal_minutes.json",
+        "benchmarks/equal_minutes.py --data PEOPLE --minutes 18 --json docs/results/equal_minutes.json",
     ),
     "faithful": (
         "Faithfulness to the released networks and the paper's metrics",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion import cli
-from primdiffusion.device import best_device, device_info
+from primdiffusion.device import best_device, device_info, has_bfloat16, has_fast_bfloat16
 from primdiffusion.machine import choose_device, memory, share_processors
 from tiny_model import tiny_model
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
@@ -131,3 +131,18 @@ def test_the_denoiser_needs_no_float64_on_an_apple_gpu():
     with fake, NoFloat64(), PlainIndices(simulated):
         x0 = model.denoiser(x, t)
     assert (x0.device.type, x0.dtype, x0.shape) == ("mps", torch.float32, x.shape)
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "has", "fast"),
+    [
+        ({"avx2": True}, False, False),
+        ({"avx512_bf16": True, "amx_bf16": False}, True, False),
+        ({"avx512_bf16": True, "amx_bf16": True}, True, True),
+        ({"sve_bf16": True}, True, True),
+    ],
+)
+def test_a_processor_is_fast_in_bfloat16_with_matrix_instructions(monkeypatch, capabilities, has, fast):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    device = torch.device("cpu")
+    assert (has_bfloat16(device), has_fast_bfloat16(device)) == (has, fast)

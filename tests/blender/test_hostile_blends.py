@@ -41,6 +41,7 @@ def pristine(addon, tmp_path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
 
 
+@pytest.mark.any_blender  # properties are read alike by all; the tests below save and open files on each
 @pytest.mark.parametrize("name", PROPERTIES)
 def test_no_value_of_a_property_leaves_the_folder_or_raises(pristine, tmp_path, name):
     faults = {what: found for what, found in tried(name, pristine, tmp_path / "case") if found}

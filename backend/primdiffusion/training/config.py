@@ -60,7 +60,7 @@ class PhaseConfig(Checked):
     """Samples per step, each at a random noise level."""
     optimiser: Literal["adamw", "muon"] = "adamw"
     """adamw; or muon, Muon for hidden layers at three times the learning rate, AdamW for the rest. Muon is for the
-    default preset, and computes in bfloat16: devices that are slow in it take AdamW."""
+    default preset, and computes in bfloat16: devices without instructions for it take AdamW."""
     learning_rate: Positive = 1e-3
     """Learning rate of AdamW after a warm-up of 100 steps."""
     weight_decay: NotNegative = 0.01

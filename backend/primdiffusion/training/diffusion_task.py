@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from primdiffusion.device import has_fast_bfloat16
+from primdiffusion.device import has_bfloat16
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import encode_srgb
@@ -50,9 +50,9 @@ class DiffusionTask(Task):
         """Return the model with the networks in use, without a card."""
 
     def optimiser(self, phase: str, network: nn.Module) -> torch.optim.Optimizer:
-        """Return Muon where the settings name it and the device multiplies bfloat16 fast, otherwise AdamW."""
+        """Return Muon where the settings name it and the device has instructions for bfloat16, otherwise AdamW."""
         settings = self.phases[phase]
-        if settings.optimiser == "muon" and has_fast_bfloat16(self.device):
+        if settings.optimiser == "muon" and has_bfloat16(self.device):
             return MuonAdamW(network, settings.learning_rate, settings.weight_decay)
         return super().optimiser(phase, network)
 

@@ -52,7 +52,7 @@ class NetTask(DiffusionTask):
 @pytest.fixture(autouse=True)
 def fast(monkeypatch):
     """A device that multiplies bfloat16 fast."""
-    monkeypatch.setattr(diffusion_task, "has_fast_bfloat16", lambda device: True)
+    monkeypatch.setattr(diffusion_task, "has_bfloat16", lambda device: True)
 
 
 def started(memory_format=torch.channels_last, **settings):
@@ -112,7 +112,7 @@ def test_a_saved_state_goes_on_bit_for_bit(tmp_path):
 def test_a_device_that_is_slow_in_bfloat16_takes_adamw(monkeypatch, tmp_path):
     state = started()
     state.save(tmp_path / "muon.safetensors")
-    monkeypatch.setattr(diffusion_task, "has_fast_bfloat16", lambda device: False)
+    monkeypatch.setattr(diffusion_task, "has_bfloat16", lambda device: False)
     slow = started()
     advance(slow, 1)
     assert all("exp_avg" in slow.optimiser.state[parameter] for parameter in slow.network.parameters())
