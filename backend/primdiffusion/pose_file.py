@@ -16,7 +16,7 @@ from primdiffusion.formats.poses.motion import Motion
 def read_motion(path: str | Path) -> BodyPose:
     """Read all frames of a file (`formats.poses.files`): rotations [F, 24, 3, 3], translations [F, 3] in metres, y up.
 
-    Raises FileNotFoundError or MotionFileError.
+    Raises FileNotFoundError or FileError.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"the pose file {path} does not exist: check the path")

@@ -18,14 +18,7 @@ from torch.overrides import TorchFunctionMode
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import open_regular, private_content
-from primdiffusion.formats.tensor_layout import (
-    LENGTH_BYTES,
-    StoredTensor,
-    TensorLayout,
-    TensorLayoutError,
-    check_limits,
-    read_layout,
-)
+from primdiffusion.formats.tensor_layout import LENGTH_BYTES, StoredTensor, TensorLayout, check_limits, read_layout
 
 LARGEST_FILE = 16 * 2**30
 _KINDS = {
@@ -114,11 +107,8 @@ class TensorFile:
 
 
 def _layout(file: io.BufferedReader | io.BytesIO) -> TensorLayout:
-    try:
-        layout = read_layout(file)
-        check_limits(layout)
-    except TensorLayoutError as error:
-        raise ValueError(str(error)) from error
+    layout = read_layout(file)
+    check_limits(layout)
     return layout
 
 

@@ -82,7 +82,7 @@ class _Archive:
     """
 
     def __init__(self, file: io.BufferedReader | io.BytesIO, path: Path) -> None:
-        """Find the members. Raises ArrayFileError for an archive that torch.save does not write, OSError."""
+        """Find the members. Raises FileError for an archive that torch.save does not write, OSError."""
         self._path = path
         self._members = stored_members(file, path)
         self._bytes = private_content(file)

@@ -12,11 +12,12 @@ from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
+from ..formats.regular_files import FileError
 from ..scene.armature import build_armature
 from ..scene.convention import points_to_backend, points_to_blender
 from .body import Body, blend, fit_surface, vertex_normals
 from .registration import Registration, axis_name, register, scale_note
-from .scan_files import Parameters, ScanError, ScanFile, read_parameters
+from .scan_files import Parameters, ScanFile, read_parameters
 from .skinned_surface import mesh_points
 
 _FAR_M, _LOOSE_M = 0.10, 0.06
@@ -55,7 +56,7 @@ def bind_static(
     """Bind meshes to a new armature with the 24 joints and bring them to its T rest, metres, facing forward.
 
     The pose is that of the parameters beside the scan; the shape is theirs where it fits, and else fitted to the
-    surface, for betas mean nothing on another body. Raises ScanError where there are none or they do not fit.
+    surface, for betas mean nothing on another body. Raises FileError where there are none or they do not fit.
     """
     parameters = read_parameters(scan_file)
     found = _register(scan_file, body, parameters, meshes)
@@ -82,7 +83,7 @@ def _register(scan_file: ScanFile, body: Body, parameters: Parameters, meshes) -
     posed = posed * parameters.scale + parameters.translation
     found = register(points_to_backend(mesh_points(meshes)), posed)
     if found.distance > _FAR_M * parameters.scale:
-        raise ScanError(
+        raise FileError(
             f"{scan_file.path} does not match {scan_file.parameters}: its surface is {found.distance * 100:.0f} cm off "
             "the body on average; check that they belong together and that the parameters are SMPL's"
         )
@@ -142,7 +143,7 @@ def _shape(body: Body, parameters: Parameters, surface: ScanSurface, scan_file: 
         return own.betas, np.zeros(3), [f"shape of its parameters, {own.residual * 1000:.0f} mm off on average"]
     fit = fit_surface(body, np.zeros(0), parameters.rotations, np.zeros(3), nearest)
     if fit.residual > _FAR_M:
-        raise ScanError(
+        raise FileError(
             f"{scan_file.path} does not match {scan_file.parameters}: its surface is {fit.residual * 100:.0f} cm from "
             "the body; check that they belong together"
         )

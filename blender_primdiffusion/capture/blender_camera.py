@@ -15,18 +15,14 @@ _FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 NEAR_M, FAR_M = 1e-3, 1e4
 
 
-class CameraError(ValueError):
-    """A camera that cannot take a capture's pictures."""
-
-
 def aim(camera: bpy.types.Object, view: View) -> tuple[float, float]:
     """Make a camera object see what `view` does; returns the pixels' aspect (x, y) that the scene must have.
 
-    Raises CameraError for pixels that are no rectangles.
+    Raises ValueError for pixels that are no rectangles.
     """
     k, data = view.intrinsics, camera.data
     if abs(k[0, 1]) > 1e-9 * k[0, 0]:
-        raise CameraError(f"a camera has skewed pixels ({k[0, 1]:g}): Blender has rectangular ones only")
+        raise ValueError(f"a camera has skewed pixels ({k[0, 1]:g}): Blender has rectangular ones only")
     aspect = (max(1.0, k[1, 1] / k[0, 0]), max(1.0, k[0, 0] / k[1, 1]))
     tall = aspect[1] / aspect[0]
     data.type, data.sensor_fit, data.sensor_width = "PERSP", "HORIZONTAL", _SENSOR_MM
@@ -49,11 +45,11 @@ def view_of(
 ) -> View:
     """What a camera object of the user's sees in pictures of `size` (width, height), by Blender's own projection.
 
-    Raises CameraError for cameras without perspective.
+    Raises ValueError for cameras without perspective.
     """
     evaluated = camera.evaluated_get(depsgraph)
     if evaluated.type != "CAMERA" or evaluated.data.type != "PERSP":
-        raise CameraError(f"{camera.name!r} is no perspective camera: choose others, or change its lens type")
+        raise ValueError(f"{camera.name!r} is no perspective camera: choose others, or change its lens type")
     width, height = size
     projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, scale_x=aspect[0], scale_y=aspect[1])
     intrinsics = np.array(

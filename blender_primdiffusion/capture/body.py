@@ -12,18 +12,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import MOST_BODY_VALUES, ArrayFileError, all_finite, read_arrays
+from ..formats.arrays import MOST_BODY_VALUES, all_finite, read_arrays
 from ..formats.body_layout import body_data
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.poses.skeleton import chain, joint_positions
+from ..formats.regular_files import FileError
 
 BETAS = 10
 """Shape components in use."""
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "f", "kintree_table")
-
-
-class BodyError(ValueError):
-    """A body model that cannot be read; one sentence."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -49,12 +46,12 @@ class Body:
     def rest(self, betas: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """A person's vertices [V, 3] and joints [24, 3] at rest (SMPL eqs. 8 and 10). Missing betas count as zero.
 
-        Raises BodyError where there are more betas than the body has components and the further ones are not zero.
+        Raises FileError where there are more betas than the body has components and the further ones are not zero.
         """
         betas = np.asarray(betas, np.float64).ravel()
         known = self.shape_basis.shape[-1]
         if np.any(betas[known:] != 0):
-            raise BodyError(f"{len(betas)} betas were given, the body {self.name!r} has {known}: drop the last ones")
+            raise FileError(f"{len(betas)} betas were given, the body {self.name!r} has {known}: drop the last ones")
         vertices = self.template + self.shape_basis[..., : len(betas)] @ betas[:known]
         return vertices, self.joint_regressor @ vertices
 
@@ -98,16 +95,16 @@ def skin(points: NDArray, weights: NDArray, transforms: NDArray) -> NDArray[np.f
 def read_body(path: Path | None = None) -> Body:
     """The default body, or a user's own SMPL as an .npz of plain arrays.
 
-    Raises FileNotFoundError without a default body, and BodyError where the file is not there, holds pickled arrays, or
+    Raises FileNotFoundError without a default body, and FileError where the file is not there, holds pickled arrays, or
     is not of SMPL's form.
     """
     source = body_data("body.npz") if path is None else Path(path)
     if not source.is_file():
-        raise BodyError(f"there is no body model {source}: check the path")
+        raise FileError(f"there is no body model {source}: check the path")
     try:
         arrays = read_arrays(source, optional=_KEYS, most_values=MOST_BODY_VALUES)
-    except ArrayFileError as e:
-        raise BodyError(f"{e}; a body model is an .npz of plain arrays in SMPL's form") from e
+    except FileError as e:
+        raise FileError(f"{e}; a body model is an .npz of plain arrays in SMPL's form") from e
     _check(source, arrays)
     pose_basis = np.asarray(arrays["posedirs"], np.float64)
     return Body(
@@ -124,7 +121,7 @@ def read_body(path: Path | None = None) -> Body:
 def _check(source: Path, arrays: dict[str, NDArray]) -> None:
     missing = [key for key in _KEYS if key not in arrays]
     if missing:
-        raise BodyError(f"{source} holds no {missing[0]!r}: use an .npz of SMPL's form with plain arrays")
+        raise FileError(f"{source} holds no {missing[0]!r}: use an .npz of SMPL's form with plain arrays")
     count = len(np.atleast_1d(arrays["v_template"]))
     shapes = {
         "v_template": (count, 3), "shapedirs": (count, 3, None), "posedirs": (count, 3, 207),
@@ -134,11 +131,11 @@ def _check(source: Path, arrays: dict[str, NDArray]) -> None:
         array = arrays[key]
         fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         if not fits or array.dtype.kind not in "iuf" or not (key == "kintree_table" or all_finite(array)):
-            raise BodyError(f"{source}: {key!r} has shape {array.shape} of {array.dtype}, not SMPL's finite numbers")
+            raise FileError(f"{source}: {key!r} has shape {array.shape} of {array.dtype}, not SMPL's finite numbers")
     if tuple(arrays["kintree_table"][0][1:].tolist()) != PARENTS[1:]:
-        raise BodyError(f"{source}: its joints are not SMPL's 24; SMPL-H and SMPL-X bodies do not serve here")
+        raise FileError(f"{source}: its joints are not SMPL's 24; SMPL-H and SMPL-X bodies do not serve here")
     if arrays["f"].max(initial=0) >= count or arrays["f"].min(initial=0) < 0:
-        raise BodyError(f"{source}: its faces name vertices that are not there")
+        raise FileError(f"{source}: its faces name vertices that are not there")
 
 
 _RIDGE_M = 0.008

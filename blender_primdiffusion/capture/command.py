@@ -18,12 +18,12 @@ import bpy
 
 from ..backend.child_streams import stdin_has_ended
 from ..console import CANCELLED, DONE, FAILED, UNUSABLE, Stop, UsageError, duration, separate_stdout, stopped_by_signals
-from ..formats.capture_layout import CaptureFolderError
 from ..formats.capture_repair import repair, verify
-from .job import CaptureError, CaptureProgress, run
+from ..formats.regular_files import FileError
+from .job import CaptureProgress, run
 from .options import ASK_FROM, MARK, parse, settings_of
 from .report import Report, report_path
-from .scan import ScanError, ScanFile, find_scans
+from .scan import ScanFile, find_scans
 from .settings import CaptureSettings
 
 _PRINT_S = 1.0
@@ -51,7 +51,7 @@ def main(argv: Sequence[str]) -> int:
                 return CANCELLED
             with stopped_by_signals() as stop:
                 return _run(options, say, stop)
-        except (CaptureFolderError, CaptureError, ScanError, OSError, ValueError) as error:
+        except (OSError, ValueError) as error:
             print(f"capture: {error}", file=sys.stderr, flush=True)
             return UNUSABLE
         except _Stopped:
@@ -62,19 +62,19 @@ def main(argv: Sequence[str]) -> int:
 def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
     """The scans of some folders, sorted by name; of `only`, where names are given.
 
-    Raises ScanError where there are none, or two of a name.
+    Raises FileError where there are none, or two of a name.
     """
     found: dict[str, ScanFile] = {}
     for folder in folders:
         for scan in find_scans(folder):
             if scan.name in found:
-                raise ScanError(f"two scans are called {scan.name}: rename the file or folder of one")
+                raise FileError(f"two scans are called {scan.name}: rename the file or folder of one")
             found[scan.name] = scan
     unknown = sorted(set(only) - set(found))
     if unknown:
-        raise ScanError(f"there is no scan {unknown[0]} in {', '.join(map(str, folders))}")
+        raise FileError(f"there is no scan {unknown[0]} in {', '.join(map(str, folders))}")
     if not found:
-        raise ScanError("there are no scans: name a folder of them with --people")
+        raise FileError("there are no scans: name a folder of them with --people")
     return [found[name] for name in sorted(found) if not only or name in only]
 
 
@@ -141,7 +141,7 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
         settings.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = error.strerror or error
-        raise CaptureFolderError(
+        raise FileError(
             f"nothing can be written to {settings.out} ({reason}): choose another folder with --out"
         ) from error
     report, printed = Report(), 0.0

@@ -20,7 +20,8 @@ from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
 from ..formats.poses.files import read_motion
-from ..formats.poses.motion import Motion, MotionFileError
+from ..formats.poses.motion import Motion
+from ..formats.regular_files import FileError
 from ..formats.removing import check_unlinked
 from ..formats.requests import FLOAT_DEPTH
 from ..formats.whole_files import remove_abandoned, temporary_folder
@@ -40,7 +41,7 @@ def choose_poses(settings: CaptureSettings, report: Report) -> Motion:
     """The poses [F] of a capture, for all subjects: near-T first, then built-in ones or a spread of the files'.
 
     Subjects stay in place: translations are left out. A file that cannot be used is noted
-    in the report. Raises MotionFileError where none can.
+    in the report. Raises FileError where none can.
     """
     if not settings.pose_files:
         return _in_place(built_in_poses(settings.pose_count))
@@ -49,12 +50,10 @@ def choose_poses(settings: CaptureSettings, report: Report) -> Motion:
         try:
             motions.append(read_motion(path))
             report.notes += [f"{path.name}: {note}" for note in motions[-1].notes]
-        except MotionFileError as error:
+        except FileError as error:
             report.fail("", "poses", str(error))
     if not motions:
-        raise MotionFileError(
-            f"none of the {len(settings.pose_files)} pose files can be used: {report.failed[-1]['why']}"
-        )
+        raise FileError(f"none of the {len(settings.pose_files)} pose files can be used: {report.failed[-1]['why']}")
     return _in_place(pick_poses(motions, settings.pose_count, settings.seed))
 
 
@@ -66,15 +65,11 @@ _CENTRE_PASSES = frozenset({"depth", FLOAT_DEPTH, "normal", "part"})
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
-class CaptureError(ValueError):
-    """A capture is impossible; the message is one sentence."""
-
-
 class Loader(Protocol):
     """Loads a scan into the context's scene."""
 
     def __call__(self, context: bpy.types.Context, scan_file: ScanFile, body: Body) -> Scan:
-        """Raises ScanError."""
+        """Raises FileError."""
         ...
 
 
@@ -109,13 +104,13 @@ def run(
 
     Finished views are skipped, so the same call resumes after a kill and ends in the same files. A subject that fails
     is noted in the report, which the generator returns; closing the generator cancels, and leaves nothing in the file.
-    The user's scene is active between steps. Raises CaptureFolderError, CaptureError for poses that are not finite,
-    MotionFileError where there are no poses, and OSError where the disk is full.
+    The user's scene is active between steps. Raises FileError, ValueError for poses that are not finite,
+    FileError where there are no poses, and OSError where the disk is full.
     """
     report = Report() if report is None else report
     poses = choose_poses(settings, report) if poses is None else poses
     if not (np.isfinite(poses.rotations).all() and np.isfinite(poses.translations).all()):
-        raise CaptureError(f"the poses of {poses.name} hold numbers that are not finite: leave them out")
+        raise ValueError(f"the poses of {poses.name} hold numbers that are not finite: leave them out")
     claim(settings.out, settings.about(len(poses)))
     body = read_body(settings.body)
     ordered = sorted(scans, key=lambda scan: scan.name)
@@ -147,7 +142,7 @@ class _Places:
         self._placed: dict[str, Placed] = {}
 
     def of(self, scan_file: ScanFile) -> Placed:
-        """Raises ScanError where one of the group cannot be loaded."""
+        """Raises FileError where one of the group cannot be loaded."""
         if self._alone is not None:
             return self._alone
         if scan_file.name not in self._placed:
@@ -242,7 +237,7 @@ def _views_around(scan: Scan, settings: CaptureSettings, poses: Motion) -> list[
 def _check_outside(scan: Scan, context: bpy.types.Context, views: list[View], frame: int) -> None:
     inside = cameras_inside(scan.objects, context.evaluated_depsgraph_get(), views)
     if inside:
-        raise CaptureError(
+        raise ValueError(
             f"camera {inside[0]} is inside the human in frame {frame}: move it away, or give the rig a larger margin"
         )
 

@@ -14,8 +14,8 @@ from ..formats.arrays import all_finite
 from ..formats.camera_rig import Arrangement, Rig, View
 from ..formats.json_files import read_json
 from ..formats.poses.files import ENDINGS
+from ..formats.regular_files import as_file_error
 from ..formats.requests import LAYOUTS, PASSES, check_seed
-from .blender_camera import CameraError
 from .settings import Background, CaptureSettings, Device, Light
 
 MARK = "PRIMDIFFUSION "
@@ -79,7 +79,7 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 
 
 def settings_of(options: argparse.Namespace) -> CaptureSettings:
-    """The settings that options ask for. Raises ValueError, CameraError and OSError for impossible ones."""
+    """The settings that options ask for. Raises ValueError and OSError for impossible ones."""
     width, height = options.size
     rig = Rig(
         arrangement=options.arrangement,
@@ -116,23 +116,19 @@ def settings_of(options: argparse.Namespace) -> CaptureSettings:
 
 
 def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
-    """The cameras of a cameras.json, in the order of their names. Raises CameraError or OSError."""
-    try:
+    """The cameras of a cameras.json, in the order of their names. Raises FileError or OSError."""
+    with as_file_error(path, "holds no cameras as cameras.json has them", "render the captures again"):
         named = read_json(path)
         views = []
         for name in sorted(named):
             k, r, t = (np.array(named[name][key], np.float64) for key in "KRT")
             if (k.shape, r.shape, t.size) != ((3, 3), (3, 3), 3) or not all(map(all_finite, (k, r, t))):
-                raise CameraError(f"{path}: {name} has no finite K [3, 3], R [3, 3] and T [3]")
+                raise ValueError(f"{name} has no finite K [3, 3], R [3, 3] and T [3]")
             if not np.allclose(r @ r.T, np.eye(3), atol=1e-5) or np.linalg.det(r) < 0:
-                raise CameraError(f"{path}: R of {name} is no rotation")
+                raise ValueError(f"R of {name} is not a rotation")
             views.append(View(k, r, t.ravel(), width, height))
-    except (ValueError, TypeError, LookupError, AttributeError) as error:
-        if isinstance(error, CameraError):
-            raise
-        raise CameraError(f"{path} holds no cameras as cameras.json has them ({error!r:.100})") from error
-    if not views:
-        raise CameraError(f"{path} holds no camera")
+        if not views:
+            raise ValueError("the list is empty")
     return tuple(views)
 
 

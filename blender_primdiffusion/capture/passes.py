@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..formats.capture_layout import picture_path
 from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_exr, write_png
-from ..formats.regular_files import read_regular
+from ..formats.regular_files import FileError, read_regular
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from .surfaces import PART
@@ -22,10 +22,6 @@ from .surfaces import PART
 _LARGEST_FILE = 2**32
 _MAGIC, _MULTIPART = 20000630, 0x1000
 _DTYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
-
-
-class ExrError(ValueError):
-    """A file that is no uncompressed OpenEXR of scan lines, or not whole."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -38,13 +34,15 @@ class _Part:
 def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
     """All channels by name, [H, W] float32, top row first; those of a part called `ViewLayer.Depth` too.
 
-    Names are as Blender gives them: "ViewLayer.Combined.R". Raises ExrError.
+    Names are as Blender gives them: "ViewLayer.Combined.R". Raises FileError.
     """
     data = read_regular(path, _LARGEST_FILE)
     try:
         return _read(data)
     except (struct.error, IndexError, ValueError, KeyError, OverflowError) as error:
-        raise ExrError(f"{path} is no whole, uncompressed OpenEXR picture ({error!s:.160}): render it again") from error
+        raise FileError(
+            f"{path} is no whole, uncompressed OpenEXR picture ({error!s:.160}): render it again"
+        ) from error
 
 
 def _read(data: bytes) -> dict[str, NDArray[np.float32]]:
@@ -230,11 +228,11 @@ def _write_jpeg(path: Path, pixels: NDArray[np.uint8]) -> None:
 
 
 def _chosen(path: Path, planes: dict[str, NDArray], endings: list[str]) -> list[NDArray[np.float32]]:
-    """Planes by the ends of their names, of one size and without NaN: that is 0. Raises ExrError."""
+    """Planes by the ends of their names, of one size and without NaN: that is 0. Raises FileError."""
     found = [next((plane for name, plane in planes.items() if name.endswith(f".{ending}")), None) for ending in endings]
     shapes = {plane.shape for plane in found if plane is not None}
     missing = [ending for ending, plane in zip(endings, found, strict=True) if plane is None]
     if missing or len(shapes) != 1:
         what = f"holds no pass {missing[0]}" if missing else "holds passes of several sizes"
-        raise ExrError(f"{path} {what}: render it again")
+        raise FileError(f"{path} {what}: render it again")
     return [np.nan_to_num(plane, nan=0.0, posinf=np.inf, neginf=-np.inf) for plane in found if plane is not None]

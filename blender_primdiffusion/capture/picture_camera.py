@@ -10,7 +10,7 @@ import numpy as np
 
 from ..formats.camera_rig import View
 from ..formats.regular_files import open_regular
-from .blender_camera import CameraError, aim, view_of
+from .blender_camera import aim, view_of
 
 NAME = "Picture"
 LONG_SIDE_DEGREES = 45.0
@@ -68,10 +68,10 @@ def picture_of(camera: bpy.types.Object | None) -> bpy.types.Image | None:
 
 
 def picture_view(context: bpy.types.Context, camera: bpy.types.Object, image: bpy.types.Image) -> View:
-    """What the camera sees in the picture. Raises CameraError where its size is not the scene's render size."""
+    """What the camera sees in the picture. Raises ValueError where its size is not the scene's render size."""
     render, size = context.scene.render, tuple(image.size)
     if (render.resolution_x, render.resolution_y) != size:
-        raise CameraError(
+        raise ValueError(
             f"the render size is {render.resolution_x} x {render.resolution_y} pixels, the picture's {size[0]} x "
             f"{size[1]}: make them equal in the output properties, or choose the picture again"
         )

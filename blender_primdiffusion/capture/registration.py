@@ -9,8 +9,8 @@ import numpy as np
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
+from ..formats.regular_files import FileError
 from ..scene.convention import BLENDER_FROM_BACKEND
-from .scan_files import ScanError
 
 SHORTEST, TALLEST = 0.5, 2.6
 """Heights of humans in metres: less than a power of ten apart."""
@@ -32,7 +32,7 @@ class Standing:
 def stand_up(axes: NDArray, points: NDArray, name: str) -> Standing:
     """Upright, from the axes left, up and front of a human (columns [3, 3]) and its surface [V, 3], as imported.
 
-    Raises ScanError where no power of ten makes it a person's height.
+    Raises FileError where no power of ten makes it a person's height.
     """
     rotation = BLENDER_FROM_BACKEND @ np.asarray(axes).T
     up = np.asarray(axes)[:, 1]
@@ -41,7 +41,7 @@ def stand_up(axes: NDArray, points: NDArray, name: str) -> Standing:
     scale = unit_of(height, name)
     reach = float(np.ptp(points, axis=0).max()) * scale
     if not reach <= _WIDEST:
-        raise ScanError(f"{name} has points {reach:.4g} m apart: remove what is not the person, or lost vertices")
+        raise FileError(f"{name} has points {reach:.4g} m apart: remove what is not the person, or lost vertices")
     notes = [f"{height * scale:.2f} m tall", scale_note(scale)]
     tilt = np.degrees(np.arccos(np.clip(up[2], -1, 1)))
     if tilt > 1:
@@ -53,11 +53,11 @@ def stand_up(axes: NDArray, points: NDArray, name: str) -> Standing:
 
 
 def unit_of(height: float, name: str) -> float:
-    """The power of ten that makes `height` a person's in metres. Raises ScanError where there is none."""
+    """The power of ten that makes `height` a person's in metres. Raises FileError where there is none."""
     for scale in (1.0, 0.01, 100.0, 0.001, 1000.0, 0.1, 10.0):
         if SHORTEST <= height * scale <= TALLEST:
             return scale
-    raise ScanError(
+    raise FileError(
         f"{name} is {height:.4g} m tall, and no change of units makes that a person of {SHORTEST:g} to {TALLEST:g} m: "
         "scale it to metres"
     )

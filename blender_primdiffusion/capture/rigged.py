@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.poses.skeleton import chain
+from ..formats.regular_files import FileError
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
-from .scan_files import ScanError, ScanFile
+from .scan_files import ScanFile
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -100,11 +101,11 @@ class RigSkeleton:
 
 
 def find_armature(objects: Sequence[bpy.types.Object], scan_file: ScanFile) -> bpy.types.Object | None:
-    """The armature that moves meshes; None where none does. Raises ScanError where several do."""
+    """The armature that moves meshes; None where none does. Raises FileError where several do."""
     used = {armature for obj in objects if obj.type == "MESH" for armature in [moved_by(obj)] if armature}
     if len(used) > 1:
         names = ", ".join(sorted(armature.name for armature in used))
-        raise ScanError(
+        raise FileError(
             f"{scan_file.path} holds {len(used)} skeletons ({names}): save each person in a file of its own"
         )
     return next(iter(used), None)
@@ -126,10 +127,10 @@ def moved_by(mesh: bpy.types.Object) -> bpy.types.Object | None:
 def split_meshes(
     objects: Sequence[bpy.types.Object], scan_file: ScanFile
 ) -> tuple[list[bpy.types.Object], list[bpy.types.Object]]:
-    """Meshes with faces that follow the armature, and those that do not. Raises ScanError where no mesh has a face."""
+    """Meshes with faces that follow the armature, and those that do not. Raises FileError where no mesh has a face."""
     meshes = [obj for obj in objects if obj.type == "MESH" and len(obj.data.polygons)]
     if not meshes:
-        raise ScanError(f"{scan_file.path} holds no surface: export the person's mesh, not only its skeleton or points")
+        raise FileError(f"{scan_file.path} holds no surface: export the person's mesh, not only its skeleton or points")
     moving = [mesh for mesh in meshes if moved_by(mesh) is not None]
     return moving, [mesh for mesh in meshes if mesh not in moving]
 

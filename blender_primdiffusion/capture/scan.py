@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rigs import BoneMap, facing, map_bones, rig_from_smpl
 from ..formats.poses.rotation import matrix_to_quaternion, to_axis_angle
+from ..formats.regular_files import FileError
 from ..scene.convention import points_to_blender
 from .bind import bind_static
 from .body import Body, ShapeFit, fit_joints
@@ -29,12 +30,12 @@ from .rigged import (
     to_backend,
     uniform_scale,
 )
-from .scan_files import ScanError, ScanFile, find_scans, import_file, own_betas
+from .scan_files import ScanFile, find_scans, import_file, own_betas
 from .skinned_surface import SkinnedSurface, mesh_points, skinned_surface
 from .stage import AddedData
 from .surfaces import complete_colours
 
-__all__ = ["Scan", "ScanError", "ScanFile", "find_scans", "load_scan"]
+__all__ = ["Scan", "FileError", "ScanFile", "find_scans", "load_scan"]
 
 _POOR_FIT_M = 0.05
 _EXACT_M = 0.001
@@ -113,7 +114,7 @@ def load_scan(context: bpy.types.Context, scan_file: ScanFile, body: Body) -> Sc
     """Import a person into the context's scene: upright, facing forward, in metres, ready to be posed.
 
     A skinned person keeps its rig; `body` is fitted to its joints. A person without a rig needs SMPL parameters of
-    `body` beside it and gets a rig. Raises ScanError, and then leaves nothing in the file.
+    `body` beside it and gets a rig. Raises FileError, and then leaves nothing in the file.
     """
     added = AddedData()
     try:
@@ -146,7 +147,7 @@ def _load_rigged(context, scan_file: ScanFile, body: Body, objects, armature, ad
         bones = map_bones([bone.name for bone in armature.data.bones])
         axes = facing(bone_heads(armature, bones.joints))
     except ValueError as e:
-        raise ScanError(f"{scan_file.path}: {e}") from e
+        raise FileError(f"{scan_file.path}: {e}") from e
     free_bones(armature, list(bones.joints.values()))
     standing = stand_up(axes, mesh_points(meshes), str(scan_file.path))
     root = add_root(context, objects, scan_file.name, affine(standing.rotation * standing.scale, np.zeros(3)))

@@ -13,11 +13,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import ArrayFileError, all_finite, read_arrays
+from ..formats.arrays import all_finite, read_arrays
 from ..formats.json_files import parse_json
 from ..formats.poses.files import POSE_KEYS, motion_from_arrays
-from ..formats.poses.motion import MotionFileError
-from ..formats.regular_files import open_regular, portable_name, real_path
+from ..formats.regular_files import FileError, open_regular, portable_name, real_path
 
 ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
 """Files of scans; of several with the same name in a folder, the first of these is used."""
@@ -26,10 +25,6 @@ _GENERIC = {"person", "model", "scan", "mesh", "scene", "body", "human", "untitl
 _RELEASED = ("outputs_re_fitting/refit_smpl_2nd_plain.npz", "refit_smpl_2nd_plain.npz")
 _LARGEST_JSON, _LARGEST_SCAN = 64 * 2**20, 2**40
 """Bytes; the importers of Blender read the scans."""
-
-
-class ScanError(ValueError):
-    """A scan cannot be used; the message is one sentence."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,15 +42,15 @@ class ScanFile:
 def find_scans(folder: Path | str) -> list[ScanFile]:
     """The scans in a folder and below, sorted by path; or the one in a file.
 
-    Hidden folders are left out. Raises ScanError where the folder is missing or holds no scan.
+    Hidden folders are left out. Raises FileError where the folder is missing or holds no scan.
     """
     folder = Path(folder)
     if folder.is_file():
         if folder.suffix.lower() not in ENDINGS:
-            raise ScanError(f"{folder} is no scan: give a .glb, .gltf, .fbx or .obj, or a folder of them")
+            raise FileError(f"{folder} is no scan: give a .glb, .gltf, .fbx or .obj, or a folder of them")
         return [ScanFile(_slug(folder), folder, _parameters(folder))]
     if not folder.is_dir():
-        raise ScanError(f"there is no folder of scans {folder}: check the path")
+        raise FileError(f"there is no folder of scans {folder}: check the path")
     chosen: dict[Path, Path] = {}
     for path in _models(folder):
         stem = path.with_suffix("")
@@ -63,11 +58,11 @@ def find_scans(folder: Path | str) -> list[ScanFile]:
             chosen[stem] = path
     if not chosen:
         if any(folder.rglob("*.human*")):
-            raise ScanError(
+            raise FileError(
                 f"{folder} holds people made of primitives, and captures are made of meshes: export these as .glb "
                 "(primdiffusion export), or name a folder of scans"
             )
-        raise ScanError(f"{folder} holds no scans: none of its files ends in {', '.join(ENDINGS)}")
+        raise FileError(f"{folder} holds no scans: none of its files ends in {', '.join(ENDINGS)}")
     taken: set[str] = set()
     scans = []
     for path in sorted(chosen.values()):
@@ -138,15 +133,15 @@ def _parameters(path: Path) -> Path | None:
 
 
 def import_file(path: Path) -> list[bpy.types.Object]:
-    """Import a .glb, .gltf, .fbx or .obj into the scene; its objects. Raises ScanError where Blender cannot read it."""
+    """Import a .glb, .gltf, .fbx or .obj into the scene; its objects. Raises FileError where Blender cannot read it."""
     if not path.is_file():
-        raise ScanError(f"there is no scan {path}: check the path")
+        raise FileError(f"there is no scan {path}: check the path")
     before = {obj.session_uid for obj in bpy.data.objects}
     importers = {".glb": _import_gltf, ".gltf": _import_gltf, ".fbx": _import_fbx, ".obj": _import_obj}
     try:
         importers[path.suffix.lower()](str(path))
     except Exception as e:  # Python importers raise anything on damaged files
-        raise ScanError(f"{path} cannot be imported: {_last_line(e)}; export it again") from e
+        raise FileError(f"{path} cannot be imported: {_last_line(e)}; export it again") from e
     return [obj for obj in bpy.data.objects if obj.session_uid not in before]
 
 
@@ -195,22 +190,22 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
     """The parameters of a scan; of several frames the first.
 
     The .npz of plain arrays has `global_orient` and `body_pose` (or `pose`, `poses`), `betas`, and if wanted `transl`
-    or `trans`, `scale`, and `body`, the name of the body whose shape `betas` are. Raises ScanError where it is missing
+    or `trans`, `scale`, and `body`, the name of the body whose shape `betas` are. Raises FileError where it is missing
     or holds something else.
     """
     path = scan_file.parameters
     if path is None:
         pickled = [e for e in (".pkl", ".pickle") if scan_file.path.with_suffix(e).is_file()]
         hint = "; pickles are never read, save it as .npz of plain arrays" if pickled else ""
-        raise ScanError(
+        raise FileError(
             f"{scan_file.path} has no skeleton, and no SMPL parameters are beside it: put {scan_file.path.stem}.npz "
             f"with global_orient, body_pose, betas and transl there{hint}"
         )
     try:
         arrays = read_arrays(path, optional=(*POSE_KEYS, *_SHAPE_KEYS, "scale", "body"))
         motion = motion_from_arrays({key: arrays[key] for key in POSE_KEYS if key in arrays}, path)
-    except (ArrayFileError, MotionFileError, OSError) as e:
-        raise ScanError(str(e)) from e
+    except OSError as e:
+        raise FileError(str(e)) from e
     betas = next((arrays[key] for key in _SHAPE_KEYS if key in arrays), np.zeros(10))
     scale = arrays.get("scale", np.ones(1))
     return Parameters(
@@ -225,12 +220,12 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
 
 def _row(values: NDArray, path: Path, name: str) -> NDArray[np.float64]:
     if values.dtype.kind not in "iuf" or values.size == 0 or not all_finite(values):
-        raise ScanError(f"{path}: {name!r} holds something else than finite numbers")
+        raise FileError(f"{path}: {name!r} holds something else than finite numbers")
     return np.asarray(values, np.float64).reshape(-1, values.shape[-1] if values.ndim else 1)[0]
 
 
 def _positive(values: NDArray, path: Path) -> float:
     number = float(_row(values, path, "scale")[0])
     if not number > 0:
-        raise ScanError(f"{path}: 'scale' is {number:g}, not positive")
+        raise FileError(f"{path}: 'scale' is {number:g}, not positive")
     return number

@@ -10,7 +10,7 @@ from pathlib import Path
 import bpy
 
 from ..formats.camera_rig import View
-from ..formats.regular_files import check_regular
+from ..formats.regular_files import FileError, check_regular
 from ..formats.removing import remove_file, remove_folder
 from .blender_camera import aim
 from .passes import Centres, Colours, read_centres, read_colours
@@ -89,10 +89,6 @@ _LAYERS = 256
 """Transparent surfaces along a ray: hair has many layers."""
 
 
-class StageError(RuntimeError):
-    """A scene that cannot be lit or rendered."""
-
-
 class Stage:
     """A scene with a camera, lights and Cycles' settings; `close` removes all of it."""
 
@@ -133,7 +129,7 @@ class Stage:
             yield bpy.context
 
     def choose_hdri(self, seed: int) -> None:
-        """Light by the picture that a view's seed chooses of a folder. Raises StageError."""
+        """Light by the picture that a view's seed chooses of a folder. Raises FileError."""
         if len(self._hdris) > 1 and self._environment is not None:
             before, path = self._environment.image, self._hdris[seed % len(self._hdris)]
             if before.filepath == str(path):
@@ -198,7 +194,7 @@ def _load_hdri(path: Path) -> bpy.types.Image:
         check_regular(str(path))  # Blender would wait for a pipe
         return bpy.data.images.load(str(path))
     except (RuntimeError, OSError) as error:
-        raise StageError(f"the HDRI {path} cannot be read: choose an .hdr or .exr picture") from error
+        raise FileError(path, "cannot be read as an HDRI", "choose an .hdr or .exr picture") from error
 
 
 _NARROWEST_PX = 0.01
@@ -206,14 +202,14 @@ _NARROWEST_PX = 0.01
 
 
 def shoot_colours(stage: Stage, view: View, seed: int, samples: int) -> Colours:
-    """Colours and coverage, averaged over each pixel by a box of its size. Raises StageError."""
+    """Colours and coverage, averaged over each pixel by a box of its size. Raises RuntimeError."""
     cycles = stage.scene.cycles
     cycles.pixel_filter_type, cycles.samples = "BOX", samples
     return read_colours(_render(stage, view, seed))
 
 
 def shoot_centres(stage: Stage, view: View, seed: int) -> Centres:
-    """What the rays through the pixels' centres hit. Raises StageError."""
+    """What the rays through the pixels' centres hit. Raises RuntimeError."""
     cycles = stage.scene.cycles
     denoise, cycles.use_denoising = cycles.use_denoising, False
     cycles.pixel_filter_type, cycles.filter_width, cycles.samples = "GAUSSIAN", _NARROWEST_PX, 1
@@ -236,7 +232,7 @@ def _render(stage: Stage, view: View, seed: int) -> Path:
         result = next(image for image in bpy.data.images if image.type == "RENDER_RESULT")
         result.save_render(str(path), scene=scene)
     except RuntimeError as error:
-        raise StageError(f"Cycles could not render: {' '.join(str(error).split())}") from error
+        raise RuntimeError(f"Cycles could not render: {' '.join(str(error).split())}") from error
     if not path.is_file():
-        raise StageError(f"Cycles wrote no picture to {stage.scratch}: is there room, and is the folder writable?")
+        raise RuntimeError(f"Cycles wrote no picture to {stage.scratch}: is there room, and is the folder writable?")
     return path

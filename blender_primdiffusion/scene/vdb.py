@@ -1,7 +1,7 @@
 """Blender's Python module openvdb, and what there is of it where it is missing, as it may be in Debian.
 
 Humans need no volumes to be drawn by PrimDiffusion, only by Cycles and EEVEE. So without the module nothing is refused
-but writing: each writer raises `NoOpenVdbError`.
+but writing: each writer raises ValueError.
 """
 
 from __future__ import annotations
@@ -19,20 +19,13 @@ except ModuleNotFoundError:
     _openvdb = None
 
 
-class NoOpenVdbError(ValueError):
-    """Volumes cannot be written: Blender's Python lacks openvdb."""
-
-    def __init__(self) -> None:
-        super().__init__(
+def openvdb() -> ModuleType:
+    """The module. Raises ValueError where Blender's Python lacks it."""
+    if _openvdb is None:
+        raise ValueError(
             "the Python of this Blender lacks openvdb, without which volumes cannot be written for Cycles and EEVEE: "
             "install it (on Debian and Ubuntu: sudo apt install python3-openvdb), then start Blender again"
         )
-
-
-def openvdb() -> ModuleType:
-    """The module. Raises NoOpenVdbError."""
-    if _openvdb is None:
-        raise NoOpenVdbError
     return _openvdb
 
 

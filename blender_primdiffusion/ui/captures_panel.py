@@ -22,7 +22,7 @@ from ..jobs.follow import Reporting, redraw
 from ..places import shows_captures
 from ..scene.blend_values import setting_path
 from ..scene.convention import points_to_backend
-from .captures_session import Busy, captures
+from .captures_session import captures
 from .captures_settings import words_of
 from .drawing import DATA, SidebarPanel, draw_lines, draw_section, property_columns
 
@@ -66,7 +66,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         """With a window another Blender renders and a timer follows it; in background mode this one renders."""
         try:
             if captures.busy:
-                raise Busy("captures are being rendered; wait for them or press Cancel")
+                raise ValueError("captures are being rendered; wait for them or press Cancel")
             words = self._words(context)
             if bpy.app.background:
                 return self._render_here(context, words)

@@ -28,10 +28,6 @@ PATIENCE_S = 0.7
 _MOST_LINES = 200
 
 
-class Busy(ValueError):
-    """A capture runs already."""
-
-
 class CaptureSession:
     """Starts the child, follows it, ends it. All methods are for Blender's main thread."""
 
@@ -66,9 +62,9 @@ class CaptureSession:
         return self._folder
 
     def start(self, words: Sequence[str]) -> None:
-        """Begin a run of the command `capture`. Raises Busy, or OSError where no Blender can be started."""
+        """Begin a run of the command `capture`. Raises ValueError while one runs, OSError where no Blender starts."""
         if self.busy:
-            raise Busy("captures are being rendered; wait for them or press Cancel")
+            raise ValueError("captures are being rendered; wait for them or press Cancel")
         folder = str(self.new_folder())
         self.error = self.notice = self._fault = ""
         self.message, self.fraction, self.eta_s, self.exit_code = "Starting Blender", 0.0, None, None

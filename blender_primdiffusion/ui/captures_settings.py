@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from ..capture.blender_camera import CameraError, view_of
+from ..capture.blender_camera import view_of
 from ..formats.camera_rig import Rig
 from ..formats.requests import LAYOUTS, PASSES
 from ..scene.blend_values import setting_path
@@ -225,7 +225,7 @@ def _custom_words(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, 
     objects = asked.cameras.all_objects if asked.cameras is not None else context.selected_objects
     cameras = sorted((obj for obj in objects if obj.type == "CAMERA"), key=lambda obj: obj.name)
     if not cameras:
-        raise CameraError("no camera takes pictures: choose a collection with cameras, or select some")
+        raise ValueError("no camera takes pictures: choose a collection with cameras, or select some")
     views = [view_of(camera, depsgraph, (asked.width, asked.height), aspect) for camera in cameras]
     named = {
         f"camera{i:04d}": {"K": v.intrinsics.tolist(), "R": v.rotation.tolist(), "T": v.translation.tolist()}

@@ -16,8 +16,8 @@ from ..backend.requests import sentence
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.bvh import bone_names, parse_bvh
 from ..formats.poses.files import ENDINGS, read_motion
-from ..formats.poses.motion import MotionFileError
-from ..formats.poses.rigs import UnknownBonesError, map_bones
+from ..formats.poses.rigs import map_bones
+from ..formats.regular_files import FileError
 from ..scene.human import armature_of, humans
 from .drawing import draw_lines, property_columns
 from .motion_placing import Placement, extend_range, facts, place_motion
@@ -97,7 +97,7 @@ def _look_at(path: str, up: str, _changed: int, _size: int) -> FileFacts:
             bones = tuple(bone_names(parse_bvh(Path(path))))
             map_bones(bones)
         motion = read_motion(path, up)
-    except (MotionFileError, UnknownBonesError, OSError) as error:
+    except (FileError, OSError) as error:
         return FileFacts({}, bones, {}, str(error))
     return FileFacts(facts(motion), bones, dict(motion.detected.bones))
 

@@ -13,7 +13,7 @@ import zipfile
 import pytest
 import torch
 from primdiffusion import torch_file
-from primdiffusion.formats.arrays import ArrayFileError
+from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 
@@ -98,7 +98,7 @@ def test_two_members_of_what_torch_takes_for_one_name_are_refused(tmp_path, name
     members.insert(0 if first else len(members), (name, HOSTILE["memory"]))
     path = archive_of(tmp_path / "a.pt", members)
     path.write_bytes(path.read_bytes().replace(b"data.pkl?.txt", b"data.pkl\0.txt"))  # readers end names at a null
-    with refused(ArrayFileError, "a.pt"):
+    with refused(FileError, "a.pt"):
         torch_file.load(path)
 
 

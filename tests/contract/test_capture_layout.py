@@ -14,6 +14,7 @@ import torch
 from PIL import Image
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.formats import camera_files, camera_rig, capture_layout, picture_files
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.camera import look_at
 from scipy.spatial.transform import Rotation
 from support.errors import refused
@@ -140,11 +141,11 @@ def test_smpl_parameters_are_read_plain_and_as_the_released_code_does(tmp_path):
 def test_a_folder_is_claimed_once(tmp_path):
     capture_layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
     capture_layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
-    with refused(capture_layout.CaptureFolderError, "seed is 1", "wanted is 2"):
+    with refused(FileError, "seed is 1", "wanted is 2"):
         capture_layout.claim(tmp_path / "a", {"seed": 2, "size": (3, 4)})
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "thesis.tex").touch()
-    with refused(capture_layout.CaptureFolderError):
+    with refused(FileError):
         capture_layout.claim(tmp_path / "b", {"seed": 1})
 
 

@@ -229,13 +229,11 @@ def read_hdri(path: Path) -> None:
     import bpy
 
     from blender_primdiffusion.capture.settings import CaptureSettings
-    from blender_primdiffusion.capture.stage import StageError, _light
+    from blender_primdiffusion.capture.stage import _light
 
     scene = bpy.data.scenes.new("Light")
     try:
         _light(scene, CaptureSettings(path.parent, light="hdri", hdri=path))
-    except StageError as error:  # `captures` tells these by itself
-        raise ValueError(str(error)) from error
     finally:
         bpy.data.scenes.remove(scene)
 

@@ -24,14 +24,7 @@ import torch
 from numpy.random import Generator
 from primdiffusion import tensor_file
 from primdiffusion.formats.json_files import Pairs
-from primdiffusion.formats.tensor_layout import (
-    DTYPES,
-    LONGEST_HEADER,
-    TensorLayout,
-    TensorLayoutError,
-    check_limits,
-    read_layout,
-)
+from primdiffusion.formats.tensor_layout import DTYPES, LONGEST_HEADER, TensorLayout, check_limits, read_layout
 
 from blender_primdiffusion.scene.human_file import HumanTensors, read_tensors
 from fuzz import mutations
@@ -309,7 +302,7 @@ def verdicts(count: int, seed: int = 0) -> Iterator[tuple[bytes, bool, str]]:
 def difference(path: Path, content: bytes) -> tuple[bool, str]:
     """Whether the library accepts a file, and what our readers find otherwise; empty where they agree."""
     expected = _library(path, content)
-    layout = _or_none(lambda: read_layout(io.BytesIO(content), LONGEST_HEADER), TensorLayoutError)
+    layout = _or_none(lambda: read_layout(io.BytesIO(content), LONGEST_HEADER), ValueError)
     accepted = expected is not None
     if (layout is not None) != accepted:
         return accepted, "the format's verdicts differ"
@@ -319,7 +312,7 @@ def difference(path: Path, content: bytes) -> tuple[bool, str]:
         return accepted, "" if ours is None and theirs is None else "a program accepts it alone"
     if (layout.metadata, {name: _found(layout, content, name) for name in layout.tensors}) != expected:
         return accepted, "the format's contents differ"
-    within = _or_none(lambda: check_limits(layout) or True, TensorLayoutError) is not None
+    within = _or_none(lambda: check_limits(layout) or True, ValueError) is not None
     is_human = layout.metadata.get("format") == HUMAN["format"]
     if (ours is not None) != (within and is_human) or (theirs is not None) != within:
         return accepted, "the programs' verdicts differ"

@@ -14,9 +14,9 @@ import torch
 
 from primdiffusion.body.model import BodyModel, J
 from primdiffusion.failures import optional_package
-from primdiffusion.formats.arrays import ArrayFileError, all_finite, array_names, read_arrays, read_npy
-from primdiffusion.formats.regular_files import FileContent, read_regular
-from primdiffusion.formats.smpl_pickle import BodyFileError, as_array, read_pickle
+from primdiffusion.formats.arrays import all_finite, array_names, read_arrays, read_npy
+from primdiffusion.formats.regular_files import FileContent, FileError, read_regular
+from primdiffusion.formats.smpl_pickle import as_array, read_pickle
 
 LARGEST_BODY_FILE = 512 * 2**20
 """SMPL with 300 shape components takes 250 MB."""
@@ -54,7 +54,7 @@ def load_body(
 
     Raises:
         FileNotFoundError: a file does not exist.
-        BodyFileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range.
+        FileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range.
         UnsafePickleError: a pickle names a global that a body model does not need.
     """
     if not isinstance(path, FileContent) and not pathlib.Path(path).is_file():
@@ -96,17 +96,15 @@ class _ArrayFile:
     def __init__(self, file: FileContent) -> None:
         self.file, suffix = file, file.path.suffix
         if suffix not in (".pkl", ".npz"):
-            raise BodyFileError(f"{file} ends in {suffix!r}; body models are .pkl or .npz files.")
+            raise FileError(f"{file} ends in {suffix!r}; body models are .pkl or .npz files.")
         self._pickled = read_pickle(file) if suffix == ".pkl" else None
         self._names = _npz_names(file) if self._pickled is None else set(self._pickled)
 
     def __contains__(self, name: str) -> bool:
         return name in self._names
 
-    def wrong(self, name: str, complaint: str) -> BodyFileError:
-        return BodyFileError(
-            f"{self.file}: {name!r} {complaint}; use an unchanged SMPL file or one in the same format."
-        )
+    def wrong(self, name: str, complaint: str) -> FileError:
+        return FileError(f"{self.file}: {name!r} {complaint}; use an unchanged SMPL file or one in the same format.")
 
     def raw(self, name: str) -> np.ndarray:
         if name not in self:
@@ -151,10 +149,7 @@ class _ArrayFile:
 
 
 def _npz_names(file: FileContent) -> set[str]:
-    try:
-        return set(array_names(file))
-    except ArrayFileError as error:
-        raise BodyFileError(str(error)) from error
+    return set(array_names(file))
 
 
 def _parents(arrays: _ArrayFile) -> np.ndarray:
@@ -185,13 +180,13 @@ def _texture_coordinates(
         source = f"the automatic unwrap of {arrays.file.path.name}"
     numbers = coordinates.dtype.kind in "iuf" and coordinate_faces.dtype.kind in "iuf"
     if not numbers or coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
-        raise BodyFileError(
+        raise FileError(
             f"{source}: texture coordinates of shapes {coordinates.shape} and {coordinate_faces.shape} do not fit a "
             f"body of {len(faces)} faces; they must be numbers, T x 2 and {len(faces)} x 3, in the body's face order."
         )
     coordinate_faces = coordinate_faces.astype(np.int64)
     if not all_finite(coordinates) or coordinate_faces.min() < 0 or coordinate_faces.max() >= len(coordinates):
-        raise BodyFileError(
+        raise FileError(
             f"{source}: texture coordinates are NaN or their numbers out of range; use the body's own UV file."
         )
     return coordinates.astype(np.float32), coordinate_faces
@@ -205,12 +200,9 @@ def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 
 
 def _numpy_file(file: FileContent) -> np.ndarray:
-    try:
-        array = read_npy(file)
-    except ArrayFileError as error:
-        raise BodyFileError(str(error)) from error
+    array = read_npy(file)
     if array.dtype.kind not in "iuf":
-        raise BodyFileError(f"{file} does not hold one array of numbers; give the pair (vt.npy, ft.npy).")
+        raise FileError(f"{file} does not hold one array of numbers; give the pair (vt.npy, ft.npy).")
     return array
 
 
@@ -230,9 +222,9 @@ def _obj_texture_coordinates(file: FileContent, faces: np.ndarray) -> tuple[np.n
         coordinate_faces = [[corner_of_face[frozenset(face)][v] for v in face] for face in faces.tolist()]
         return np.array(coordinates), np.array(coordinate_faces)
     except (ValueError, TypeError, IndexError, OverflowError) as error:
-        raise BodyFileError(f"{file} is not an OBJ with texture coordinates in every face ({error!s:.100}).") from error
+        raise FileError(f"{file} is not an OBJ with texture coordinates in every face ({error!s:.100}).") from error
     except KeyError as error:
-        raise BodyFileError(
+        raise FileError(
             f"{file} lacks a face of the body (vertices {sorted(error.args[0])}, counted from 0); "
             "use the OBJ made for this body."
         ) from error

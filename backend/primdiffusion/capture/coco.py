@@ -84,7 +84,7 @@ def write_coco(
         report: called with the name of each annotated subject.
 
     Raises:
-        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a pass or file is missing, or damaged.
+        FileNotFoundError, FileError: a pass or file is missing, or damaged.
         ValueError: attributes of a subject are not a mapping.
         OutsideFolderError, OSError: a file cannot be written, or lies behind a link out of the captures.
     """
@@ -115,7 +115,7 @@ def keypoints_of(subject: Subject) -> Float[np.ndarray, "F 17 3"]:
     """World positions of COCO's keypoints; the face's are NaN where the subject's joints are not the default body's.
 
     Raises:
-        ArrayFileError: joints.npz is damaged.
+        FileError: joints.npz is damaged.
     """
     joints, body = joints_of(subject).astype(np.float64), default_body()
     points = np.full((subject.frames, len(KEYPOINTS), 3), np.nan)

@@ -66,7 +66,7 @@ def captured_person(
     Raises:
         FileNotFoundError: the folder or a file of the subject does not exist.
         ValueError: the subject is missing or ambiguous, the frame is missing, or another body model was used.
-        CaptureFolderError, FileError, ArrayFileError, BodyFileError: a file is damaged or has another size.
+        FileError: a file is damaged or has another size.
     """
     captures, name = choose_subject(path, subject)
     person = captures.subject(name)
@@ -91,7 +91,7 @@ def choose_subject(path: str | Path, subject: str | None = None) -> tuple[Captur
     Raises:
         FileNotFoundError: the folder does not exist or contains no subjects.
         ValueError: there is no such subject, or several and `subject` is None.
-        CaptureFolderError, FileError: the dataset's own files are damaged.
+        FileError: the dataset's own files are damaged.
     """
     path = Path(path).absolute()
     if (path / CAMERAS_FILE).is_file():
@@ -127,7 +127,7 @@ def conditioning_views(
         KeyError: there is no subject of this name.
         FileNotFoundError: a file of the subject is missing.
         ValueError: there is no such frame or camera, or no mask shows the subject.
-        FileError, ArrayFileError, BodyFileError: a file is damaged, or a mask and its image differ in size.
+        FileError: a file is damaged, or a mask and its image differ in size.
     """
     person = captures.subject(subject)
     _check_frame(person, frame)
@@ -180,7 +180,7 @@ def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
 
     Raises:
         ValueError: there are too many, they are out of range, or stored joints are not the body's.
-        ArrayFileError: joints.npz is damaged.
+        FileError: joints.npz is damaged.
     """
     betas, components = torch.from_numpy(subject.smpl.betas), body.shape_basis.shape[-1]
     name, remedy = (

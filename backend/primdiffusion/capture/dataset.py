@@ -228,7 +228,7 @@ class CaptureDataset(SampleSet[TrainingSample]):
         """The sample at a position.
 
         Raises:
-            FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, FileError: a file is missing or damaged.
         """
         epoch, index = position
         if self._order[0] != epoch:
@@ -307,7 +307,7 @@ def batches(
 
     Raises:
         ValueError: the batch size is not positive.
-        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, FileError: a file is missing or damaged.
     """
     if size < 1:
         raise ValueError(f"the batch size is {size}: give 1 or more")

@@ -20,7 +20,7 @@ from primdiffusion.body.model import BodyModel, J, default_body
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import JsonError, parse_json
-from primdiffusion.formats.regular_files import read_regular
+from primdiffusion.formats.regular_files import FileError, read_regular
 from primdiffusion.geometry.pictures import MOST_PIXELS, decoded, decoded_bytes, opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
@@ -42,10 +42,6 @@ LARGEST_UV = 1e4
 """Repeats of a texture."""
 
 
-class GlbError(ValueError):
-    """A file that is damaged, not binary glTF, or uses unsupported features."""
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class Glb:
     """A .glb file in memory."""
@@ -61,12 +57,12 @@ class Glb:
         """Values of an accessor, [count] or [count, width]; normalised integers as float32 in [0, 1].
 
         Raises:
-            GlbError: it does not exist, exceeds the file, or is sparse.
+            FileError: it does not exist, exceeds the file, or is sparse.
         """
         try:
             about = self.content["accessors"][accessor]
             if "sparse" in about or accessor < 0:
-                raise GlbError(f"{self.path}: accessor {accessor} is sparse, which is not supported: export without")
+                raise FileError(f"{self.path}: accessor {accessor} is sparse, which is not supported: export without")
             view = self.content["bufferViews"][about["bufferView"]]
             number, width, count = np.dtype(NUMBERS[about["componentType"]]), WIDTHS[about["type"]], int(about["count"])
             first = int(view.get("byteOffset", 0)) + int(about.get("byteOffset", 0))
@@ -74,10 +70,10 @@ class Glb:
             if min(first, count - 1, stride - number.itemsize * width) < 0:
                 raise ValueError("negative size")
             raw = np.frombuffer(self.binary, np.uint8, (count - 1) * stride + number.itemsize * width, first)
-        except GlbError:
+        except FileError:
             raise
         except (LookupError, TypeError, ValueError, OverflowError) as e:
-            raise GlbError(f"{self.path}: accessor {accessor} is damaged ({e!s:.160}): export the file again") from e
+            raise FileError(f"{self.path}: accessor {accessor} is damaged ({e!s:.160}): export the file again") from e
         rows = np.lib.stride_tricks.as_strided(raw, (count, number.itemsize * width), (stride, 1))
         values = np.ascontiguousarray(rows).view(number)
         if about.get("normalized") and number.kind in "iu":
@@ -88,7 +84,7 @@ class Glb:
         """An embedded image, sRGB-encoded with straight alpha.
 
         Raises:
-            GlbError: it does not exist, is not embedded, or cannot be decoded.
+            FileError: it does not exist, is not embedded, or cannot be decoded.
         """
         try:
             with opened_picture(io.BytesIO(self._image_bytes(image))) as picture:
@@ -109,8 +105,8 @@ class Glb:
         first = int(view.get("byteOffset", 0))
         return self.binary[first : first + int(view["byteLength"])]
 
-    def _unreadable_image(self, image: int, reason: Exception) -> GlbError:
-        return GlbError(
+    def _unreadable_image(self, image: int, reason: Exception) -> FileError:
+        return FileError(
             f"{self.path}: image {image!s:.20} cannot be read ({reason!s:.160}): pack PNG or JPEG into the file"
         )
 
@@ -120,16 +116,16 @@ def read_glb(path: str | Path) -> Glb:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        GlbError: it is not binary glTF 2.0, or truncated.
+        FileError: it is not binary glTF 2.0, or truncated.
     """
     path = Path(path)
     data = read_regular(path, LARGEST_GLB)
     try:
         magic, version, length = struct.unpack_from("<4sII", data)
         if magic != MAGIC or version != 2:
-            raise GlbError(f"{path} is not a binary glTF 2.0 file: export it as .glb")
+            raise FileError(f"{path} is not a binary glTF 2.0 file: export it as .glb")
         if length > len(data):
-            raise GlbError(f"{path} is truncated ({len(data)} of {length} bytes): write it again")
+            raise FileError(f"{path} is truncated ({len(data)} of {length} bytes): write it again")
         chunks, at = {}, 12
         while at + 8 <= length:
             size, kind = struct.unpack_from("<I4s", data, at)
@@ -137,9 +133,9 @@ def read_glb(path: str | Path) -> Glb:
             at += 8 + size
         content = parse_json(chunks[JSON_CHUNK])
     except (struct.error, KeyError, JsonError) as e:
-        raise GlbError(f"{path} is not a complete .glb file ({e!s:.160}): write it again") from e
+        raise FileError(f"{path} is not a complete .glb file ({e!s:.160}): write it again") from e
     if not isinstance(content, dict):
-        raise GlbError(f"{path} contains no glTF object: write it again")
+        raise FileError(f"{path} contains no glTF object: write it again")
     return Glb(path, content, chunks.get(BINARY_CHUNK, b""), len(data))
 
 
@@ -193,15 +189,15 @@ def read_person(path: str | Path) -> SkinnedPerson:
 
     Raises:
         FileNotFoundError: the file does not exist.
-        GlbError: it is not a complete .glb, not rigged with the 24 joints, or has no betas.
+        FileError: it is not a complete .glb, not rigged with the 24 joints, or has no betas.
     """
     glb = read_glb(path)
     try:
         return SkinnedPerson(TexturedMesh(_parts(glb)), _betas(glb))
-    except GlbError:
+    except FileError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
-        raise GlbError(
+        raise FileError(
             f"{path} is not a human on the default body ({type(e).__name__} {e!s:.80}): make it again"
         ) from e
 
@@ -211,13 +207,13 @@ def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
     places = [glb.content.get("asset", {}), *scenes]
     extras: Any = next((p["extras"][OURS] for p in places if OURS in (p.get("extras") or {})), None)
     if extras is None:
-        raise GlbError(f"{glb.path} has no betas: only files from primdiffusion people can be read")
+        raise FileError(f"{glb.path} has no betas: only files from primdiffusion people can be read")
     if extras.get("body", "default") != "default":
-        raise GlbError(f"{glb.path} is rigged on the body {extras['body']!r:.60}: only the default body is supported")
+        raise FileError(f"{glb.path} is rigged on the body {extras['body']!r:.60}: only the default body is supported")
     betas = np.asarray(extras["betas"], np.float64)
     components = default_body().shape_basis.shape[-1]
     if betas.ndim != 1 or len(betas) > components or not (np.abs(betas) <= LARGEST_BETA).all():
-        raise GlbError(
+        raise FileError(
             f"{glb.path} has betas of shape {betas.shape}; at most {components}, within {LARGEST_BETA:g} of 0, are "
             "supported: make the human again"
         )
@@ -232,19 +228,19 @@ def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
         if "mesh" not in node:
             continue
         if "skin" not in node:
-            raise GlbError(f"{glb.path}: the mesh {node.get('name')!r:.60} has no skin: make the human again")
+            raise FileError(f"{glb.path}: the mesh {node.get('name')!r:.60} has no skin: make the human again")
         joints = _joints(glb, node["skin"])
         for number, primitive in enumerate(glb.content["meshes"][node["mesh"]]["primitives"]):
             name = str(node.get("name", f"part {len(parts)}")) + (f" {number}" if number else "")
             parts.append(_part(glb, name, primitive, joints, textures.of_material(primitive.get("material"))))
             corners += parts[-1].faces.size + parts[-1].vertices.size
             if len(parts) > MOST_PARTS or corners > most_corners:
-                raise GlbError(
+                raise FileError(
                     f"{glb.path} has more than {MOST_PARTS} parts, or than the {most_corners} corners that a file of "
                     "its size may have: make a simpler human"
                 )
     if not parts:
-        raise GlbError(f"{glb.path} contains no mesh: make the human again")
+        raise FileError(f"{glb.path} contains no mesh: make the human again")
     return tuple(parts)
 
 
@@ -252,7 +248,7 @@ def _joints(glb: Glb, skin: int) -> Int[np.ndarray, "n"]:
     """SMPL index of each joint of a skin."""
     names = [glb.content["nodes"][node].get("name") for node in glb.content["skins"][skin]["joints"]]
     if unknown := sorted({str(name) for name in names if name not in JOINT_NAMES}):
-        raise GlbError(f"{glb.path} has joints {', '.join(unknown[:3])!s:.100}: rig it with SMPL's {J} joints")
+        raise FileError(f"{glb.path} has joints {', '.join(unknown[:3])!s:.100}: rig it with SMPL's {J} joints")
     return np.array([JOINT_NAMES.index(name) for name in names], np.int32)
 
 
@@ -263,7 +259,9 @@ def _part(
     vertices = glb.array(attributes["POSITION"]).astype(np.float64)
     faces = glb.array(primitive["indices"]).astype(np.int64) if "indices" in primitive else np.arange(len(vertices))
     if primitive.get("mode", 4) != 4 or len(faces) % 3 or not ((faces >= 0) & (faces < len(vertices))).all():
-        raise GlbError(f"{glb.path}: the faces of {name!r:.60} are not triangles of its vertices: make the human again")
+        raise FileError(
+            f"{glb.path}: the faces of {name!r:.60} are not triangles of its vertices: make the human again"
+        )
     faces = faces.reshape(-1, 3).astype(np.int32)
     uv = glb.array(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((len(vertices), 2), np.float32)
     index = joints[glb.array(attributes["JOINTS_0"]).astype(np.int64)]
@@ -271,12 +269,12 @@ def _part(
     total = weight.sum(1, keepdims=True)
     weighted = (weight >= 0).all() and (total > 0).all() and (total < LARGEST_NUMBER).all()
     if not (np.abs(vertices) < FARTHEST).all() or not weighted:
-        raise GlbError(
+        raise FileError(
             f"{glb.path}: {name!r:.60} has vertices that are not finite, without joints, or {FARTHEST:g} m from "
             "the origin: make the human again"
         )
     if not (np.abs(uv) <= LARGEST_UV).all():
-        raise GlbError(f"{glb.path}: {name!r:.60} has texture coordinates out of range: make the human again")
+        raise FileError(f"{glb.path}: {name!r:.60} has texture coordinates out of range: make the human again")
     return TexturedPart(
         name=name,
         vertices=vertices,
@@ -310,12 +308,12 @@ class _Textures:
         self._decoded: dict[_Surface, UInt8[np.ndarray, "H W 4"]] = {}
 
     def of_material(self, number: int | None) -> UInt8[np.ndarray, "H W 4"]:
-        """Base colour times factor; opaque unless the material uses alpha. Raises GlbError."""
+        """Base colour times factor; opaque unless the material uses alpha. Raises FileError."""
         surface = _surface(self._glb, number)
         if surface not in self._decoded:
             self._texels += 1 if surface.image is None else self._glb.picture_texels(surface.image)
             if self._texels > self._most_texels:
-                raise GlbError(
+                raise FileError(
                     f"{self._glb.path} has textures of more than the {self._most_texels} texels that a file of its "
                     "size may have: make a simpler human"
                 )

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.poses.motion import MotionFileError
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.pose_file import read_motion
 
@@ -33,7 +33,7 @@ def read_motions(paths: Sequence[Path]) -> tuple[list[BodyPose], list[str]]:
     for path in paths:
         try:
             motions.append(read_motion(path))
-        except (FileNotFoundError, MotionFileError) as e:
+        except (FileNotFoundError, FileError) as e:
             failures.append(str(e))
     return motions, failures
 

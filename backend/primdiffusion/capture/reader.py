@@ -194,7 +194,7 @@ class Captures:
 
         Raises:
             KeyError: there is no subject of this name.
-            FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, FileError: a file is missing or damaged.
         """
         if name not in self.subjects:
             raise KeyError(f"{self.root} has no subject {name!r}")
@@ -208,7 +208,7 @@ class Captures:
 
         Raises:
             KeyError, IndexError: there is no such subject, frame or camera.
-            FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+            FileNotFoundError, FileError: a file is missing or damaged.
         """
         person = self.subject(subject)
         if not (0 <= frame < person.frames and 0 <= camera < len(person.views)):
@@ -235,7 +235,7 @@ def open_captures(root: str | Path) -> Captures:
 
     Raises:
         FileNotFoundError: the folder does not exist or contains no subjects.
-        CaptureFolderError: its dataset.json is damaged or of another version.
+        FileError: its dataset.json is damaged or of another version.
         FileError: the list contains an invalid name.
     """
     root = Path(root)
@@ -245,7 +245,7 @@ def open_captures(root: str | Path) -> Captures:
     passes = about.get("passes", [])
     if not isinstance(passes, list) or not all(isinstance(name, str) for name in passes):
         path = root / capture_layout.DATASET_FILE
-        raise capture_layout.CaptureFolderError(f"{path} names no passes: render the captures again")
+        raise FileError(path, "names no passes", "render the captures again")
     listed = root / capture_layout.LIST_FILE
     if listed.is_file():
         names = sorted(set(capture_layout.read_list(root)))

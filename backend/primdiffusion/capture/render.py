@@ -161,7 +161,7 @@ def write_parameters(subject: Path, setup: CaptureSetup) -> None:
     """Write SMPL parameters, joints and cameras.
 
     Raises:
-        CaptureFolderError: the folder contains other poses or another shape.
+        FileError: the folder contains other poses or another shape.
         OSError: a file cannot be written.
     """
     theta = matrix_to_axis_angle(setup.poses.joint_rotation).numpy().reshape(len(setup.skinning), -1)
@@ -277,7 +277,7 @@ def render(job: RenderJob, workers: int = 1) -> Iterator[SubjectResult]:
     A subject is skipped if it has a complete.json and all its files have the sizes listed there.
 
     Raises:
-        CaptureFolderError: the folder contains something else.
+        FileError: the folder contains something else.
         ValueError: a pass is unknown, or workers is less than 1.
         OSError: the folder cannot be written.
     """

@@ -11,8 +11,9 @@ from PIL import Image, ImageDraw
 
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
 from primdiffusion.capture.reader import Captures, Subject
-from primdiffusion.formats.arrays import ArrayFileError, read_numbers
+from primdiffusion.formats.arrays import read_numbers
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.whole_files import replacing
 
 BONE, JOINT = (255, 255, 255), (255, 64, 64)
@@ -25,7 +26,7 @@ def draw_sheet(captures: Captures, out: Path, rows: int, columns: int, size: int
 
     Raises:
         ValueError: a size is not positive.
-        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, FileError: a file is missing or damaged.
     """
     if min(rows, columns, size) < 1:
         raise ValueError(f"rows, columns and size are {rows}, {columns} and {size}: give 1 or more")
@@ -54,7 +55,7 @@ def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarr
     """World positions of the joints from joints.npz; without it (released layout), those of the body (None: default).
 
     Raises:
-        ArrayFileError: joints.npz is damaged, or of other frames or joints.
+        FileError: joints.npz is damaged, or of other frames or joints.
     """
     path = subject.folder / "joints.npz"
     try:
@@ -62,7 +63,7 @@ def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarr
     except FileNotFoundError:
         return body_joints(subject, default_body() if body is None else body)
     if joints.shape != (subject.frames, J, 3):
-        raise ArrayFileError(f"{path} has joints of shape {joints.shape} for {subject.frames} frames: render again")
+        raise FileError(f"{path} has joints of shape {joints.shape} for {subject.frames} frames: render again")
     return joints
 
 
@@ -84,7 +85,7 @@ def reprojection_error(subject: Subject) -> float:
     The cameras are those of cameras.json. 0 without joints.npz.
 
     Raises:
-        ArrayFileError: joints.npz is damaged or has another number of cameras.
+        FileError: joints.npz is damaged or has another number of cameras.
     """
     path = subject.folder / "joints.npz"
     try:
@@ -92,7 +93,7 @@ def reprojection_error(subject: Subject) -> float:
     except FileNotFoundError:
         return 0.0
     if stored["pixel"].shape != (len(subject.views), *stored["world"].shape[:2], 2):
-        raise ArrayFileError(
+        raise FileError(
             f"{path} has joints of shape {stored['pixel'].shape} for {len(subject.views)} cameras: render again"
         )
     errors = [

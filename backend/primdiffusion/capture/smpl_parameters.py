@@ -10,10 +10,11 @@ import torch
 from jaxtyping import Float32
 
 from primdiffusion.body.model import BodyPose, J
-from primdiffusion.formats.arrays import ArrayFileError, all_finite, read_numbers, read_pickled_bytes
+from primdiffusion.formats.arrays import all_finite, read_numbers, read_pickled_bytes
 from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
-from primdiffusion.formats.motion_size import MotionTooLongError, check_motion_size
-from primdiffusion.formats.smpl_pickle import BodyFileError, array_of_objects, as_array, load_restricted
+from primdiffusion.formats.motion_size import check_motion_size
+from primdiffusion.formats.regular_files import FileError
+from primdiffusion.formats.smpl_pickle import array_of_objects, as_array, load_restricted
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
 
@@ -38,8 +39,8 @@ def read_smpl(subject: Path) -> SmplParameters:
 
     Raises:
         FileNotFoundError: neither file exists.
-        ArrayFileError: the file is damaged or has other contents.
-        BodyFileError: its pickle is damaged or contains more than arrays.
+        FileError: the file is damaged or has other contents.
+        FileError: its pickle is damaged or contains more than arrays.
     """
     plain, pickled = subject / SMPL_FOLDER / SMPL_PLAIN_FILE, subject / SMPL_FOLDER / SMPL_FILE
     if plain.is_file():
@@ -57,27 +58,24 @@ def _read_pickled(path: Path) -> dict[str, np.ndarray]:
         if not isinstance(content, dict):
             raise ValueError(f"it contains a {type(content).__name__}")
         return {key: as_array(content[key]) for key in KEYS}
-    except BodyFileError:
+    except FileError:
         raise
     except KeyError as e:
-        raise ArrayFileError(f"{path} lacks {e}: render the subject again, or download the file again") from e
+        raise FileError(f"{path} lacks {e}: render the subject again, or download the file again") from e
     except (ValueError, TypeError) as e:
-        raise ArrayFileError(f"{path} contains no dictionary of SMPL parameters ({e!s:.160}): download it again") from e
+        raise FileError(f"{path} contains no dictionary of SMPL parameters ({e!s:.160}): download it again") from e
 
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
-    try:
-        check_motion_size(path, max(values.size for values in arrays.values()))
-    except MotionTooLongError as e:
-        raise ArrayFileError(str(e)) from e
+    check_motion_size(path, max(values.size for values in arrays.values()))
     frames = len(arrays["global_orient"])
     shapes = {"global_orient": (frames, 3), "body_pose": (frames, 3 * (J - 1)), "transl": (frames, 3)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
-            raise ArrayFileError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: render it again")
+            raise FileError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: render it again")
     betas = arrays["betas"].reshape(-1)
     if not all(map(all_finite, arrays.values())) or not frames or arrays["betas"].ndim > 2:
-        raise ArrayFileError(f"{path} has no frames, or NaN or infinite values: render the subject again")
+        raise FileError(f"{path} has no frames, or NaN or infinite values: render the subject again")
     return SmplParameters(
         theta=np.concatenate([arrays["global_orient"], arrays["body_pose"]], axis=1).astype(np.float32),
         translation=arrays["transl"].astype(np.float32),

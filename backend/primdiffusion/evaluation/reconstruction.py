@@ -128,7 +128,7 @@ def evaluate(
 
     Raises:
         KeyError: unknown subject.
-        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, FileError: a file is missing or damaged.
         ValueError: a frame or camera does not exist, or a subject has another body model.
     """
     settings = settings or EvaluationSettings()

@@ -87,7 +87,7 @@ class MeshProxy:
 def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: OnStage = lambda *_: None) -> MeshProxy:
     """Extract the outer surface, with colours rendered by the marcher from outside.
 
-    Exceptions raised by `on_stage` cancel. Raises NoSurface. Takes about ten seconds of processor time.
+    Exceptions raised by `on_stage` cancel. Raises ValueError. Takes about ten seconds of processor time.
     """
     body, anchors = body_of(human)
     primitives = place(human)

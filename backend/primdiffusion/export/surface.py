@@ -26,10 +26,6 @@ _MARGIN = 2
 THIN = "this human is nowhere dense enough to have a surface: generate it again"
 
 
-class NoSurface(ValueError):
-    """The density never reaches the isosurface level."""
-
-
 class OuterSurface(NamedTuple):
     """Closed triangles, counter-clockwise seen from outside."""
 
@@ -41,12 +37,12 @@ class OuterSurface(NamedTuple):
 def outside_surface(grid: Merged, on_wait: Callable[[], None] = lambda: None) -> OuterSurface:
     """Extract the outer surface by marching cubes (libigl); cavities are filled, small pieces dropped.
 
-    `on_wait` is called regularly; exceptions it raises cancel. Raises NoSurface.
+    `on_wait` is called regularly; exceptions it raises cancel. Raises ValueError.
     """
     density = np.pad(grid.density, _MARGIN)
     solid = filled(density > LEVEL, grid.voxel)
     if not solid.any():
-        raise NoSurface(THIN)
+        raise ValueError(THIN)
     on_wait()
     values = np.where(density > LEVEL, density, 2 * LEVEL)  # cavities and closed gaps count as full
     values = np.where(solid, np.minimum(values, 2 * LEVEL), np.minimum(density, LEVEL * 0.999))
@@ -92,6 +88,6 @@ def _large_pieces(vertices: Array, faces: Array) -> OuterSurface:
     volume = np.bincount(piece, np.linalg.det(mesh.triangles) / 6)
     mesh.update_faces(volume[piece] >= SMALLEST_PIECE)
     if not len(mesh.faces):
-        raise NoSurface(THIN)
+        raise ValueError(THIN)
     mesh.remove_unreferenced_vertices()
     return OuterSurface(np.array(mesh.vertices), np.array(mesh.faces))

@@ -19,7 +19,7 @@ from typing import IO, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .regular_files import FileContent, open_regular
+from .regular_files import FileContent, FileError, open_regular
 
 LARGEST_BYTES = 512 * 2**20
 """Largest size of what one call reads: small files can claim petabytes. An hour of motion at 60 frames/s takes 285
@@ -53,12 +53,8 @@ Source = str | Path | FileContent
 """A file by its path, or as it was read before."""
 
 
-class ArrayFileError(ValueError):
-    """A file of arrays that cannot be read; the message names the file."""
-
-
 def array_names(path: Source) -> list[str]:
-    """Return the names of the arrays in an .npz. Raises ArrayFileError for a damaged file, and OSError."""
+    """Return the names of the arrays in an .npz. Raises FileError for a damaged file, and OSError."""
     with _archive(path) as archive:
         return [name.removesuffix(".npy") for name in archive.namelist()]
 
@@ -82,7 +78,7 @@ def read_arrays(
     types: the values of all arrays together.
 
     Raises:
-        ArrayFileError: the file is damaged, lacks an array, or one is pickled or larger than `LARGEST_BYTES`.
+        FileError: the file is damaged, lacks an array, or one is pickled or larger than `LARGEST_BYTES`.
         OSError: it cannot be opened; FileNotFoundError if it does not exist.
     """
     arrays, total, packed, values = {}, 0, 0, 0
@@ -98,7 +94,7 @@ def read_arrays(
                 head = _header(stream, member.file_size, f"{path}: {name!r}")
                 values += math.prod(head[0])
                 if most_values is not None and values > most_values:
-                    raise ArrayFileError(f"{path}: {name!r} makes it {values} values, more than {most_values}: cut it")
+                    raise FileError(f"{path}: {name!r} makes it {values} values, more than {most_values}: cut it")
                 arrays[name] = _filled(stream, *head, f"{path}: {name!r}")
     return arrays
 
@@ -106,13 +102,13 @@ def read_arrays(
 def read_numbers(
     path: str | Path, required: Sequence[str] = (), optional: Sequence[str] = (), *, most_values: int | None = None
 ) -> dict[str, NDArray]:
-    """As `read_arrays`; also raises ArrayFileError for arrays that are not finite numbers."""
+    """As `read_arrays`; also raises FileError for arrays that are not finite numbers."""
     arrays = read_arrays(path, required, optional, most_values=most_values)
     for name, values in arrays.items():
         if values.dtype.kind not in "biuf":
-            raise ArrayFileError(f"{path}: {name!r} holds {values.dtype}, not numbers: save it as numbers")
+            raise FileError(f"{path}: {name!r} holds {values.dtype}, not numbers: save it as numbers")
         if not all_finite(values):
-            raise ArrayFileError(f"{path}: {name!r} holds NaN or infinite numbers: make it again")
+            raise FileError(f"{path}: {name!r} holds NaN or infinite numbers: make it again")
     return arrays
 
 
@@ -129,7 +125,7 @@ def check_shapes(
 ) -> None:
     """Check that `arrays` are numbers of these shapes. A letter is a size, the same in all arrays, added to `sizes`.
 
-    Raises ArrayFileError, and KeyError for a missing array.
+    Raises FileError, and KeyError for a missing array.
     """
     for name, shape in shapes.items():
         values = arrays[name]
@@ -138,7 +134,7 @@ def check_shapes(
             fits = fits and size == (sizes.setdefault(expected, size) if isinstance(expected, str) else expected)
         if not fits:
             expected_shape = tuple(sizes.get(s, s) if isinstance(s, str) else s for s in shape)
-            raise ArrayFileError(
+            raise FileError(
                 f"{path}: {name!r} holds {values.dtype} {values.shape} instead of numbers of shape {expected_shape}"
             )
 
@@ -168,7 +164,7 @@ def read_pickled_bytes(path: str | Path, name: str) -> bytes:
         with archive.open(member) as stream:
             _, _, dtype = _head(stream, what)
             if not dtype.hasobject:
-                raise ArrayFileError(f"{what} holds {dtype}, not a dictionary of arrays: download it again")
+                raise FileError(f"{what} holds {dtype}, not a dictionary of arrays: download it again")
             return b"".join(iter(lambda: stream.read(_CHUNK), b""))
 
 
@@ -188,20 +184,20 @@ def stored_members(file: BinaryIO, path: str | Path) -> dict[str, StoredMember]:
     """Return the members of an archive without compression, as torch.save writes it, from the open file at `path`.
 
     Names that differ in upper and lower case, or in slashes and backslashes, count as equal: torch's own reader does
-    not tell them apart. Raises ArrayFileError, also where two names are equal.
+    not tell them apart. Raises FileError, also where two names are equal.
     """
     with _archive_in(file, path) as archive:
         members: dict[str, StoredMember] = {}
         end = file.seek(0, io.SEEK_END)
         for info in archive.infolist():
             if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
-                raise ArrayFileError(f"{path} is compressed, which torch.save never does: save it again")
+                raise FileError(f"{path} is compressed, which torch.save never does: save it again")
             archive.open(info).close()  # compares its two headers; encrypted members are errors
             file.seek(info.header_offset)
             name_bytes, extra_bytes = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
             begin = info.header_offset + _LOCAL_HEADER.size + name_bytes + extra_bytes
             if begin + info.file_size > end:
-                raise ArrayFileError(f"{path}: {info.filename!r:.60} is cut short: copy or export it again")
+                raise FileError(f"{path}: {info.filename!r:.60} is cut short: copy or export it again")
             members[info.filename] = StoredMember(begin, info.file_size, info.CRC)
         _check_names(path, [name.replace("\\", "/").lower() for name in archive.namelist()])
         return members
@@ -256,17 +252,17 @@ def _archive_in(file: BinaryIO, path: Source) -> Iterator[zipfile.ZipFile]:
         with zipfile.ZipFile(_Reads(file)) as archive:  # type: ignore[arg-type]
             _check_names(path, [name.removesuffix(".npy") for name in archive.namelist()])
             yield archive
-    except ArrayFileError:
+    except FileError:
         raise
     except _UNREADABLE as e:
-        raise ArrayFileError(f"{path} is not a whole .npz file ({str(e)[:100]}): copy or export it again") from e
+        raise FileError(f"{path} is not a whole .npz file ({str(e)[:100]}): copy or export it again") from e
 
 
 def _check_names(path: Source, names: Sequence[str]) -> None:
     """Check that names differ: of two members of one name, readers choose different ones."""
     if len(set(names)) < len(names):
         twice = next(name for name, count in collections.Counter(names).items() if count > 1)
-        raise ArrayFileError(f"{path} holds {twice!r:.60} twice: save it again")
+        raise FileError(f"{path} holds {twice!r:.60} twice: save it again")
 
 
 @contextlib.contextmanager
@@ -284,23 +280,23 @@ def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo | None:
 def _needed(archive: zipfile.ZipFile, path: Source, name: str) -> zipfile.ZipInfo:
     member = _member(archive, name)
     if member is None:
-        raise ArrayFileError(f"{path} holds no array {name!r}: make it again")
+        raise FileError(f"{path} holds no array {name!r}: make it again")
     if member.flag_bits & 1:
-        raise ArrayFileError(f"{path}: {name!r} is encrypted, which is not supported: save it without a password")
+        raise FileError(f"{path}: {name!r} is encrypted, which is not supported: save it without a password")
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack without a limit
-        raise ArrayFileError(f"{path}: {name!r} is compressed in another way than numpy's: save it with numpy.savez")
+        raise FileError(f"{path}: {name!r} is compressed in another way than numpy's: save it with numpy.savez")
     _check_ratio(member.file_size, member.compress_size, f"{path}: {name!r}")
     return member
 
 
 def _check_ratio(size: int, packed: int, what: str) -> None:
     if size > max(MOST_REPEATED, LARGEST_RATIO * packed):
-        raise ArrayFileError(f"{what} unpacks to {size / 2**20:.0f} MB of the same: cut it")
+        raise FileError(f"{what} unpacks to {size / 2**20:.0f} MB of the same: cut it")
 
 
 def _check_size(size: int, what: str) -> None:
     if size > LARGEST_BYTES:
-        raise ArrayFileError(f"{what} unpacks to {size / 2**20:.0f} MB, more than {LARGEST_BYTES // 2**20}: cut it")
+        raise FileError(f"{what} unpacks to {size / 2**20:.0f} MB, more than {LARGEST_BYTES // 2**20}: cut it")
 
 
 def _head(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
@@ -320,9 +316,9 @@ def _head(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype
         if len(shape) > 32 or not all(type(side) is int and 0 <= side < 2**62 for side in shape):
             raise ValueError("an impossible shape")
     except _HEADER_ERRORS as e:
-        raise ArrayFileError(f"{what} is not an array of numpy's format: save it with numpy.save or savez") from e
+        raise FileError(f"{what} is not an array of numpy's format: save it with numpy.save or savez") from e
     if not dtype.hasobject and (dtype.kind not in _KINDS or dtype.itemsize <= 0):  # sizes of long texts wrap
-        raise ArrayFileError(f"{what} holds {dtype!s:.60}, not numbers or text: save it as one of these")
+        raise FileError(f"{what} holds {dtype!s:.60}, not numbers or text: save it as one of these")
     return shape, fortran, dtype
 
 
@@ -330,11 +326,11 @@ def _header(stream: IO[bytes], size: int, what: str) -> tuple[tuple[int, ...], b
     """As `_head`, of numbers or text that fit into `size` bytes."""
     shape, fortran, dtype = _head(stream, what)
     if dtype.hasobject:
-        raise ArrayFileError(f"{what} holds pickled Python objects, which are never read: save it as plain arrays")
+        raise FileError(f"{what} holds pickled Python objects, which are never read: save it as plain arrays")
     wanted = math.prod(shape) * dtype.itemsize
     if wanted > size:
         promised = wanted if wanted < 2**63 else "countless"
-        raise ArrayFileError(f"{what} is cut short: its header promises {promised} bytes, {size} are there")
+        raise FileError(f"{what} is cut short: its header promises {promised} bytes, {size} are there")
     return shape, fortran, dtype
 
 
@@ -351,7 +347,7 @@ def _filled(stream: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: np.
     while filled < raw.size:
         chunk = stream.read(min(_CHUNK, raw.size - filled))
         if not chunk:
-            raise ArrayFileError(f"{what} is cut short: its header promises {raw.size} bytes, {filled} are there")
+            raise FileError(f"{what} is cut short: its header promises {raw.size} bytes, {filled} are there")
         raw[filled : filled + len(chunk)] = np.frombuffer(chunk, np.uint8)
         filled += len(chunk)
     array = raw.view(dtype)

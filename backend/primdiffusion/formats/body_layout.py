@@ -52,7 +52,7 @@ def body_data(name: str) -> Path:
 def read_layout(path: Path) -> dict[str, NDArray]:
     """cell_face [K], cell_barycentric [K, 3], cell_chart [K], texel_face [H, W] and texel_barycentric [H, W, 3].
 
-    Integers are int64, weights float64. Raises ArrayFileError and OSError.
+    Integers are int64, weights float64. Raises FileError and OSError.
     """
     stored = read_arrays(path, ("cell_face", "cell_barycentric", "cell_chart", "texel_face", "texel_barycentric"))
     layout = {name: values.astype(np.float64 if "barycentric" in name else np.int64) for name, values in stored.items()}

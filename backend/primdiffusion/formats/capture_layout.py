@@ -39,10 +39,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import ArrayFileError, read_numbers
+from .arrays import read_numbers
 from .camera_rig import View
 from .json_files import parse_json, read_json
-from .regular_files import open_regular, read_regular
+from .regular_files import FileError, open_regular, read_regular
 from .removing import check_inside, remove_file
 from .whole_files import remove_abandoned, temporary_name, write_atomically
 
@@ -60,10 +60,6 @@ LIST_FILE, DATASET_FILE, COMPLETE_FILE = "release_human_list.txt", "dataset.json
 
 LARGEST_FILE, LARGEST_LIST = 512 * 2**20, 32 * 2**20
 """Bytes of a file of a subject, and of the list of subjects."""
-
-
-class CaptureFolderError(ValueError):
-    """A folder without the expected captures."""
 
 
 def picture_path(subject: Path, kind: str, camera: int, frame: int) -> Path:
@@ -87,15 +83,13 @@ def write_npz(path: Path, **arrays: NDArray) -> None:
 def claim(root: Path, about: Mapping[str, Any]) -> None:
     """Create the dataset `root` with the settings `about`, or check that an existing one has the same.
 
-    Raises CaptureFolderError if the folder contains another dataset or other files.
+    Raises FileError if the folder contains another dataset or other files.
     """
     wanted = {"format": FORMAT, "version": VERSION, **parse_json(json.dumps(about))}
     remove_abandoned(root, root / DATASET_FILE)
     if not (root / DATASET_FILE).exists():
         if root.is_dir() and any(not path.name.startswith(".") for path in root.iterdir()):
-            raise CaptureFolderError(
-                f"{root} is not empty and holds no {DATASET_FILE}: choose a new folder for the captures"
-            )
+            raise FileError(f"{root} is not empty and holds no {DATASET_FILE}: choose a new folder for the captures")
         root.mkdir(parents=True, exist_ok=True)
         unlike = temporary_name(root / DATASET_FILE)
         try:  # a link fails where another process was first, which a rename would not
@@ -114,25 +108,25 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
     differing = [key for key in {**present, **wanted} if present.get(key) != wanted.get(key)]
     if differing:
         key = differing[0]
-        raise CaptureFolderError(
+        raise FileError(
             f"{root} holds other captures: its {key:.40} is {present.get(key)!r:.60}, wanted is "
             f"{wanted.get(key)!r:.60}; choose another folder, or the same settings"
         )
 
 
 def read_about(root: Path) -> dict[str, Any]:
-    """Read the settings of a dataset. Raises CaptureFolderError if they are missing or damaged."""
+    """Read the settings of a dataset. Raises FileError if they are missing or damaged."""
     try:
         about = read_json(root / DATASET_FILE)
     except FileNotFoundError:
-        raise CaptureFolderError(f"{root} holds no captures: there is no {DATASET_FILE} in it") from None
+        raise FileError(f"{root} holds no captures: there is no {DATASET_FILE} in it") from None
     except (OSError, ValueError) as e:
-        raise CaptureFolderError(f"{root / DATASET_FILE} cannot be read ({e!s:.160}): render the captures again") from e
+        raise FileError(f"{root / DATASET_FILE} cannot be read ({e!s:.160}): render the captures again") from e
     if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise CaptureFolderError(f"{root / DATASET_FILE} is not the {DATASET_FILE} of captures: choose another folder")
+        raise FileError(f"{root / DATASET_FILE} is not the {DATASET_FILE} of captures: choose another folder")
     if about.get("version") != VERSION:
         version = about.get("version")
-        raise CaptureFolderError(f"{root} is of version {version!s:.20}: this program reads version {VERSION}")
+        raise FileError(f"{root} is of version {version!s:.20}: this program reads version {VERSION}")
     return about
 
 
@@ -153,7 +147,7 @@ def write_list(root: Path, subjects: Sequence[str]) -> None:
 def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas: NDArray, translation: NDArray) -> None:
     """Write SMPL parameters: axis-angle [F,3] and [F,69], betas [B], metres [F,3]; frame 0 is the near-T pose.
 
-    Raises CaptureFolderError if the folder holds those of another human, or other poses.
+    Raises FileError if the folder holds those of another human, or other poses.
     """
     arrays = {
         "global_orient": np.asarray(global_orient, np.float32),
@@ -221,11 +215,11 @@ def damage(subject: Path, *, checksums: bool = True) -> dict[Path, str]:
 def _check_same_smpl(subject: Path, wanted: Mapping[str, NDArray]) -> None:
     try:
         present = read_numbers(subject / SMPL_FOLDER / SMPL_PLAIN_FILE, tuple(wanted))
-    except (FileNotFoundError, ArrayFileError):
+    except (FileNotFoundError, FileError):
         return  # missing or truncated: it is written again
     for name, values in wanted.items():
         if present[name].shape != values.shape or not np.allclose(present[name], values, atol=1e-5):
-            raise CaptureFolderError(
+            raise FileError(
                 f"{subject} holds another human or other poses ({name} differs): choose another folder, or remove it"
             )
 

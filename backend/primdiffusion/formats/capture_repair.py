@@ -12,7 +12,6 @@ from .capture_layout import (
     ENDINGS,
     LIST_FILE,
     RELEASED_REFERENCE,
-    CaptureFolderError,
     damage,
     picture_path,
     read_about,
@@ -20,7 +19,7 @@ from .capture_layout import (
     write_list,
 )
 from .picture_files import is_whole_picture
-from .regular_files import TooLargeError
+from .regular_files import FileError, TooLargeError
 from .removing import check_inside, remove_file
 from .whole_files import is_abandoned
 
@@ -32,7 +31,7 @@ def verify(root: Path, *, checksums: bool = True) -> dict[Path, str]:
     """Return what is wrong with a dataset, by file, or by the folder of an unfinished subject.
 
     Finished subjects are compared with the sizes and, if `checksums`, the checksums that they had. Raises
-    CaptureFolderError if the folder contains no captures.
+    FileError if the folder contains no captures.
     """
     about = _read_checked(root)
     wrong: dict[Path, str] = {}
@@ -111,18 +110,16 @@ def _read_checked(root: Path) -> dict[str, Any]:
     rig, passes = about.get("rig"), about.get("passes")
     frames, cameras = about.get("frames"), rig.get("count") if isinstance(rig, dict) else None
     if not isinstance(frames, int) or not isinstance(cameras, int) or min(frames, cameras) < 1:
-        raise CaptureFolderError(
-            f"{root / DATASET_FILE} lacks the numbers of frames and cameras: render into a new folder"
-        )
+        raise FileError(f"{root / DATASET_FILE} lacks the numbers of frames and cameras: render into a new folder")
     if not isinstance(passes, list) or not all(isinstance(name, str) for name in passes):
-        raise CaptureFolderError(f"{root / DATASET_FILE} names no passes: render into a new folder")
+        raise FileError(f"{root / DATASET_FILE} names no passes: render into a new folder")
     if not set(passes) <= set(ENDINGS) or len(passes) > len(ENDINGS):
-        raise CaptureFolderError(
+        raise FileError(
             f"{root / DATASET_FILE} names passes that this program does not know: {passes!r:.80}; render into a "
             "new folder"
         )
     if frames * cameras * len(passes) > MOST_PICTURES:
-        raise CaptureFolderError(
+        raise FileError(
             f"{root / DATASET_FILE} names {frames} frames of {cameras} cameras, more than {MOST_PICTURES} pictures a "
             "human: render into a new folder"
         )

@@ -16,7 +16,7 @@ import re
 
 import numpy as np
 
-from .regular_files import FileContent
+from .regular_files import FileContent, FileError
 
 MOST_OPERATIONS = 300_000
 """SMPL's files have a few thousand: their arrays are one string each. Indices of the memo, for which the unpickler
@@ -36,11 +36,7 @@ _DAMAGED = (
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
 
 
-class BodyFileError(ValueError):
-    """A file is not a valid body model."""
-
-
-class UnsafePickleError(BodyFileError):
+class UnsafePickleError(FileError):
     """A pickle names a global that a body model does not need."""
 
 
@@ -161,11 +157,11 @@ def read_pickle(file: FileContent) -> dict[str, object]:
 
     Raises:
         UnsafePickleError: the pickle names a global outside the list above.
-        BodyFileError: it is not a pickle, is truncated, or does not hold a dictionary.
+        FileError: it is not a pickle, is truncated, or does not hold a dictionary.
     """
     content = load_restricted(file.content, str(file))
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise BodyFileError(
+        raise FileError(
             f"{file} holds no dictionary of named arrays but a {type(content).__name__}; is it an SMPL file?"
         )
     return content
@@ -176,7 +172,7 @@ def load_restricted(data: bytes, name: str) -> object:
 
     Raises:
         UnsafePickleError: the pickle names a global outside the list above.
-        BodyFileError: it is not a pickle, is truncated, or exceeds MOST_OPERATIONS or MOST_TUPLES.
+        FileError: it is not a pickle, is truncated, or exceeds MOST_OPERATIONS or MOST_TUPLES.
     """
     try:
         _scan(data)
@@ -185,7 +181,7 @@ def load_restricted(data: bytes, name: str) -> object:
         raise UnsafePickleError(f"{name}: {error}") from None
     except _DAMAGED as error:
         reason = " ".join(str(error).split())
-        raise BodyFileError(f"{name} is not a whole pickle file ({reason:.80}); download it again.") from error
+        raise FileError(f"{name} is not a whole pickle file ({reason:.80}); download it again.") from error
 
 
 def array_of_objects(value: object) -> list[object]:

@@ -45,10 +45,6 @@ _DEEPEST = 127
 _WORD = 2**64
 
 
-class TensorLayoutError(ValueError):
-    """A file that is not in the safetensors format. The message is a reason without the file's name."""
-
-
 @dataclasses.dataclass(frozen=True)
 class StoredTensor:
     """What a header says of a tensor."""
@@ -98,30 +94,30 @@ class TensorLayout:
 def read_layout(file: BinaryIO, longest: int = LARGEST_HEADER) -> TensorLayout:
     """Read the header of an open file, whose position is the start of the data afterwards.
 
-    Raises TensorLayoutError, also for a header of more than `longest` bytes, and OSError.
+    Raises ValueError, also for a header of more than `longest` bytes, and OSError.
     """
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     length = file.read(LENGTH_BYTES)
     if len(length) < LENGTH_BYTES:
-        raise TensorLayoutError("it is shorter than the length of a header")
+        raise ValueError("it is shorter than the length of a header")
     count = int.from_bytes(length, "little")
     if count > min(longest, LONGEST_HEADER):
-        raise TensorLayoutError(f"its header is longer than {longest / 2**20:.0f} MB")
+        raise ValueError(f"its header is longer than {longest / 2**20:.0f} MB")
     header = file.read(count)
     if len(header) < count:
-        raise TensorLayoutError("its header is cut short")
+        raise ValueError("its header is cut short")
     return parse_layout(header, size - LENGTH_BYTES - count)
 
 
 def parse_layout(header: bytes, data_bytes: int) -> TensorLayout:
-    """The layout that a header describes, of a file with so many bytes of data. Raises TensorLayoutError."""
+    """The layout that a header describes, of a file with so many bytes of data. Raises ValueError."""
     try:
         tree = parse_pairs(header, _DEEPEST)
     except JsonError as error:
-        raise TensorLayoutError(f"its header is not JSON ({error!s:.80})") from error
+        raise ValueError(f"its header is not JSON ({error!s:.80})") from error
     if not isinstance(tree, Pairs):
-        raise TensorLayoutError("its header is not a JSON object")
+        raise ValueError("its header is not a JSON object")
     tensors = {name: _tensor(name, value) for name, value in tree if name != _METADATA}
     texts = _metadata([value for name, value in tree if name == _METADATA])
     tensors = dict(sorted(tensors.items(), key=lambda item: (item[1].begin, item[1].end)))
@@ -134,15 +130,15 @@ def check_limits(layout: TensorLayout) -> None:
     """Check what the programs require beyond the format, and of which the format's own reader knows nothing.
 
     A name occurs once, dtypes are those of `DTYPES`, and a tensor has no more axes than `MOST_DIMENSIONS` and no more
-    values than numpy and torch can address, even if one of its sides is 0. Raises TensorLayoutError.
+    values than numpy and torch can address, even if one of its sides is 0. Raises ValueError.
     """
     if layout.repeated:
-        raise TensorLayoutError(f"it holds {layout.repeated[0]!r:.40} twice")
+        raise ValueError(f"it holds {layout.repeated[0]!r:.40} twice")
     for name, stored in layout.tensors.items():
         if stored.dtype not in DTYPES:
-            raise TensorLayoutError(f"{name!r:.40} is {stored.dtype}, a type that no tensor here has")
+            raise ValueError(f"{name!r:.40} is {stored.dtype}, a type that no tensor here has")
         if len(stored.shape) > MOST_DIMENSIONS or math.prod(side for side in stored.shape if side) >= 2**60:
-            raise TensorLayoutError(f"{name!r:.40} has {len(stored.shape)} axes or sides that no tensor here has")
+            raise ValueError(f"{name!r:.40} has {len(stored.shape)} axes or sides that no tensor here has")
 
 
 def _repeated(pairs: Pairs) -> tuple[str, ...]:
@@ -153,11 +149,11 @@ def _repeated(pairs: Pairs) -> tuple[str, ...]:
 def _metadata(found: list[Any]) -> Pairs:
     """The metadata, of the values of `__metadata__` in a header."""
     if len(found) > 1:
-        raise TensorLayoutError("it holds its metadata twice")
+        raise ValueError("it holds its metadata twice")
     if not found or found[0] is None:
         return Pairs()
     if not isinstance(found[0], Pairs) or not all(isinstance(text, str) for _, text in found[0]):
-        raise TensorLayoutError("its metadata are not strings")
+        raise ValueError("its metadata are not strings")
     return found[0]
 
 
@@ -171,10 +167,10 @@ def _tensor(name: str, value: Any) -> StoredTensor:
         complete = isinstance(value, list) and len(value) == len(_FIELDS)
         fields = dict(zip(_FIELDS, value, strict=True)) if complete else {}
     if not complete:
-        raise TensorLayoutError(f"{name!r:.40} lacks a type, shape or place, or has two")
+        raise ValueError(f"{name!r:.40} lacks a type, shape or place, or has two")
     shape, offsets = fields["shape"], fields["data_offsets"]
     if not (_are_sizes(shape) and _are_sizes(offsets) and len(offsets) == 2):
-        raise TensorLayoutError(f"{name!r:.40} has no shape or place of whole numbers")
+        raise ValueError(f"{name!r:.40} has no shape or place of whole numbers")
     return StoredTensor(_dtype(name, fields["dtype"]), tuple(shape), *offsets)
 
 
@@ -183,7 +179,7 @@ def _dtype(name: str, value: Any) -> str:
     if isinstance(value, Pairs) and len(value) == 1 and value[0][1] is None:
         value = value[0][0]
     if not isinstance(value, str) or value not in _BITS:
-        raise TensorLayoutError(f"{name!r:.40} has the unknown type {value!r:.20}")
+        raise ValueError(f"{name!r:.40} has the unknown type {value!r:.20}")
     return value
 
 
@@ -200,14 +196,14 @@ def _check_cover(tensors: dict[str, StoredTensor], data_bytes: int) -> None:
     start = 0
     for name, stored in tensors.items():
         if stored.begin != start or stored.end < start:
-            raise TensorLayoutError(f"{name!r:.40} overlaps another tensor, or bytes before it belong to none")
+            raise ValueError(f"{name!r:.40} overlaps another tensor, or bytes before it belong to none")
         start = stored.end
         bits = 1
         for factor in (*stored.shape, _BITS[stored.dtype]):
             bits *= factor
             if bits >= _WORD:
-                raise TensorLayoutError(f"{name!r:.40} has an impossible shape")
+                raise ValueError(f"{name!r:.40} has an impossible shape")
         if bits != 8 * (stored.end - stored.begin):
-            raise TensorLayoutError(f"{name!r:.40} has another size than its shape")
+            raise ValueError(f"{name!r:.40} has another size than its shape")
     if start != data_bytes:
-        raise TensorLayoutError(f"it holds {data_bytes} bytes of data, its header describes {start}")
+        raise ValueError(f"it holds {data_bytes} bytes of data, its header describes {start}")

@@ -16,12 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from primdiffusion.formats.regular_files import read_regular
-
-
-class ProxyFileError(ValueError):
-    """A damaged or incomplete .mhclo or .obj file."""
-
+from primdiffusion.formats.regular_files import FileError, read_regular
 
 LARGEST_TEXT = 64 * 2**20
 """Bytes of a file."""
@@ -97,7 +92,7 @@ def parse_obj(text: str) -> ObjMesh:
     """Parse vertices, texture coordinates and faces; polygons become triangle fans; missing uv are (0, 0).
 
     Raises:
-        ProxyFileError: a face refers to a vertex that does not exist.
+        FileError: a face refers to a vertex that does not exist.
     """
     vertices: list[list[float]] = []
     coordinates: list[list[float]] = [[0.0, 0.0]]
@@ -119,13 +114,13 @@ def parse_obj(text: str) -> ObjMesh:
                 faces.append((index[0], index[k], index[k + 1]))
                 face_coordinates.append((uv_index[0], uv_index[k], uv_index[k + 1]))
     if any(not abs(value) <= LARGEST_NUMBER for row in (*vertices, *coordinates) for value in row):
-        raise ProxyFileError(f"the .obj holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again")
+        raise FileError(f"the .obj holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again")
     if not faces or not vertices:
-        raise ProxyFileError("the .obj has no faces or no vertices: give a mesh of an asset pack")
+        raise FileError("the .obj has no faces or no vertices: give a mesh of an asset pack")
     face_array = np.array(faces, np.int32)
     uv_array = np.array(face_coordinates)
     if face_array.min() < 0 or face_array.max() >= len(vertices) or uv_array.max() >= len(coordinates):
-        raise ProxyFileError(
+        raise FileError(
             f"face indices of the .obj are outside its {len(vertices)} vertices and {len(coordinates) - 1} texture "
             "coordinates: the file is damaged or uses relative indices, which are not supported"
         )
@@ -136,7 +131,7 @@ def parse_mhclo(text: str) -> Proxy:
     """Parse a .mhclo file; unknown keys are ignored.
 
     Raises:
-        ProxyFileError: no vertices, or a line with a wrong number of values.
+        FileError: no vertices, or a line with a wrong number of values.
     """
     reference: list[tuple[int, int, int]] = []
     weight: list[list[float]] = []
@@ -159,7 +154,7 @@ def parse_mhclo(text: str) -> Proxy:
             z_depth = int(words[1])
         elif key.isdigit() and section == "verts":
             if len(words) not in (1, 6, 9):
-                raise ProxyFileError(f"a vertex line of {name or 'the .mhclo'} has {len(words)} values, not 1, 6 or 9")
+                raise FileError(f"a vertex line of {name or 'the .mhclo'} has {len(words)} values, not 1, 6 or 9")
             index = [int(word) for word in words[:3]] if len(words) > 1 else [int(key)] * 3
             reference.append((index[0], index[1], index[2]))
             weight.append([float(word) for word in words[3:6]] if len(words) > 1 else [1.0, 0.0, 0.0])
@@ -167,11 +162,9 @@ def parse_mhclo(text: str) -> Proxy:
         elif key.isdigit() and section == "delete_verts":
             deleted.extend(_vertex_ranges(words))
     if not reference:
-        raise ProxyFileError(f"{name or 'the .mhclo'} has no vertices after its line 'verts': the file is damaged")
+        raise FileError(f"{name or 'the .mhclo'} has no vertices after its line 'verts': the file is damaged")
     if any(not abs(value) <= LARGEST_NUMBER for row in (*weight, *offset) for value in row):
-        raise ProxyFileError(
-            f"the .mhclo holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again"
-        )
+        raise FileError(f"the .mhclo holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again")
     return Proxy(
         name=name,
         reference=np.array(reference, np.int64),
@@ -193,7 +186,7 @@ def _vertex_ranges(words: list[str]) -> list[int]:
         elif in_range:
             last = int(word)
             if last > MOST_VERTICES:
-                raise ProxyFileError(f"the .mhclo deletes vertex {last}, more than there are: fetch it again")
+                raise FileError(f"the .mhclo deletes vertex {last}, more than there are: fetch it again")
             numbers.extend(range(numbers[-1] + 1, last + 1))
             in_range = False
         else:
@@ -205,19 +198,17 @@ def read_pair(mhclo: Path, obj: Path) -> tuple[Proxy, ObjMesh]:
     """Read a proxy and its mesh.
 
     Raises:
-        ProxyFileError: the files are damaged or do not belong together.
+        FileError: the files are damaged or do not belong together.
     """
     try:
         proxy = parse_mhclo(read_regular(mhclo, LARGEST_TEXT).decode("utf-8", errors="replace"))
         mesh = parse_obj(read_regular(obj, LARGEST_TEXT).decode("utf-8", errors="replace"))
-    except ProxyFileError as error:
-        raise ProxyFileError(f"{mhclo}: {error}") from error
+    except FileError as error:
+        raise FileError(f"{mhclo}: {error}") from error
     except (ValueError, IndexError, OverflowError) as error:
-        raise ProxyFileError(
-            f"{mhclo.name} or {obj} has an unreadable line ({error!s:.60}): fetch both again"
-        ) from error
+        raise FileError(f"{mhclo.name} or {obj} has an unreadable line ({error!s:.60}): fetch both again") from error
     if len(proxy.reference) != len(mesh.vertices):
-        raise ProxyFileError(
+        raise FileError(
             f"{mhclo} binds {len(proxy.reference)} vertices but {obj} has {len(mesh.vertices)}: fetch both again"
         )
     return proxy, mesh

@@ -93,7 +93,7 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
 
     Each file is searched at its recorded path, then by name in the folders `beside`; the content hash must match, and
     what is loaded are the bytes that were hashed. Raises BodySetupError if a file is missing or has changed, and
-    BodyFileError.
+    FileError.
     """
     folders, wanted = tuple(beside), (files.smpl, *files.uv)
     paths = [_found(file, folders) for file in wanted]

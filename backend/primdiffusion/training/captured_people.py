@@ -94,7 +94,7 @@ def looks_of(
     """Return the payloads of a subject, on the CPU, and the betas of the body that carries the boxes.
 
     Raises:
-        FileNotFoundError, FileError, ArrayFileError, BodyFileError: captures are missing or damaged.
+        FileNotFoundError, FileError: captures are missing or damaged.
         ValueError: they are of another body; the pictures lead to numbers that are not finite.
     """
     subject = captures.subject(name)

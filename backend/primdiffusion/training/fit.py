@@ -61,7 +61,7 @@ def fit(config: FitConfig) -> EncoderModel:
         ValueError: settings that cannot be, or others than those with which the run in this folder began; captures
             without a frame, or of another body; objective or gradient that are not finite; too little
             memory (says which batch to try).
-        FileNotFoundError, FileError, ArrayFileError, BodyFileError: files are missing or
+        FileNotFoundError, FileError: files are missing or
             damaged.
         OSError: there is no room; the last whole state remains.
     """

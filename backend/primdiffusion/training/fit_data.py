@@ -84,7 +84,7 @@ def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
 
     Raises:
         ValueError: a subject was captured on another body model.
-        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a camera has no images, a file is damaged.
+        FileNotFoundError, FileError: a camera has no images, a file is damaged.
     """
     return torch.stack([default_betas(captures.subject(name)) for name in captures.subjects])
 
@@ -99,7 +99,7 @@ def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: 
     """Yield the batches of a run, with the original errors of worker processes.
 
     Raises:
-        FileNotFoundError, FileError, ArrayFileError, BodyFileError: a file is missing or damaged.
+        FileNotFoundError, FileError: a file is missing or damaged.
         ChildProcessError: a worker was killed.
     """
     try:

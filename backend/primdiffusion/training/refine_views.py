@@ -127,7 +127,7 @@ def meshed_person(path: str | Path) -> Human:
     """Return a human of `primdiffusion people`, a .glb in the rest pose of the default body; takes about 3 s.
 
     Raises:
-        FileNotFoundError, GlbError: as `read_person`.
+        FileNotFoundError, FileError: as `read_person`.
         ValueError: the mesh is empty.
     """
     person = read_person(path)

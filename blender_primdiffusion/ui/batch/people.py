@@ -44,7 +44,7 @@ class Movement:
 
 
 def movement_of(options: argparse.Namespace) -> Movement | None:
-    """What --pose or --motion names. Raises MotionFileError."""
+    """What --pose or --motion names. Raises FileError."""
     path = options.pose or options.motion
     return None if path is None else Movement(read_motion(path), options.pose is not None)
 

@@ -44,10 +44,6 @@ class NoBackend(RuntimeError):
     """No Python runs the backend; the message names those that were tried."""
 
 
-class ChildFailed(RuntimeError):
-    """The child could not do what it was asked for; the message is for the user."""
-
-
 class Stopped(Exception):
     """The command was asked to stop."""
 
@@ -107,7 +103,8 @@ def ask(
 ) -> Any:
     """The child's answer, a record of `formats.answers`; `on_progress` is called with the request whenever it changes.
 
-    Raises NoBackend, ChildFailed, and Stopped once `stop` is set, within a second; then no file is left.
+    Raises NoBackend, RuntimeError with the child's error, and Stopped once `stop` is set, within a second; then no file
+    is left.
     """
     request = ChildRequest(backend, method, params)
     while not request.finished:
@@ -119,7 +116,7 @@ def ask(
     if request.state == "cancelled":
         raise Stopped
     if request.error is not None:
-        raise (NoBackend if request.error.kind in {"environment", "timeout"} else ChildFailed)(str(request.error))
+        raise (NoBackend if request.error.kind in {"environment", "timeout"} else RuntimeError)(str(request.error))
     return request.result
 
 

@@ -14,7 +14,8 @@ import torch
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.failures import MissingPackageError
-from primdiffusion.formats.smpl_pickle import BodyFileError, UnsafePickleError
+from primdiffusion.formats.regular_files import FileError
+from primdiffusion.formats.smpl_pickle import UnsafePickleError
 from smplx.lbs import lbs
 from support.errors import refused
 
@@ -161,7 +162,7 @@ def test_obj_texture_coordinates_follow_the_bodys_face_order(tmp_path, uv_pair):
     np.testing.assert_array_equal(body.uv_faces, ft)
     np.testing.assert_allclose(body.uv, vt, rtol=1e-6)
     (tmp_path / "uv.obj").write_text("\n".join(lines[:-1]))
-    with refused(BodyFileError):
+    with refused(FileError):
         load_body(tmp_path / "SMPL_NEUTRAL.pkl", uv=tmp_path / "uv.obj")
 
 
@@ -209,7 +210,7 @@ def test_other_ways_to_reach_code_are_rejected(tmp_path, program):
 def test_a_pickle_cannot_change_the_readers_own_classes(tmp_path, uv_pair):
     path = tmp_path / "SMPL_NEUTRAL.pkl"
     path.write_bytes(b"cnumpy\nndarray\n(dS'__setstate__'\nNsb.")  # BUILD on the class itself
-    with pytest.raises(BodyFileError):
+    with pytest.raises(FileError):
         load_body(path)
     load_body(pickled(tmp_path, smpl_arrays()), uv=uv_pair)
 
@@ -239,7 +240,7 @@ NAN = np.where(np.arange(V * 3).reshape(V, 3) == 7, np.nan, 0.0)
     ],
 )
 def test_broken_content_is_named(tmp_path, uv_pair, content, name):
-    with refused(BodyFileError, name):
+    with refused(FileError, name):
         load_body(pickled(tmp_path, content), uv=uv_pair)
 
 
@@ -252,13 +253,13 @@ def test_files_cut_short_are_named(tmp_path, uv_pair, kind, keep):
         np.savez(path, **{k: v for k, v in smpl_arrays().items() if k != "J_regressor"})
     whole = path.read_bytes()
     path.write_bytes(whole[: int(keep * len(whole))])
-    with refused(BodyFileError, path.name):
+    with refused(FileError, path.name):
         load_body(path, uv=uv_pair)
 
 
 def test_npz_with_pickled_objects_is_rejected(tmp_path, uv_pair):
     np.savez(tmp_path / "body.npz", **spoiled("v_template", np.array([Hostile(print, "ran")] * V)))
-    with refused(BodyFileError, "v_template"):
+    with refused(FileError, "v_template"):
         load_body(tmp_path / "body.npz", uv=uv_pair)
 
 
@@ -266,18 +267,18 @@ def test_wrong_paths_and_texture_files_are_named(tmp_path, uv_pair):
     with refused(FileNotFoundError, "nowhere.pkl"):
         load_body(tmp_path / "nowhere.pkl")
     (tmp_path / "body.fbx").write_bytes(b"")
-    with refused(BodyFileError, ".fbx"):
+    with refused(FileError, ".fbx"):
         load_body(tmp_path / "body.fbx")
     path = pickled(tmp_path, smpl_arrays())
     np.save(tmp_path / "short.npy", np.zeros((F - 1, 3), int))
-    with refused(BodyFileError, "116"):
+    with refused(FileError, "116"):
         load_body(path, uv=(uv_pair[0], tmp_path / "short.npy"))
     np.save(tmp_path / "far.npy", np.full((F, 3), 70))
-    with refused(BodyFileError):
+    with refused(FileError):
         load_body(path, uv=(uv_pair[0], tmp_path / "far.npy"))
     np.savez(tmp_path / "texts.npz", vt=np.full((F, 2), "a"), ft=np.zeros((F, 3), int))
-    with refused(BodyFileError):
+    with refused(FileError):
         load_body(path, uv=tmp_path / "texts.npz")
     np.save(tmp_path / "objects.npy", np.array([Hostile(print, "ran")]), allow_pickle=True)
-    with refused(BodyFileError, "objects.npy"):
+    with refused(FileError, "objects.npy"):
         load_body(path, uv=(uv_pair[0], tmp_path / "objects.npy"))

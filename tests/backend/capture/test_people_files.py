@@ -6,7 +6,8 @@ import struct
 import numpy as np
 import pytest
 from capture_scenes import save_person
-from primdiffusion.capture.people_files import GlbError, read_person
+from primdiffusion.capture.people_files import read_person
+from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 FLOAT, BYTE = 5126, 5120
@@ -46,7 +47,7 @@ def test_numbers_that_no_mesh_has_are_rejected(person, name, kind, value):
     tree["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": len(values)})
     about.update(bufferView=len(tree["bufferViews"]) - 1, componentType=kind, byteOffset=0)
     write(path, tree, binary + values)
-    with refused(GlbError, "person.glb"):
+    with refused(FileError, "person.glb"):
         read_person(path)
 
 
@@ -54,7 +55,7 @@ def test_a_small_file_cannot_name_endless_parts(person):
     path, tree, binary = person
     tree["nodes"] += [node for node in tree["nodes"] if "mesh" in node] * 50_000
     write(path, tree, binary)
-    with refused(GlbError, "100"):
+    with refused(FileError, "100"):
         read_person(path)
 
 
@@ -77,5 +78,5 @@ def test_textures_that_a_file_of_its_size_cannot_have_are_not_decoded(person, mo
     monkeypatch.setattr("primdiffusion.capture.people_files.decoded_bytes", lambda _size: 4)
     monkeypatch.setattr("primdiffusion.capture.people_files.Glb.picture", lambda *_: pytest.fail("decoded"))
     monkeypatch.setattr("primdiffusion.capture.people_files.Glb.picture_texels", lambda *_: 2)
-    with refused(GlbError, "1 texels"):
+    with refused(FileError, "1 texels"):
         read_person(path)

@@ -10,8 +10,7 @@ import torch
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.poses import built_in_poses, choose_poses
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.arrays import ArrayFileError
-from primdiffusion.formats.poses.motion import MotionFileError
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.pose_file import read_motion
 from support.errors import refused
@@ -61,7 +60,7 @@ def test_a_pickled_dictionary_is_the_same_motion_and_nothing_else_is_loaded(tmp_
     assert torch.equal(pickled.translation, plain.translation)
     for content in (pickle.dumps([1]), pickle.dumps(Path), b"nothing", pickle.dumps({"body_pose": "x"})):
         (tmp_path / "b.pkl").write_bytes(content)
-        with refused(MotionFileError, "b.pkl"):
+        with refused(FileError, "b.pkl"):
             read_motion(tmp_path / "b.pkl")
 
 
@@ -100,7 +99,7 @@ def test_fingers_are_not_taken_for_smpls_hand_joints(tmp_path, numbers):
 @pytest.mark.parametrize(("moves", "fault"), [([[0, 0, 0]] * 4, "5 frames"), ([[0, 0, float("nan")]] * 5, "NaN")])
 def test_translations_that_do_not_fit_are_rejected_by_name(tmp_path, moves, fault):
     (tmp_path / "a.json").write_text(json.dumps({"poses": THETA.tolist(), "trans": moves}))
-    with refused(MotionFileError, "a.json", fault):
+    with refused(FileError, "a.json", fault):
         read_motion(tmp_path / "a.json")
 
 
@@ -111,7 +110,7 @@ def test_translations_that_do_not_fit_are_rejected_by_name(tmp_path, moves, faul
 )  # fmt: skip
 def test_files_that_are_no_poses_are_rejected_by_name(tmp_path, name, content):
     (tmp_path / name).write_bytes(content)
-    with refused((MotionFileError, ArrayFileError), name):
+    with refused((FileError), name):
         read_motion(tmp_path / name)
 
 

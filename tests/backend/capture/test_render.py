@@ -14,11 +14,12 @@ import psutil
 import pytest
 from capture_scenes import box_person, captured, save_person, small_job
 from primdiffusion import cli
-from primdiffusion.capture.people_files import GlbError, find_people, read_glb, read_person
+from primdiffusion.capture.people_files import find_people, read_glb, read_person
 from primdiffusion.capture.render import render
 from primdiffusion.commands.captures import parse_shard
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.capture_repair import verify
+from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 from support.runs import within
 
@@ -47,7 +48,7 @@ def test_a_persons_file_is_read_as_it_was_written(tmp_path):
 def test_a_file_cut_short_is_rejected_by_name(tmp_path, cut):
     path = save_person(tmp_path / "a.glb")
     path.write_bytes(path.read_bytes()[:cut])
-    with refused(GlbError, "a.glb"):
+    with refused(FileError, "a.glb"):
         read_person(path)
 
 
@@ -83,7 +84,7 @@ def change(path: Path, edit) -> None:
 def test_files_without_a_human_are_rejected(tmp_path, edit, why):
     path = save_person(tmp_path / "a.glb")
     change(path, edit)
-    with pytest.raises(GlbError, match=why):
+    with pytest.raises(FileError, match=why):
         read_person(path)
 
 
@@ -250,7 +251,7 @@ def test_another_person_or_pose_in_the_same_folder_is_rejected(tmp_path):
 
 def test_other_settings_in_the_same_folder_are_rejected(tmp_path):
     captured(tmp_path, people=1)
-    with refused(capture_layout.CaptureFolderError, "samples is 9", "wanted is 25"):
+    with refused(FileError, "samples is 9", "wanted is 25"):
         list(render(small_job(tmp_path, people=1, samples=5)))
 
 

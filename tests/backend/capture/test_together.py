@@ -19,6 +19,7 @@ from primdiffusion.capture.together import groups, turned
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.group_places import GAP, places
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.srgb import decode_srgb
 from support.errors import refused
 
@@ -210,5 +211,5 @@ def test_groups_that_cannot_be_are_refused(tmp_path, capsys, words):
 def test_captures_of_single_humans_do_not_continue_as_groups(tmp_path):
     job = small_job(tmp_path, people=2, frames=1)
     assert {outcome.status for outcome in render(job)} == {"done"}
-    with refused(capture_layout.CaptureFolderError, "together"):
+    with refused(FileError, "together"):
         list(render(small_job(tmp_path, people=2, frames=1, together=(job.people,))))

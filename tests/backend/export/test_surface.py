@@ -8,7 +8,7 @@ import torch
 import trimesh
 from export_people import ball, person
 from primdiffusion.export.simplify import simplified, unwrapped
-from primdiffusion.export.surface import NoSurface, depth_below, outside_surface
+from primdiffusion.export.surface import depth_below, outside_surface
 from primdiffusion.failures import MissingPackageError
 from primdiffusion.human import place
 from primdiffusion.primitives.primitives import Primitives
@@ -59,7 +59,7 @@ def test_depth_is_measured_from_the_surface():
 def test_a_person_of_nothing_is_rejected_with_a_sentence():
     primitives = place(person())
     empty = type(primitives)(**{**vars(primitives), "density": torch.zeros_like(primitives.density)})
-    with refused(NoSurface):
+    with refused(ValueError):
         outside_surface(merge(empty, 0.02, points=1))
 
 

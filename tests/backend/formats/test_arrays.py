@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from primdiffusion.formats import arrays, regular_files
 from primdiffusion.formats.arrays import (
-    ArrayFileError,
     all_finite,
     array_names,
     array_shape,
@@ -22,6 +21,7 @@ from primdiffusion.formats.arrays import (
     read_numbers,
     write_deflated,
 )
+from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 
@@ -71,7 +71,7 @@ def assert_one_sentence(error: Exception, path) -> None:
 )
 def test_a_member_that_is_no_array_is_one_sentence(tmp_path, member):
     path = npz(tmp_path / "poses.npz", member)
-    with pytest.raises(ArrayFileError) as raised:
+    with pytest.raises(FileError) as raised:
         read_arrays(path, ("pose",))
     assert_one_sentence(raised.value, path)
 
@@ -79,7 +79,7 @@ def test_a_member_that_is_no_array_is_one_sentence(tmp_path, member):
 @pytest.mark.parametrize(("offset", "value"), [(8, 99), (8, 12), (6, 1)], ids=["unknown", "bzip2", "encrypted"])
 def test_members_packed_in_another_way_are_rejected(tmp_path, offset, value):
     path = patched(npz(tmp_path / "poses.npz", npy(data=bytes(12))), offset, value)
-    with pytest.raises(ArrayFileError) as raised:
+    with pytest.raises(FileError) as raised:
         read_arrays(path, ("pose",))
     assert_one_sentence(raised.value, path)
 
@@ -87,7 +87,7 @@ def test_members_packed_in_another_way_are_rejected(tmp_path, offset, value):
 def test_a_bomb_is_not_unpacked(tmp_path):
     path = npz(tmp_path / "bomb.npz", npy(data=bytes(12)) + bytes(2**26), zipfile.ZIP_BZIP2)
     tracemalloc.start()
-    with pytest.raises(ArrayFileError):
+    with pytest.raises(FileError):
         read_arrays(path, ("pose",))
     assert tracemalloc.get_traced_memory()[1] < 2**23
     tracemalloc.stop()
@@ -96,7 +96,7 @@ def test_a_bomb_is_not_unpacked(tmp_path):
 def test_megabytes_of_zeros_are_not_unpacked(tmp_path):
     size = 65 * 2**20
     path = npz(tmp_path / "bomb.npz", npy("'|u1'", f"({size},)", bytes(size)))
-    with refused(ArrayFileError, "65 MB"):
+    with refused(FileError, "65 MB"):
         read_arrays(path, ("pose",))
 
 
@@ -104,7 +104,7 @@ def test_arrays_of_one_call_share_the_limit(tmp_path, monkeypatch):
     monkeypatch.setattr("primdiffusion.formats.arrays.LARGEST_BYTES", 1000)
     path = tmp_path / "two.npz"
     np.savez(path, a=np.zeros(100), b=np.zeros(100, np.uint8))
-    with refused(ArrayFileError):
+    with refused(FileError):
         read_arrays(path, ("a", "b"))
     assert len(read_arrays(path, ("b",))["b"]) == 100
 
@@ -115,7 +115,7 @@ def test_a_long_list_of_names_is_not_read(tmp_path):
     end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, len(entry) * count, 0, 0)
     path = tmp_path / "many.npz"
     path.write_bytes(entry * count + end)
-    with refused(ArrayFileError):
+    with refused(FileError):
         array_names(path)
 
 
@@ -131,7 +131,7 @@ def test_folders_and_pipes_are_not_opened(tmp_path, read):
 @pytest.mark.parametrize("value", [np.nan, np.inf, 1e39])
 def test_numbers_fit_float32(tmp_path, value):
     np.savez(tmp_path / "a.npz", uv=np.array([0.0, value]))
-    with refused(ArrayFileError, "NaN"):
+    with refused(FileError, "NaN"):
         read_numbers(tmp_path / "a.npz", ("uv",))
 
 
@@ -145,7 +145,7 @@ def test_what_is_written_is_read(tmp_path):
 
 def test_a_shape_beyond_the_file_is_rejected_without_reading(tmp_path):
     path = npz(tmp_path / "people.npz", npy("'|u1'", "(50000000, 1024, 8, 8, 8, 4)"))
-    with refused(ArrayFileError):
+    with refused(FileError):
         array_shape(path, "pose")
 
 
@@ -174,7 +174,7 @@ def test_numbers_of_half_precision_are_checked_without_a_warning():
 def test_the_smallest_integer_is_too_large(tmp_path):
     assert not all_finite(np.array([0, -(2**63)]))
     np.savez(tmp_path / "a.npz", a=np.array([-(2**63)]))
-    with refused(ArrayFileError, "NaN"):
+    with refused(FileError, "NaN"):
         read_numbers(tmp_path / "a.npz", ("a",))
 
 
@@ -182,21 +182,21 @@ def test_the_smallest_integer_is_too_large(tmp_path):
 def test_sides_of_a_shape_are_integers(tmp_path, shape):
     head = f"{{'descr': '<f4', 'fortran_order': False, 'shape': {shape}, }}".ljust(117).encode() + b"\n"
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
-    with refused(ArrayFileError, "a.npy"):
+    with refused(FileError, "a.npy"):
         read_npy(tmp_path / "a.npy")
 
 
 @pytest.mark.parametrize("values", [np.ones(2, complex), np.zeros(2, "M8[s]"), np.zeros(2, [("a", "f4")])])
 def test_neither_complex_numbers_nor_dates_nor_records_are_read(tmp_path, values):
     np.save(tmp_path / "a.npy", values)
-    with refused(ArrayFileError):
+    with refused(FileError):
         read_npy(tmp_path / "a.npy")
 
 
 def test_a_text_whose_size_wraps_is_rejected(tmp_path):
     head = b"{'descr': '<U1000000000', 'fortran_order': False, 'shape': (), }".ljust(117) + b"\n"
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
-    with refused(ArrayFileError, "a.npy"):
+    with refused(FileError, "a.npy"):
         read_npy(tmp_path / "a.npy")
 
 
@@ -214,7 +214,7 @@ def test_two_arrays_of_one_name_are_rejected(tmp_path, names):
         for name in names:
             archive.writestr(name, npy())
     for read in (read_arrays, array_names, lambda path: array_shape(path, "pose")):
-        with refused(ArrayFileError, "pose"):
+        with refused(FileError, "pose"):
             read(tmp_path / "a.npz")
 
 

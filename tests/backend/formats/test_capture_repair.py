@@ -13,6 +13,7 @@ import pytest
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.capture_repair import list_subjects, repair, verify
 from primdiffusion.formats.picture_files import write_png
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.removing import OutsideFolderError
 from support.errors import refused
 
@@ -62,7 +63,7 @@ def test_a_partial_file_is_removed_without_rendering_the_subject_again(root):
 @pytest.mark.parametrize("about", [{"frames": 0}, {"rig": {}}, {"passes": "mask"}, {"passes": ["x-ray"]}])
 def test_settings_that_do_not_describe_captures_are_rejected(tmp_path, about):
     capture_layout.claim(tmp_path, {"frames": 1, "rig": {"count": 1}, "passes": ["mask"], **about})
-    with pytest.raises(capture_layout.CaptureFolderError):
+    with pytest.raises(FileError):
         verify(tmp_path)
 
 
@@ -98,7 +99,7 @@ def test_a_mark_that_cannot_be_used_leaves_its_subject_unfinished(root, text):
 def test_a_dataset_that_cannot_be_is_named(root, about):
     file = root / capture_layout.DATASET_FILE
     file.write_text(json.dumps({**json.loads(file.read_text()), **about}))
-    with refused(capture_layout.CaptureFolderError, "dataset.json"):
+    with refused(FileError, "dataset.json"):
         verify(root)
 
 

@@ -5,7 +5,7 @@ import pytest
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.files import read_motion
 from primdiffusion.formats.poses.mhr import JOINTS, REST
-from primdiffusion.formats.poses.motion import MotionFileError
+from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 from support.mhr_files import mhr_arrays, write_mhr
 
@@ -66,7 +66,7 @@ def test_joints_in_another_order_are_found_by_their_names(tmp_path):
 )
 def test_what_is_no_pose_of_mhr_is_one_sentence(tmp_path, change, text):
     path = write_mhr(tmp_path / "a.npz", changed(**change))
-    with refused(MotionFileError, "a.npz", text):
+    with refused(FileError, "a.npz", text):
         read_motion(path)
 
 
@@ -75,11 +75,11 @@ def test_parameters_without_joints_are_refused_with_what_to_save(tmp_path, key):
     arrays = mhr_arrays(THETA, MOVE)
     del arrays[key]
     for ending in ("npz", "json", "pkl"):
-        with refused(MotionFileError, f"a.{ending}", "pred_global_rots", "pred_joint_coords"):
+        with refused(FileError, f"a.{ending}", "pred_global_rots", "pred_joint_coords"):
             read_motion(write_mhr(tmp_path / f"a.{ending}", arrays))
 
 
 def test_several_humans_are_one_too_many(tmp_path):
     (tmp_path / "a.json").write_text('[{"pred_cam_t": [0, 0, 1]}, {"pred_cam_t": [0, 0, 1]}]')
-    with refused(MotionFileError, "a.json", "2 humans"):
+    with refused(FileError, "a.json", "2 humans"):
         read_motion(tmp_path / "a.json")

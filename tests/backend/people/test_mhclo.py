@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from primdiffusion.people.mhclo import ProxyFileError, parse_mhclo, parse_obj, read_pair
+from primdiffusion.formats.regular_files import FileError
+from primdiffusion.people.mhclo import parse_mhclo, parse_obj, read_pair
 from support.errors import refused
 
 BASE = np.array([[0.0, 0, 0], [2, 0, 0], [0, 4, 0], [0, 0, 6], [1, 1, 1]])
@@ -62,7 +63,7 @@ def test_proxy_vertex_is_hidden_only_if_all_its_references_are():
 
 @pytest.mark.parametrize("text", ["name x\nverts 0\n", "verts 0\n1 2 3 4\n"])
 def test_damaged_mhclo_is_rejected(text):
-    with pytest.raises(ProxyFileError):
+    with pytest.raises(FileError):
         parse_mhclo(text)
 
 
@@ -73,12 +74,12 @@ def test_polygons_become_fans_with_their_own_texture_coordinates():
 
 
 def test_faces_that_name_missing_vertices_are_rejected():
-    with refused(ProxyFileError, "outside"):
+    with refused(FileError, "outside"):
         parse_obj("v 0 0 0\nf 1 2 3\n")
 
 
 def test_files_of_different_size_are_rejected_with_both_counts(tmp_path):
     (tmp_path / "a.mhclo").write_text(MHCLO)
     (tmp_path / "a.obj").write_text(OBJ)
-    with refused(ProxyFileError, "3 vertices"):
+    with refused(FileError, "3 vertices"):
         read_pair(tmp_path / "a.mhclo", tmp_path / "a.obj")

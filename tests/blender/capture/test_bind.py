@@ -10,12 +10,12 @@ import pytest
 import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle, to_axis_angle
+from blender_primdiffusion.formats.regular_files import FileError
 from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load
 from support.errors import refused
 
 from blender_primdiffusion.capture.bind import join_surface, surface_weights, unpose
 from blender_primdiffusion.capture.body import skin
-from blender_primdiffusion.capture.scan import ScanError
 
 SCANNED = scan_fixtures.a_pose() @ from_axis_angle(np.random.default_rng(5).normal(0, 0.12, (24, 3)))
 PLACE = np.array([0.4, 1.1, 0.3])
@@ -140,10 +140,10 @@ def test_loose_cloth_takes_the_weights_of_what_it_hangs_on(tmp_path, empty_scene
 def test_a_scan_without_parameters_is_named(tmp_path, empty_scene):
     path = write_scan(tmp_path / "anna.obj")
     path.with_suffix(".npz").rename(tmp_path / "other.txt")
-    with refused(ScanError, "SMPL", "anna.npz"):
+    with refused(FileError, "SMPL", "anna.npz"):
         load(path)
     path.with_suffix(".pkl").write_bytes(b"")
-    with refused(ScanError):
+    with refused(FileError):
         load(path)
     assert len(bpy.data.objects) == 0
 
@@ -163,7 +163,7 @@ def test_a_scan_without_parameters_is_named(tmp_path, empty_scene):
 )
 def test_parameters_that_are_none_are_named(tmp_path, empty_scene, changes, name):
     path = write_scan(tmp_path / "anna.obj", **changes)
-    with refused(ScanError, name):
+    with refused(FileError, name):
         load(path)
     assert len(bpy.data.objects) == 0
 
@@ -172,7 +172,7 @@ def test_parameters_that_are_none_are_named(tmp_path, empty_scene, changes, name
 def test_parameters_of_another_scan_are_named(tmp_path, empty_scene):
     lying = from_axis_angle(np.random.default_rng(9).normal(0, 1.2, (24, 3)))
     path = write_scan(tmp_path / "anna.obj", body_pose=to_axis_angle(lying)[1:].reshape(1, 69))
-    with refused(ScanError):
+    with refused(FileError):
         load(path)
 
 

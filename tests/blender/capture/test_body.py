@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
-from blender_primdiffusion.capture.body import BodyError, read_body
+from blender_primdiffusion.capture.body import read_body
 
 pytestmark = pytest.mark.any_blender
 
@@ -77,7 +78,7 @@ def test_betas_that_lack_are_zero_and_betas_too_many_are_rejected(body):
     few, _ = body.rest([1.0, -1.0])
     all_of_them, _ = body.rest([1.0, -1.0, *[0.0] * 30])
     np.testing.assert_array_equal(few, all_of_them)
-    with refused(BodyError, "11 betas"):
+    with refused(FileError, "11 betas"):
         body.rest(np.ones(11))
 
 
@@ -95,10 +96,10 @@ def test_betas_that_lack_are_zero_and_betas_too_many_are_rejected(body):
 def test_a_body_of_another_form_is_named(tmp_path, change, name):
     content = {key: value for key, value in (arrays() | change).items() if value is not None}
     np.savez(tmp_path / "body.npz", **content)
-    with refused(BodyError, name):
+    with refused(FileError, name):
         read_body(tmp_path / "body.npz")
 
 
 def test_a_missing_body_is_named(tmp_path):
-    with refused(BodyError):
+    with refused(FileError):
         read_body(tmp_path / "none.npz")

@@ -18,22 +18,17 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.camera_rig import Rig, look_at
-from blender_primdiffusion.formats.capture_layout import (
-    COMPLETE_FILE,
-    LIST_FILE,
-    RELEASED_REFERENCE,
-    CaptureFolderError,
-    picture_path,
-)
+from blender_primdiffusion.formats.capture_layout import COMPLETE_FILE, LIST_FILE, RELEASED_REFERENCE, picture_path
 from blender_primdiffusion.formats.capture_repair import repair, verify
 from blender_primdiffusion.formats.poses.motion import Motion
+from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.formats.whole_files import writer
 from capture_child import PEOPLE, small
 from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
 from support.errors import refused
 
 from blender_primdiffusion.capture import passes
-from blender_primdiffusion.capture.job import CaptureError, _name_reference, run
+from blender_primdiffusion.capture.job import _name_reference, run
 from blender_primdiffusion.capture.report import Report
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.stage import data_blocks
@@ -259,7 +254,7 @@ def test_the_released_codes_reference_is_written_on_request(empty_scene, tmp_pat
 @pytest.mark.parametrize("change", [{"seed": 5}, {"samples": 3}, {"light": "dome"}, {"passes": ("img",)}])
 def test_a_folder_with_other_captures_is_rejected(copy, empty_scene, change):
     before = files_of(copy)
-    with refused(CaptureFolderError):
+    with refused(FileError):
         capture(empty_scene, small(copy, **change))
     assert files_of(copy) == before
 
@@ -274,7 +269,7 @@ def test_other_poses_are_rejected_before_anything_is_overwritten(copy, empty_sce
 def test_poses_that_are_not_finite_are_rejected(empty_scene, tmp_path):
     rotations = POSES.rotations.copy()
     rotations[1, 3] = np.nan
-    with refused(CaptureError):
+    with refused(ValueError):
         capture(empty_scene, small(tmp_path / "a"), poses=Motion(rotations, POSES.translations, 1.0, "walk.npz"))
     assert not (tmp_path / "a").exists()
 

@@ -12,12 +12,13 @@ import scan_fixtures
 import synthetic
 from blender_primdiffusion.formats.camera_rig import bounding_sphere
 from blender_primdiffusion.formats.joints import JOINT_NAMES
-from blender_primdiffusion.formats.poses.rigs import RIGS, UnknownBonesError, map_bones
+from blender_primdiffusion.formats.poses.rigs import RIGS, map_bones
 from blender_primdiffusion.formats.poses.rotation import about_axis
+from blender_primdiffusion.formats.regular_files import FileError
 from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load, own_person
 from support.errors import refused
 
-from blender_primdiffusion.capture.scan import Scan, ScanError
+from blender_primdiffusion.capture.scan import Scan
 
 HANDS = np.isin(BODY.skin_weights.argmax(1), [JOINT_NAMES.index("left_hand"), JOINT_NAMES.index("right_hand")])
 
@@ -153,7 +154,7 @@ def test_unknown_bones_are_named(tmp_path, empty_scene):
     names = {name: f"Bone.{number:03d}" for number, name in enumerate(JOINT_NAMES)}
     scan_fixtures.person(BODY, BETAS, None, names)
     path = scan_fixtures.save(tmp_path / "anna.glb")
-    with refused(ScanError, "pelvis", "left_hip") as e:
+    with refused(FileError, "pelvis", "left_hip") as e:
         load(path)
     assert str(path) in str(e.value)
     assert len(bpy.data.objects) == 0
@@ -163,7 +164,7 @@ def test_a_size_that_no_unit_explains_is_named(tmp_path, empty_scene):
     _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     scan_fixtures.move([armature], np.diag([0.2, 0.2, 0.2, 1]))
     path = scan_fixtures.save(tmp_path / "anna.glb")
-    with refused(ScanError, "0.3"):
+    with refused(FileError, "0.3"):
         load(path)
 
 
@@ -171,7 +172,7 @@ def test_a_size_that_no_unit_explains_is_named(tmp_path, empty_scene):
 def test_two_people_in_a_file_are_named(tmp_path, empty_scene):
     for _ in range(2):
         scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
-    with refused(ScanError, "2 skeletons"):
+    with refused(FileError, "2 skeletons"):
         load(scan_fixtures.save(tmp_path / "two.glb"))
 
 
@@ -179,7 +180,7 @@ def test_two_people_in_a_file_are_named(tmp_path, empty_scene):
 def test_a_damaged_file_is_named_and_leaves_nothing(tmp_path, empty_scene, ending):
     path = tmp_path / f"bad{ending}"
     path.write_bytes(b"glTF\x02\x00\x00\x00 nonsense" * 20)
-    with refused(ScanError):
+    with refused(FileError):
         load(path)
     assert len(bpy.data.objects) == 0
 
@@ -187,7 +188,7 @@ def test_a_damaged_file_is_named_and_leaves_nothing(tmp_path, empty_scene, endin
 def test_a_skeleton_without_a_surface_is_named(tmp_path, empty_scene):
     mesh, _ = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     bpy.data.objects.remove(mesh)
-    with refused(ScanError):
+    with refused(FileError):
         load(scan_fixtures.save(tmp_path / "bones.fbx"))
 
 
@@ -204,22 +205,22 @@ def test_every_rigs_own_names_are_known_with_any_prefix(rig):
 
 
 def test_names_that_are_no_rigs_are_rejected():
-    with refused(UnknownBonesError, "pelvis"):
+    with refused(FileError, "pelvis"):
         map_bones(["a", "b"])
-    with refused(UnknownBonesError, "left_knee"):
+    with refused(FileError, "left_knee"):
         map_bones([name for name in JOINT_NAMES if name != "left_knee"])
 
 
 def test_a_lost_vertex_is_named(tmp_path, empty_scene):
     mesh, _ = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
     mesh.data.vertices[0].co.x = 1e6
-    with refused(ScanError):
+    with refused(FileError):
         load(scan_fixtures.save(tmp_path / "anna.glb"))
 
 
 def test_an_importers_failure_is_reported_by_its_exception_not_its_place(tmp_path, empty_scene):
     (tmp_path / "anna.glb").write_bytes(glb_of({"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [7]}]}))
-    with refused(ScanError):
+    with refused(FileError):
         load(tmp_path / "anna.glb")
 
 

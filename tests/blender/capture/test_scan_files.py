@@ -8,11 +8,12 @@ import bpy
 import numpy as np
 import pytest
 import scan_fixtures
+from blender_primdiffusion.formats.regular_files import FileError
 from loaded_scans import BETAS, BODY, load
 from support.errors import refused
 
 from blender_primdiffusion.capture.registration import unit_of
-from blender_primdiffusion.capture.scan import ScanError, find_scans
+from blender_primdiffusion.capture.scan import find_scans
 from blender_primdiffusion.capture.scan_files import own_betas
 from blender_primdiffusion.capture.surfaces import choose_picture
 
@@ -69,15 +70,15 @@ def test_the_released_parameters_and_a_lone_npz_are_found(tmp_path):
 
 
 def test_folders_and_files_without_scans_are_named(tmp_path):
-    with refused(ScanError):
+    with refused(FileError):
         find_scans(tmp_path / "none")
-    with refused(ScanError):
+    with refused(FileError):
         find_scans(tmp_path)
     touch(tmp_path / "people" / "person_000007" / "person.human.safetensors")
-    with refused(ScanError, ".glb"):
+    with refused(FileError, ".glb"):
         find_scans(tmp_path / "people")
     touch(tmp_path / "a.blend")
-    with refused(ScanError):
+    with refused(FileError):
         find_scans(tmp_path / "a.blend")
 
 
@@ -96,7 +97,7 @@ def test_people_are_between_half_a_metre_and_two_and_a_half(height, scale):
 
 @pytest.mark.parametrize("height", [0.0, 0.3, 3.5, 1e6, float("nan")])
 def test_other_heights_are_rejected(height):
-    with refused(ScanError):
+    with refused(FileError):
         unit_of(height, "x")
 
 

@@ -7,9 +7,10 @@ import pytest
 import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.files import read_motion
-from blender_primdiffusion.formats.poses.motion import Motion, MotionFileError
+from blender_primdiffusion.formats.poses.motion import Motion
 from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle, slerp, to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
+from blender_primdiffusion.formats.regular_files import FileError
 from bvh_files import motion_of, write_bvh
 from support.errors import refused
 
@@ -91,7 +92,7 @@ def test_a_given_up_axis_is_turned_up(tmp_path, axis):
 
 def test_an_axis_that_is_none_is_rejected(tmp_path):
     np.save(tmp_path / "p.npy", np.zeros(72))
-    with refused(MotionFileError, "w"):
+    with refused(FileError, "w"):
         read_motion(tmp_path / "p.npy", "w")
 
 
@@ -119,5 +120,5 @@ def test_bones_chosen_by_hand_are_as_good_as_known_names(tmp_path):
     np.testing.assert_allclose(to_axis_angle(b.rotations[:, body]), to_axis_angle(a.rotations[:, body]), atol=1e-6)
     assert b.detected.rig == "chosen by hand"
     assert b.detected.bones == own
-    with refused(MotionFileError, "tail", "SMPL"):
+    with refused(FileError, "tail", "SMPL"):
         read_motion(strange, bones={**own, "tail": "bone 1"})

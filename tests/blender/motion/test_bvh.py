@@ -11,9 +11,9 @@ import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.bvh import parse_bvh
 from blender_primdiffusion.formats.poses.files import read_motion
-from blender_primdiffusion.formats.poses.motion import MotionFileError
 from blender_primdiffusion.formats.poses.rotation import about_axis, to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joint_positions
+from blender_primdiffusion.formats.regular_files import FileError
 from bvh_files import FRAMES, motion_of, write_bvh
 
 from blender_primdiffusion.scene.armature import build_armature, keyframe_poses
@@ -129,7 +129,7 @@ def test_broken_files_are_named(tmp_path, change, message):
     rotations, moves = motion_of()
     path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, moves, scan_fixtures.MIXAMO)
     path.write_text(change(path.read_text()))
-    with pytest.raises(MotionFileError, match=message) as caught:
+    with pytest.raises(FileError, match=message) as caught:
         read_motion(path)
     assert str(path) in str(caught.value)
 

@@ -13,10 +13,11 @@ import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import from_axis_angle, to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import joint_positions
+from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.jobs.assets import clay_figure, picture_of_file
-from blender_primdiffusion.motion.own_poses import PoseFileError, delete_pose, load_pose, own_poses, save_pose
+from blender_primdiffusion.motion.own_poses import delete_pose, load_pose, own_poses, save_pose
 from blender_primdiffusion.motion.pose_library import (
     apply_pose,
     builtin_poses,
@@ -211,7 +212,7 @@ def test_a_damaged_pose_file_is_named(armature, tmp_path, content):
 
 def test_a_folder_that_cannot_be_written_is_reported(tmp_path):
     (tmp_path / "file").write_text("")
-    with refused(PoseFileError):
+    with refused(FileError):
         save_pose(tmp_path / "file", "a", np.zeros((24, 3)), np.zeros(3))
     path = save_pose(tmp_path / "poses", "a", np.ones((24, 3)), np.arange(3.0))
     np.testing.assert_array_equal(load_pose(path)[1], [0, 1, 2])

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..joints import JOINT_NAMES
-from ..regular_files import TooLargeError, read_regular
-from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion, MotionFileError
-from .rigs import BoneMap, UnknownBonesError, chosen_bones, map_bones, retarget
+from ..regular_files import FileError, TooLargeError, read_regular
+from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion
+from .rigs import BoneMap, chosen_bones, map_bones, retarget
 from .rotation import about_axis
 from .skeleton import REST_JOINTS
 
@@ -88,15 +88,15 @@ def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motio
     file's axes.
 
     See `rigs.retarget`. The root's path is scaled by the length of the legs, so feet slide little. Positions of joints
-    other than the root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises MotionFileError.
+    other than the root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises FileError.
     """
     hierarchy = parse_bvh(path)
     try:
         names = bone_names(hierarchy)
         bones = map_bones(names) if chosen is None else chosen_bones(names, chosen)
         return _retarget(hierarchy, bones, path)
-    except (UnknownBonesError, ValueError) as e:
-        raise MotionFileError(f"{path}: {e}") from e
+    except ValueError as e:
+        raise FileError(f"{path}: {e}") from e
 
 
 def bone_names(hierarchy: Hierarchy) -> list[str]:
@@ -105,29 +105,29 @@ def bone_names(hierarchy: Hierarchy) -> list[str]:
 
 
 def parse_bvh(path: Path) -> Hierarchy:
-    """Parse a BVH file. Raises MotionFileError where it is no BVH file or truncated."""
+    """Parse a BVH file. Raises FileError where it is no BVH file or truncated."""
     try:
         text = read_regular(path, LARGEST_BYTES).decode("utf-8", errors="replace")
     except TooLargeError as e:
-        raise MotionFileError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces") from e
+        raise FileError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces") from e
     head, found, tail = text.partition("MOTION")
     if not found or "HIERARCHY" not in head:
-        raise MotionFileError(f"{path} is not a BVH file: it has no HIERARCHY followed by MOTION")
+        raise FileError(f"{path} is not a BVH file: it has no HIERARCHY followed by MOTION")
     if len(head) > LONGEST_HIERARCHY:
-        raise MotionFileError(f"{path} has a HIERARCHY of more than {LONGEST_HIERARCHY} characters: export it again")
+        raise FileError(f"{path} has a HIERARCHY of more than {LONGEST_HIERARCHY} characters: export it again")
     try:
         names, parents, offsets, channels = _parse_hierarchy(head.split("HIERARCHY", 1)[1].split())
         values, frame_time = _parse_motion(tail, sum(map(len, channels)), len(names))
     except (ValueError, IndexError, KeyError, OverflowError) as e:
-        raise MotionFileError(f"{path} is not a complete BVH file ({e!s:.120}): export it again") from e
+        raise FileError(f"{path} is not a complete BVH file ({e!s:.120}): export it again") from e
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
-        raise MotionFileError(f"{path} holds NaN or infinite numbers: export the motion again")
+        raise FileError(f"{path} holds NaN or infinite numbers: export the motion again")
     if max(np.abs(values).max(initial=0), np.abs(offsets).max(initial=0)) > LARGEST_NUMBER:
-        raise MotionFileError(
+        raise FileError(
             f"{path} holds numbers above {LARGEST_NUMBER:g}, which are no angles or lengths: export it again"
         )
     if not names:
-        raise MotionFileError(f"{path} has no ROOT: export the motion again")
+        raise FileError(f"{path} has no ROOT: export the motion again")
     return Hierarchy(names, parents, offsets, channels, values, frame_time)
 
 

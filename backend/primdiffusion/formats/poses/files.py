@@ -10,26 +10,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import ArrayFileError, array_names, read_arrays, read_npy
+from ..arrays import array_names, read_arrays, read_npy
 from ..json_files import read_json
-from ..motion_size import MotionTooLongError, check_motion_size
-from ..regular_files import TooLargeError, read_regular
+from ..motion_size import check_motion_size
+from ..regular_files import FileError, TooLargeError, read_regular
 from ..rotations import first_improper, improper_text
 from ..smpl_pickle import as_array, load_restricted
 from . import mhr
 from .axes import axis_direction, axis_name, find_up, turn_y_up
 from .bvh import read_bvh
-from .motion import (
-    DEFAULT_FPS,
-    NO_RATE,
-    RATES,
-    Detected,
-    Motion,
-    MotionFileError,
-    check_numbers,
-    first_of,
-    stated_rate,
-)
+from .motion import DEFAULT_FPS, NO_RATE, RATES, Detected, Motion, check_numbers, first_of, stated_rate
 from .rotation import from_axis_angle, nearest
 
 LARGEST_PICKLE = 64 * 2**20
@@ -63,17 +53,17 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
     - .npz, .json and .pkl of SAM 3D Body: see `mhr`.
     - .bvh: any rig that `rigs` knows.
 
-    Without a frame rate it is `DEFAULT_FPS`, with a note. Raises MotionFileError where there is no such file, or it
+    Without a frame rate it is `DEFAULT_FPS`, with a note. Raises FileError where there is no such file, or it
     holds objects, NaN or other data.
     """
     path = Path(path)
     if not path.is_file():
-        raise MotionFileError(f"there is no pose file {path}: check the path")
+        raise FileError(f"there is no pose file {path}: check the path")
     if up not in UP_AXES:
-        raise MotionFileError(f"the axis {up!r} cannot be up: give one of {_listed(list(UP_AXES[1:]))}")
+        raise FileError(f"the axis {up!r} cannot be up: give one of {_listed(list(UP_AXES[1:]))}")
     suffix = path.suffix.lower()
     if suffix not in ENDINGS:
-        raise MotionFileError(f"{path} is no pose file: {', '.join(ENDINGS[:-1])} and {ENDINGS[-1]} files are")
+        raise FileError(f"{path} is no pose file: {', '.join(ENDINGS[:-1])} and {ENDINGS[-1]} files are")
     axes = np.eye(3)
     try:
         if suffix == ".bvh":
@@ -82,24 +72,21 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
             arrays = _READERS[suffix](path)
             motion = motion_from_arrays(arrays, path)
             detect_up = suffix == ".npz" and "trans" in arrays and ("poses" in arrays or "pose_body" in arrays)
-    except (ArrayFileError, TooLargeError) as e:
-        raise MotionFileError(str(e)) from e
+    except TooLargeError as e:
+        raise FileError(str(e)) from e
     except OSError as e:
-        raise MotionFileError(f"{path} cannot be read ({e.strerror or e}): check that it may be opened") from e
+        raise FileError(f"{path} cannot be read ({e.strerror or e}): check that it may be opened") from e
     if up:
         return _turned(motion, axis_name(axes @ axis_direction(up)), up)
     return _upright(motion, axes) if detect_up else motion
 
 
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
-    """The motion of arrays of a file, axes unchanged. Raises MotionFileError, and OSError where there is no such file.
+    """The motion of arrays of a file, axes unchanged. Raises FileError, and OSError where there is no such file.
 
     Their names are `POSE_KEYS` or `mhr.KEYS`.
     """
-    try:
-        check_motion_size(path, max((array.size for array in arrays.values()), default=0))
-    except MotionTooLongError as e:
-        raise MotionFileError(str(e)) from e
+    check_motion_size(path, max((array.size for array in arrays.values()), default=0))
     if mhr.ROTATIONS in arrays or (mhr.holds_some(arrays) and not _holds_smpl(arrays)):
         return mhr.motion_of(arrays, path)
     return motion_from_numbers(arrays, str(path))
@@ -108,11 +95,11 @@ def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
 def motion_from_numbers(content: Any, name: str) -> Motion:
     """The motion of arrays by their usual names, or of lists as in JSON, axes unchanged; errors call it `name`.
 
-    Raises MotionFileError where it holds no poses.
+    Raises FileError where it holds no poses.
     """
     arrays = _arrays(content, name)
     if not _holds_smpl(arrays):
-        raise MotionFileError(f"{name} holds no poses: it needs 'pose', or 'global_orient' and 'body_pose'")
+        raise FileError(f"{name} holds no poses: it needs 'pose', or 'global_orient' and 'body_pose'")
     check_numbers(arrays, name)
     rest, poses = first_of(arrays, _REST), first_of(arrays, _POSES)
     if rest is None:
@@ -128,13 +115,13 @@ def motion_from_numbers(content: Any, name: str) -> Motion:
                 root = root[:, None]  # a matrix a frame
             first = _matrices(root, name)[:, 0]
             if len(first) not in (1, len(rotations)):
-                raise MotionFileError(f"{name}: {len(first)} frames of global_orient but {len(rotations)} of body_pose")
+                raise FileError(f"{name}: {len(first)} frames of global_orient but {len(rotations)} of body_pose")
             rotations[:, 0] = first
     frames = len(rotations)
     translations = first_of(arrays, _TRANSLATIONS)
     translations = np.zeros((frames, 3)) if translations is None else np.asarray(translations, np.float64)
     if translations.size not in (3, 3 * frames):
-        raise MotionFileError(f"{name}: {frames} frames of poses but translations of shape {translations.shape}")
+        raise FileError(f"{name}: {frames} frames of poses but translations of shape {translations.shape}")
     translations = np.array(np.broadcast_to(translations.reshape(-1, 3), (frames, 3)))
     stated = stated_rate(arrays, name)
     detected = Detected(rig=_BODIES.get(joints, f"{joints} joints"), up="y", fps=stated)
@@ -151,10 +138,8 @@ def _read_npz(path: Path) -> dict[str, NDArray]:
     arrays = read_arrays(path, optional=_KEYS)
     if not (_holds_smpl(arrays) or mhr.holds_some(arrays)):
         if "smpl" in names:
-            raise MotionFileError(
-                f"{path} holds pickled objects, which are never read: use the version with plain arrays"
-            )
-        raise MotionFileError(
+            raise FileError(f"{path} holds pickled objects, which are never read: use the version with plain arrays")
+        raise FileError(
             f"{path} holds no poses: it holds {_listed(names)} and needs 'poses', or 'global_orient' and 'body_pose'"
         )
     return arrays
@@ -168,7 +153,7 @@ def _read_json(path: Path) -> dict[str, NDArray]:
     try:
         content = read_json(path)
     except (ValueError, OSError) as e:
-        raise MotionFileError(f"{path} is not JSON that can be read ({e!s:.120}): export it again") from e
+        raise FileError(f"{path} is not JSON that can be read ({e!s:.120}): export it again") from e
     return _arrays(_one_human(content, path), str(path))
 
 
@@ -179,21 +164,21 @@ def _read_pickle(path: Path) -> dict[str, NDArray]:
             raise ValueError(f"it contains a {type(content).__name__}")
         found = {key: content[key] for key in _KEYS if key in content}
         return {key: np.asarray(value) if key == mhr.NAMES else as_array(value) for key, value in found.items()}
-    except MotionFileError:
+    except FileError:
         raise
     except (ValueError, TypeError) as e:
-        raise MotionFileError(f"{path} is not a pickled dictionary of poses ({e!s:.160}): save it as .npz") from e
+        raise FileError(f"{path} is not a pickled dictionary of poses ({e!s:.160}): save it as .npz") from e
 
 
 _READERS = {".npz": _read_npz, ".npy": _read_npy, ".json": _read_json, ".pkl": _read_pickle}
 
 
 def _one_human(content: Any, path: Path) -> Any:
-    """SAM 3D Body's list of humans as its only one; other content as it is. Raises MotionFileError for several."""
+    """SAM 3D Body's list of humans as its only one; other content as it is. Raises FileError for several."""
     if not isinstance(content, list) or not content or not all(isinstance(human, dict) for human in content):
         return content
     if len(content) > 1:
-        raise MotionFileError(path, f"holds {len(content)} humans", "save one of them in a file of its own")
+        raise FileError(path, f"holds {len(content)} humans", "save one of them in a file of its own")
     return content[0]
 
 
@@ -204,7 +189,7 @@ def _arrays(content: Any, name: str) -> dict[str, NDArray]:
     try:
         return {key: np.asarray(content[key]) for key in _KEYS if key in content}
     except (ValueError, TypeError, OverflowError) as e:
-        raise MotionFileError(f"{name} holds something else than lists of numbers of equal length ({e!s:.80})") from e
+        raise FileError(f"{name} holds something else than lists of numbers of equal length ({e!s:.80})") from e
 
 
 def _upright(motion: Motion, axes: NDArray) -> Motion:
@@ -240,7 +225,7 @@ def _rotations(given: NDArray, name: str, joints_before: int = 0) -> NDArray[np.
     elif count == _BODY_JOINTS or count > 24:
         taken = _BODY_JOINTS
     else:
-        raise MotionFileError(
+        raise FileError(
             f"{name} holds poses of {count} joints (shape {given.shape}): needed are SMPL's 24, 22 without hands, or "
             "those of SMPL-H or SMPL-X"
         )
@@ -256,7 +241,7 @@ def _matrices(values: NDArray, name: str, joints_before: int = 0) -> NDArray[np.
         given = values if values.ndim == 4 else values[None]
         improper = first_improper(given)
         if improper is not None:
-            raise MotionFileError(
+            raise FileError(
                 f"{name} holds {improper_text(improper[0], improper[1] + joints_before)}; export the poses again"
             )
         return nearest(given)
@@ -265,7 +250,7 @@ def _matrices(values: NDArray, name: str, joints_before: int = 0) -> NDArray[np.
     if values.ndim == 2 and values.shape[1] == 3 and values.shape[0] in (_BODY_JOINTS, 23, 24, 52, 55):
         values = values.reshape(1, -1)  # one pose, a row a joint
     if values.ndim not in (2, 3) or values.shape[-1] % 3 or (values.ndim == 3 and values.shape[-1] != 3):
-        raise MotionFileError(
+        raise FileError(
             f"{name} holds poses of shape {values.shape}: needed are 72 axis-angle numbers a frame (24 joints x 3)"
         )
     return from_axis_angle(values.reshape(len(values), -1, 3))

@@ -20,8 +20,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..regular_files import FileError
 from ..rotations import first_improper, improper_text
-from .motion import DEFAULT_FPS, NO_RATE, RATES, Detected, Motion, MotionFileError, check_numbers, stated_rate
+from .motion import DEFAULT_FPS, NO_RATE, RATES, Detected, Motion, check_numbers, stated_rate
 from .rigs import map_bones, retarget
 from .rotation import from_axis_angle, nearest
 from .skeleton import REST_JOINTS
@@ -108,12 +109,12 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     """The motion of arrays with SAM 3D Body's names on SMPL's skeleton, y up.
 
     Body parts turn as MHR's do, from its rest pose (`rigs.retarget`). Lengths at rest are those of the file. Fingers,
-    face and the joints of the torso and the feet that SMPL lacks are left out. Raises MotionFileError, which names
+    face and the joints of the torso and the feet that SMPL lacks are left out. Raises FileError, which names
     `path`.
     """
     if ROTATIONS not in arrays or PLACES not in arrays:
         has = f"holds {', '.join(sorted(set(arrays) & set(KEYS)))} of MHR but not both {ROTATIONS} and {PLACES}"
-        raise MotionFileError(path, has, "save both as SAM 3D Body returns them")
+        raise FileError(path, has, "save both as SAM 3D Body returns them")
     names = _names(arrays.get(NAMES), path)
     numbers = {key: array for key, array in arrays.items() if key in (ROTATIONS, PLACES, CAMERA, *RATES)}
     check_numbers(numbers, str(path))
@@ -121,7 +122,7 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     places = _frames(arrays[PLACES], (len(names), 3), PLACES, path)
     camera = _frames(arrays.get(CAMERA, np.zeros(3)), (3,), CAMERA, path)
     if len(places) != len(turns) or len(camera) not in (1, len(turns)):
-        raise MotionFileError(
+        raise FileError(
             path,
             f"has {len(turns)} frames of {ROTATIONS}, {len(places)} of {PLACES} and {len(camera)} of {CAMERA}",
             "save as many of each",
@@ -131,7 +132,7 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     improper = first_improper(turns)
     if improper is not None:
         text = improper_text(improper[0], list(index)[improper[1]])
-        raise MotionFileError(path, f"holds {text}", "export the poses again")
+        raise FileError(path, f"holds {text}", "export the poses again")
     world = dict(zip(index, np.moveaxis(nearest(turns), 1, 0), strict=True))
     at = {name: places[:, number] * Y_UP for name, number in index.items()}
     bones = map_bones(REST)
@@ -139,7 +140,7 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     try:
         rotations, from_file = retarget(bones, _places_at_rest(world, at), turned)
     except ValueError as e:
-        raise MotionFileError(path, f"has joints of no human ({e})", "save the poses again") from e
+        raise FileError(path, f"has joints of no human ({e})", "save the poses again") from e
     pelvis = (at["root"] + camera * Y_UP) @ from_file.T
     stated = stated_rate(arrays, str(path))
     notes = (NO_RATE,) if not stated and len(turns) > 1 else ()
@@ -152,13 +153,11 @@ def _names(given: NDArray | None, path: Path) -> list[str]:
     if given is None:
         return list(JOINTS)
     if given.ndim != 1 or given.dtype.kind != "U":
-        raise MotionFileError(path, f"has {NAMES} of {given.dtype} {given.shape}", "give a list of names, one a joint")
+        raise FileError(path, f"has {NAMES} of {given.dtype} {given.shape}", "give a list of names, one a joint")
     names = [str(name) for name in given]
     missing = [name for name in REST if names.count(name) != 1]
     if missing:
-        raise MotionFileError(
-            path, f"lacks the joint {missing[0]!r} of MHR, or names it twice", "save all of its joints"
-        )
+        raise FileError(path, f"lacks the joint {missing[0]!r} of MHR, or names it twice", "save all of its joints")
     return names
 
 
@@ -167,7 +166,7 @@ def _frames(values: NDArray, shape: tuple[int, ...], key: str, path: Path) -> ND
     values = values if values.ndim > len(shape) else values[None]
     if values.shape[1:] != shape:
         wanted = f"{key} of shape {values.shape} instead of [F, {', '.join(map(str, shape))}]"
-        raise MotionFileError(path, f"has {wanted}", f"save MHR's {len(JOINTS)} joints, or their {NAMES} too")
+        raise FileError(path, f"has {wanted}", f"save MHR's {len(JOINTS)} joints, or their {NAMES} too")
     return np.asarray(values, np.float64)
 
 

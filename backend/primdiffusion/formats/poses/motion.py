@@ -43,10 +43,6 @@ RATES = ("mocap_framerate", "mocap_frame_rate", "fps", "framerate")
 """Names of a frame rate in files."""
 
 
-class MotionFileError(FileError):
-    """A file of poses cannot be used; the message says what is wrong and what to do."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Motion:
     """Poses of SMPL's skeleton; y up, facing +z where the pelvis' rotation is the identity."""
@@ -94,25 +90,25 @@ def first_of(arrays: Mapping[str, NDArray], keys: Iterable[str]) -> NDArray | No
 
 
 def check_numbers(arrays: Mapping[str, NDArray], name: str) -> None:
-    """Raise MotionFileError, which calls the file `name`, for arrays that are not the numbers of a motion."""
+    """Raise FileError, which calls the file `name`, for arrays that are not the numbers of a motion."""
     for key, array in arrays.items():
         if array.dtype.kind not in "iuf":
-            raise MotionFileError(f"{name}: {key!r} holds {array.dtype} instead of numbers")
+            raise FileError(f"{name}: {key!r} holds {array.dtype} instead of numbers")
         if array.size == 0:
-            raise MotionFileError(f"{name}: {key!r} holds no frame; export the motion again")
+            raise FileError(f"{name}: {key!r} holds no frame; export the motion again")
         if not np.isfinite(array).all():
-            raise MotionFileError(f"{name}: {key!r} holds NaN or infinite numbers; export the motion again")
+            raise FileError(f"{name}: {key!r} holds NaN or infinite numbers; export the motion again")
         if array.size > MOST_NUMBERS or np.abs(array.astype(np.float64)).max() > LARGEST_NUMBER:
-            raise MotionFileError(
+            raise FileError(
                 f"{name}: {key!r} holds more than {MOST_NUMBERS} numbers, or one above {LARGEST_NUMBER:g}; cut the "
                 "motion into pieces, or export it again"
             )
 
 
 def stated_rate(arrays: Mapping[str, NDArray], name: str) -> float:
-    """The frame rate in arrays of a file called `name`; 0 where they state none. Raises MotionFileError."""
+    """The frame rate in arrays of a file called `name`; 0 where they state none. Raises FileError."""
     rate = first_of(arrays, RATES)
     stated = float(rate.ravel()[0]) if rate is not None and rate.size == 1 and float(rate.ravel()[0]) > 0 else 0.0
     if stated and not SMALLEST_FPS <= stated <= LARGEST_FPS:
-        raise MotionFileError(f"{name} states {stated:g} frames per second; export the motion again")
+        raise FileError(f"{name} states {stated:g} frames per second; export the motion again")
     return stated

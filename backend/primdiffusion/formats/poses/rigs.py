@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..joints import JOINT_NAMES, PARENTS
+from ..regular_files import FileError
 from .rotation import about_axis, between
 from .skeleton import REST_JOINTS, unchain
 
@@ -96,10 +97,6 @@ _LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist",
 _SHORTEST = 1e-6
 
 
-class UnknownBonesError(ValueError):
-    """Bone names that match no known rig; the message names the missing joints."""
-
-
 @dataclasses.dataclass(frozen=True)
 class BoneMap:
     """Which bone of a rig is which joint."""
@@ -115,7 +112,7 @@ class BoneMap:
 def map_bones(names: Iterable[str]) -> BoneMap:
     """The bones as the rig whose names fit best, with any prefix that they share.
 
-    Raises UnknownBonesError where no rig matches; it names the missing joints and some of the bones.
+    Raises FileError where no rig matches; it names the missing joints and some of the bones.
     """
     bones = list(names)
     plain = {}
@@ -125,7 +122,7 @@ def map_bones(names: Iterable[str]) -> BoneMap:
     best = max(found, key=lambda m: (len(m.joints), len(m.tips)), default=BoneMap("SMPL", {}, {}))
     missing = _missing_joints(best.joints)
     if missing:
-        raise UnknownBonesError(
+        raise FileError(
             f"no bone is known to be {_listed(missing):.60} (nearest rig: {best.rig}); the bones are "
             f"{_listed(bones):.80}: "
             "name them as in SMPL, Mixamo, Unreal, Rigify or RenderPeople"
@@ -136,22 +133,22 @@ def map_bones(names: Iterable[str]) -> BoneMap:
 def chosen_bones(names: Iterable[str], joints: Mapping[str, str]) -> BoneMap:
     """A bone map chosen by the user, SMPL's joint -> bone; empty bones count as not chosen.
 
-    Raises UnknownBonesError for a joint that SMPL does not have, a bone that is not among `names`, and a joint of
+    Raises FileError for a joint that SMPL does not have, a bone that is not among `names`, and a joint of
     `NEEDED` without a bone.
     """
     bones = list(names)
     chosen = {joint: bone for joint, bone in joints.items() if bone}
     for joint, bone in chosen.items():
         if joint not in JOINT_NAMES:
-            raise UnknownBonesError(f"the bone map names {joint!r}, which is no joint of SMPL: correct or remove it")
+            raise FileError(f"the bone map names {joint!r}, which is no joint of SMPL: correct or remove it")
         if bone not in bones:
-            raise UnknownBonesError(
+            raise FileError(
                 f"the bone map has {bone!r} for {joint}, which is not in the file; its bones are "
                 f"{_listed(bones)}: choose one of them"
             )
     missing = _missing_joints(chosen)
     if missing:
-        raise UnknownBonesError(f"the bone map has no bone for {_listed(missing)}: choose one for each")
+        raise FileError(f"the bone map has no bone for {_listed(missing)}: choose one for each")
     return BoneMap(MANUAL, chosen, {})
 
 
