@@ -6,8 +6,8 @@ import sys
 import pytest
 import torch
 from primdiffusion import cli
+from primdiffusion.commands.export_onnx import export_denoiser
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.export.denoiser_onnx import export_denoiser
 from primdiffusion.failures import MissingPackageError, describe
 from support.errors import refused
 from tiny_model import save_tiny_checkpoint, tiny_model
