@@ -20,8 +20,8 @@ from ..formats import compact_human
 from ..formats.arrays import all_finite, check_shapes
 from ..formats.human_metadata import version_fault
 from ..formats.json_files import parse_json
+from ..formats.poses.rotation import first_improper, improper_text
 from ..formats.regular_files import as_file_error, read_regular
-from ..formats.rotations import first_improper, improper_text
 from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, check_limits, read_layout
 from ..formats.whole_files import written_whole
 from .human import BETA_COUNT, LARGEST_PERSON

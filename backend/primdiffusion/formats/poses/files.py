@@ -14,12 +14,20 @@ from ..arrays import array_names, read_arrays, read_npy
 from ..json_files import read_json
 from ..motion_size import check_motion_size
 from ..regular_files import FileError, TooLargeError, read_regular
-from ..rotations import first_improper, improper_text
 from ..smpl_pickle import as_array, load_restricted
 from . import mhr
 from .bvh import read_bvh
 from .motion import DEFAULT_FPS, NO_RATE, RATES, Detected, Motion, check_numbers, first_of, stated_rate
-from .rotation import axis_direction, axis_name, find_up, from_axis_angle, nearest, turn_y_up
+from .rotation import (
+    axis_direction,
+    axis_name,
+    find_up,
+    first_improper,
+    from_axis_angle,
+    improper_text,
+    nearest,
+    turn_y_up,
+)
 
 LARGEST_PICKLE = 64 * 2**20
 """Bytes of a .pkl."""

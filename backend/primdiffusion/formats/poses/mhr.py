@@ -21,10 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..regular_files import FileError
-from ..rotations import first_improper, improper_text
 from .motion import DEFAULT_FPS, NO_RATE, RATES, Detected, Motion, check_numbers, stated_rate
 from .rigs import map_bones, retarget
-from .rotation import from_axis_angle, nearest
+from .rotation import first_improper, from_axis_angle, improper_text, nearest
 from .skeleton import REST_JOINTS
 
 ROTATIONS, PLACES, CAMERA, NAMES = "pred_global_rots", "pred_joint_coords", "pred_cam_t", "joint_names"

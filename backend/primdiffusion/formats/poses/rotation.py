@@ -1,5 +1,6 @@
-"""Rotation matrices from and to other representations, any batch shape, radians, column vectors; and the axis that
-points up in a file of poses.
+"""Rotation matrices, column vectors: from and to other representations, checks of those in files, a motion's up axis.
+
+Conversions take any batch shape, and radians.
 """
 
 from __future__ import annotations
@@ -7,8 +8,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ..joints import JOINT_NAMES
 from .skeleton import REST_JOINTS
 
+TOLERANCE = 1e-3
+"""Largest difference of a scalar product of two columns from that of a rotation."""
+_COMMON_JOINTS = 22
+"""Joints that have the same names in SMPL, SMPL-H and SMPL-X."""
 _CLEARLY_UP = 0.6
 """Least mean cosine between the pelvis' up direction and an axis for that axis to count as up."""
 _BLOCK = 100_000
@@ -159,3 +165,29 @@ def turn_y_up(rotations: NDArray, translations: NDArray, up: str) -> tuple[NDArr
     rotations[:, 0] = turn @ rotations[:, 0]
     pelvis = REST_JOINTS[0]
     return rotations, (np.asarray(translations) + pelvis) @ turn.T - pelvis
+
+
+def first_improper(matrices: NDArray) -> tuple[int, int] | None:
+    """Return frame and joint of the first of the matrices [F, n, 3, 3] that is not a rotation; None if all are.
+
+    The columns of a rotation are orthonormal within `TOLERANCE`, and its determinant is positive, and so about 1.
+    """
+    given = np.asarray(matrices, np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):
+        gram = np.swapaxes(given, -1, -2) @ given
+        orthonormal = (np.abs(gram - np.eye(3)) <= TOLERANCE).all((-1, -2))
+        volume = (np.cross(given[..., 0], given[..., 1]) * given[..., 2]).sum(-1)
+        proper = orthonormal & (volume > 0)
+    if proper.all():
+        return None
+    frame, joint = np.argwhere(~proper)[0]
+    return int(frame), int(joint)
+
+
+def improper_text(frame: int | str, joint: int | str) -> str:
+    """Describe a matrix that is not a rotation, as a part of a sentence."""
+    name = JOINT_NAMES[joint] if isinstance(joint, int) and joint < _COMMON_JOINTS else joint
+    return (
+        f"a matrix for joint {name} in frame {frame} that is not a rotation: orthonormal within {TOLERANCE:g}, "
+        "determinant 1"
+    )
