@@ -28,7 +28,7 @@ from blender_primdiffusion.scene.human import (
     volume_path,
 )
 
-pytestmark = pytest.mark.usefixtures("volumes_shown")
+pytestmark = [pytest.mark.any_blender, pytest.mark.usefixtures("volumes_shown")]
 
 FINE = 8
 """Seeds that the fake child takes as orders, and one that it does not."""

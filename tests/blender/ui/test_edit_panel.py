@@ -27,6 +27,7 @@ FINE = 8
 COUNT = 8
 """Primitives of the synthetic people."""
 ops = bpy.ops.primdiffusion
+pytestmark = pytest.mark.any_blender
 
 
 @pytest.fixture
