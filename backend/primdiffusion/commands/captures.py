@@ -30,6 +30,7 @@ from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
+from primdiffusion.formats.schema import Range, check
 from primdiffusion.pose_file import read_motion
 from primdiffusion.training.captured_people import read_cards
 
@@ -70,7 +71,7 @@ class RenderCaptures:
     """Seed of the choice of poses."""
     workers: int = 1
     """Number of processes; each uses a core and about 1 GB."""
-    together: int = 1
+    together: Annotated[int, Range(1, MOST)] = 1
     """Number of humans, 1 to 8, that stand together on a floor, in front of the same cameras; `coco` makes one image of
     them."""
     shard: str = "0/1"
@@ -84,6 +85,7 @@ class RenderCaptures:
         Raises:
             ValueError: settings are invalid, or a human could not be rendered (see the report).
         """
+        check(self)
         index, count = parse_shard(self.shard)
         people = find_subjects(self.people)
         passes = self._passes(people)
@@ -92,8 +94,6 @@ class RenderCaptures:
         names = sorted(people)[index::count]
         if self.pose_count == 0 and len(self.poses) != 1:
             raise ValueError("pose_count 0 takes all frames of one motion file: give one with --poses")
-        if not 1 <= self.together <= MOST:
-            raise ValueError(f"together is {self.together}: give 1 to {MOST}")
         if self.released_reference and self.together > 1:
             raise ValueError("the released code expects its reference alone: leave out --together")
         poses, unread = self._poses()

@@ -57,7 +57,7 @@ class EvaluateReconstruction:
     views: int = 8
     """Number of cameras given to the encoder, spread around the human."""
     frame: int = 0
-    """The pose in which."""
+    """Index of the pose that these views show."""
     size: int = 512
     """Pixels a side of the pictures that are compared."""
     lpips: tuple[Path, ...] = ()
