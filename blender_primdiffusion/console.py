@@ -1,12 +1,19 @@
-"""Command lines within Blender: a separate stdout, durations as text, Ctrl-C between pieces of work."""
+"""Command lines within Blender: options of records, a separate stdout, durations as text, Ctrl-C between jobs."""
 
 from __future__ import annotations
 
+import argparse
 import contextlib
+import dataclasses
 import os
 import signal
 import sys
+import typing
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Literal, NoReturn
+
+from .formats.schema import descriptions, field_types, split
 
 DONE, FAILED, UNUSABLE, NO_BACKEND, CANCELLED = 0, 1, 2, 3, 130
 """Exit codes: all done; some failed, and the report lists them; usage error; no Python runs the backend; stopped."""
@@ -14,6 +21,29 @@ DONE, FAILED, UNUSABLE, NO_BACKEND, CANCELLED = 0, 1, 2, 3, 130
 
 class UsageError(ValueError):
     """Options that a command does not accept."""
+
+
+class CommandParser(argparse.ArgumentParser):
+    """A parser of command lines that raises UsageError, with options for fields of records."""
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(message)
+
+    def add_declared(self, record: type, field: str, option: str = "", **changes: Any) -> None:
+        """An option for a field: a flag, a choice, a file or a number, with its default and description."""
+        kind, _ = split(field_types(record)[field])
+        default = next(each.default for each in dataclasses.fields(record) if each.name == field)
+        settings: dict[str, Any] = {"help": descriptions(record)[field].rstrip(".").replace("%", "%%")}
+        if kind is bool:
+            settings["action"] = "store_true"
+        elif default is None:
+            settings["type"] = Path
+        else:
+            choices = typing.get_args(kind) if typing.get_origin(kind) is Literal else None
+            settings |= {"type": type(default), "choices": choices, "default": default}
+            words = default if isinstance(default, tuple) else (default,)
+            settings["help"] += f" (default {' '.join(map(str, words))})"
+        self.add_argument(option or f"--{field.replace('_', '-')}", dest=field, **settings | changes)
 
 
 def duration(seconds: float) -> str:

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator, Sequence
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import NoReturn, get_args
+from typing import Any
 
 import numpy as np
 
-from ..console import UsageError
+from ..console import CommandParser
 from ..formats.arrays import all_finite
-from ..formats.camera_rig import Arrangement, Rig, View
+from ..formats.camera_rig import Rig, View
 from ..formats.json_files import read_json
 from ..formats.poses.files import ENDINGS
 from ..formats.regular_files import as_file_error
-from ..formats.requests import LAYOUTS, PASSES, check_seed
-from .settings import Background, CaptureSettings, Device, Light
+from ..formats.requests import LAYOUTS, PASSES
+from .settings import CaptureSettings
 
 MARK = "PRIMDIFFUSION "
 """Begins each line of --progress json; an object follows: {"line": ...}, or the fields of `job.Progress`."""
@@ -24,46 +25,39 @@ ASK_FROM = 100
 """Views, before which a user at a terminal is asked."""
 
 
-def parser() -> argparse.ArgumentParser:
+def parser() -> CommandParser:
     """All options of the command, with their defaults."""
     rig = Rig()
-    made = argparse.ArgumentParser(
-        prog="capture", description="Render people from all sides in Cycles, into a dataset."
-    )
-    made.error = _raise_usage_error
-    add = made.add_argument
+    made = CommandParser(prog="capture", description="Render people from all sides in Cycles, into a dataset.")
+    add, declared = made.add_argument, made.add_declared
     add("--people", type=Path, nargs="+", default=[], help="folders of scans, or of what `primdiffusion people` made")
     add("--out", type=Path, required=True, help="the dataset's folder; an unfinished one is resumed")
-    add("--seed", type=_seed, default=0, help="of the choice of poses and of the noise (default %(default)s)")
+    declared(CaptureSettings, "seed")
     add("--only", nargs="+", default=[], metavar="SUBJECT", help="only these subjects")
     add("--shard", type=_shard, default=(0, 1), metavar="I/N", help="the people I, I + N, ... of the sorted list")
-    add("--together", type=int, default=1, metavar="N", help="stand N people together on a floor, at most 8")
-    add("--shadows", action="store_true", help="those of --together shade each other under a dome or HDRI light")
-    add("--body", type=Path, help="an SMPL body as .npz of plain arrays instead of the default one")
+    declared(CaptureSettings, "together", metavar="N")
+    declared(CaptureSettings, "shadows")
+    declared(CaptureSettings, "body")
     add("--pose-files", type=Path, nargs="+", default=[], help="poses: .npz, .npy, .json, .pkl, .bvh, or folders")
-    add("--poses", type=int, default=20, help="how many; the first is near-T (default %(default)s)")
-    add("--cameras", type=int, default=rig.count, help="how many (default %(default)s)")
-    add("--arrangement", choices=get_args(Arrangement), default=rig.arrangement)
-    add("--elevations", type=float, nargs="+", default=rig.elevations, help="of rings, degrees above the horizon")
-    add("--fov", type=float, default=rig.vertical_fov, help="vertical, degrees (default %(default)s)")
+    declared(CaptureSettings, "pose_count", "--poses")
+    declared(Rig, "count", "--cameras")
+    declared(Rig, "arrangement")
+    declared(Rig, "elevations", type=float, nargs="+")
+    declared(Rig, "vertical_fov", "--fov")
     add("--size", type=int, nargs=2, default=(rig.width, rig.height), metavar=("WIDTH", "HEIGHT"))
-    add("--margin", type=float, default=rig.margin, help="room around people (default %(default)s)")
+    declared(Rig, "margin")
     add("--camera-file", type=Path, help='fixed cameras: {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}')
-    add("--passes", nargs="+", default=PASSES, choices=PASSES)
-    add("--float-depth", action="store_true", help="also depth as OpenEXR, float32")
-    add("--light", choices=get_args(Light), default="uniform")
-    add("--hdri", type=Path, help="the picture of --light hdri, or a folder of them, one for each view")
-    add("--background", choices=get_args(Background), default="black", help="hdri: one more pass, over the HDRI")
-    add("--samples", type=int, default=16, help="of a pixel (default %(default)s)")
-    add("--denoise", action="store_true", help="of img under a dome or HDRI light")
-    add("--device", choices=get_args(Device), default="auto")
-    add("--threads", type=int, default=0, help="of Cycles on the CPU; 0: all")
-    add("--layouts", nargs="*", default=LAYOUTS, choices=LAYOUTS, help="camera files of other projects")
-    add(
-        "--released-reference",
-        action="store_true",
-        help="the first subject also under the name the released code needs",
-    )
+    declared(CaptureSettings, "passes", type=str, nargs="+", choices=PASSES)
+    declared(CaptureSettings, "float_depth")
+    declared(CaptureSettings, "light")
+    declared(CaptureSettings, "hdri")
+    declared(CaptureSettings, "background")
+    declared(CaptureSettings, "samples")
+    declared(CaptureSettings, "denoise")
+    declared(CaptureSettings, "device")
+    declared(CaptureSettings, "threads")
+    declared(CaptureSettings, "layouts", type=str, nargs="*", choices=LAYOUTS)
+    declared(CaptureSettings, "released_reference")
     add("--list", action="store_true", help="list the subjects of the shard, render nothing")
     add("--yes", action="store_true", help=f"do not ask before {ASK_FROM} views or more; only a terminal is asked")
     add("--verify", action="store_true", help="check the dataset, render nothing")
@@ -81,38 +75,19 @@ def parse(argv: Sequence[str]) -> argparse.Namespace:
 def settings_of(options: argparse.Namespace) -> CaptureSettings:
     """The settings that options ask for. Raises ValueError and OSError for impossible ones."""
     width, height = options.size
-    rig = Rig(
-        arrangement=options.arrangement,
-        count=options.cameras,
-        elevations=tuple(options.elevations),
-        vertical_fov=options.fov,
-        width=width,
-        height=height,
-        margin=options.margin,
-    )
-    return CaptureSettings(
-        out=options.out,
-        seed=options.seed,
-        rig=rig,
-        cameras=read_cameras(options.camera_file, width, height) if options.camera_file else (),
-        pose_files=tuple(_files_of_poses(options.pose_files)),
-        pose_count=options.poses,
-        passes=tuple(kind for kind in PASSES if kind in options.passes),
-        float_depth=options.float_depth,
-        light=options.light,
-        hdri=options.hdri,
-        background=options.background,
-        samples=options.samples,
-        denoise=options.denoise,
-        device=options.device,
-        threads=options.threads,
-        shard=options.shard,
-        together=options.together,
-        shadows=options.shadows,
-        layouts=tuple(options.layouts),
-        released_reference=options.released_reference,
-        body=options.body,
-    )
+    given = vars(options) | {
+        "rig": Rig(**_fields(Rig, vars(options) | {"width": width, "height": height})),
+        "cameras": read_cameras(options.camera_file, width, height) if options.camera_file else (),
+        "pose_files": tuple(_files_of_poses(options.pose_files)),
+        "passes": tuple(kind for kind in PASSES if kind in options.passes),
+    }
+    return CaptureSettings(**_fields(CaptureSettings, given))
+
+
+def _fields(record: type, given: Mapping[str, Any]) -> dict[str, Any]:
+    """What is given for the fields of a record; lists, of options with several words, as tuples."""
+    found = {field.name: given[field.name] for field in dataclasses.fields(record)}
+    return {name: tuple(value) if isinstance(value, list) else value for name, value in found.items()}
 
 
 def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
@@ -141,18 +116,6 @@ def _files_of_poses(paths: Sequence[Path]) -> Iterator[Path]:
         if not found:
             raise ValueError(f"{path} holds no pose files: {', '.join(ENDINGS)}")
         yield from found
-
-
-def _raise_usage_error(message: str) -> NoReturn:
-    raise UsageError(message)
-
-
-def _seed(text: str) -> int:
-    try:
-        check_seed(seed := int(text))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(str(error)) from error
-    return seed
 
 
 def _shard(text: str) -> tuple[int, int]:

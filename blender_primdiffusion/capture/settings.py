@@ -6,14 +6,15 @@ import dataclasses
 import hashlib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Annotated, Any, Literal
 
 from ..formats.camera_rig import Rig, View
 from ..formats.capture_layout import ENDINGS
 from ..formats.group_places import MOST
 from ..formats.joints import JOINT_NAMES
 from ..formats.picture_files import DEPTH_UNIT
-from ..formats.requests import FLOAT_DEPTH, LAYOUTS, PASSES
+from ..formats.requests import FLOAT_DEPTH, LAYOUTS, PASSES, Count, Seed
+from ..formats.schema import Range, Slider, check
 
 Light = Literal["uniform", "dome", "hdri"]
 Background = Literal["black", "transparent", "hdri"]
@@ -27,60 +28,59 @@ class CaptureSettings:
 
     out: Path
     """The dataset's folder."""
-    seed: int = 0
-    """Seed of the choice of poses, and of the noise of every view (`capture_layout.view_seed`)."""
+    seed: Seed = 0
+    """Seed of the choice of poses, and of the noise of every view."""
     rig: Rig = dataclasses.field(default_factory=Rig)
     """Cameras around each subject; its picture size applies to `cameras` too."""
     cameras: tuple[View, ...] = ()
     """Fixed cameras for all subjects, instead of the rig's."""
     pose_files: tuple[Path, ...] = ()
     """Motion and pose files; empty for the built-in poses."""
-    pose_count: int = 20
+    pose_count: Annotated[int, Range(1, 10_000), Slider(1, 100)] = 20
+    """Number of poses; the first is near the T pose."""
     passes: tuple[str, ...] = PASSES
+    """Kinds of pictures to write."""
     float_depth: bool = False
-    """Adds the pass "depth_float": OpenEXR."""
+    """Also write depth as OpenEXR, float32."""
     light: Light = "uniform"
     """uniform: every surface shows its own colour; dome: a white sky; hdri: the picture `hdri`."""
     hdri: Path | None = None
-    """A picture, or a folder of which the seed of every view chooses one."""
+    """Environment picture, .exr or .hdr, or a folder of them, of which the seed of every view chooses one."""
     background: Background = "black"
     """transparent adds the pass "rgba", with straight alpha, hdri the pass "hdri", over the environment of the HDRI
     light; img stays over black."""
-    samples: int = 16
-    """Per pixel."""
+    samples: Annotated[Count, Slider(1, 1024)] = 16
+    """Samples of each pixel."""
     denoise: bool = False
-    """Denoise img under a dome or HDRI light; other passes never are."""
+    """Denoise colours under a dome or HDRI light; never masks, depth, normals or parts."""
     device: Device = "auto"
-    threads: int = 0
+    """Device on which Cycles renders."""
+    threads: Annotated[int, Range(0, 1024)] = 0
     """Threads of Cycles on the CPU; 0 for all cores."""
     shard: tuple[int, int] = (0, 1)
     """(i, n): the subjects i, i + n, i + 2 n, ... of the sorted list."""
-    together: int = 1
-    """Subjects that stand together on a floor, in front of the same cameras; each is rendered alone."""
+    together: Annotated[int, Range(1, MOST)] = 1
+    """Number of people who stand together on a floor, in front of the same cameras; each is rendered alone."""
     shadows: bool = False
-    """Whether subjects who stand together shade each other; the pictures differ in their colours alone."""
+    """People who stand together shade each other under a dome or HDRI light; the pictures differ in colours alone."""
     layouts: tuple[str, ...] = LAYOUTS
+    """Other projects whose camera files are written too."""
     released_reference: bool = False
-    """Whether the first subject is also stored under the name that the released code expects."""
+    """Also store the first subject under the name that the released code expects."""
     body: Path | None = None
-    """The user's SMPL body, an .npz; None for the default body."""
+    """Your SMPL body as .npz of plain arrays; the default body if omitted."""
 
     def __post_init__(self) -> None:
+        check(self)
         index, count = self.shard
         wrong = {
             f"pass {next((kind for kind in self.passes if kind not in PASSES), 'none')}: choose of {', '.join(PASSES)}":
                 not self.passes or not set(self.passes) <= set(PASSES),
             f"layouts {self.layouts}: choose of {', '.join(LAYOUTS)}": not set(self.layouts) <= set(LAYOUTS),
-            f"light {self.light}: choose of {', '.join(get_args(Light))}": self.light not in get_args(Light),
             "the HDRI light needs a picture: name its file": self.light == "hdri" and self.hdri is None,
             "the background hdri needs the light hdri": self.background == "hdri" and self.light != "hdri",
             f"{self.hdri} holds no HDRI: choose a folder with .hdr or .exr pictures":
                 self.light == "hdri" and self.hdri is not None and not self.hdris,
-            f"background {self.background}: choose of {', '.join(get_args(Background))}":
-                self.background not in get_args(Background),
-            f"{self.samples} samples: one or more": self.samples < 1,
-            f"{self.pose_count} poses: 1 to 10000": not 1 <= self.pose_count <= 10000,
-            f"{self.together} together: 1 to {MOST}": not 1 <= self.together <= MOST,
             "the released code expects its reference alone: render it without together":
                 self.together > 1 and self.released_reference,
             "people who stand together are rendered alone: put pictures behind them with captures coco --backgrounds":
@@ -88,8 +88,6 @@ class CaptureSettings:
             "shadows between people need --together 2 or more, and the light dome or hdri":
                 self.shadows and (self.together < 2 or self.light == "uniform"),
             f"shard {index}/{count}: 0/{count} to {count - 1}/{count}": not 0 <= index < count,
-            f"{self.threads} threads: 0 (all) to 1024": not 0 <= self.threads <= 1024,
-            f"device {self.device}: choose of {', '.join(get_args(Device))}": self.device not in get_args(Device),
         }  # fmt: skip
         for sentence, is_so in wrong.items():
             if is_so:

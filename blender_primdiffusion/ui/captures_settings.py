@@ -9,9 +9,11 @@ from pathlib import Path
 import bpy
 
 from ..capture.blender_camera import view_of
+from ..capture.settings import CaptureSettings
 from ..formats.camera_rig import Rig
 from ..formats.requests import LAYOUTS, PASSES
 from ..scene.blend_values import setting_path
+from .declared import declared
 
 _PASS_NAMES = {
     "img": ("Colour", "What the camera sees, over black"),
@@ -34,7 +36,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     out: bpy.props.StringProperty(
         name="Captures", description="Folder of the dataset; an unfinished one is resumed", subtype="DIR_PATH"
     )
-    seed: bpy.props.IntProperty(name="Seed", description="Seed of the choice of poses and of the render noise", min=0)
+    seed: declared(CaptureSettings, "seed")
     body: bpy.props.StringProperty(
         name="Body", description="Your SMPL body as .npz of plain arrays; empty: the default body", subtype="FILE_PATH"
     )
@@ -43,19 +45,14 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         name="of", description="Number of parts the people are divided into", min=1, default=1
     )
 
-    together: bpy.props.IntProperty(
-        name="Together", description="People who stand together on a floor, in front of the same cameras",
-        default=1, min=1, max=8,
-    )  # fmt: skip
+    together: declared(CaptureSettings, "together")
 
     poses: bpy.props.StringProperty(
         name="Poses",
         description="A file or folder of AMASS or pose .npz, .npy, .json, .pkl or .bvh; empty: built-in poses",
         subtype="FILE_PATH",
     )
-    pose_count: bpy.props.IntProperty(
-        name="Count", description="The first is near the T-pose", default=20, min=1, max=10000, soft_max=100
-    )
+    pose_count: declared(CaptureSettings, "pose_count", name="Count")
 
     arrangement: bpy.props.EnumProperty(
         name="Arrangement",
@@ -67,9 +64,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
             ("custom", "Cameras of the Scene", "The cameras of a collection, fixed for all people"),
         ],
     )
-    camera_count: bpy.props.IntProperty(
-        name="Cameras", description="Views of each pose", default=36, min=1, soft_max=200
-    )
+    camera_count: declared(Rig, "count", name="Cameras")
     rings: bpy.props.IntProperty(
         name="Rings", description="Number of rings the cameras are distributed over", default=3, min=1, max=50
     )
@@ -93,12 +88,12 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         name="Field of View", description="Vertical", default=math.radians(30),
         min=math.radians(1), max=math.radians(150), subtype="ANGLE",
     )  # fmt: skip
-    margin: bpy.props.FloatProperty(name="Margin", description="Room around people", default=1.05, min=0.1, max=100)
+    margin: declared(Rig, "margin")
     cameras: bpy.props.PointerProperty(
         name="Collection", description="Collection with the cameras", type=bpy.types.Collection
     )
 
-    samples: bpy.props.IntProperty(name="Samples", description="Of a pixel", default=16, min=1, soft_max=1024)
+    samples: declared(CaptureSettings, "samples")
     light: bpy.props.EnumProperty(
         name="Light",
         description="Lighting of the people",
@@ -113,24 +108,16 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         description="Environment picture, .exr or .hdr, or a folder of them, one for each view",
         subtype="FILE_PATH",
     )
-    denoise: bpy.props.BoolProperty(
-        name="Denoise", description="Colours under a dome or HDRI light; never masks, depth, normals or parts"
-    )
-    shadows: bpy.props.BoolProperty(
-        name="Shadows Between People", description="People who stand together shade each other"
-    )
+    denoise: declared(CaptureSettings, "denoise")
+    shadows: declared(CaptureSettings, "shadows", name="Shadows Between People")
     device: bpy.props.EnumProperty(
         name="Device",
         description="What Cycles renders on",
         items=[("auto", "Automatic", "A GPU if there is one"), ("cpu", "CPU", ""), ("gpu", "GPU", "")],
     )
 
-    width: bpy.props.IntProperty(
-        name="Width", description="Size of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
-    )
-    height: bpy.props.IntProperty(
-        name="Height", description="Size of the pictures", default=512, min=1, max=16384, subtype="PIXEL"
-    )
+    width: declared(Rig, "width", subtype="PIXEL")
+    height: declared(Rig, "height", subtype="PIXEL")
     background: bpy.props.EnumProperty(
         name="Background",
         description="What is behind the people",
@@ -147,7 +134,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         items=_PASS_ITEMS,
         default=set(PASSES),
     )
-    float_depth: bpy.props.BoolProperty(name="Float Depth", description="Also write depth as OpenEXR, 32 bits")
+    float_depth: declared(CaptureSettings, "float_depth")
     layouts: bpy.props.EnumProperty(
         name="Also for",
         description="Also write camera files in the layouts of other projects",
@@ -155,9 +142,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         items=_LAYOUT_ITEMS,
         default=set(LAYOUTS),
     )
-    released_reference: bpy.props.BoolProperty(
-        name="Released Reference", description="Also store one subject under the name that the released code expects"
-    )
+    released_reference: declared(CaptureSettings, "released_reference")
 
     def elevations(self) -> list[float]:
         """Elevations of the rings, degrees."""

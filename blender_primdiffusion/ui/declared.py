@@ -13,11 +13,11 @@ SKIP = {"SKIP_SAVE"}
 PANELS = "Not given: the panel's"
 _LARGEST = 2**31 - 1
 """Blender's integers are shorter than the backend's."""
-_MAKERS = {int: bpy.props.IntProperty, float: bpy.props.FloatProperty}
+_MAKERS = {int: bpy.props.IntProperty, float: bpy.props.FloatProperty, bool: bpy.props.BoolProperty}
 
 
 def declared(record: type, field: str, **changes: Any) -> Any:
-    """A property for an integer or a number of a record, with `changes` to what is declared."""
+    """A property for a number or a flag of a record, with `changes` to what is declared."""
     kind, marks = split(field_types(record)[field])
     settings: dict[str, Any] = {
         "name": field.replace("_", " ").title(),

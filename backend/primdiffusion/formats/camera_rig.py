@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from .schema import Checked, Length, Range, Slider
 
 Arrangement = Literal["rings", "sphere", "hemisphere"]
 _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
@@ -44,36 +46,23 @@ class View:
 
 
 @dataclasses.dataclass(frozen=True)
-class Rig:
+class Rig(Checked):
     """Equal cameras on a sphere around a target, which is at the centre of their images."""
 
     arrangement: Arrangement = "rings"
-    count: int = 36
-    elevations: tuple[float, ...] = (-10.0, 15.0, 40.0)
+    """Arrangement of the cameras."""
+    count: Annotated[int, Range(1), Slider(1, 200)] = 36
+    """Number of views of each pose."""
+    elevations: Annotated[tuple[Annotated[float, Range(-89, 89)], ...], Length(1)] = (-10.0, 15.0, 40.0)
     """Elevation of each ring, degrees above the horizon; cameras are distributed evenly to the rings."""
-    vertical_fov: float = 30.0
-    """Degrees."""
-    width: int = 512
-    height: int = 512
-    margin: float = 1.05
-    """Size of the view relative to the bounding sphere."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError for invalid values."""
-        wrong = {
-            "count": self.count < 1,
-            "elevations": not self.elevations or not all(-89 <= angle <= 89 for angle in self.elevations),
-            "vertical_fov": not 1 <= self.vertical_fov <= 150,
-            "width": not 1 <= self.width <= 16384,
-            "height": not 1 <= self.height <= 16384,
-            "margin": not 0 < self.margin <= 100,
-        }
-        for name in wrong:
-            if wrong[name]:
-                raise ValueError(
-                    f"{name} of the camera rig is {getattr(self, name)}: at least one camera, elevations within 89 "
-                    "degrees, a field of view of 1 to 150 degrees, pictures of 1 to 16384 pixels a side"
-                )
+    vertical_fov: Annotated[float, Range(1, 150)] = 30.0
+    """Vertical field of view, degrees."""
+    width: Annotated[int, Range(1, 16384)] = 512
+    """Width of the images, pixels."""
+    height: Annotated[int, Range(1, 16384)] = 512
+    """Height of the images, pixels."""
+    margin: Annotated[float, Range(0.1, 100)] = 1.05
+    """Size of the view relative to the bounding sphere of the humans."""
 
     def views(self, target: NDArray, radius: float) -> list[View]:
         """Return the cameras around `target` [3], at a distance that shows all of a sphere of `radius` metres.

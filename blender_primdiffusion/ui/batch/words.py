@@ -6,12 +6,11 @@ import argparse
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn, get_args
 
-from ...console import UsageError
+from ...console import CommandParser, UsageError
 from ...formats.regular_files import real_path
 from ...formats.requests import GenerateRequest
-from ...formats.schema import FieldError, descriptions, field_types, read, split
+from ...formats.schema import FieldError, read
 
 ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
 """Names of render engines on the command line -> Blender's."""
@@ -31,7 +30,7 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     add("--count", type=_whole(1), default=1, help="how many (default %(default)s)")
     add("--seed", type=int, default=0, help="of the first; the others follow on it (default %(default)s)")
     for field, option in DECLARED.items():
-        _add_declared(made, field, option)
+        made.add_declared(GenerateRequest, field, option)
     add("--attributes", nargs="+", default=[], metavar="NAME=VALUE", help='like sex=female height=1.7 "hair=long bob"')
     add("--checkpoint", type=Path, help="a .safetensors file instead of the preferences' or the default one")
     blend = made.add_mutually_exclusive_group()
@@ -92,17 +91,8 @@ def motion_name(options: argparse.Namespace) -> str | None:
     return None if path is None else str(real_path(path))
 
 
-def _parser(name: str, description: str) -> argparse.ArgumentParser:
-    made = argparse.ArgumentParser(prog=f"primdiffusion {name}", description=description, epilog=_EPILOG)
-    made.error = _raise_usage_error
-    return made
-
-
-def _add_declared(made: argparse.ArgumentParser, field: str, option: str) -> None:
-    kind, _ = split(field_types(GenerateRequest)[field])
-    choices, default = get_args(kind) or None, getattr(GenerateRequest, field)
-    about = f"{descriptions(GenerateRequest)[field].rstrip('.')} (default %(default)s)"
-    made.add_argument(option, dest=field, type=type(default), choices=choices, default=default, help=about)
+def _parser(name: str, description: str) -> CommandParser:
+    return CommandParser(prog=f"primdiffusion {name}", description=description, epilog=_EPILOG)
 
 
 def _add_motion(made: argparse.ArgumentParser) -> None:
@@ -113,10 +103,6 @@ def _add_motion(made: argparse.ArgumentParser) -> None:
 
 def _add_python(made: argparse.ArgumentParser) -> None:
     made.add_argument("--python", type=Path, metavar="PATH", help="the backend's Python instead of the preferences'")
-
-
-def _raise_usage_error(message: str) -> NoReturn:
-    raise UsageError(message)
 
 
 def _check_files(options: argparse.Namespace, *names: str) -> None:

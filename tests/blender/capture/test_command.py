@@ -9,7 +9,7 @@ from support.errors import refused
 
 from blender_primdiffusion.capture import command
 from blender_primdiffusion.capture.options import parse, settings_of
-from blender_primdiffusion.console import CANCELLED, DONE, UsageError
+from blender_primdiffusion.console import CANCELLED, DONE
 
 pytestmark = pytest.mark.any_blender
 
@@ -67,5 +67,5 @@ def test_the_estimate_grows_with_pixels_and_samples_and_counts_the_shards_own_pe
 
 @pytest.mark.parametrize("seed", ["-1", str(2**63)])
 def test_a_seed_out_of_range_is_named(tmp_path, seed):
-    with refused(UsageError, str(seed)):
-        parse(["--out", str(tmp_path), f"--seed={seed}"])
+    with refused(ValueError, str(seed)):
+        settings_of(parse(["--out", str(tmp_path), f"--seed={seed}"]))

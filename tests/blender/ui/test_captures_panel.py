@@ -22,9 +22,9 @@ from support.errors import refused
 import blender_primdiffusion
 from blender_primdiffusion.capture import launch
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.capture.options import MARK, UsageError, parse, settings_of
+from blender_primdiffusion.capture.options import MARK, parse, settings_of
 from blender_primdiffusion.capture.stage import data_blocks
-from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
+from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE, UsageError
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui import captures_session

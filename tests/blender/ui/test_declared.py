@@ -4,6 +4,7 @@ import bpy
 import pytest
 from blender_primdiffusion.formats.schema import Range, Slider, descriptions, field_types, split
 
+from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.formats import requests
 
 LARGEST = 2**31 - 1
@@ -12,6 +13,7 @@ SETTINGS = {
     "primdiffusion_edit": (requests.VaryRequest, ("amount", "seed")),
     "primdiffusion_reconstruct": (requests.ReconstructRequest, ("frame", "views")),
     "primdiffusion_export": (requests.ProxyRequest, ("triangles",)),
+    "primdiffusion_captures": (CaptureSettings, ("together", "pose_count", "samples", "seed")),
 }
 
 
