@@ -19,8 +19,7 @@ from ..formats.answers import FitPostureAnswer, ReconstructAnswer
 from ..formats.camera_rig import View
 from ..formats.json_files import read_json
 from ..formats.regular_files import as_file_error
-from ..motion.pose_library import check_posable
-from ..motion.posture import take_world_posture, world_posture
+from ..motion.pose_library import check_posable, take_world_posture, world_posture
 from ..scene.blend_values import file_path
 from ..scene.handles import handles_from_joints, joints_from_handles
 from ..scene.human import BODY_FILE, armature_of, state_folder

@@ -7,19 +7,21 @@ from collections.abc import Collection
 
 import bpy
 import numpy as np
+from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import from_axis_angle, matrix_to_quaternion, slerp, to_axis_angle
 from ..scene.armature import bone_bases, model_origin, rest_rotations
-from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
+from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend, points_to_blender
 from ..scene.handles import key_handles
 from .adjust import leg_ratio
 from .poses import LIBRARY, grounding
 
 _MIRROR = np.array([1.0, -1.0, -1.0])
 """Signs of an axis-angle vector when left and right are swapped."""
+_UNSCALED = 1e-3
 
 
 @functools.cache
@@ -134,3 +136,47 @@ def selected_joints(armature: bpy.types.Object) -> list[str]:
 def _other_side(name: str) -> str:
     side, _, part = name.partition("_")
     return {"left": f"right_{part}", "right": f"left_{part}"}.get(side, name)
+
+
+def world_posture(armature: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """An armature in the world as the backend describes it: axis-angle vectors [24, 3] and a translation [3], metres,
+    y up, with the object's own place and turn in both.
+
+    Raises ValueError for an armature without SMPL's joints, or scaled.
+    """
+    turn, place = _rigid(armature)
+    rotations, translation = current_pose(armature)
+    rotations[0] = turn @ rotations[0]
+    rest = rest_joints(armature)[0]
+    return to_axis_angle(rotations), turn @ (rest + translation) + _origin(armature, turn, place) - rest
+
+
+def take_world_posture(armature: bpy.types.Object, pose: NDArray, translation: NDArray) -> None:
+    """Pose an armature, and move the object, which keeps its turn, so that it is in this posture of `world_posture`.
+
+    Raises ValueError as `world_posture` and `check_posable` do. Makes no undo step.
+    """
+    check_posable(armature)
+    turn, _ = _rigid(armature)
+    rest = rest_joints(armature)[0]
+    pose = np.array(pose, np.float64)
+    pose[0] = to_axis_angle(turn.T @ from_axis_angle(pose[0]))
+    apply_pose(armature, pose, np.zeros(3))
+    moved = translation + rest - turn @ rest
+    matrix = np.array(armature.matrix_world)
+    matrix[:3, 3] = points_to_blender(moved) - matrix[:3, :3] @ model_origin(armature.data)
+    armature.matrix_world = Matrix(matrix.tolist())
+
+
+def _rigid(armature: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The object's turn [3, 3] and place [3], y up."""
+    matrix = np.array(armature.matrix_world, np.float64)
+    linear = matrix[:3, :3]
+    if np.abs(linear.T @ linear - np.eye(3)).max() > _UNSCALED or np.linalg.det(linear) < 0:
+        raise ValueError(f"the armature {armature.name!r} is scaled: set its scale to 1 to fit it to a picture")
+    return BLENDER_FROM_BACKEND.T @ linear @ BLENDER_FROM_BACKEND, points_to_backend(matrix[:3, 3])
+
+
+def _origin(armature: bpy.types.Object, turn: NDArray, place: NDArray) -> NDArray[np.float64]:
+    """Where the object puts the origin of the body model, y up."""
+    return turn @ points_to_backend(model_origin(armature.data)) + place

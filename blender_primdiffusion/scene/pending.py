@@ -19,8 +19,7 @@ from ..formats.whole_files import remove_abandoned
 from .attachment import in_viewport
 from .human import MARK, PERSON_FILE, PRIMITIVE_VDB, is_own, state_folder, volume_name, volume_path, write_error
 from .rest_human import read_human
-from .vdb import readable_format
-from .volumes import format_of, is_readable, reload_volume, write_volume
+from .volumes import format_of, is_readable, readable_format, reload_volume, write_volume
 
 _WRITTEN_AS = (5, 0, 0)
 """The version of Blender by which grids of a newer format are placed: what older ones cannot read came later."""

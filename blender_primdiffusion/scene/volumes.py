@@ -1,4 +1,8 @@
-"""Primitives as VDB files, and Blender's cache of their grids."""
+"""Primitives as VDB files, and Blender's cache of their grids.
+
+Blender's module openvdb may be missing, as in Debian. Humans need no volumes to be drawn by PrimDiffusion, only by
+Cycles and EEVEE, so nothing is refused then but writing: each writer raises ValueError.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +14,7 @@ import struct
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 
 import bpy
 import numpy as np
@@ -18,7 +23,12 @@ from numpy.typing import NDArray
 from ..formats.regular_files import exists_in_its_folder, open_regular
 from ..formats.whole_files import temporary_folder
 from .human import volume_path
-from .vdb import grid_bytes, openvdb, readable_format
+
+bpy.utils.expose_bundled_modules()
+try:
+    import openvdb as _openvdb
+except ModuleNotFoundError:
+    _openvdb = None
 
 VOXELS = 8
 """Voxels along a side of a primitive."""
@@ -36,6 +46,34 @@ _ALL_ACTIVE = -1.0
 """A tolerance below every difference from the background, so that zeros become active voxels too."""
 LARGEST_VDB = 4 << 30
 """Bytes of a file whose header is read; a merged human has a few hundred MB."""
+
+
+def openvdb() -> ModuleType:
+    """The module. Raises ValueError where Blender's Python lacks it."""
+    if _openvdb is None:
+        raise ValueError(
+            "the Python of this Blender lacks openvdb, without which volumes cannot be written for Cycles and EEVEE: "
+            "install it (on Debian and Ubuntu: sudo apt install python3-openvdb), then start Blender again"
+        )
+    return _openvdb
+
+
+def readable_format() -> int:
+    """The newest format version that this Blender reads; 5.2 writes 225, and 5.0 reads up to 224.
+
+    Without the module it is not known, and nothing can be written in another: any.
+    """
+    return sys.maxsize if _openvdb is None else _openvdb.FILE_FORMAT_VERSION
+
+
+def grid_bytes(path: Path) -> int:
+    """Bytes that a file's grids take once read, as its header says; 0 where it is damaged, and without the module."""
+    if _openvdb is None:
+        return 0
+    try:
+        return sum(grid.metadata.get("file_mem_bytes", 0) for grid in _openvdb.readAllGridMetadata(str(path)))
+    except (OSError, RuntimeError):
+        return 0
 
 
 @dataclasses.dataclass(frozen=True)

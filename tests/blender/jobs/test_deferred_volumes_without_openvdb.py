@@ -8,7 +8,7 @@ from deferred_volumes_stage import COUNT, on_disk
 from support.errors import refused
 
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_after_loading
-from blender_primdiffusion.scene import vdb
+from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.human import humans, person_file, volumes_of
 from blender_primdiffusion.scene.volumes import Memory, person_memory
 
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.any_blender
 @pytest.fixture
 def without_openvdb(monkeypatch):
     """Blender's Python lacks the module."""
-    monkeypatch.setattr(vdb, "_openvdb", None)
+    monkeypatch.setattr(volumes, "_openvdb", None)
 
 
 @pytest.fixture

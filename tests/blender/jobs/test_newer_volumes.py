@@ -18,8 +18,7 @@ from blender_primdiffusion.scene.attachment import show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.human import humans, person_file, volume_path
-from blender_primdiffusion.scene.vdb import openvdb, readable_format
-from blender_primdiffusion.scene.volumes import format_of
+from blender_primdiffusion.scene.volumes import format_of, openvdb, readable_format
 
 COUNT = 5
 ops = bpy.ops.primdiffusion
