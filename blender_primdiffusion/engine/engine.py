@@ -9,10 +9,9 @@ import bpy
 from ..backend.drawing import Drawing
 from ..formats.requests import RAY_STEP
 from . import studio
-from .camera import camera_view, wanted_region
 from .frames import Frame
 from .picture import scene_content, solids_file
-from .view import PinholeView, blender_depth
+from .view import PinholeView, blender_depth, camera_view, wanted_region
 from .viewport import Viewport
 from .who_draws import ENGINE
 

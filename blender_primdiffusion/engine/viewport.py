@@ -13,16 +13,15 @@ import numpy as np
 from gpu_extras.presets import draw_texture_2d
 
 from . import studio
-from .camera import camera_frame
 from .gpu.composite import PictureTextures
-from .gpu.humans import gpu_humans
 from .gpu.picture import GpuPicture, GpuScene, GpuSolids
 from .gpu.refine import GpuRefinement, MarchRequest
+from .gpu.scene_reading import gpu_humans
 from .gpu.start import gpu_start
 from .picture import SceneContent, scene_content
 from .refine import Refinement, ShownPicture, ViewRequest
 from .solids import SceneSolids, changed_by, scene_solids, stored
-from .view import view_from_matrices
+from .view import camera_frame, view_from_matrices
 
 TICK_S = 1 / 60
 STARTING = "Starting the backend (the first picture after an installation compiles the marcher: half a minute)"

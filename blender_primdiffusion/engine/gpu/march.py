@@ -26,12 +26,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..boxes import Boxes
-from ..relief import relief_of
 from ..view import PinholeView
 from . import shaders
-from .caching import cache_until_exit
-from .relief import GpuRelief
-from .shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
+from .relief import GpuRelief, relief_of
+from .shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER, cache_until_exit
 
 STRIDES = [1, 2, 4]
 SAMPLES_PER_VOXEL = 2.0

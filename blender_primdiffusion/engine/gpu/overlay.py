@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 
 from ...scene.convention import points_to_backend
 from ..boxes import Boxes, seen_part
-from ..camera import camera_frame
-from ..view import NO_SURFACE_M, PinholeView, view_from_matrices
+from ..view import NO_SURFACE_M, PinholeView, camera_frame, view_from_matrices
 from .composite import NO_PLANES, Part, PictureTextures, ViewLook, draw_picture, keep_bones
 from .march import GpuMarch, GpuMarcher
 from .refine import REVEAL_S, GpuRefinement, MarchRequest

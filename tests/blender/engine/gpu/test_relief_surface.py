@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from blender_primdiffusion.engine.boxes import EDGE_PX, Boxes, seen_part
-from blender_primdiffusion.engine.relief import VISIBLE, Relief, relief_of
+from blender_primdiffusion.engine.gpu.relief import VISIBLE, Relief, relief_of
 from blender_primdiffusion.engine.view import PinholeView
 
 pytestmark = pytest.mark.any_blender
