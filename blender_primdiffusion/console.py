@@ -1,10 +1,11 @@
-"""Command lines within Blender: options of records, a separate stdout, durations as text, Ctrl-C between jobs."""
+"""Command lines within Blender: options of records, a separate stdout, durations as text, Ctrl-C, reports."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import dataclasses
+import json
 import os
 import signal
 import sys
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import Any, Literal, NoReturn
 
 from .formats.schema import descriptions, field_types, split
+from .formats.whole_files import write_atomically
 
 DONE, FAILED, UNUSABLE, NO_BACKEND, CANCELLED = 0, 1, 2, 3, 130
 """Exit codes: all done; some failed, and the report lists them; usage error; no Python runs the backend; stopped."""
@@ -115,3 +117,32 @@ def stopped_by_signals() -> Iterator[Stop]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler if handler is not None else signal.SIG_DFL)
+
+
+@dataclasses.dataclass
+class Report:
+    """Results of a batch so far."""
+
+    done: list[str] = dataclasses.field(default_factory=list)
+    """Subjects that were finished now."""
+    failed: list[dict[str, str]] = dataclasses.field(default_factory=list)
+    """For each failure: subject (empty for none), what was tried, and why it failed."""
+    skipped: list[str] = dataclasses.field(default_factory=list)
+    """Subjects that were finished before."""
+    notes: list[str] = dataclasses.field(default_factory=list)
+    """Notes on scans and poses, a sentence each."""
+
+    def fail(self, subject: str, what: str, why: str) -> str:
+        """Note a failure; returns it as one line."""
+        why = " ".join(why.split())
+        self.failed.append({"subject": subject, "what": what, "why": why})
+        return f"{subject or what}: {why}"
+
+    def write(self, root: Path, shard: tuple[int, int]) -> None:
+        """To report.json, or report-i-of-n.json of one shard among several."""
+        write_atomically(report_path(root, shard), json.dumps(dataclasses.asdict(self), indent=1))
+
+
+def report_path(root: Path, shard: tuple[int, int]) -> Path:
+    """Path of a shard's report."""
+    return root / ("report.json" if shard[1] == 1 else f"report-{shard[0]}-of-{shard[1]}.json")

@@ -17,12 +17,23 @@ from collections.abc import Callable, Sequence
 import bpy
 
 from ..backend.child_streams import stdin_has_ended
-from ..console import CANCELLED, DONE, FAILED, UNUSABLE, Stop, UsageError, duration, separate_stdout, stopped_by_signals
+from ..console import (
+    CANCELLED,
+    DONE,
+    FAILED,
+    UNUSABLE,
+    Report,
+    Stop,
+    UsageError,
+    duration,
+    report_path,
+    separate_stdout,
+    stopped_by_signals,
+)
 from ..formats.capture_repair import repair, verify
 from ..formats.regular_files import FileError
 from .job import CaptureProgress, run
 from .options import ASK_FROM, MARK, parse, settings_of
-from .report import Report, report_path
 from .scan import ScanFile, find_scans
 from .settings import CaptureSettings
 

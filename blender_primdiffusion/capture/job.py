@@ -15,6 +15,7 @@ from typing import Protocol
 import bpy
 import numpy as np
 
+from ..console import Report
 from ..formats.camera_files import write_layouts
 from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
@@ -29,7 +30,6 @@ from ..motion.poses import built_in_poses, pick_poses
 from .body import Body, read_body
 from .group import Placed, groups_of, load_neighbours, place_group
 from .passes import write_passes
-from .report import Report
 from .scan import Scan, ScanFile, load_scan
 from .settings import CaptureSettings
 from .skinned_surface import cameras_inside

@@ -12,7 +12,7 @@ import bpy
 from ..formats.camera_rig import View
 from ..formats.regular_files import FileError, check_regular
 from ..formats.removing import remove_file, remove_folder
-from .blender_camera import aim
+from .cameras import aim
 from .passes import Centres, Colours, read_centres, read_colours
 from .settings import CaptureSettings, Device
 from .surfaces import OPAQUE, PART

@@ -14,7 +14,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..backend.requests import sentence
-from ..capture.picture_camera import aim_at_picture, picture_of, picture_view
+from ..capture.cameras import aim_at_picture, picture_of, picture_view
 from ..formats.answers import FitPostureAnswer, ReconstructAnswer
 from ..formats.camera_rig import View
 from ..formats.json_files import read_json

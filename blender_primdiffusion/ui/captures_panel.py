@@ -11,11 +11,11 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from ..capture.blender_camera import aim
+from ..capture.cameras import aim
 from ..capture.command import describe, estimate, scans_in
 from ..capture.job import run
 from ..capture.options import ASK_FROM, parse, settings_of
-from ..capture.report import Report, report_path
+from ..console import Report, report_path
 from ..formats.camera_rig import bounding_sphere
 from ..formats.capture_repair import repair, verify
 from ..jobs.follow import Reporting, redraw

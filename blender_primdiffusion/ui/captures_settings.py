@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 
-from ..capture.blender_camera import view_of
+from ..capture.cameras import view_of
 from ..capture.settings import CaptureSettings
 from ..formats.camera_rig import Rig
 from ..formats.requests import LAYOUTS, PASSES

@@ -15,7 +15,7 @@ from ..jobs.follow import Reporting, submit
 from ..jobs.missing_files import look, state
 from ..jobs.target import HumanTarget, selected_person
 from ..scene.collect import collect_files, ignored_values, unused
-from ..scene.duplicate import duplicate_human
+from ..scene.copies import duplicate_human
 from ..scene.edit import leave_mode, select_human
 from ..scene.human import armature_of, check_editable, humans, humans_folder, note_state, person_file, remove_human
 from ..scene.missing import MissingFiles, missing_files, repair

@@ -7,7 +7,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..capture.picture_camera import add_picture_camera, picture_of
+from ..capture.cameras import add_picture_camera, picture_of
 from ..jobs.copies import separate
 from ..jobs.follow import Reporting, submit
 from ..jobs.from_picture import FitPictureJob, PictureJob, PictureTask

@@ -262,7 +262,7 @@ def read_behind(path: Path) -> None:
 def place_photograph(path: Path) -> None:
     import bpy
 
-    from blender_primdiffusion.capture.picture_camera import add_picture_camera
+    from blender_primdiffusion.capture.cameras import add_picture_camera
 
     add_picture_camera(bpy.context, path, np.zeros(3))
 

@@ -204,7 +204,7 @@ EXTENSION = {
     "capture/body.py": ("body of captures",),
     "capture/options.py": ("cameras",),
     "capture/passes.py": ("picture of Cycles",),
-    "capture/picture_camera.py": ("Blender: plain picture",),
+    "capture/cameras.py": ("Blender: plain picture",),
     "capture/scan_files.py": ("shape of a scan", "parameters of a scan", "Blender: scan"),
     "capture/stage.py": ("Blender: HDRI",),
     "capture/surfaces.py": ("Blender: picture of a scan",),

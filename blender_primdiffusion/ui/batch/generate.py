@@ -13,8 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from ...backend.requests import Backend, ChildRequest
-from ...capture.report import Report
-from ...console import Stop, duration
+from ...console import Report, Stop, duration
 from ...formats.regular_files import real_path
 from ...formats.removing import check_unlinked
 from ...jobs.queue import chosen_checkpoint

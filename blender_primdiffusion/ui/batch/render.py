@@ -17,8 +17,7 @@ from pathlib import Path
 import bpy
 
 from ...backend.requests import Backend
-from ...capture.report import Report
-from ...console import Stop
+from ...console import Report, Stop
 from ...engine import studio
 from ...engine.engine import ENGINE
 from ...formats.regular_files import check_regular, exists_in_its_folder, real_path

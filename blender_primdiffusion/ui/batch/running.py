@@ -17,16 +17,17 @@ import bpy
 
 from ...backend.environment import VARIABLE
 from ...backend.requests import Backend, ChildRequest
-from ...capture.report import Report, report_path
 from ...console import (
     CANCELLED,
     DONE,
     FAILED,
     NO_BACKEND,
     UNUSABLE,
+    Report,
     Stop,
     UsageError,
     duration,
+    report_path,
     separate_stdout,
     stopped_by_signals,
 )

@@ -20,9 +20,9 @@ from support.errors import refused
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.group import place_group
 from blender_primdiffusion.capture.job import run
-from blender_primdiffusion.capture.report import Report
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.stage import data_blocks
+from blender_primdiffusion.console import Report
 
 pytestmark = pytest.mark.any_blender
 POSES = two_poses()

@@ -29,9 +29,9 @@ from support.errors import refused
 
 from blender_primdiffusion.capture import passes
 from blender_primdiffusion.capture.job import _name_reference, run
-from blender_primdiffusion.capture.report import Report
 from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.capture.stage import data_blocks
+from blender_primdiffusion.console import Report
 
 pytestmark = pytest.mark.any_blender
 

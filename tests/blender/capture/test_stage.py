@@ -20,8 +20,8 @@ from PIL import Image
 from scipy.ndimage import center_of_mass, grey_dilation
 from support.errors import refused
 
-from blender_primdiffusion.capture.blender_camera import aim, view_of
 from blender_primdiffusion.capture.body import read_body
+from blender_primdiffusion.capture.cameras import aim, view_of
 from blender_primdiffusion.capture.job import run
 from blender_primdiffusion.capture.passes import srgb_bytes, write_passes
 from blender_primdiffusion.capture.settings import CaptureSettings

@@ -13,7 +13,7 @@ from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.collect import unused
-from blender_primdiffusion.scene.duplicate import duplicate_human
+from blender_primdiffusion.scene.copies import duplicate_human
 from blender_primdiffusion.scene.human import (
     armature_of,
     folder_of,

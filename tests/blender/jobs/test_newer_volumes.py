@@ -16,7 +16,7 @@ from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene import pending
 from blender_primdiffusion.scene.attachment import show_in_viewport
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.duplicate import duplicate_human
+from blender_primdiffusion.scene.copies import duplicate_human
 from blender_primdiffusion.scene.human import humans, person_file, volume_path
 from blender_primdiffusion.scene.volumes import format_of, openvdb, readable_format
 

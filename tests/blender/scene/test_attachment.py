@@ -16,7 +16,7 @@ from support.errors import refused
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import ATTACHMENT, IN_VIEWPORT, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.duplicate import duplicate_human
+from blender_primdiffusion.scene.copies import duplicate_human
 from blender_primdiffusion.scene.human import armature_of, body_of, folder_of, humans, volumes_of
 from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of, primitives_of
 

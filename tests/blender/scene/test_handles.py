@@ -21,9 +21,8 @@ from blender_primdiffusion.scene.armature import (
     pose_from_joint_rotations,
 )
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.copies import separate_copies
+from blender_primdiffusion.scene.copies import duplicate_human, separate_copies
 from blender_primdiffusion.scene.cycles import posed_extent
-from blender_primdiffusion.scene.duplicate import duplicate_human
 from blender_primdiffusion.scene.handles import add_handles, bake_handles, has_handles
 from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.limbs import CONTROLS, LIMBS

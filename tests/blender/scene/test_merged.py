@@ -15,7 +15,7 @@ from support.errors import refused
 from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
-from blender_primdiffusion.scene.duplicate import duplicate_human
+from blender_primdiffusion.scene.copies import duplicate_human
 from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, sequence_files, state_folder, volume_path
 from blender_primdiffusion.scene.material import (
     density_gain,

@@ -17,7 +17,7 @@ from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint
 from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.duplicate import rename_human
+from blender_primdiffusion.scene.copies import rename_human
 from blender_primdiffusion.scene.human import BETAS, MARK, ORIGIN, armature_of, body_of, humans
 from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape

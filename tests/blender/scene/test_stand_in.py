@@ -13,8 +13,8 @@ import pytest
 from human_stage import build_posed, named, whole
 
 import blender_primdiffusion
+from blender_primdiffusion.scene.copies import duplicate_human, rename_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
-from blender_primdiffusion.scene.duplicate import duplicate_human, rename_human
 from blender_primdiffusion.scene.human import armature_of, body_of, volumes_of
 from blender_primdiffusion.scene.stand_in import STAND_IN
 

@@ -14,7 +14,7 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import request_of
 
-from blender_primdiffusion.capture.picture_camera import picture_of, picture_view, stored_turned
+from blender_primdiffusion.capture.cameras import picture_of, picture_view, stored_turned
 from blender_primdiffusion.jobs import from_picture
 from blender_primdiffusion.jobs.from_picture import PictureJob, PictureTask
 from blender_primdiffusion.jobs.queue import queue
