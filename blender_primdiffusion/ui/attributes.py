@@ -1,18 +1,26 @@
-"""Attributes to generate humans with: menus of those that the checkpoint knows, Any by default."""
+"""Attributes to generate humans with: menus of those that the checkpoint knows, Any by default.
+
+The backend writes them into the checkpoint's metadata, which are read without torch.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import bpy
 
-from ..backend.vocabulary import Vocabulary, read_vocabulary
-from ..formats.regular_files import is_local_path
+from ..formats.json_files import parse_json
+from ..formats.regular_files import as_file_error, is_local_path, open_regular
+from ..formats.tensor_layout import check_limits, read_layout
 from ..places import backend_module_path, preference
 
+_LARGEST_FILE = 16 << 30
+"""Bytes, as in the backend's `tensor_file`."""
+_LARGEST_NUMBER = 1e9
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
 """Those with a menu; scripts may use any that the checkpoint has."""
@@ -26,6 +34,33 @@ _read: dict[Path, tuple[float, Vocabulary]] = {}
 """By path, with the modification time of the file."""
 _items: dict[tuple[str, ...], list[Item]] = {}
 """Holds the strings of dynamic menus, to which Blender holds no references."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Vocabulary:
+    """Attributes that a model knows; none for one that was trained without."""
+
+    categories: Mapping[str, tuple[str, ...]] = dataclasses.field(default_factory=dict)
+    """Name -> values to choose from: sex, outfit, hair."""
+    scalars: Mapping[str, tuple[float, float]] = dataclasses.field(default_factory=dict)
+    """Name -> mean and standard deviation: height in metres, weight in kilograms."""
+
+
+def read_vocabulary(path: Path) -> Vocabulary:
+    """The vocabulary of a checkpoint; an empty one where the file has none.
+
+    Raises OSError for a file that cannot be read and ValueError for one that is no checkpoint.
+    """
+    with as_file_error(path, "is damaged or no checkpoint of a diffusion model", "choose another file"):
+        with open_regular(path, _LARGEST_FILE) as file:
+            layout = read_layout(file)
+        check_limits(layout)
+        tree = parse_json(layout.metadata["architecture"]).get("vocabulary") or {}
+        categories = {name: tuple(map(str, values)) for name, values in tree.get("categories", {}).items()}
+        scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree.get("scalars", {}).items()}
+        if not all(abs(mean) <= _LARGEST_NUMBER and 0 < std <= _LARGEST_NUMBER for mean, std in scalars.values()):
+            raise ValueError("a mean or standard deviation that no quantity has")
+    return Vocabulary(categories, scalars)
 
 
 def known() -> Vocabulary:

@@ -12,9 +12,8 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..capture.cameras import aim
-from ..capture.command import describe, estimate, scans_in
+from ..capture.command import ASK_FROM, describe, estimate, parse, scans_in, settings_of
 from ..capture.job import run
-from ..capture.options import ASK_FROM, parse, settings_of
 from ..console import Report, report_path
 from ..formats.camera_rig import bounding_sphere
 from ..formats.capture_repair import repair, verify

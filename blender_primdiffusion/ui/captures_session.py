@@ -16,7 +16,7 @@ import bpy
 from ..backend.child_streams import Output
 from ..backend.child_variables import BLENDER, COMPUTING, passed_on
 from ..capture import launch
-from ..capture.options import MARK
+from ..capture.command import MARK
 from ..console import CANCELLED, DONE
 from ..formats.answers import CapturesProgress
 from ..formats.json_files import parse_message

@@ -169,7 +169,7 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
 def words_of(
     asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path, people: str = "", out: str = ""
 ) -> list[str]:
-    """The command `capture` in words (`capture.options`); a file of cameras, where needed, goes to `folder`.
+    """The command `capture` in words (`capture.command`); a file of cameras, where needed, goes to `folder`.
 
     `people` and `out` go before the panel's. Raises ValueError where something is missing or a path is impossible.
     """

@@ -15,14 +15,18 @@ from ..formats.picture_files import write_png
 from ..formats.poses.rotation import to_axis_angle
 from ..formats.poses.skeleton import joint_positions
 from ..jobs.assets import clay_figure
-from ..motion.own_poses import delete_pose, load_pose, own_poses, picture_of, save_pose
 from ..motion.pose_library import (
     apply_pose,
     builtin_poses,
     check_posable,
     current_pose,
+    delete_pose,
     key_pose,
+    load_pose,
     mirrored,
+    own_poses,
+    picture_of,
+    save_pose,
     selected_joints,
     standing,
 )

@@ -14,8 +14,8 @@ from primdiffusion import tensor_file
 from primdiffusion.formats import tensor_layout
 from primdiffusion.formats.tensor_layout import DTYPES, LARGEST_HEADER, MOST_DIMENSIONS, parse_layout
 
-from blender_primdiffusion.backend.vocabulary import read_vocabulary
 from blender_primdiffusion.scene import human_file
+from blender_primdiffusion.ui.attributes import read_vocabulary
 
 READERS = {"extension": human_file.read_tensors, "backend": tensor_file.opened, "vocabulary": read_vocabulary}
 

@@ -55,7 +55,7 @@ def make_checkpoint(folder: Path) -> Path:
 
 
 def read_vocabulary(path: Path) -> None:
-    from blender_primdiffusion.backend.vocabulary import read_vocabulary
+    from blender_primdiffusion.ui.attributes import read_vocabulary
 
     finite(*read_vocabulary(path).scalars.values())
 
@@ -130,7 +130,7 @@ def make_cameras(folder: Path) -> Path:
 
 
 def read_cameras(path: Path) -> None:
-    from blender_primdiffusion.capture.options import read_cameras
+    from blender_primdiffusion.capture.command import read_cameras
 
     finite_members(*read_cameras(path, 32, 32))
 

@@ -159,7 +159,7 @@ def read_pose_file(path: Path) -> None:
 
 
 def read_own_pose(path: Path) -> None:
-    from blender_primdiffusion.motion.own_poses import load_pose
+    from blender_primdiffusion.motion.pose_library import load_pose
 
     finite(*load_pose(path))
 

@@ -8,7 +8,7 @@ import pytest
 from support.errors import refused
 
 from blender_primdiffusion.capture import command
-from blender_primdiffusion.capture.options import parse, settings_of
+from blender_primdiffusion.capture.command import parse, settings_of
 from blender_primdiffusion.console import CANCELLED, DONE
 
 pytestmark = pytest.mark.any_blender

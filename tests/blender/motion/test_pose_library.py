@@ -17,13 +17,16 @@ from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.jobs.assets import clay_figure, picture_of_file
-from blender_primdiffusion.motion.own_poses import delete_pose, load_pose, own_poses, save_pose
 from blender_primdiffusion.motion.pose_library import (
     apply_pose,
     builtin_poses,
     current_pose,
+    delete_pose,
+    load_pose,
     mirrored,
+    own_poses,
     rest_joints,
+    save_pose,
 )
 from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.build import build_human

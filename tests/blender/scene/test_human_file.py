@@ -10,7 +10,7 @@ import pytest
 import synthetic_shape
 
 from blender_primdiffusion.jobs.export import put
-from blender_primdiffusion.motion.own_poses import save_pose
+from blender_primdiffusion.motion.pose_library import save_pose
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.human import copy_file, person_file

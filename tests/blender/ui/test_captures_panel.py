@@ -22,7 +22,7 @@ from support.errors import refused
 import blender_primdiffusion
 from blender_primdiffusion.capture import launch
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.capture.options import MARK, parse, settings_of
+from blender_primdiffusion.capture.command import MARK, parse, settings_of
 from blender_primdiffusion.capture.stage import data_blocks
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE, UsageError
 from blender_primdiffusion.scene.armature import build_armature
