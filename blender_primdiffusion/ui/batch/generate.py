@@ -19,9 +19,9 @@ from ...formats.removing import check_unlinked
 from ...jobs.queue import chosen_checkpoint
 from ...scene.human import PERSON_FILE
 from ..attributes import Attributes, parsed
+from .arguments import DECLARED, motion_name, parse_generate
 from .people import Movement, movement_of, person_blend
 from .running import Clock, Say, ask, attempt, backend_of, begun, publish, run, staging
-from .words import DECLARED, motion_name, parse_generate
 
 SETTINGS = "settings.json"
 """The settings of a folder's humans."""

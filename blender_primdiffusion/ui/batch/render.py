@@ -27,6 +27,7 @@ from ...jobs.deferred_volumes import deferred_volumes
 from ...jobs.export import opened
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
 from ...scene.human import PERSON_FILE, humans, humans_folder, volume_path
+from .arguments import ENGINES, motion_name, parse_render
 from .people import (
     Movement,
     build_person,
@@ -48,7 +49,6 @@ from .running import (
     python_for_engine,
     run,
 )
-from .words import ENGINES, motion_name, parse_render
 
 PERSON_ENDINGS = (".human.safetensors", ".human")
 
