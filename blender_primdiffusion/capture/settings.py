@@ -43,7 +43,7 @@ class CaptureSettings:
     float_depth: bool = False
     """Also write depth as OpenEXR, float32."""
     light: Light = "uniform"
-    """uniform: every surface shows its own colour; dome: a white sky; hdri: the picture `hdri`."""
+    """uniform: every surface shows its own colour; dome: a white sky; hdri: an environment picture."""
     hdri: Path | None = None
     """Environment picture, .exr or .hdr, or a folder of them, of which the seed of every view chooses one."""
     background: Background = "black"

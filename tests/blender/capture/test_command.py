@@ -5,10 +5,12 @@ from __future__ import annotations
 import io
 
 import pytest
+from blender_primdiffusion.formats.camera_rig import Rig
 from support.errors import refused
 
 from blender_primdiffusion.capture import command
 from blender_primdiffusion.capture.command import parse, settings_of
+from blender_primdiffusion.capture.settings import CaptureSettings
 from blender_primdiffusion.console import CANCELLED, DONE
 
 pytestmark = pytest.mark.any_blender
@@ -63,6 +65,20 @@ def test_the_estimate_grows_with_pixels_and_samples_and_counts_the_shards_own_pe
     _, sentence = command.estimate(settings_of(parse([*options, "--size", "1024", "1024", "--samples", "32"])), 5)
     assert "2 people" in sentence
     assert f"{2.2 * 20 * 4 * 2 // 60:.0f} min" in sentence
+
+
+def test_options_left_out_are_the_defaults_of_the_settings(tmp_path):
+    assert settings_of(parse(["--out", str(tmp_path)])) == CaptureSettings(tmp_path)
+
+
+def test_each_option_reaches_its_setting(tmp_path):
+    words = "--poses 3 --cameras 5 --fov 20 --margin 2 --samples 7 --together 2 --light dome --shadows --float-depth"
+    settings = settings_of(parse(["--out", str(tmp_path), *words.split(), "--elevations", "-5", "5", "--denoise"]))
+    rig = Rig(count=5, vertical_fov=20.0, margin=2.0, elevations=(-5.0, 5.0))
+    assert settings == CaptureSettings(
+        tmp_path, rig=rig, pose_count=3, samples=7, together=2, light="dome", shadows=True, float_depth=True,
+        denoise=True,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("seed", ["-1", str(2**63)])
