@@ -37,10 +37,12 @@ def checkpoint(tmp_path_factory) -> str:
     return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
 
 
+@pytest.mark.any_blender
 def test_the_same_tree_gives_the_same_bytes(archive, tmp_path):
     assert build_addon.build(tmp_path).read_bytes() == archive.read_bytes()
 
 
+@pytest.mark.any_blender
 def test_the_zip_holds_addon_backend_and_licence_and_nothing_stray(archive):
     names = zipfile.ZipFile(archive).namelist()
     assert names == sorted(names)

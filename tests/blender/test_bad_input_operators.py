@@ -274,6 +274,7 @@ def _varied(person) -> Job:
     return VaryJob.of(person, {"steps": 1, "amount": 0.5, "seed": 3})
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("ask", [_generated, _varied], ids=["generated", "varied"])
 @pytest.mark.parametrize("situation", SITUATIONS, ids=lambda one: one.__name__)
 def test_a_waiting_result_enters_the_scene_or_reports_why_not(anna, situation, ask, capfd):

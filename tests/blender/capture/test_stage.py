@@ -319,7 +319,7 @@ def test_hdris_of_a_folder_light_views_by_their_seeds_and_are_behind_people(empt
     (tmp_path / "skies").mkdir()
     for name, colour in colours.items():
         save_hdri(tmp_path / "skies" / name, colour)
-    rig = Rig(count=6, elevations=(0.0,), width=SIZE, height=SIZE)
+    rig = Rig(count=3, elevations=(0.0,), width=SIZE, height=SIZE)
     settings = CaptureSettings(
         tmp_path / "out", rig=rig, samples=4, light="hdri", hdri=tmp_path / "skies", background="hdri", device="cpu",
         passes=("img", "mask"),
@@ -329,7 +329,7 @@ def test_hdris_of_a_folder_light_views_by_their_seeds_and_are_behind_people(empt
     list(run(empty_scene, settings, [NamedPerson("anna")], poses=POSES, load=load_painted))
     assert set(bpy.data.images) <= before | {image for image in bpy.data.images if image.type == "RENDER_RESULT"}
     used = set()
-    for camera in range(6):
+    for camera in range(3):
         behind, alone, mask = (
             np.asarray(Image.open(picture_path(tmp_path / "out/anna", kind, camera, 0))).astype(int)
             for kind in ("hdri", "img", "mask")
@@ -343,7 +343,7 @@ def test_hdris_of_a_folder_light_views_by_their_seeds_and_are_behind_people(empt
         brightness = (behind - alone) @ (0.299, 0.587, 0.114)
         assert np.abs(brightness)[mask == 255].mean() < 6  # JPEG keeps brightness better than colour
     assert len(used) > 1
-    again = picture_path(tmp_path / "out/anna", "hdri", 3, 1)
+    again = picture_path(tmp_path / "out/anna", "hdri", 2, 1)
     content = again.read_bytes()
     again.unlink()
     (tmp_path / "out/anna" / COMPLETE_FILE).unlink()

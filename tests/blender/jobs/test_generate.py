@@ -5,25 +5,21 @@ from __future__ import annotations
 import os
 import re
 import signal
-import time
 from pathlib import Path
 
 import bpy
 import pytest
-from jobs_driven import drive, error_of, notice_of, shown, until_running
+from jobs_driven import drive, error_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
 
 import blender_primdiffusion
 from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs import queue as queue_module
-from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
-
-"""Seeds that the fake child takes as orders."""
 
 
 def ask(context, seed: int, steps: int) -> None:
@@ -70,6 +66,7 @@ def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_j
     assert not queue.busy
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize(
     ("seed", "sentence"),
     [
@@ -89,13 +86,7 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed,
     assert re.search(sentence, " ".join(panel_texts(addon)))
 
 
-def test_after_a_death_the_next_generation_works(addon):
-    with pytest.raises(RuntimeError):
-        bpy.ops.primdiffusion.generate(seed=DIES, steps=1)
-    assert bpy.ops.primdiffusion.generate(seed=7, steps=1) == {"FINISHED"}
-    assert error_of("generate") == ""
-
-
+@pytest.mark.any_blender
 def test_a_killed_child_is_reported(addon):
     ask(addon, TAKES_LONG, 50)
     until_running()
@@ -126,26 +117,7 @@ def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_resul
     assert any("Generated in" in text for text in panel_texts(addon))
 
 
-def test_cancel_ends_the_job_and_adds_nothing(addon):
-    assert not bpy.ops.primdiffusion.cancel.poll()
-    ask(addon, TAKES_LONG, 50)
-    for _ in range(20):
-        follow()
-        time.sleep(0.01)
-    assert bpy.ops.primdiffusion.cancel() == {"FINISHED"}
-    drive()
-    assert (error_of("generate"), notice_of("generate")) == ("", "Cancelled")
-    assert not humans(addon.scene)
-
-
-def test_loading_another_file_drops_the_job(addon):
-    ask(addon, TAKES_LONG, 50)
-    follow()
-    bpy.ops.wm.read_homefile(use_empty=True)
-    assert not queue.busy
-    assert follow() is None
-
-
+@pytest.mark.any_blender
 def test_an_interpreter_that_does_not_exist_is_named(saved_scene, monkeypatch):
     monkeypatch.setattr(queue_module, "preference", lambda name: "/nowhere/python" if name == "backend_python" else "")
     blender_primdiffusion.register()

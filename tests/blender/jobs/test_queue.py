@@ -23,7 +23,6 @@ from blender_primdiffusion.ui.jobs_panel import PRIMDIFFUSION_PT_jobs
 
 pytestmark = pytest.mark.any_blender
 
-"""Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
 

@@ -19,7 +19,6 @@ from blender_primdiffusion.ui import variations_panel
 
 pytestmark = pytest.mark.any_blender
 
-"""Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
 

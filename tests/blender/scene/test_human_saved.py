@@ -18,12 +18,6 @@ ops = bpy.ops.primdiffusion
 ODD = 'Ä ö\' "x" 100%s 年'
 
 
-def test_saving_and_loading(person):
-    where = places(person)
-    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    assert whole(named(), where)
-
-
 def test_saved_under_another_name_elsewhere_and_then_moved(person, tmp_path):
     where, elsewhere = places(person), tmp_path / ODD
     elsewhere.mkdir()

@@ -146,25 +146,6 @@ def test_a_human_of_an_earlier_version_is_reshaped_about_its_own_origin(person, 
     assert ORIGIN not in armature_of(person).data
 
 
-def test_undo_and_redo_bring_back_bones_mesh_volumes_and_betas(person):
-    def state():
-        (someone,) = humans(bpy.context.scene)
-        bpy.context.view_layer.update()
-        surface = [list(vertex.co) for vertex in body_of(someone).data.vertices]
-        return heads(someone).tolist(), surface, evaluated_matrices(someone).tolist(), betas_of(someone).tolist()
-
-    bpy.ops.ed.undo_push(message="before")
-    before = state()
-    reshape(person, SHAPE)
-    bpy.ops.ed.undo_push(message="reshape")
-    after = state()
-    assert before[0] != after[0]
-    bpy.ops.ed.undo()
-    assert state() == before
-    bpy.ops.ed.redo()
-    assert state() == after
-
-
 def test_mode_selection_scenes_and_objects_stay_as_they_were(person, saved_scene):
     armature = armature_of(person)
     saved_scene.view_layer.objects.active = armature

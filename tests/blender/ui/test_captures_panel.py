@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from blender_primdiffusion.formats.capture_layout import picture_path
 from blender_primdiffusion.formats.joints import JOINT_NAMES
-from capture_person import FACES, _few_faces, chequers, files_of
+from capture_person import _few_faces, chequers, files_of
 from support.errors import refused
 
 import blender_primdiffusion
@@ -234,14 +234,13 @@ def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypat
 def test_cancelling_ends_the_child_and_the_next_run_resumes(extension, only_good, tmp_path):
     asked = extension.scene.primdiffusion_captures
     asked.people, asked.out = str(only_good), str(tmp_path / "captures")
-    asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 3, 400, 400, 30
+    asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 3, 200, 200, 8
     captures.start(words_of(asked, extension, captures.new_folder()))
     follow(until=lambda: captures.fraction > 0)
     assert bpy.ops.primdiffusion.cancel(what="CAPTURES") == {"FINISHED"}
     follow()
     assert captures.notice.startswith("Cancelled")
     assert captures.error == ""
-    asked.width = asked.height = 400
     done = files_of(tmp_path / "captures")
     captures.start(words_of(asked, extension, captures.new_folder()))
     follow()
@@ -331,10 +330,6 @@ def test_hostile_camera_files_are_rejected(tmp_path):
 def test_unknown_options_are_rejected():
     with pytest.raises(UsageError):
         parse(["--out", "a", "--rm", "-rf"])
-
-
-def test_few_faces_are_a_few(empty_scene):
-    assert abs(len(_few_faces()[1]) - FACES) < 60
 
 
 def test_the_button_asks_before_hundreds_of_views(extension, only_good, tmp_path, monkeypatch):

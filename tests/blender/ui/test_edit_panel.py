@@ -22,8 +22,8 @@ from blender_primdiffusion.scene.edit import painted_weights
 from blender_primdiffusion.scene.human import armature_of, body_of, humans, humans_folder, person_file, remove_human
 from blender_primdiffusion.ui import edit_panel
 
-"""Seeds that the fake child takes as orders."""
 FINE = 8
+"""A seed that is no order to the fake child."""
 COUNT = 8
 """Primitives of the synthetic people."""
 ops = bpy.ops.primdiffusion
@@ -184,22 +184,19 @@ def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, s
     assert sentence not in drawn("REDRESS")
 
 
-def test_a_human_removed_during_the_job_is_reported_and_the_other_is_untouched(person):
-    other = paths(humans(bpy.context.scene)[1])
+@pytest.mark.parametrize("by_hand", [False, True], ids=["human removed", "objects deleted by hand"])
+def test_a_human_removed_during_the_job_is_reported_and_the_other_is_untouched(person, by_hand):
+    _, other = humans(bpy.context.scene)
+    before = paths(other)
     start(person)
     until_running()
-    remove_human(person)
+    if by_hand:
+        bpy.data.batch_remove(list(person.all_objects))
+    else:
+        remove_human(person)
     drive()
     assert "'Human' was removed during the edit" in error_of("vary")
-    assert [paths(left) for left in humans(bpy.context.scene)] == [other]
-
-
-def test_objects_deleted_by_hand_while_the_job_runs_count_as_removal(person):
-    start(person)
-    until_running()
-    bpy.data.batch_remove(list(person.all_objects))
-    drive()
-    assert "was removed during the edit" in error_of("vary")
+    assert paths(other) == before
     assert not queue.busy
 
 

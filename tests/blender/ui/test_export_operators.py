@@ -91,6 +91,7 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
     assert not list(out.iterdir())
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize(
     ("operator", "properties", "sentence"),
     [
@@ -224,6 +225,7 @@ def test_a_person_is_put_where_they_were_dropped(store):
     assert person.name == "person"
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize("damage", ["short", "text", "cut", "other"])
 def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, damage):
     path = out / "a.human"

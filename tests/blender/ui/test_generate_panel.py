@@ -22,9 +22,7 @@ from blender_primdiffusion.scene import cycles
 from blender_primdiffusion.scene.cycles import posed_extent
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
 from blender_primdiffusion.scene.place import GAP_M
-from blender_primdiffusion.ui import generate_panel, render_panel
-
-"""A seed that the fake child takes as an order."""
+from blender_primdiffusion.ui import generate_panel
 
 
 @pytest.fixture
@@ -208,14 +206,3 @@ def test_the_next_step_waits_until_no_job_is_running(addon):
     queue.add(addon, GenerateJob(4, {"steps": 5}))
     texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
     assert "primdiffusion.set_up_engine" not in texts
-
-
-@pytest.mark.parametrize(
-    ("engine", "line"),
-    [("PRIMDIFFUSION", "humans exactly"), ("CYCLES", "approximately"), ("BLENDER_WORKBENCH", "choose an engine above")],
-)
-def test_the_output_tab_offers_both_engines_and_a_line_says_how_the_chosen_one_shows_humans(addon, engine, line):
-    addon.scene.render.engine = engine
-    texts = shown(render_panel.PRIMDIFFUSION_PT_render, addon)
-    assert texts.count("primdiffusion.set_up_engine") == 2
-    assert line in " ".join(texts)

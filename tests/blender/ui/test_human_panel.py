@@ -101,18 +101,23 @@ def test_impossible_heights_leave_the_human_unchanged(person, capsys):
 
 
 def test_one_undo_takes_a_slider_back_and_redo_brings_it_again(person):
+    def state():
+        """Bones, mesh, volumes and betas."""
+        (someone,) = humans(bpy.context.scene)
+        heads = [list(bone.head_local) for bone in armature_of(someone).data.bones]
+        return heads, surface(someone), world(someone).tolist(), betas_of(someone).tolist()
+
     bpy.ops.ed.undo_push(message="before")
-    before = surface(person)
+    before = state()
     settings(person).betas = TALL
-    after = surface(person)
+    after = state()
+    assert all(new != old for new, old in zip(after, before, strict=True))
     bpy.ops.ed.undo_push(message="Shape")
     bpy.ops.ed.undo()
-    (person,) = humans(bpy.context.scene)
-    assert surface(person) == before
+    assert state() == before
     bpy.ops.ed.redo()
-    (person,) = humans(bpy.context.scene)
-    assert surface(person) == after
-    np.testing.assert_allclose(betas_of(person), TALL)
+    assert state() == after
+    np.testing.assert_allclose(after[3], TALL)
 
 
 def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_why(person, addon):

@@ -159,6 +159,7 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
     assert len(sequence_files(merged_of(person).data)) == 5
 
 
+@pytest.mark.any_blender
 @pytest.mark.parametrize(
     ("order", "message"), [("fails", "checkpoint is damaged"), ("gives garbage", "damaged"), ("dies", "ended")]
 )

@@ -326,12 +326,6 @@ def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
         assert click.modal(held, around, SimpleNamespace(type=kind, value=value)) == result
 
 
-def test_without_a_window_nothing_is_drawn(addon):
-    from blender_primdiffusion import engine
-
-    assert engine._draw_handlers == []
-
-
 def test_a_picture_above_the_overlays_leaves_the_bones_of_the_same_reading(people, monkeypatch):
     drawn = []
     monkeypatch.setattr(module, "overlay", people.overlay)
