@@ -337,7 +337,6 @@ def test_a_full_memory_file_system_gives_way_to_the_disk(tmp_path, monkeypatch):
     frames.close()
 
 
-@pytest.mark.any_blender
 def test_links_in_shared_memory_lose_nothing_outside(tmp_path, monkeypatch):
     memory = tmp_path / "memory"
     memory.mkdir()

@@ -18,12 +18,10 @@ from support.errors import refused
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import attach_volumes, build_human
-from blender_primdiffusion.scene.collect import collect_before_saving
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.cycles import overlap_warning, overlap_warning_in
+from blender_primdiffusion.scene.cycles import overlap_warning
 from blender_primdiffusion.scene.human import (
     MARK,
-    VolumeWriteError,
     armature_of,
     body_of,
     folder_of,
@@ -132,16 +130,6 @@ def test_provenance_and_overlaps_are_stored_on_the_collection(person):
     assert "draws only 31" in overlap_warning(collection)
 
 
-def test_overlaps_are_reported_only_when_rendering_with_cycles(person):
-    collection, _ = person
-    collection[MARK] = json.dumps({**json.loads(collection[MARK]), "most_overlapping": 40})
-    scene = bpy.context.scene
-    scene.render.engine = "BLENDER_WORKBENCH"
-    assert overlap_warning_in(scene, collection) is None
-    scene.render.engine = "CYCLES"
-    assert "draws only 31" in overlap_warning_in(scene, collection)
-
-
 def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_path):
     collection, arrays = person
     rotations, translation = strong_pose(1)
@@ -159,23 +147,6 @@ def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_pa
     for volume in bpy.data.volumes:
         assert volume.grids.load(), volume.grids.error_message
         assert {grid.name for grid in volume.grids} == {"density", "Cd"}
-
-
-def test_a_person_built_before_the_first_save_is_collected_beside_the_blend(empty_scene, tmp_path):
-    source = synthetic.write(tmp_path / "human", 8)
-    build_human(empty_scene, source)
-    assert all(path.startswith(bpy.app.tempdir) for path in volume_files())
-    bpy.app.handlers.save_pre.append(collect_before_saving)
-    try:
-        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
-    finally:
-        bpy.app.handlers.save_pre.remove(collect_before_saving)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
-    assert all(volume.filepath.startswith("//shot_humans/Human/") for volume in bpy.data.volumes)
-    assert all(volume.grids.load() for volume in bpy.data.volumes)
-    (copied,) = (tmp_path / "shot_humans" / "Human").glob(f"*/{source.name}")
-    assert copied.read_bytes() == source.read_bytes()
-    assert not list(tmp_path.rglob("*.part"))
 
 
 def test_removal_takes_everything_but_the_files(person):
@@ -201,13 +172,6 @@ def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_pa
         build_human(saved_scene, path)
     assert not any(datablocks().values())
     assert sorted(tmp_path.rglob("*")) == files
-
-
-def test_an_unwritable_folder_leaves_the_scene_as_it_was(saved_scene, tmp_path):
-    (tmp_path / "shot_humans").write_text("in the way")
-    with refused(VolumeWriteError):
-        build_human(saved_scene, synthetic.write(tmp_path / "human", 8))
-    assert not any(datablocks().values())
 
 
 def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(

@@ -13,16 +13,13 @@ import synthetic_shape
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
 from scene_stage import replace
 from support import tensor_files
-from support.errors import refused
 
-from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.human import (
     BETAS,
     MARK,
-    VolumeWriteError,
     armature_of,
     body_of,
     folder_of,
@@ -189,29 +186,6 @@ def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person,
     assert {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"} == before
     assert [list(bone.head_local) for bone in armature_of(twin).data.bones] == bones
     assert first(twin)
-
-
-def test_a_damaged_result_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp_path):
-    bad = tmp_path / "bad.human"
-    bad.write_bytes(b"PK no more")
-    before, files = paths(person), sorted(tmp_path.rglob("*.*"))
-    with refused(ValueError, "bad.human"):
-        replace(person, bad)
-    assert paths(person) == before
-    assert sorted(tmp_path.rglob("*.*")) == files
-
-
-def test_a_full_disk_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp_path, monkeypatch):
-    def full(*_):
-        raise OSError("no space left on device")
-
-    edited = redyed(tmp_path, 3)
-    before, files = paths(person), sorted(tmp_path.rglob("*"))
-    monkeypatch.setattr(volumes, "write_vdb", full)
-    with refused(VolumeWriteError):
-        replace(person, edited)
-    assert paths(person) == before
-    assert sorted(tmp_path.rglob("*")) == files
 
 
 def test_after_saving_under_another_name_an_edit_goes_to_the_new_folder(person, saved_scene, tmp_path):

@@ -111,18 +111,6 @@ def test_a_failure_while_building_removes_what_was_written(saved_scene, source, 
     assert not bpy.data.collections
 
 
-def test_slices_write_a_file_at_a_time(saved_scene, source):
-    preparation = Preparation(source, "Anna")
-    fractions = []
-    while not preparation.over:
-        preparation.work(0.0)
-        fractions.append(preparation.fraction)
-    assert fractions == sorted(fractions)
-    assert len(set(fractions)) >= 12
-    prepared = preparation.take()
-    assert len(list(prepared.folder.glob("prim_*.vdb"))) == 12
-
-
 @pytest.mark.parametrize("steps", [0, 1, 5, 40, 1000])
 def test_stopped_preparing_leaves_no_files_however_far_it_was(saved_scene, tmp_path, steps):
     source = synthetic.write(tmp_path / "human", 64)

@@ -62,18 +62,6 @@ def test_the_panels_subject_is_not_looked_for_in_another_folder(addon, captures)
     assert "subject" not in asked_of_the_child(humans(addon.scene)[0])
 
 
-def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon, captures):
-    bpy.ops.ed.undo_push(message="before")
-    bpy.ops.primdiffusion.human_from_captures(directory=str(captures))
-    assert len(bpy.data.volumes) == 8
-    bpy.ops.ed.undo()
-    assert not humans(bpy.context.scene)
-    assert not bpy.data.volumes
-    bpy.ops.ed.redo()
-    assert len(humans(bpy.context.scene)) == 1
-    assert not queue.busy
-
-
 def test_the_operator_cannot_be_redone_with_a_slider():
     options = reconstruct_panel.PRIMDIFFUSION_OT_human_from_captures.bl_options
     assert not {"REGISTER", "UNDO"} & options
@@ -119,12 +107,6 @@ def test_the_panel_shows_progress_and_cancel_ends_the_job_without_a_person(addon
     drive()
     assert (error_of("reconstruct"), notice_of("reconstruct")) == ("", "Cancelled")
     assert not humans(addon.scene)
-
-
-def test_the_timer_builds_the_person(addon, captures):
-    queue.add(addon, generate.ReconstructJob(str(captures), "", 0, 8))
-    drive()
-    assert len(humans(addon.scene)) == 1
 
 
 def test_subjects_are_those_of_the_list_or_of_the_folders(captures):
