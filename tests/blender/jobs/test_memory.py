@@ -18,7 +18,6 @@ from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
 
 pytestmark = pytest.mark.any_blender
-"""Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
 

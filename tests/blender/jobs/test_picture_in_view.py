@@ -23,7 +23,6 @@ from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.build import build_human
 
 pytestmark = pytest.mark.any_blender
-"""Seeds that the fake child takes as orders."""
 LEVEL = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """A view along +y."""
 WIDE = np.diag([0.01, 0.01, 0.01, 1.0]) @ LEVEL

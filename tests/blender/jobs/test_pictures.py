@@ -18,7 +18,6 @@ from blender_primdiffusion.jobs.pictures import SoFar, so_far
 from blender_primdiffusion.jobs.queue import queue
 
 pytestmark = pytest.mark.any_blender
-"""Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
 

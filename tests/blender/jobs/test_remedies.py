@@ -14,7 +14,6 @@ from blender_primdiffusion.jobs import remedies
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 
 pytestmark = pytest.mark.any_blender
-"""Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
 

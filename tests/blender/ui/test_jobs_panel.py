@@ -16,7 +16,6 @@ from blender_primdiffusion.ui import jobs_panel
 from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 
 pytestmark = pytest.mark.any_blender
-"""Seeds that the fake child takes as orders."""
 ops = bpy.ops.primdiffusion
 
 

@@ -22,8 +22,6 @@ from blender_primdiffusion.ui.batch.running import NoBackend, ask
 
 pytestmark = pytest.mark.any_blender
 
-"""Seeds that the fake child takes as orders."""
-
 
 def generate(out: Path, *words: object) -> int:
     return execute(["generate", "--out", str(out), "--steps", "1", "--pictures", "16", *map(str, words)])
