@@ -5,17 +5,19 @@ from __future__ import annotations
 import os
 import re
 import signal
+import time
 from pathlib import Path
 
 import bpy
 import pytest
-from jobs_driven import drive, error_of, shown, until_running
+from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
 
 import blender_primdiffusion
 from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs import queue as queue_module
+from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import armature_of, humans, person_file
@@ -115,6 +117,17 @@ def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_resul
     drive()
     assert len(humans(addon.scene)) == 1
     assert any("Generated in" in text for text in panel_texts(addon))
+
+
+def test_a_cancel_while_the_child_is_being_started_ends_the_job_and_adds_nothing(addon):
+    ask(addon, TAKES_LONG, 50)
+    for _ in range(20):
+        follow()
+        time.sleep(0.01)
+    assert bpy.ops.primdiffusion.cancel() == {"FINISHED"}
+    drive()
+    assert (error_of("generate"), notice_of("generate")) == ("", "Cancelled")
+    assert not humans(addon.scene)
 
 
 @pytest.mark.any_blender
