@@ -116,7 +116,7 @@ def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
     if metadata.get("format") != FORMAT:
         raise NoPersonError(path, "is a safetensors file without a human", "choose a .human.safetensors file")
     if fault := version_fault(metadata):
-        raise FileError(path, fault)
+        raise FileError(path, *fault)
 
 
 def _body_setup(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, torch.Tensor]) -> BodySetup:

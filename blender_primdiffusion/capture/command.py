@@ -185,19 +185,20 @@ def main(argv: Sequence[str]) -> int:
 def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
     """The scans of some folders, sorted by name; of `only`, where names are given.
 
-    Raises FileError where there are none, or two of a name.
+    Raises ValueError where there are none, and FileError for two of a name.
     """
     found: dict[str, ScanFile] = {}
     for folder in folders:
         for scan in find_scans(folder):
             if scan.name in found:
-                raise FileError(f"two scans are called {scan.name}: rename the file or folder of one")
+                reason = f"is called {scan.name}, as is {found[scan.name].path}"
+                raise FileError(scan.path, reason, "rename the file or folder of one")
             found[scan.name] = scan
     unknown = sorted(set(only) - set(found))
     if unknown:
-        raise FileError(f"there is no scan {unknown[0]} in {', '.join(map(str, folders))}")
+        raise FileError(", ".join(map(str, folders)), f"holds no scan {unknown[0]}", "correct --only")
     if not found:
-        raise FileError("there are no scans: name a folder of them with --people")
+        raise ValueError("there are no scans: name a folder of them with --people")
     return [found[name] for name in sorted(found) if not only or name in only]
 
 
@@ -264,9 +265,7 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
         settings.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = error.strerror or error
-        raise FileError(
-            f"nothing can be written to {settings.out} ({reason}): choose another folder with --out"
-        ) from error
+        raise FileError(settings.out, f"cannot be written to ({reason})", "choose another folder with --out") from error
     report, printed = Report(), 0.0
     with contextlib.closing(run(bpy.context, settings, scans, report)) as steps:
         for progress in steps:

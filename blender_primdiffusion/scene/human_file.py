@@ -21,7 +21,7 @@ from ..formats.arrays import all_finite, check_shapes
 from ..formats.human_metadata import version_fault
 from ..formats.json_files import parse_json
 from ..formats.poses.rotation import first_improper, improper_text
-from ..formats.regular_files import as_file_error, read_regular
+from ..formats.regular_files import FileError, as_file_error, read_regular
 from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, check_limits, read_layout
 from ..formats.whole_files import written_whole
 from .human import BETA_COUNT, LARGEST_PERSON
@@ -124,7 +124,7 @@ def read_payload(path: Path) -> HumanPayload:
 def payload_in(human: HumanTensors, name: str, remedy: str = GENERATE_AGAIN) -> HumanPayload:
     """As `read_payload`, of a file of this name that was read."""
     if fault := version_fault(human.metadata):
-        raise ValueError(f"{name!r} {fault}")
+        raise FileError(repr(name), *fault)
     shapes = {field: shape for field, shape in _PAYLOAD.items() if field in human.arrays or field != "rest_half_extent"}
     with as_file_error(repr(name), "is damaged", remedy):
         stored = expanded(human).arrays

@@ -168,7 +168,7 @@ def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how
 
 @pytest.mark.parametrize(
     ("version", "message"),
-    [("4", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
+    [("4", "format 4"), ("10", "format 10"), ("one", "format version 'one'"), ("0", "'0'")],
 )
 def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, version, message):
     path = tmp_path / "other.human.safetensors"

@@ -34,14 +34,14 @@ class Provenance(Open):
     edits: list[Edit] = dataclasses.field(default_factory=list)
 
 
-def version_fault(metadata: Mapping[str, str]) -> str | None:
-    """Why a file's version cannot be read, if so: the end of a sentence that begins with the file's name."""
+def version_fault(metadata: Mapping[str, str]) -> tuple[str, str] | None:
+    """Why a file's version cannot be read, if so: reason and remedy of a FileError."""
     version = metadata.get("format_version", "")
     newest = compact_human.FORMAT_VERSION
     if not (version.isascii() and version.isdecimal() and len(version) <= 9) or int(version) < 1:
-        return f"does not contain a valid human (format version {version!r:.9}): generate it again"
+        return f"does not contain a valid human (format version {version!r:.9})", "generate it again"
     if int(version) > newest:
-        return f"was written by a newer PrimDiffusion (format {version}, this one reads up to {newest}): update it"
+        return f"has format {version} of a newer PrimDiffusion, this one reads up to {newest}", "update PrimDiffusion"
     return None
 
 

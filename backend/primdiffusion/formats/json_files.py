@@ -28,7 +28,7 @@ class JsonError(ValueError):
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file as `parse_json` does. Raises JsonError, TooLargeError and OSError."""
+    """Read a JSON file as `parse_json` does. Raises JsonError, FileError and OSError."""
     return parse_json(read_regular(path, LARGEST_BYTES))
 
 

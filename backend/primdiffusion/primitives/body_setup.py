@@ -20,7 +20,7 @@ from primdiffusion.body.smpl_files import LARGEST_BODY_FILE, load_body, read_bod
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import (
     FileContent,
-    TooLargeError,
+    FileError,
     check_regular,
     check_size,
     is_plain_path,
@@ -134,7 +134,7 @@ def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
             stamp = _Stamp.of(path)
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
             continue
-        except (OSError, TooLargeError) as error:
+        except (OSError, FileError) as error:
             problem = f"cannot be read ({getattr(error, 'strerror', None) or 'it is too large'})"
             continue
         if _sha256(stamp) == file.sha256:
@@ -173,7 +173,7 @@ class _Stamp:
 
     @classmethod
     def of(cls, path: Path) -> _Stamp:
-        """Raises as `check_regular`, and TooLargeError; FileNotFoundError for an empty file."""
+        """Raises as `check_regular`, and FileError; FileNotFoundError for an empty file."""
         stat = check_regular(path)
         if not stat.st_size:  # also endless files of /proc
             raise FileNotFoundError(errno.ENOENT, "the file is empty", str(path))
