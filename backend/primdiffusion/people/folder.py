@@ -79,7 +79,7 @@ def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int
 
     Raises:
         ValueError: the folder contains other samples; a worker process was killed.
-        AssetsMissingError, FileError: asset files are missing or damaged.
+        FileNotFoundError, FileError: asset files are missing or damaged.
         OSError: a file cannot be written.
     """
     if workers < 1:
