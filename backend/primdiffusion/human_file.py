@@ -31,7 +31,7 @@ from primdiffusion.formats.regular_files import FileError, as_file_error
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human
 from primdiffusion.primitives.anchors import Anchors
-from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
+from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, find_body_setup
 from primdiffusion.primitives.primitives import K, Payload, S
 
 FORMAT = "primdiffusion.human"
@@ -105,8 +105,8 @@ def load_human(path: str | Path) -> Human:
         body_setup = _body_setup(path, metadata, tensors) if "body" in metadata else None
         human = Human(payload, tensors["betas"], provenance_of(metadata), body_setup).validate()
         _check_values(human)
-    except BodySetupError as e:
-        raise FileError(path, "needs its body", str(e)) from e
+    except FileError as e:
+        raise FileError(path, f"needs its body, but {e.path} {e.reason}", e.remedy) from e
     except ValueError as e:
         raise FileError(path, "does not contain a valid human", str(e)) from e
     return human
