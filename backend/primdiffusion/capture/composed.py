@@ -50,7 +50,7 @@ def write_composed(
 
     Raises:
         FileNotFoundError, FileError: an image or the background is missing or damaged.
-        OutsideFolderError, OSError: the file cannot be written, or lies behind a link out of the captures.
+        FileError, OSError: the file cannot be written, or lies behind a link out of the captures.
     """
     path, view = composed_path(subject, frame, camera), subject.views[camera]
     check_inside(path, subject.folder.parent)

@@ -52,7 +52,7 @@ def verify(root: Path, *, checksums: bool = True) -> dict[Path, str]:
 def repair(root: Path, wrong: Collection[Path]) -> None:
     """Remove the files that `verify` has found, with the completion marks of their subjects; rewrite the list.
 
-    The command that rendered the dataset then renders only those files again. Raises OutsideFolderError, before it
+    The command that rendered the dataset then renders only those files again. Raises FileError, before it
     removes anything, where one of them lies behind a link out of its folder, and OSError.
     """
     for path in wrong:

@@ -15,6 +15,7 @@ from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
 from support.errors import refused
 
+from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import attach_volumes, build_human
@@ -23,7 +24,6 @@ from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning, overlap_warning_in
 from blender_primdiffusion.scene.human import (
     MARK,
-    VolumeWriteError,
     armature_of,
     body_of,
     folder_of,
@@ -205,7 +205,7 @@ def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_pa
 
 def test_an_unwritable_folder_leaves_the_scene_as_it_was(saved_scene, tmp_path):
     (tmp_path / "shot_humans").write_text("in the way")
-    with refused(VolumeWriteError):
+    with refused(FileError):
         build_human(saved_scene, synthetic.write(tmp_path / "human", 8))
     assert not any(datablocks().values())
 

@@ -15,6 +15,7 @@ from scene_stage import replace
 from support import tensor_files
 from support.errors import refused
 
+from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
@@ -22,7 +23,6 @@ from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.human import (
     BETAS,
     MARK,
-    VolumeWriteError,
     armature_of,
     body_of,
     folder_of,
@@ -208,7 +208,7 @@ def test_a_full_disk_leaves_scene_and_disk_as_they_were(person, saved_scene, tmp
     edited = redyed(tmp_path, 3)
     before, files = paths(person), sorted(tmp_path.rglob("*"))
     monkeypatch.setattr(volumes, "write_vdb", full)
-    with refused(VolumeWriteError):
+    with refused(FileError):
         replace(person, edited)
     assert paths(person) == before
     assert sorted(tmp_path.rglob("*")) == files
