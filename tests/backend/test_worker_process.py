@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from primdiffusion.worker_process import THREAD_COUNTS, ProcessDied, each, run_in_process
+from primdiffusion.worker_process import THREAD_COUNTS, each, run_in_process
 from support.errors import refused
 
 
@@ -23,7 +23,7 @@ def test_answers_and_errors_come_back():
 
 
 def test_a_process_that_dies_is_an_error():
-    with refused(ProcessDied, "_exit"):
+    with refused(ValueError, "_exit"):
         run_in_process(os._exit, 3, on_wait=nothing)
 
 
