@@ -28,7 +28,7 @@ from ..console import (
     CommandParser,
     Report,
     Stop,
-    UsageError,
+    Stopped,
     duration,
     report_path,
     separate_stdout,
@@ -99,7 +99,7 @@ def parser() -> CommandParser:
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
-    """The options in `argv`. Raises UsageError; SystemExit after --help."""
+    """The options in `argv`. Raises ValueError; SystemExit after --help."""
     return parser().parse_args(list(argv))
 
 
@@ -156,15 +156,11 @@ def _shard(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
-class _Stopped(Exception):
-    """The command was asked to stop."""
-
-
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns its exit code. Blender's own messages on stdout are dropped."""
     try:
         options = parse(argv)
-    except UsageError as error:
+    except ValueError as error:
         print(f"capture: {error}; --help names all options", file=sys.stderr, flush=True)
         return UNUSABLE
     with separate_stdout() as write:
@@ -177,7 +173,7 @@ def main(argv: Sequence[str]) -> int:
         except (OSError, ValueError) as error:
             print(f"capture: {error}", file=sys.stderr, flush=True)
             return UNUSABLE
-        except _Stopped:
+        except Stopped:
             say("Stopped; the same command resumes from here.")
             return CANCELLED
 
@@ -278,7 +274,7 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
                     printed = time.monotonic()
                     say(describe(progress))
             if stop.is_set():
-                raise _Stopped
+                raise Stopped
     say(f"{len(report.done)} done, {len(report.skipped)} were there, {len(report.failed)} failed")
     if report.failed:
         say(f"What failed and why: {report_path(settings.out, settings.shard)}")
