@@ -59,7 +59,7 @@ class MergedState:
 
 def read_grid(path: Path) -> MergedGrid:
     """Read the child's file. Raises ValueError for a damaged one, OSError."""
-    with as_file_error(f"the merged grid {path.name!r}", "is damaged", "merge again"):
+    with as_file_error(path, "is not a merged volume or is damaged", "merge again"):
         stored = read_arrays(path, tuple(_SHAPES))
         check_shapes(path, stored, _SHAPES, {})
         faulty = [name for name, values in stored.items() if not all_finite(values)]

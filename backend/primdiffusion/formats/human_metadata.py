@@ -60,14 +60,14 @@ def provenance_of(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _no_json(error: ValueError) -> ValueError:
-    return ValueError(f"its provenance is not JSON ({error!s:.100}): generate the human again")
+    return ValueError(f"its provenance is not JSON ({error!s:.100})")
 
 
 def check_provenance(provenance: Any) -> None:
     """Raise ValueError, naming the entry, for one of a wrong type."""
     if not isinstance(provenance, Mapping):
-        raise ValueError(f"its provenance is {provenance!r:.60}, not a JSON object: generate the human again")
+        raise ValueError(f"its provenance is {provenance!r:.60}, not a JSON object")
     try:
         read(Provenance, provenance)
     except FieldError as error:
-        raise ValueError(f"{error.field!r} of its provenance is not valid: generate the human again") from error
+        raise ValueError(f"{error.field!r} of its provenance is not valid") from error

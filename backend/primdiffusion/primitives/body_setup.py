@@ -102,7 +102,7 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
     while len(_loaded) > _KEPT:
         del _loaded[next(iter(_loaded))]
     if tuple(rest_half_extent.shape) != (K, 3) or not bool((rest_half_extent > 0).all()):
-        raise ValueError(f"the stored rest extents are not {K} x 3 positive: import or generate the file again")
+        raise ValueError(f"the stored rest extents are not {K} x 3 positive")
     return dataclasses.replace(
         body_setup, anchors=dataclasses.replace(body_setup.anchors, rest_half_extent=rest_half_extent), files=files
     )
