@@ -105,7 +105,7 @@ def find_armature(objects: Sequence[bpy.types.Object], scan_file: ScanFile) -> b
     used = {armature for obj in objects if obj.type == "MESH" for armature in [moved_by(obj)] if armature}
     if len(used) > 1:
         names = ", ".join(sorted(armature.name for armature in used))
-        raise FileError(scan_file.path, f"holds {len(used)} skeletons ({names})", "save each person in a file of its own")
+        raise FileError(scan_file.path, f"holds {len(used)} skeletons ({names})", "save each person in its own file")
     return next(iter(used), None)
 
 

@@ -130,7 +130,8 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
 def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph) -> Drawing:
     """Draw one view layer into the engine's result; returns when it is finished or cancelled by the user.
 
-    Raises ChildProcessError with the child's error, FileNotFoundError for a human without a file, and ValueError for what cannot be drawn.
+    Raises ChildProcessError with the child's error, FileNotFoundError for a human without a file, and ValueError for
+    what cannot be drawn.
     """
     scene = depsgraph.scene
     camera = engine.camera_override or scene.camera

@@ -162,5 +162,3 @@ def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequen
     digest = hashlib.sha256(f"{state_of(collection)} {shape}".encode())
     digest.update(rounded.tobytes())
     return digest.hexdigest()[:16]
-
-

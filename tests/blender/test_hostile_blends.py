@@ -8,11 +8,11 @@ from pathlib import Path
 import bpy
 import pytest
 from blend_tampering import COUNT, PROPERTIES, SECRET, Stage, build, in_preferences, panels_fault, person, tried
+from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.backend import environment
 from blender_primdiffusion.backend.environment import BackendNotFound, candidates
-from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_before_rendering
 from blender_primdiffusion.jobs.queue import chosen_checkpoint, queue
 from blender_primdiffusion.places import EXTENSION, preference

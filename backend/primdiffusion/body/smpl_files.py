@@ -54,8 +54,8 @@ def load_body(
 
     Raises:
         FileNotFoundError: a file does not exist.
-        FileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range, or a pickle names
-            a global that arrays do not need.
+        FileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range, or a pickle
+            names a global that arrays do not need.
     """
     if not isinstance(path, FileContent) and not pathlib.Path(path).is_file():
         raise FileNotFoundError(f"There is no body model at {path}; give the path of an SMPL .pkl or .npz file.")
@@ -185,8 +185,8 @@ def _texture_coordinates(
     if not numbers or coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
         raise FileError(
             source,
-            f"has texture coordinates of shapes {coordinates.shape} and {coordinate_faces.shape}, which do not fit a body "
-            f"of {len(faces)} faces",
+            f"has texture coordinates of shapes {coordinates.shape} and {coordinate_faces.shape}, which do not fit a "
+            f"body of {len(faces)} faces",
             f"give numbers T x 2 and {len(faces)} x 3, in the body's face order",
         )
     coordinate_faces = coordinate_faces.astype(np.int64)

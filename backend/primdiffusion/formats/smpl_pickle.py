@@ -201,9 +201,7 @@ def as_array(value: object, nesting: int = 0) -> np.ndarray:
         ValueError: the value is not a plain array of numbers, or its parts contradict each other.
     """
     if nesting > MAX_NESTING:
-        raise ValueError(
-            f"an array is made from arrays nested more than {MAX_NESTING} deep"
-        )
+        raise ValueError(f"an array is made from arrays nested more than {MAX_NESTING} deep")
     try:
         return _as_array(value, nesting)
     except (TypeError, LookupError, AttributeError, OverflowError, MemoryError) as error:

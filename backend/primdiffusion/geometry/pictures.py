@@ -51,8 +51,8 @@ def opened_picture(
     `bytes_each` is the number of bytes that the block makes of a pixel, by which large pictures of small files are
     rejected before anything is decoded.
 
-    Raises ValueError with a reason that does not name the file, FileError for one that is too large, and OSError for one
-    that cannot be opened.
+    Raises ValueError with a reason that does not name the file, FileError for a file that is too large, and OSError for
+    one that cannot be opened.
     """
     with contextlib.ExitStack() as stack:
         if isinstance(source, Path):

@@ -121,8 +121,7 @@ def parse_obj(text: str) -> ObjMesh:
     uv_array = np.array(face_coordinates)
     if face_array.min() < 0 or face_array.max() >= len(vertices) or uv_array.max() >= len(coordinates):
         raise ValueError(
-            f"a face refers to others than its {len(vertices)} vertices and {len(coordinates) - 1} texture coordinates, "
-            "counted from the first"
+            f"a face refers to others than its {len(vertices)} vertices and {len(coordinates) - 1} texture coordinates"
         )
     return ObjMesh(np.array(vertices, np.float64), face_array, np.array(coordinates, np.float64)[uv_array])
 

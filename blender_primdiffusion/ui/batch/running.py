@@ -96,8 +96,8 @@ def ask(
 ) -> Any:
     """The child's answer, a record of `formats.answers`; `on_progress` is called with the request whenever it changes.
 
-    Raises BackendNotFound, RuntimeError with the child's error, and Stopped once `stop` is set, within a second; then no
-    file is left.
+    Raises BackendNotFound, RuntimeError with the child's error, and Stopped once `stop` is set, within a second; then
+    no file is left.
     """
     request = ChildRequest(backend, method, params)
     while not request.finished:

@@ -13,9 +13,9 @@ from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.model import load_encoder, look_up
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.released.imported import Reference, reference_extents
 from primdiffusion.released.stage_one import account_stage_one, encoder_tensors

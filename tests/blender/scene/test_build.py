@@ -10,12 +10,12 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.regular_files import FileError
 from human_stage import strong_pose
 from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
 from support.errors import refused
 
-from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import attach_volumes, build_human

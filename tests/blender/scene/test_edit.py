@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from blender_primdiffusion.formats.regular_files import FileError
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
 from scene_stage import replace
 from support import tensor_files
 from support.errors import refused
 
-from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human

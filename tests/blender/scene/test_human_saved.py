@@ -7,10 +7,10 @@ import shutil
 
 import bpy
 import pytest
+from blender_primdiffusion.formats.regular_files import FileError
 from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
-from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.scene.collect import collect_files
 from blender_primdiffusion.scene.human import folder_of, humans_folder, person_file, volume_path
 from blender_primdiffusion.scene.missing import missing_files
