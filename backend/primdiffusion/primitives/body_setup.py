@@ -138,7 +138,7 @@ def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
         shown, problem = f"{path!s:.120}", "has changed"
     if problem == "has changed":
         raise _changed(shown, file)
-    reason = f"{problem} (the body file with sha256 {file.sha256[:12]}...)"
+    reason = f"{problem} (a body file, sha256 {file.sha256[:12]}...)"
     raise FileError(shown, reason, "restore it, or put a copy beside the file that refers to it")
 
 
@@ -151,7 +151,7 @@ def _read(path: Path, file: FileFingerprint) -> FileContent:
 
 
 def _changed(shown: str, file: FileFingerprint) -> FileError:
-    reason = f"has changed (the body file had sha256 {file.sha256[:12]}...)"
+    reason = f"has changed (a body file, sha256 was {file.sha256[:12]}...)"
     return FileError(shown, reason, "restore it, or import the checkpoint again with this file")
 
 
