@@ -21,15 +21,15 @@ DONE, FAILED, UNUSABLE, NO_BACKEND, CANCELLED = 0, 1, 2, 3, 130
 """Exit codes: all done; some failed, and the report lists them; usage error; no Python runs the backend; stopped."""
 
 
-class UsageError(ValueError):
-    """Options that a command does not accept."""
+class Stopped(Exception):
+    """The command was asked to stop."""
 
 
 class CommandParser(argparse.ArgumentParser):
-    """A parser of command lines that raises UsageError, with options for fields of records."""
+    """A parser of command lines that raises ValueError, with options for fields of records."""
 
     def error(self, message: str) -> NoReturn:
-        raise UsageError(message)
+        raise ValueError(message)
 
     def add_declared(self, record: type, field: str, option: str = "", **changes: Any) -> None:
         """An option for a field: a flag, a choice, a file or a number, with its default and description."""

@@ -29,7 +29,10 @@ class PictureOutOfMemory(MemoryError):
     """An image that does not fit into memory."""
 
     def __init__(self, width: int, height: int):
-        super().__init__(f"there is not enough memory for a picture of {width} x {height} pixels")
+        super().__init__(width, height)  # by which it is pickled
+
+    def __str__(self) -> str:
+        return "there is not enough memory for a picture of {} x {} pixels".format(*self.args)
 
 
 class MissingPackageError(ImportError):

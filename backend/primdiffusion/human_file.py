@@ -31,7 +31,7 @@ from primdiffusion.formats.regular_files import FileError, as_file_error
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human
 from primdiffusion.primitives.anchors import Anchors
-from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
+from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, find_body_setup
 from primdiffusion.primitives.primitives import K, Payload, S
 
 FORMAT = "primdiffusion.human"
@@ -101,14 +101,10 @@ def load_human(path: str | Path) -> Human:
     _check_shapes(path, tensors)
     tensors |= {name: tensors[name].float() for name in SHAPES}
     payload = Payload(tensors["rgb"], tensors["density"], tensors["delta_scale"])
-    try:
+    with as_file_error(path, "does not contain a valid human", "generate it again"):
         body_setup = _body_setup(path, metadata, tensors) if "body" in metadata else None
         human = Human(payload, tensors["betas"], provenance_of(metadata), body_setup).validate()
         _check_values(human)
-    except BodySetupError as e:
-        raise FileError(path, "needs its body", str(e)) from e
-    except ValueError as e:
-        raise FileError(path, "does not contain a valid human", str(e)) from e
     return human
 
 
@@ -116,12 +112,15 @@ def _check_format(path: Path, metadata: Mapping[str, str]) -> None:
     if metadata.get("format") != FORMAT:
         raise NoPersonError(path, "is a safetensors file without a human", "choose a .human.safetensors file")
     if fault := version_fault(metadata):
-        raise FileError(path, fault)
+        raise FileError(path, *fault)
 
 
 def _body_setup(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, torch.Tensor]) -> BodySetup:
     extents = tensors.get("rest_half_extent", torch.empty(0))
-    return find_body_setup(BodyFiles.from_json(metadata["body"]), extents, [path.parent])
+    try:
+        return find_body_setup(BodyFiles.from_json(metadata["body"]), extents, [path.parent])
+    except FileError as e:
+        raise FileError(path, f"needs its body, but {e.path} {e.reason}", e.remedy) from e
 
 
 def _expanded(path: Path, tensors: dict[str, torch.Tensor], metadata: Mapping[str, str]) -> dict[str, torch.Tensor]:
@@ -154,13 +153,10 @@ def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
 def _check_values(human: Human) -> None:
     for name, values in vars(human.payload).items():
         if float(values.abs().max()) > compact_human.LARGEST_VALUE or (name == "density" and float(values.min()) < 0):
-            raise ValueError(f"{name!r} holds impossible values: generate the human again")
+            raise ValueError(f"{name!r} holds impossible values")
     largest = float(human.betas.abs().max())
     if largest > LARGEST_BETA:
-        raise ValueError(
-            f"the largest beta is {largest:.3g}, but bodies are only valid up to {LARGEST_BETA:g}: "
-            "choose smaller betas, or generate the human again"
-        )
+        raise ValueError(f"the largest beta is {largest:.3g}, but bodies are only valid up to {LARGEST_BETA:g}")
 
 
 @fixed_threads(GRID_THREADS)

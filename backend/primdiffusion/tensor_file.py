@@ -35,7 +35,7 @@ Network = TypeVar("Network", bound=nn.Module)
 def read(path: Path, limit: int = LARGEST_FILE) -> tuple[dict[str, Tensor], dict[str, str]]:
     """Return the tensors and the metadata of a file of at most `limit` bytes.
 
-    Raises ValueError, also for numbers that are not finite or above LARGEST_NUMBER; TooLargeError,
+    Raises ValueError, also for numbers that are not finite or above LARGEST_NUMBER; FileError for a larger file,
     FileNotFoundError and other OSErrors.
     """
     file = opened(path, limit)

@@ -57,7 +57,7 @@ def load(path: Path) -> object:
     """Return what torch.save wrote. Numbers of large files since torch 1.6 stay on disk until they are used.
 
     The file is opened once, and what is loaded are the bytes whose operations were checked. Raises PICKLE_ERRORS,
-    TooLargeError (a ValueError) and OSError.
+    FileError and OSError.
     """
     with open_regular(path, LARGEST_FILE) as file, warnings.catch_warnings():
         warnings.simplefilter("ignore")  # torch warns about pickles that it then rejects
@@ -106,7 +106,7 @@ class _Archive:
         return unpickler.load()
 
     def _load_copy(self, content: bytes) -> object:
-        """Load a copy of the members that belong to the pickle `content`. Raises PICKLE_ERRORS, TooLargeError."""
+        """Load a copy of the members that belong to the pickle `content`. Raises PICKLE_ERRORS, FileError."""
         members: dict[str, bytes | memoryview] = {"data.pkl": content, "byteorder": b"little", "version": b"3\n"}
         for saved_id in _storage_ids(content):
             key, member, _ = self._stored(saved_id)

@@ -45,15 +45,12 @@ def _end_with_parent() -> None:
         os._exit(1)
 
 
-class ProcessDied(RuntimeError):
-    """The process exited without returning a result."""
-
-
 def run_in_process(function: Callable[..., Any], *arguments: Any, on_wait: Callable[[], None]) -> Any:
     """Return `function(*arguments)`, computed in a spawned process; arguments and result are pickled.
 
     The process imports the function's module, so that module should import quickly. `on_wait` is called every
-    POLL_S; an exception it raises kills the process. Raises the function's own exceptions, and ProcessDied.
+    POLL_S; an exception it raises kills the process. Raises the function's own exceptions, and ValueError for a
+    process that died.
     """
     context = multiprocessing.get_context("spawn")
     answers, answering = context.Pipe(duplex=False)
@@ -65,7 +62,7 @@ def run_in_process(function: Callable[..., Any], *arguments: Any, on_wait: Calla
             on_wait()
         done, answer = answers.recv()
     except EOFError as e:
-        raise ProcessDied(f"the process of {function.__name__} died, perhaps out of memory: try again") from e
+        raise ValueError(f"the process of {function.__name__} died, perhaps out of memory: try again") from e
     finally:
         process.kill()
         process.join()

@@ -85,10 +85,6 @@ class Silent:
 Event = Response | ErrorResponse | Notification | Died | Silent
 
 
-class MalformedMessage(ValueError):
-    """A message of the child that is not what the protocol promises; its text names the fault."""
-
-
 def is_program(path: Path) -> bool:
     """Whether a path is that of the backend's command line, instead of a Python's."""
     return path.stem.lower() == PROGRAM
@@ -231,7 +227,7 @@ class BackendClient:
                     self._abandoned.discard(event.id)
                 elif not (isinstance(event, Notification) and event.method == "heartbeat"):
                     events.append(event)
-        except MalformedMessage as fault:
+        except ValueError as fault:
             return [*events, *self._give_up(str(fault))]
         if exit_code is not None and not self._lines and self._output is not None and self._output.at_end:
             events.extend(self._end(exit_code))
@@ -289,13 +285,13 @@ class BackendClient:
     # what has arrived
 
     def _arrived(self) -> Iterator[Event]:
-        """Messages, for POLL_S at most. Raises MalformedMessage."""
+        """Messages, for POLL_S at most. Raises ValueError."""
         end = time.monotonic() + POLL_S
         while self._output is not None:
             if not self._lines:
                 self._lines.extend(self._output.lines())
                 if self._output.lost_message:
-                    raise MalformedMessage(f"longer than {LONGEST_LINE >> 20} MB")
+                    raise ValueError(f"longer than {LONGEST_LINE >> 20} MB")
                 if not self._lines:
                     return
             line = self._lines.popleft()
@@ -307,13 +303,13 @@ class BackendClient:
                 return
 
     def _event(self, line: bytes) -> Event:
-        """Read a message. Raises MalformedMessage."""
+        """Read a message. Raises ValueError."""
         try:
             return self._read(read(Message, parse_message(line)))
         except FieldError as fault:
-            raise MalformedMessage(fault.field) from fault
+            raise ValueError(fault.field) from fault
         except ValueError as error:
-            raise MalformedMessage("not JSON") from error
+            raise ValueError("not JSON") from error
 
     def _read(self, message: Message) -> Event:
         """Raises FieldError."""
@@ -340,7 +336,7 @@ class BackendClient:
         self._ended = True
         last = self._output.rest() if self._output is not None else b""
         if last.lstrip().startswith(b"{"):
-            with contextlib.suppress(MalformedMessage):  # cut off by its death
+            with contextlib.suppress(ValueError):  # cut off by its death
                 yield self._event(last)
         self._close_streams()
         if not self._expected_to_end:

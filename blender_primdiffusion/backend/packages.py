@@ -215,10 +215,6 @@ _WHAT_WENT_WRONG = (
 )
 
 
-class SetUpFailed(RuntimeError):
-    """The environment was not finished; the message is one sentence for the user."""
-
-
 def clean_environment(temporary: Path, pip_cache: Path) -> dict[str, str]:
     """For pip and venv: nothing of a user's Python set-up, pip's own settings (mirror, proxy, certificate) stay."""
     environment = passed_on(NETWORK)
@@ -232,7 +228,7 @@ def followed(
 ) -> Generator[str, None, None]:
     """Run a command whose output is added to the log, and yield its output so far while it runs; closing ends it.
 
-    Raises SetUpFailed with what `explain` makes of the output and the exit code of a command that fails.
+    Raises RuntimeError with what `explain` makes of the output and the exit code of a command that fails.
     """
     with log.open("ab") as output:
         output.write(f"$ {' '.join(command)}\n".encode())
@@ -249,7 +245,7 @@ def followed(
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
         except OSError as error:
-            raise SetUpFailed(f"{command[0]} cannot be run: {error.strerror}") from error
+            raise RuntimeError(f"{command[0]} cannot be run: {error.strerror}") from error
     try:
         while (exit_code := process.poll()) is None:
             yield _output_since(log, start)
@@ -258,7 +254,7 @@ def followed(
             process.kill()
             process.wait()
     if exit_code != 0:
-        raise SetUpFailed(explain(_output_since(log, start), exit_code))
+        raise RuntimeError(explain(_output_since(log, start), exit_code))
 
 
 def _output_since(log: Path, start: int) -> str:

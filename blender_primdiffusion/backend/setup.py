@@ -27,7 +27,7 @@ from ..formats.removing import remove_file, remove_folder
 from ..formats.whole_files import write_atomically
 from .client import BackendClient
 from .environment import MARK, BackendPython, SetUpFolder, search, tried
-from .packages import Lock, SetUpFailed, clean_environment, followed, what_went_wrong
+from .packages import Lock, clean_environment, followed, what_went_wrong
 from .requests import Backend, ChildRequest
 
 State = Literal["absent", "broken", "ready"]
@@ -58,7 +58,7 @@ class Step:
 
 
 Steps = Generator[Step, None, str]
-"""Returns a sentence on how it ended; raises SetUpFailed or OSError."""
+"""Returns a sentence on how it ended; raises RuntimeError or OSError."""
 
 
 def state_of(folder: SetUpFolder) -> tuple[State, dict[str, Any]]:
@@ -80,7 +80,7 @@ def set_up(
     folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path, wheels: Path | None = None
 ) -> Steps:
     """Rebuild the environment from the package index, or from a folder of `wheels`; it is ready once it has generated
-    a human. `compute` (cpu, cuda or apple) is for its mark. Raises SetUpFailed, and OSError."""
+    a human. `compute` (cpu, cuda or apple) is for its mark. Raises RuntimeError, and OSError."""
     python, host = folder.python, sys.executable
     _check_own(folder)
     for path in () if wheels is None else wheels.iterdir():
@@ -142,10 +142,10 @@ def remove(folder: SetUpFolder, cache: Path | None) -> Steps:
 
 
 def _check_own(folder: SetUpFolder) -> None:
-    """Raises SetUpFailed for links: what they lead to is not ours to empty."""
+    """Raises RuntimeError for links: what they lead to is not ours to empty."""
     for path in (folder.environment, folder.downloads, folder.temporary):
         if path.is_symlink():
-            raise SetUpFailed(f"{path} is a link to another folder: remove the link, then set the backend up again")
+            raise RuntimeError(f"{path} is a link to another folder: remove the link, then set the backend up again")
 
 
 def _pip(python: Path) -> list[str]:
@@ -170,9 +170,9 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
         if request.error is not None:
             tried[python] = False
             last = f" ({request.error.log[-1]})" if request.error.kind == "died" and request.error.log else ""
-            raise SetUpFailed(f"the self-test failed: {request.error.message}{last}")
+            raise RuntimeError(f"the self-test failed: {request.error.message}{last}")
         if not request.result.person.is_file():
-            raise SetUpFailed("the self-test failed: the backend made no human and did not say why")
+            raise RuntimeError("the self-test failed: the backend made no human and did not say why")
         return {
             "device": request.info.get("device_name") or "",
             "seconds": round(time.monotonic() - began, 1),

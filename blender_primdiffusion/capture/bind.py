@@ -83,10 +83,8 @@ def _register(scan_file: ScanFile, body: Body, parameters: Parameters, meshes) -
     posed = posed * parameters.scale + parameters.translation
     found = register(points_to_backend(mesh_points(meshes)), posed)
     if found.distance > _FAR_M * parameters.scale:
-        raise FileError(
-            f"{scan_file.path} does not match {scan_file.parameters}: its surface is {found.distance * 100:.0f} cm off "
-            "the body on average; check that they belong together and that the parameters are SMPL's"
-        )
+        reason = f"does not match {scan_file.parameters} (surface and body are {found.distance * 100:.0f} cm apart)"
+        raise FileError(scan_file.path, reason, "check that they belong together and that the parameters are SMPL's")
     return found
 
 
@@ -143,10 +141,8 @@ def _shape(body: Body, parameters: Parameters, surface: ScanSurface, scan_file: 
         return own.betas, np.zeros(3), [f"shape of its parameters, {own.residual * 1000:.0f} mm off on average"]
     fit = fit_surface(body, np.zeros(0), parameters.rotations, np.zeros(3), nearest)
     if fit.residual > _FAR_M:
-        raise FileError(
-            f"{scan_file.path} does not match {scan_file.parameters}: its surface is {fit.residual * 100:.0f} cm from "
-            "the body; check that they belong together"
-        )
+        reason = f"does not match {scan_file.parameters} (surface and body are {fit.residual * 100:.0f} cm apart)"
+        raise FileError(scan_file.path, reason, "check that they belong together")
     note = f"shape of the {body.name} body fitted to its surface, {fit.residual * 1000:.0f} mm off on average"
     return fit.betas, fit.shift, [note]
 

@@ -21,6 +21,7 @@ from ..formats.regular_files import FileError
 BETAS = 10
 """Shape components in use."""
 _KEYS = ("v_template", "shapedirs", "posedirs", "J_regressor", "weights", "f", "kintree_table")
+_BODY_MODEL = "use an .npz of SMPL's form with plain arrays"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -46,12 +47,12 @@ class Body:
     def rest(self, betas: NDArray) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """A person's vertices [V, 3] and joints [24, 3] at rest (SMPL eqs. 8 and 10). Missing betas count as zero.
 
-        Raises FileError where there are more betas than the body has components and the further ones are not zero.
+        Raises ValueError where there are more betas than the body has components and the further ones are not zero.
         """
         betas = np.asarray(betas, np.float64).ravel()
         known = self.shape_basis.shape[-1]
         if np.any(betas[known:] != 0):
-            raise FileError(f"{len(betas)} betas were given, the body {self.name!r} has {known}: drop the last ones")
+            raise ValueError(f"{len(betas)} betas were given, the body {self.name!r} has {known}: drop the last ones")
         vertices = self.template + self.shape_basis[..., : len(betas)] @ betas[:known]
         return vertices, self.joint_regressor @ vertices
 
@@ -100,11 +101,8 @@ def read_body(path: Path | None = None) -> Body:
     """
     source = body_data("body.npz") if path is None else Path(path)
     if not source.is_file():
-        raise FileError(f"there is no body model {source}: check the path")
-    try:
-        arrays = read_arrays(source, optional=_KEYS, most_values=MOST_BODY_VALUES)
-    except FileError as e:
-        raise FileError(f"{e}; a body model is an .npz of plain arrays in SMPL's form") from e
+        raise FileError(source, "does not exist", "check the path of the body model")
+    arrays = read_arrays(source, optional=_KEYS, most_values=MOST_BODY_VALUES)
     _check(source, arrays)
     pose_basis = np.asarray(arrays["posedirs"], np.float64)
     return Body(
@@ -121,7 +119,7 @@ def read_body(path: Path | None = None) -> Body:
 def _check(source: Path, arrays: dict[str, NDArray]) -> None:
     missing = [key for key in _KEYS if key not in arrays]
     if missing:
-        raise FileError(f"{source} holds no {missing[0]!r}: use an .npz of SMPL's form with plain arrays")
+        raise FileError(source, f"holds no {missing[0]!r}", _BODY_MODEL)
     count = len(np.atleast_1d(arrays["v_template"]))
     shapes = {
         "v_template": (count, 3), "shapedirs": (count, 3, None), "posedirs": (count, 3, 207),
@@ -131,11 +129,12 @@ def _check(source: Path, arrays: dict[str, NDArray]) -> None:
         array = arrays[key]
         fits = array.ndim == len(shape) and all(n in (None, m) for n, m in zip(shape, array.shape, strict=True))
         if not fits or array.dtype.kind not in "iuf" or not (key == "kintree_table" or all_finite(array)):
-            raise FileError(f"{source}: {key!r} has shape {array.shape} of {array.dtype}, not SMPL's finite numbers")
+            found = f"holds {key!r} of shape {array.shape} and type {array.dtype}, not SMPL's finite numbers"
+            raise FileError(source, found, _BODY_MODEL)
     if tuple(arrays["kintree_table"][0][1:].tolist()) != PARENTS[1:]:
-        raise FileError(f"{source}: its joints are not SMPL's 24; SMPL-H and SMPL-X bodies do not serve here")
+        raise FileError(source, "has other joints than SMPL's 24", "use a body of SMPL, not of SMPL-H or SMPL-X")
     if arrays["f"].max(initial=0) >= count or arrays["f"].min(initial=0) < 0:
-        raise FileError(f"{source}: its faces name vertices that are not there")
+        raise FileError(source, "has faces with vertices that are not there", _BODY_MODEL)
 
 
 _RIDGE_M = 0.008

@@ -28,7 +28,7 @@ from ..console import (
     CommandParser,
     Report,
     Stop,
-    UsageError,
+    Stopped,
     duration,
     report_path,
     separate_stdout,
@@ -99,7 +99,7 @@ def parser() -> CommandParser:
 
 
 def parse(argv: Sequence[str]) -> argparse.Namespace:
-    """The options in `argv`. Raises UsageError; SystemExit after --help."""
+    """The options in `argv`. Raises ValueError; SystemExit after --help."""
     return parser().parse_args(list(argv))
 
 
@@ -156,15 +156,11 @@ def _shard(text: str) -> tuple[int, int]:
     return int(index), int(count)
 
 
-class _Stopped(Exception):
-    """The command was asked to stop."""
-
-
 def main(argv: Sequence[str]) -> int:
     """Run the command; returns its exit code. Blender's own messages on stdout are dropped."""
     try:
         options = parse(argv)
-    except UsageError as error:
+    except ValueError as error:
         print(f"capture: {error}; --help names all options", file=sys.stderr, flush=True)
         return UNUSABLE
     with separate_stdout() as write:
@@ -177,7 +173,7 @@ def main(argv: Sequence[str]) -> int:
         except (OSError, ValueError) as error:
             print(f"capture: {error}", file=sys.stderr, flush=True)
             return UNUSABLE
-        except _Stopped:
+        except Stopped:
             say("Stopped; the same command resumes from here.")
             return CANCELLED
 
@@ -185,19 +181,20 @@ def main(argv: Sequence[str]) -> int:
 def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
     """The scans of some folders, sorted by name; of `only`, where names are given.
 
-    Raises FileError where there are none, or two of a name.
+    Raises ValueError where there are none, and FileError for two of a name.
     """
     found: dict[str, ScanFile] = {}
     for folder in folders:
         for scan in find_scans(folder):
             if scan.name in found:
-                raise FileError(f"two scans are called {scan.name}: rename the file or folder of one")
+                reason = f"is called {scan.name}, as is {found[scan.name].path}"
+                raise FileError(scan.path, reason, "rename the file or folder of one")
             found[scan.name] = scan
     unknown = sorted(set(only) - set(found))
     if unknown:
-        raise FileError(f"there is no scan {unknown[0]} in {', '.join(map(str, folders))}")
+        raise FileError(", ".join(map(str, folders)), f"holds no scan {unknown[0]}", "correct --only")
     if not found:
-        raise FileError("there are no scans: name a folder of them with --people")
+        raise ValueError("there are no scans: name a folder of them with --people")
     return [found[name] for name in sorted(found) if not only or name in only]
 
 
@@ -264,9 +261,7 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
         settings.out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         reason = error.strerror or error
-        raise FileError(
-            f"nothing can be written to {settings.out} ({reason}): choose another folder with --out"
-        ) from error
+        raise FileError(settings.out, f"cannot be written to ({reason})", "choose another folder with --out") from error
     report, printed = Report(), 0.0
     with contextlib.closing(run(bpy.context, settings, scans, report)) as steps:
         for progress in steps:
@@ -279,7 +274,7 @@ def _render(options: argparse.Namespace, settings: CaptureSettings, scans: list[
                     printed = time.monotonic()
                     say(describe(progress))
             if stop.is_set():
-                raise _Stopped
+                raise Stopped
     say(f"{len(report.done)} done, {len(report.skipped)} were there, {len(report.failed)} failed")
     if report.failed:
         say(f"What failed and why: {report_path(settings.out, settings.shard)}")

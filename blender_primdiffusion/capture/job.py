@@ -41,7 +41,7 @@ def choose_poses(settings: CaptureSettings, report: Report) -> Motion:
     """The poses [F] of a capture, for all subjects: near-T first, then built-in ones or a spread of the files'.
 
     Subjects stay in place: translations are left out. A file that cannot be used is noted
-    in the report. Raises FileError where none can.
+    in the report. Raises ValueError where none can.
     """
     if not settings.pose_files:
         return _in_place(built_in_poses(settings.pose_count))
@@ -53,7 +53,7 @@ def choose_poses(settings: CaptureSettings, report: Report) -> Motion:
         except FileError as error:
             report.fail("", "poses", str(error))
     if not motions:
-        raise FileError(f"none of the {len(settings.pose_files)} pose files can be used: {report.failed[-1]['why']}")
+        raise ValueError(f"none of the {len(settings.pose_files)} pose files can be used: {report.failed[-1]['why']}")
     return _in_place(pick_poses(motions, settings.pose_count, settings.seed))
 
 
@@ -104,8 +104,8 @@ def run(
 
     Finished views are skipped, so the same call resumes after a kill and ends in the same files. A subject that fails
     is noted in the report, which the generator returns; closing the generator cancels, and leaves nothing in the file.
-    The user's scene is active between steps. Raises FileError, ValueError for poses that are not finite,
-    FileError where there are no poses, and OSError where the disk is full.
+    The user's scene is active between steps. Raises FileError, ValueError for poses that are not finite and where there
+    are no poses, and OSError where the disk is full.
     """
     report = Report() if report is None else report
     poses = choose_poses(settings, report) if poses is None else poses

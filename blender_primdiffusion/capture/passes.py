@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..formats.capture_layout import picture_path
 from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_exr, write_png
-from ..formats.regular_files import FileError, read_regular
+from ..formats.regular_files import FileError, as_file_error, read_regular
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from .surfaces import PART
@@ -37,12 +37,8 @@ def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
     Names are as Blender gives them: "ViewLayer.Combined.R". Raises FileError.
     """
     data = read_regular(path, _LARGEST_FILE)
-    try:
+    with as_file_error(path, "is not a whole, uncompressed OpenEXR picture", "render it again", struct.error):
         return _read(data)
-    except (struct.error, IndexError, ValueError, KeyError, OverflowError) as error:
-        raise FileError(
-            f"{path} is no whole, uncompressed OpenEXR picture ({error!s:.160}): render it again"
-        ) from error
 
 
 def _read(data: bytes) -> dict[str, NDArray[np.float32]]:
@@ -234,5 +230,5 @@ def _chosen(path: Path, planes: dict[str, NDArray], endings: list[str]) -> list[
     missing = [ending for ending, plane in zip(endings, found, strict=True) if plane is None]
     if missing or len(shapes) != 1:
         what = f"holds no pass {missing[0]}" if missing else "holds passes of several sizes"
-        raise FileError(f"{path} {what}: render it again")
+        raise FileError(path, what, "render it again")
     return [np.nan_to_num(plane, nan=0.0, posinf=np.inf, neginf=-np.inf) for plane in found if plane is not None]

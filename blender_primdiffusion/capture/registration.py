@@ -41,7 +41,7 @@ def stand_up(axes: NDArray, points: NDArray, name: str) -> Standing:
     scale = unit_of(height, name)
     reach = float(np.ptp(points, axis=0).max()) * scale
     if not reach <= _WIDEST:
-        raise FileError(f"{name} has points {reach:.4g} m apart: remove what is not the person, or lost vertices")
+        raise FileError(name, f"has points {reach:.4g} m apart", "remove what is not the person, or lost vertices")
     notes = [f"{height * scale:.2f} m tall", scale_note(scale)]
     tilt = np.degrees(np.arccos(np.clip(up[2], -1, 1)))
     if tilt > 1:
@@ -57,10 +57,8 @@ def unit_of(height: float, name: str) -> float:
     for scale in (1.0, 0.01, 100.0, 0.001, 1000.0, 0.1, 10.0):
         if SHORTEST <= height * scale <= TALLEST:
             return scale
-    raise FileError(
-        f"{name} is {height:.4g} m tall, and no change of units makes that a person of {SHORTEST:g} to {TALLEST:g} m: "
-        "scale it to metres"
-    )
+    reason = f"is {height:.4g} m tall, and no change of units makes that a person of {SHORTEST:g} to {TALLEST:g} m"
+    raise FileError(name, reason, "scale it to metres")
 
 
 def scale_note(scale: float) -> str:

@@ -105,9 +105,7 @@ def find_armature(objects: Sequence[bpy.types.Object], scan_file: ScanFile) -> b
     used = {armature for obj in objects if obj.type == "MESH" for armature in [moved_by(obj)] if armature}
     if len(used) > 1:
         names = ", ".join(sorted(armature.name for armature in used))
-        raise FileError(
-            f"{scan_file.path} holds {len(used)} skeletons ({names}): save each person in a file of its own"
-        )
+        raise FileError(scan_file.path, f"holds {len(used)} skeletons ({names})", "save each person in its own file")
     return next(iter(used), None)
 
 
@@ -130,7 +128,7 @@ def split_meshes(
     """Meshes with faces that follow the armature, and those that do not. Raises FileError where no mesh has a face."""
     meshes = [obj for obj in objects if obj.type == "MESH" and len(obj.data.polygons)]
     if not meshes:
-        raise FileError(f"{scan_file.path} holds no surface: export the person's mesh, not only its skeleton or points")
+        raise FileError(scan_file.path, "holds no surface", "export the person's mesh, not only its skeleton or points")
     moving = [mesh for mesh in meshes if moved_by(mesh) is not None]
     return moving, [mesh for mesh in meshes if mesh not in moving]
 

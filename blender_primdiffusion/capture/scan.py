@@ -10,9 +10,9 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..formats.poses.rigs import BoneMap, facing, map_bones, rig_from_smpl
+from ..formats.poses.rigs import MATCH_BONES, UNMATCHED, BoneMap, facing, map_bones, rig_from_smpl
 from ..formats.poses.rotation import matrix_to_quaternion, to_axis_angle
-from ..formats.regular_files import FileError
+from ..formats.regular_files import as_file_error
 from ..scene.convention import points_to_blender
 from .bind import bind_static
 from .body import Body, ShapeFit, fit_joints
@@ -35,7 +35,7 @@ from .skinned_surface import SkinnedSurface, mesh_points, skinned_surface
 from .stage import AddedData
 from .surfaces import complete_colours
 
-__all__ = ["Scan", "FileError", "ScanFile", "find_scans", "load_scan"]
+__all__ = ["Scan", "ScanFile", "find_scans", "load_scan"]
 
 _POOR_FIT_M = 0.05
 _EXACT_M = 0.001
@@ -143,11 +143,10 @@ def _load_static(context, scan_file: ScanFile, body: Body, objects, added: Added
 def _load_rigged(context, scan_file: ScanFile, body: Body, objects, armature, added: AddedData) -> Scan:
     meshes, loose = split_meshes(objects, scan_file)
     set_at_rest(armature, meshes)
-    try:
+    with as_file_error(scan_file.path, UNMATCHED, MATCH_BONES):
         bones = map_bones([bone.name for bone in armature.data.bones])
+    with as_file_error(scan_file.path, "has no rest pose of a human", "export it again"):
         axes = facing(bone_heads(armature, bones.joints))
-    except ValueError as e:
-        raise FileError(f"{scan_file.path}: {e}") from e
     free_bones(armature, list(bones.joints.values()))
     standing = stand_up(axes, mesh_points(meshes), str(scan_file.path))
     root = add_root(context, objects, scan_file.name, affine(standing.rotation * standing.scale, np.zeros(3)))

@@ -47,10 +47,10 @@ def find_scans(folder: Path | str) -> list[ScanFile]:
     folder = Path(folder)
     if folder.is_file():
         if folder.suffix.lower() not in ENDINGS:
-            raise FileError(f"{folder} is no scan: give a .glb, .gltf, .fbx or .obj, or a folder of them")
+            raise FileError(folder, "is not a scan", "give a .glb, .gltf, .fbx or .obj, or a folder of them")
         return [ScanFile(_slug(folder), folder, _parameters(folder))]
     if not folder.is_dir():
-        raise FileError(f"there is no folder of scans {folder}: check the path")
+        raise FileError(folder, "does not exist", "check the path of the scans")
     chosen: dict[Path, Path] = {}
     for path in _models(folder):
         stem = path.with_suffix("")
@@ -58,11 +58,9 @@ def find_scans(folder: Path | str) -> list[ScanFile]:
             chosen[stem] = path
     if not chosen:
         if any(folder.rglob("*.human*")):
-            raise FileError(
-                f"{folder} holds people made of primitives, and captures are made of meshes: export these as .glb "
-                "(primdiffusion export), or name a folder of scans"
-            )
-        raise FileError(f"{folder} holds no scans: none of its files ends in {', '.join(ENDINGS)}")
+            reason = "holds people made of primitives, and captures are made of meshes"
+            raise FileError(folder, reason, "export these as .glb (primdiffusion export), or name a folder of scans")
+        raise FileError(folder, "holds no scans", f"give a folder of files that end in {', '.join(ENDINGS)}")
     taken: set[str] = set()
     scans = []
     for path in sorted(chosen.values()):
@@ -135,13 +133,13 @@ def _parameters(path: Path) -> Path | None:
 def import_file(path: Path) -> list[bpy.types.Object]:
     """Import a .glb, .gltf, .fbx or .obj into the scene; its objects. Raises FileError where Blender cannot read it."""
     if not path.is_file():
-        raise FileError(f"there is no scan {path}: check the path")
+        raise FileError(path, "does not exist", "check the path of the scan")
     before = {obj.session_uid for obj in bpy.data.objects}
     importers = {".glb": _import_gltf, ".gltf": _import_gltf, ".fbx": _import_fbx, ".obj": _import_obj}
     try:
         importers[path.suffix.lower()](str(path))
     except Exception as e:  # Python importers raise anything on damaged files
-        raise FileError(f"{path} cannot be imported: {_last_line(e)}; export it again") from e
+        raise FileError(path, f"cannot be imported ({_last_line(e)})", "export it again") from e
     return [obj for obj in bpy.data.objects if obj.session_uid not in before]
 
 
@@ -196,16 +194,17 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
     path = scan_file.parameters
     if path is None:
         pickled = [e for e in (".pkl", ".pickle") if scan_file.path.with_suffix(e).is_file()]
-        hint = "; pickles are never read, save it as .npz of plain arrays" if pickled else ""
+        hint = f"; {pickled[0]} beside it is not read, save it as .npz of plain arrays" if pickled else ""
         raise FileError(
-            f"{scan_file.path} has no skeleton, and no SMPL parameters are beside it: put {scan_file.path.stem}.npz "
-            f"with global_orient, body_pose, betas and transl there{hint}"
+            scan_file.path,
+            "has no skeleton, and no SMPL parameters are beside it",
+            f"put {scan_file.path.stem}.npz with global_orient, body_pose, betas and transl there{hint}",
         )
     try:
         arrays = read_arrays(path, optional=(*POSE_KEYS, *_SHAPE_KEYS, "scale", "body"))
         motion = motion_from_arrays({key: arrays[key] for key in POSE_KEYS if key in arrays}, path)
     except OSError as e:
-        raise FileError(str(e)) from e
+        raise FileError(path, f"cannot be read ({e.strerror or e})", "check that it may be opened") from e
     betas = next((arrays[key] for key in _SHAPE_KEYS if key in arrays), np.zeros(10))
     scale = arrays.get("scale", np.ones(1))
     return Parameters(
@@ -220,12 +219,12 @@ def read_parameters(scan_file: ScanFile) -> Parameters:
 
 def _row(values: NDArray, path: Path, name: str) -> NDArray[np.float64]:
     if values.dtype.kind not in "iuf" or values.size == 0 or not all_finite(values):
-        raise FileError(f"{path}: {name!r} holds something else than finite numbers")
+        raise FileError(path, f"holds something else than finite numbers in {name!r}", "save it as numbers")
     return np.asarray(values, np.float64).reshape(-1, values.shape[-1] if values.ndim else 1)[0]
 
 
 def _positive(values: NDArray, path: Path) -> float:
     number = float(_row(values, path, "scale")[0])
     if not number > 0:
-        raise FileError(f"{path}: 'scale' is {number:g}, not positive")
+        raise FileError(path, f"has a 'scale' of {number:g}", "give a positive scale, or none")
     return number

@@ -45,7 +45,7 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
         """One view layer of one frame, in a thread of Blender's, in its main one under -b. Errors end the render."""
         try:
             render_layer(self, depsgraph)
-        except (RenderFailed, ValueError, OSError) as error:
+        except (ValueError, OSError) as error:
             self._fail(str(error))
         except Exception as error:
             self._fail(f"defect in the engine: {type(error).__name__}: {error}")
@@ -127,14 +127,11 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     )
 
 
-class RenderFailed(RuntimeError):
-    """The picture could not be drawn; the message is for the user."""
-
-
 def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph) -> Drawing:
     """Draw one view layer into the engine's result; returns when it is finished or cancelled by the user.
 
-    Raises RenderFailed, FileNotFoundError for a human without a file, and ValueError for what cannot be drawn.
+    Raises ChildProcessError with the child's error, FileNotFoundError for a human without a file, and ValueError for
+    what cannot be drawn.
     """
     scene = depsgraph.scene
     camera = engine.camera_override or scene.camera
@@ -155,7 +152,7 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
         drawing = studio.drawing_child().draw(params)
         _follow(engine, drawing, result, frame, view)
         if drawing.error is not None:
-            raise RenderFailed(str(drawing.error))
+            raise ChildProcessError(str(drawing.error))
         _fill(result, frame, view)
         finished = True
     finally:

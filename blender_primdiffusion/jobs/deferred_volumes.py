@@ -12,6 +12,7 @@ from bpy.app.handlers import persistent
 from ..backend.requests import sentence
 from ..engine.engine import ENGINE
 from ..engine.gpu.overlay import overlay
+from ..formats.regular_files import FileError
 from ..places import EXTENSION
 from ..scene.collect import collect_pending
 from ..scene.earlier_files import convert_earlier
@@ -93,7 +94,7 @@ class DeferredVolumes:
     def _try(self, change: Callable[[], object]) -> None:
         try:
             change()
-        except OSError as error:
+        except (OSError, FileError) as error:
             if self.error != str(error):
                 print(f"PrimDiffusion: {error}")
             self.error = str(error)

@@ -116,7 +116,7 @@ class Fitted:
 def read_fitted(path: Path, size: tuple[int, int]) -> Fitted:
     """Read the posture of one picture of `size`. Raises ValueError and OSError."""
     content = read_json(path)
-    with as_file_error(f"the fitted pose {str(path)!r}", "cannot be read", "fit again"):
+    with as_file_error(path, "is not a fitted pose or is damaged", "fit again"):
         camera = content["cameras"]["camera0000"]
         k, r, t = (np.asarray(camera[name], np.float64) for name in ("K", "R", "T"))
         return Fitted(

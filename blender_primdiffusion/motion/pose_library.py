@@ -21,7 +21,7 @@ from ..formats.arrays import all_finite
 from ..formats.joints import JOINT_NAMES
 from ..formats.json_files import read_json
 from ..formats.poses.rotation import from_axis_angle, matrix_to_quaternion, slerp, to_axis_angle
-from ..formats.regular_files import FileError
+from ..formats.regular_files import FileError, as_file_error
 from ..formats.removing import remove_file
 from ..formats.whole_files import write_atomically
 from ..scene.armature import bone_bases, model_origin, rest_rotations
@@ -217,35 +217,34 @@ def delete_pose(pose: Path) -> None:
 def save_pose(folder: Path, name: str, pose: NDArray, translation: NDArray) -> Path:
     """Write a pose [24, 3] (axis-angle, radians) with its translation [3] (metres), both y up; returns the file.
 
-    `formats.poses.files` reads the file too (`pose`, `transl`). Raises FileError for a name that is empty, taken or
-    no valid file name, and where the folder cannot be written to.
+    `formats.poses.files` reads the file too (`pose`, `transl`). Raises ValueError for a name that is empty, taken or
+    not a valid file name, and FileError where the folder cannot be written to.
     """
     name = name.strip()
     if not name or len(name) > _LONGEST_NAME or re.search(r'[\\/:*?"<>|\x00-\x1f]', name) or name.startswith("."):
-        raise FileError(
+        raise ValueError(
             f"a pose cannot be called {name!r}: give it a name of at most {_LONGEST_NAME} letters without any of "
             r'\ / : * ? " < > |'
         )
     path = folder / f"{name}{SUFFIX}"
     if path.exists():
-        raise FileError(f"there is a pose {name!r} already: give another name, or delete that one first")
+        raise ValueError(f"there is a pose {name!r} already: give another name, or delete that one first")
     content = {"name": name, "pose": np.round(pose, 6).tolist(), "transl": np.round(translation, 6).tolist()}
     try:
         write_atomically(path, json.dumps(content, indent=1))
     except OSError as error:
-        raise FileError(f"the pose could not be written to {str(path)!r} ({error.strerror or error})") from error
+        reason = f"cannot be written ({error.strerror or error})"
+        raise FileError(path, reason, "free disk space, or make its folder writable") from error
     return path
 
 
 def load_pose(path: Path) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """The pose [24, 3] and the translation [3] in a file. Raises FileError where there is none."""
-    try:
+    with as_file_error(path, "cannot be read as a pose", "save the pose again", OSError):
         content = read_json(path)
         pose = np.asarray(content["pose"], np.float64)
         translation = np.asarray(content["transl"], np.float64)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FileError(f"the pose file {str(path)!r} cannot be read ({error!s:.160}): save the pose again") from error
     finite = all((np.abs(values) < _LARGEST_NUMBER).all() for values in (pose, translation))  # false for NaN
     if pose.shape != (24, 3) or translation.shape != (3,) or not finite:
-        raise FileError(f"the pose file {str(path)!r} holds no pose of 24 joints: save the pose again")
+        raise FileError(path, "holds no pose of 24 joints", "save the pose again")
     return pose, translation

@@ -16,7 +16,7 @@ from typing import Any, cast
 
 import bpy
 
-from ..formats.json_files import JsonError, parse_json
+from ..formats.json_files import parse_json
 from ..formats.regular_files import is_local_path, real_path
 
 LONGEST_TEXT = 4 << 20
@@ -51,7 +51,7 @@ def stored_record(holder: bpy.types.bpy_struct, name: str) -> dict[str, Any]:
     text = stored_text(holder, name)
     try:
         record = {} if text is None else parse_json(text)
-    except JsonError:
+    except ValueError:
         return {}
     return record if isinstance(record, dict) else {}
 

@@ -40,7 +40,7 @@ def body_of_file(person: Path) -> ShapeModel:
 @functools.lru_cache(maxsize=4)
 def _read_body(file: FileVersion) -> ShapeModel:
     path = file.path
-    with as_file_error(f"the body's file {str(path)!r}", "is damaged", "generate the human again"):
+    with as_file_error(path, "is not a body or is damaged", "generate the human again"):
         arrays = body_arrays(path)
         if sum(values.size for values in arrays.values()) > MOST_BODY_VALUES:
             raise ValueError(f"it holds more than {MOST_BODY_VALUES} values")

@@ -17,8 +17,8 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
-from ..formats.regular_files import exists_in_its_folder, portable_name, real_path
-from ..formats.removing import OutsideFolderError, remove_file
+from ..formats.regular_files import FileError, exists_in_its_folder, portable_name, real_path
+from ..formats.removing import remove_file
 from ..formats.whole_files import remove_empty
 from .blend_values import as_shown, stored_folder, stored_text
 from .earlier_files import EARLIER, earlier_volumes
@@ -30,7 +30,6 @@ from .human import (
     PERSON_FILE,
     PRIMITIVE_VDB,
     STATE,
-    VolumeWriteError,
     copy_file,
     humans_folder,
     is_own,
@@ -41,6 +40,7 @@ from .human import (
     stored_path,
     volume_path,
     was_newest,
+    write_error,
 )
 from .pending import pending_of
 from .volumes import reload_volume
@@ -105,8 +105,8 @@ def collect_own_files(blend_path: str) -> Collected:
 
     Elsewhere are temporary folders, also those of an earlier Blender that has crashed, and the folders of other .blend
     files. Missing files are left out, and folders of states that the .blend does not use stay, for undo. In a .blend
-    never saved, paths become absolute: Blender makes them relative when it first writes it. Raises VolumeWriteError
-    when the folder beside the .blend cannot be written.
+    never saved, paths become absolute: Blender makes them relative when it first writes it. Raises FileError when
+    the folder beside the .blend cannot be written.
     """
     return _collect(blend_path, _own_humans(), _saving)
 
@@ -115,7 +115,7 @@ def collect_pending() -> Collected:
     """Copy the folders of humans elsewhere, whose volumes are still to be written, to the temporary folder of this
     Blender, and point to the copies: they are written there. Linked humans are among them, in this session.
 
-    Raises VolumeWriteError.
+    Raises FileError.
     """
     elsewhere = (person for person in bpy.data.collections if MARK in person and not is_own(state_folder(person)))
     return _collect("", [person for person in elsewhere if pending_of(person) is not None], _Changes())
@@ -124,7 +124,7 @@ def collect_pending() -> Collected:
 def collect_files() -> Collected:
     """Copy all files of this .blend's humans beside it, and point to the copies; files of linked humans stay.
 
-    Raises ValueError for a .blend that was never saved, FileNotFoundError where files are missing, and VolumeWriteError
+    Raises ValueError for a .blend that was never saved, FileNotFoundError where files are missing, and FileError
     where they cannot be written; then nothing has changed.
     """
     if not bpy.data.filepath:
@@ -149,7 +149,7 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
         print(f"PrimDiffusion: {fault}")
     try:
         collect_own_files(blend_path)
-    except OSError as error:
+    except (OSError, FileError) as error:
         print(f"PrimDiffusion: humans of this file depend on files elsewhere: {error}")
 
 
@@ -222,12 +222,9 @@ def _collect(blend_path: str, people: Sequence[bpy.types.Collection], changes: _
                 homes[folder] = folder if _inside(folder, target) else _copied_state(folder, person, changes)
         outside = {volume: path for volume, path in merged.items() if not _inside(path, target)}
         moved = {volume: _copied_merged(volume, path, changes) for volume, path in outside.items()}
-    except (OSError, OutsideFolderError) as error:
+    except (OSError, FileError) as error:
         changes.remove_made()
-        raise VolumeWriteError(
-            f"the files of humans could not be copied to {str(target)!r} ({error}); save the .blend in a folder with "
-            "write permission and free space"
-        ) from error
+        raise write_error(target, error) from error
     for person, folder in states.items():
         volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME"}
         paths = {volume: path for volume in volumes if (path := volume_path(volume)) is not None}

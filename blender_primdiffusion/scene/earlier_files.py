@@ -19,8 +19,7 @@ import bpy
 from numpy.typing import NDArray
 
 from ..formats.arrays import MOST_BODY_VALUES, read_numbers
-from ..formats.regular_files import exists_in_its_folder, portable_name
-from ..formats.removing import OutsideFolderError
+from ..formats.regular_files import FileError, exists_in_its_folder, portable_name
 from .blend_values import file_path, stored_name
 from .human import (
     BODY_FILE,
@@ -49,7 +48,7 @@ EARLIER = (_PERSON_FILE, _BODY_FILE, _VOLUME, re.compile(r"unwritten_[0-9a-f]{12
 def convert_earlier() -> None:
     """Give each human of this layout, linked ones included, a folder of a state, and point its volumes there.
 
-    A human without its own file keeps the volumes that it has. Raises VolumeWriteError.
+    A human without its own file keeps the volumes that it has. Raises FileError.
     """
     made: dict[tuple[Path, str], Path] = {}
     for person, shown in earlier_volumes().items():
@@ -91,12 +90,16 @@ def _converted(person: bpy.types.Collection, own: Path, volumes: set[Path]) -> P
         for source, name in copies.items():
             if exists_in_its_folder(source) and not os.path.lexists(state / name):
                 copy_file(source, state / name, state, may_link=True)
+    except (OSError, FileError) as error:
+        remove_state(state)
+        raise write_error(state, error) from error
+    try:
         body = stored_name(person, _BODY, _BODY_FILE)
         places = (own.parent.parent / body, own.parent / body) if body is not None else ()
         found = next(filter(exists_in_its_folder, places), None)
         if found is not None and exists_in_its_folder(own) and "body" in read_tensors(own).metadata:
             write_body(state / BODY_FILE, read_earlier_body(found))
-    except (OSError, OutsideFolderError) as error:
+    except OSError as error:
         remove_state(state)
         raise write_error(state, error) from error
     except ValueError as error:  # a damaged file: the human has no body until the file is replaced

@@ -16,8 +16,8 @@ from typing import Any
 
 import bpy
 
-from ..formats.regular_files import check_regular, exists_in_its_folder, portable_name, real_path
-from ..formats.removing import OutsideFolderError, check_inside, remove_folder
+from ..formats.regular_files import FileError, check_regular, exists_in_its_folder, portable_name, real_path
+from ..formats.removing import check_inside, remove_folder
 from ..formats.whole_files import written_whole
 from .blend_values import file_path, stored_folder, stored_record, stored_text
 
@@ -38,15 +38,6 @@ PRIMITIVE_VDB = re.compile(r"prim_([0-9]{4,6})\.vdb")
 """File names of the volumes of primitives."""
 MERGED_VDB = re.compile(r"merged_[0-9a-f]{12}(_[0-9]{4,6})?\.vdb")
 """File names of merged volumes; those of a sequence end in the frame, counted from 1."""
-
-
-class VolumeWriteError(OSError):
-    """Files of a human could not be written; nothing was left behind."""
-
-
-def link_error(folder: Path) -> VolumeWriteError:
-    """For a folder of a human that leads out of the folder that it is in."""
-    return VolumeWriteError(f"{str(folder)!r} is a link to another folder: nothing is written there, remove the link")
 
 
 class MissingPersonFile(FileNotFoundError):
@@ -159,7 +150,7 @@ def was_newest(home: Path) -> int:
 
 
 def new_state(home: Path) -> Path:
-    """Make the folder of a human's next state in `home`; numbers count up. Raises VolumeWriteError."""
+    """Make the folder of a human's next state in `home`; numbers count up. Raises FileError."""
     try:
         check_inside(home / "state", home.parent)
         home.mkdir(parents=True, exist_ok=True)
@@ -169,9 +160,7 @@ def new_state(home: Path) -> Path:
                 (home / f"{number:04d}").mkdir()
                 note_state(home / f"{number:04d}")
                 return home / f"{number:04d}"
-    except OutsideFolderError as error:
-        raise link_error(home) from error
-    except OSError as error:
+    except (OSError, FileError) as error:
         raise write_error(home, error) from error
     raise AssertionError("numbers do not end")
 
@@ -187,12 +176,10 @@ def remove_state(folder: Path) -> None:
         folder.parent.parent.rmdir()
 
 
-def write_error(folder: Path, error: BaseException) -> VolumeWriteError:
-    """For errors of the system and of openvdb."""
-    return VolumeWriteError(
-        f"the volumes could not be written to {str(folder)!r} ({error!s:.160}); save the .blend in a folder with "
-        "write permission and free space"
-    )
+def write_error(folder: Path, error: BaseException) -> FileError:
+    """For errors of the system and of openvdb, and links that lead out of a human's folder."""
+    remedy = "save the .blend in a folder with write permission and free space"
+    return FileError(folder, f"cannot be written to ({error!s:.160})", remedy)
 
 
 def person_file(collection: bpy.types.Collection) -> Path:
@@ -216,13 +203,13 @@ def copy_file(source: Path, destination: Path, folder: Path, *, may_link: bool =
 
     Nothing is replaced. With `may_link` the copy is a second name of the same file (a hard link) where the disk has
     those: it takes no space, and deleting or replacing one leaves the other. Files of humans are replaced, never
-    written to. Raises FileExistsError where the name is taken by another content, OutsideFolderError where
+    written to. Raises FileExistsError where the name is taken by another content, FileError where
     `destination` lies outside of `folder` or `source` is a link out of its own folder, and OSError.
     """
     check_inside(destination, folder)
     check_regular(source)
     if not exists_in_its_folder(source):
-        raise OutsideFolderError(f"{source} is a link out of its folder and is not copied: remove it")
+        raise FileError(source, "is a link out of its folder and is not copied", "remove it")
     if os.path.lexists(destination):
         if same_file(source, destination):
             return False

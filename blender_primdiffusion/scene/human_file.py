@@ -21,7 +21,7 @@ from ..formats.arrays import all_finite, check_shapes
 from ..formats.human_metadata import version_fault
 from ..formats.json_files import parse_json
 from ..formats.poses.rotation import first_improper, improper_text
-from ..formats.regular_files import as_file_error, read_regular
+from ..formats.regular_files import FileError, as_file_error, read_regular
 from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, check_limits, read_layout
 from ..formats.whole_files import written_whole
 from .human import BETA_COUNT, LARGEST_PERSON
@@ -66,11 +66,11 @@ class HumanTensors:
 def read_tensors(path: Path, remedy: str = GENERATE_AGAIN) -> HumanTensors:
     """Read a .human file. Raises ValueError, with this remedy, for a file of another kind or a damaged one, OSError."""
     data = read_regular(path, LARGEST_PERSON)
-    with as_file_error(repr(path.name), "contains no human", remedy):
+    with as_file_error(path, "contains no human", remedy):
         layout = read_layout(io.BytesIO(data))
         check_limits(layout)
     if layout.metadata.get("format") != "primdiffusion.human":
-        raise ValueError(f"{path.name!r} contains no human but something else; {remedy}")
+        raise FileError(path, "contains no human but something else", remedy)
     arrays = {name: (one.dtype, one.shape, layout.raw(data, name)) for name, one in layout.tensors.items()}
     return HumanTensors(layout.metadata, arrays)
 
@@ -124,7 +124,7 @@ def read_payload(path: Path) -> HumanPayload:
 def payload_in(human: HumanTensors, name: str, remedy: str = GENERATE_AGAIN) -> HumanPayload:
     """As `read_payload`, of a file of this name that was read."""
     if fault := version_fault(human.metadata):
-        raise ValueError(f"{name!r} {fault}")
+        raise FileError(repr(name), *fault)
     shapes = {field: shape for field, shape in _PAYLOAD.items() if field in human.arrays or field != "rest_half_extent"}
     with as_file_error(repr(name), "is damaged", remedy):
         stored = expanded(human).arrays
@@ -166,7 +166,7 @@ def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> Hum
         dtype, shape, raw = human.arrays.get("delta_scale", ("", (), b""))
         if dtype != "F32" or shape != growth.shape:
             given, expected = f"{dtype}{list(shape)}", f"F32{list(growth.shape)}"
-            raise ValueError(f"the human's file holds sizes of boxes as {given}, not {expected}; {GENERATE_AGAIN}")
+            raise FileError("the human's file", f"holds sizes of boxes as {given}, not {expected}", GENERATE_AGAIN)
         arrays["delta_scale"] = _stored((_loaded(dtype, shape, raw) * growth).astype(np.float32))
     return HumanTensors(human.metadata, arrays)
 
@@ -211,19 +211,19 @@ def motion_in(human: HumanTensors, name: str) -> HumanMotion | None:
     """The motion in a file of this name, if any. Raises ValueError where it is damaged."""
     if "motion" not in human.metadata:
         return None
-    with as_file_error(f"the motion in {name!r}", "is damaged", CHOOSE_ANOTHER):
+    with as_file_error(repr(name), "holds a damaged motion", CHOOSE_ANOTHER):
         fps = float(parse_json(human.metadata["motion"])["fps"])
         arrays = [_loaded(*human.arrays[name]) for name in _MOTION]
     frames = len(arrays[0]) if arrays[0].ndim else 0
     for array, shape in zip(arrays, _MOTION.values(), strict=True):
         if array.shape != tuple(frames if s == "F" else s for s in shape) or not all_finite(array):
-            raise ValueError(f"the motion in {name!r} is damaged; {CHOOSE_ANOTHER}")
+            raise FileError(repr(name), "holds a damaged motion", CHOOSE_ANOTHER)
     if frames == 0 or not 0 < fps < 1e4 or np.any(np.diff(arrays[0]) <= 0):
-        raise ValueError(f"the motion in {name!r} has frames out of order; {CHOOSE_ANOTHER}")
+        raise FileError(repr(name), "holds a motion with frames out of order", CHOOSE_ANOTHER)
     improper = first_improper(arrays[1])
     if improper is not None:
         frame = f"{arrays[0][improper[0]]:g}"
-        raise ValueError(f"the motion in {name!r} holds {improper_text(frame, improper[1])}; {CHOOSE_ANOTHER}")
+        raise FileError(repr(name), f"holds {improper_text(frame, improper[1])} in its motion", CHOOSE_ANOTHER)
     return HumanMotion(*arrays, fps)
 
 

@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite, check_shapes, read_arrays
-from ..formats.regular_files import as_file_error
-from ..formats.removing import OutsideFolderError, remove_file
+from ..formats.regular_files import FileError, as_file_error
+from ..formats.removing import remove_file
 from .blend_values import stored_record
-from .human import VolumeWriteError, armature_of, copy_file, home_of, link_error, state_of, stored_path
+from .human import armature_of, copy_file, home_of, state_of, stored_path, write_error
 from .material import person_material
 from .volumes import write_vdb
 
@@ -59,7 +59,7 @@ class MergedState:
 
 def read_grid(path: Path) -> MergedGrid:
     """Read the child's file. Raises ValueError for a damaged one, OSError."""
-    with as_file_error(f"the merged grid {path.name!r}", "is damaged", "merge again"):
+    with as_file_error(path, "is not a merged volume or is damaged", "merge again"):
         stored = read_arrays(path, tuple(_SHAPES))
         check_shapes(path, stored, _SHAPES, {})
         faulty = [name for name, values in stored.items() if not all_finite(values)]
@@ -76,12 +76,12 @@ def index_to_local(grid: MergedGrid, blender_version: tuple[int, ...]) -> NDArra
 
 
 def write_grid(grid: MergedGrid, path: Path) -> str:
-    """Write a grid as a VDB file; returns a digest of its content. Raises VolumeWriteError."""
+    """Write a grid as a VDB file; returns a digest of its content. Raises FileError."""
     transform = index_to_local(grid, bpy.app.version)
     try:
         write_vdb(path, grid.density, grid.colour, transform)
     except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
-        raise _write_error(path.parent, error) from error
+        raise write_error(path.parent, error) from error
     digest = hashlib.sha256(transform.tobytes())
     for values in (grid.density, grid.colour):
         digest.update(np.ascontiguousarray(values).tobytes())
@@ -91,7 +91,7 @@ def write_grid(grid: MergedGrid, path: Path) -> str:
 def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list[Path]:
     """Copy written grids into `folder` under names made from their content; several become a sequence.
 
-    Raises VolumeWriteError, and then copies none.
+    Raises FileError, and then copies none.
     """
     digest = hashlib.sha256("".join(digests).encode()).hexdigest()[:12]
     ends = [f"_{number:04d}" for number in range(1, len(files) + 1)] if len(files) > 1 else [""]
@@ -101,13 +101,11 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
         for source, target in zip(files, targets, strict=True):
             if target in new:
                 copy_file(source, target, folder.parent)
-    except OutsideFolderError as error:
-        raise link_error(folder) from error
-    except OSError as error:
+    except (OSError, FileError) as error:
         for path in new:
             if path.is_file():
                 remove_file(path, folder)
-        raise _write_error(folder, error) from error
+        raise write_error(folder, error) from error
     return targets
 
 
@@ -164,10 +162,3 @@ def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequen
     digest = hashlib.sha256(f"{state_of(collection)} {shape}".encode())
     digest.update(rounded.tobytes())
     return digest.hexdigest()[:16]
-
-
-def _write_error(folder: Path, error: BaseException) -> VolumeWriteError:
-    return VolumeWriteError(
-        f"the merged volume could not be written to {str(folder)!r} ({error}); save the .blend in a folder with write "
-        "permission and free space"
-    )

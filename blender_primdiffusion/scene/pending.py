@@ -82,8 +82,8 @@ def _instanced(person: bpy.types.Collection) -> bool:
 def write_pending(pending: PendingVolumes) -> Generator[None, None, None]:
     """Write these volumes, a file a step; those that can be read by now stay.
 
-    Several may write the same volumes, as a timer and a render do. Raises as `read_human`, ValueError for a human with
-    fewer primitives, and VolumeWriteError.
+    Several may write the same volumes, as a timer and a render do. Raises as `read_human`, also for what cannot be
+    written, and ValueError for a human with fewer primitives.
     """
     folder = pending.folder
     human = read_human(folder / PERSON_FILE)

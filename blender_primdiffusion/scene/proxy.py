@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
-from ..formats.regular_files import as_file_error, portable_name
+from ..formats.regular_files import FileError, as_file_error, portable_name
 from .armature import model_origin
 from .blend_values import as_numbers, stored_record
 from .body import shape_model_of
@@ -60,17 +60,17 @@ class ProxyMesh:
 def read_proxy(path: Path) -> ProxyMesh:
     """Read the child's proxy.npz. Raises ValueError for a damaged one, OSError."""
     sizes: dict[str, int] = {}
-    with as_file_error(f"the mesh {path.name!r}", "is damaged", "export again"):
+    with as_file_error(path, "is not a mesh or is damaged", "export again"):
         arrays = read_arrays(path, ("format_version", "joint_names", *_SHAPES))
         check_shapes(path, arrays, _SHAPES, sizes)
     names = tuple(str(name) for name in arrays["joint_names"].ravel())
     if str(arrays["format_version"]) != str(_FORMAT_VERSION) or names != JOINT_NAMES:
-        raise ValueError(f"the mesh {path.name!r} is of another version: use an add-on and a backend of one release")
+        raise FileError(path, "holds a mesh of another version", "use an add-on and a backend of one release")
     for name in _SHAPES:
         if not all_finite(arrays[name]):
-            raise ValueError(f"the field {name!r} of {path.name!r} holds NaN or infinite values; export again")
+            raise FileError(path, f"holds NaN or infinite values in {name!r}", "export again")
     if arrays["faces"].min() < 0 or arrays["faces"].max() >= sizes["V"]:
-        raise ValueError(f"the faces of {path.name!r} have corners that do not exist; export again")
+        raise FileError(path, "has faces with corners that do not exist", "export again")
     return ProxyMesh(**{name: arrays[name].astype(np.int64 if name == "faces" else np.float64) for name in _SHAPES})
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.human_metadata import provenance_of
+from ..formats.regular_files import FileError, as_file_error
 from .body import body_of_file
 from .cycles import max_overlap
 from .human import LARGEST_BETA
@@ -61,14 +62,11 @@ def read_human(person: Path, remedy: str = GENERATE_AGAIN) -> RestHuman:
     tensors = read_tensors(person, remedy)
     payload = payload_in(tensors, person.name, remedy)
     if np.abs(payload.betas).max() > LARGEST_BETA:
-        raise ValueError(f"{person.name!r} is damaged (betas above {LARGEST_BETA}); {remedy}")
-    try:
+        raise FileError(person, f"has betas above {LARGEST_BETA}", remedy)
+    with as_file_error(person, "is damaged", remedy):
         made = provenance_of(tensors.metadata)
-    except ValueError as error:
-        raise ValueError(f"{person.name!r} is damaged: {error}") from error
     model = body_of_file(person)
     if len(payload.density) != len(model.face):
-        raise ValueError(
-            f"{person.name!r} holds {len(payload.density)} primitives instead of its body's {len(model.face)}; {remedy}"
-        )
+        reason = f"holds {len(payload.density)} primitives instead of its body's {len(model.face)}"
+        raise FileError(person, reason, remedy)
     return RestHuman(made, payload, model, model.rest(payload.betas.astype(np.float64)))

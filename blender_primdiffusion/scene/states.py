@@ -15,8 +15,7 @@ from pathlib import Path
 
 import bpy
 
-from ..formats.regular_files import portable_name
-from ..formats.removing import OutsideFolderError
+from ..formats.regular_files import FileError, portable_name
 from .attachment import volumes_may_wait
 from .human import (
     BODY_FILE,
@@ -74,8 +73,8 @@ def prepare(
     """Make the folder of a new human of this name, or of the next state of the human `replaced`, from a human's file.
 
     The volumes that cannot wait (see `volumes_may_wait`) are written too: those that `replaced` has, or all. Steps take
-    some milliseconds (baking takes longer) and yield the fraction done. Raises as `read_human`, and VolumeWriteError;
-    then, and when it is closed early, no files are left.
+    some milliseconds (baking takes longer) and yield the fraction done. Raises as `read_human`, also for what cannot be
+    written; then, and when it is closed early, no files are left.
     """
     began, waiting = time.monotonic(), volumes_may_wait(replaced)
     home, shown = (next_folder(name), None) if replaced is None else (home_of(replaced), tuple(volumes_of(replaced)))
@@ -98,7 +97,7 @@ def prepare(
             for number, k in enumerate(which):
                 yield number / len(which)
                 write_volume(grids, k, bpy.app.version, folder / volume_name(k))
-        except (OSError, RuntimeError, OutsideFolderError) as error:  # openvdb reports a full disk as RuntimeError
+        except (OSError, RuntimeError, FileError) as error:  # openvdb reports a full disk as RuntimeError
             raise write_error(home, error) from error
         undone.pop_all()
     return PreparedHuman(human, provenance, folder, began)

@@ -7,7 +7,8 @@ from pathlib import Path
 import bpy
 
 from ..backend.requests import error_text, sentence
-from ..formats.removing import OutsideFolderError, remove_file
+from ..formats.regular_files import FileError
+from ..formats.removing import remove_file
 from ..formats.whole_files import remove_empty
 from ..jobs.deferred_volumes import deferred_volumes, keep_writing
 from ..jobs.edit import RegenerateJob, made_from_seed
@@ -146,7 +147,7 @@ files that share the folder, may need them"""
                 removed += 1
                 folders.add(path.parent)
                 note_state(path.parent)
-            except (OSError, OutsideFolderError) as error:
+            except (OSError, FileError) as error:
                 self.report({"WARNING"}, f"{str(path)!r} could not be removed ({error!s:.160})")
         remove_empty([*folders, *({folder.parent for folder in folders} - {humans_folder(), humans_folder().parent})])
         self.report({"INFO"}, f"Removed {removed} files ({size / 1e6:.1f} MB) from {str(humans_folder())!r}")

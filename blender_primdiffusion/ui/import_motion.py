@@ -16,7 +16,6 @@ from ..backend.requests import sentence
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.bvh import bone_names, parse_bvh
 from ..formats.poses.files import ENDINGS, read_motion
-from ..formats.poses.rigs import map_bones
 from ..formats.regular_files import FileError
 from ..scene.human import armature_of, humans
 from .drawing import draw_lines, property_columns
@@ -95,7 +94,6 @@ def _look_at(path: str, up: str, _changed: int, _size: int) -> FileFacts:
     try:
         if path.lower().endswith(".bvh"):
             bones = tuple(bone_names(parse_bvh(Path(path))))
-            map_bones(bones)
         motion = read_motion(path, up)
     except (FileError, OSError) as error:
         return FileFacts({}, bones, {}, str(error))

@@ -1,8 +1,17 @@
 """What users read about exceptions."""
 
+import pickle
+
 import pytest
 import torch
-from primdiffusion.failures import describe
+from primdiffusion.failures import PictureOutOfMemory, describe
+from primdiffusion.formats.schema import FieldError
+
+
+@pytest.mark.parametrize("error", [FieldError(("views", 2), "is 0: give 1"), PictureOutOfMemory(30, 40)])
+def test_an_error_of_a_worker_process_says_the_same_in_its_parent(error):
+    again = pickle.loads(pickle.dumps(error))
+    assert (type(again), str(again), vars(again)) == (type(error), str(error), vars(error))
 
 
 def test_torch_out_of_memory_on_the_cpu_is_named():

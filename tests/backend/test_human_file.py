@@ -150,8 +150,8 @@ def damage(path, human, how):
         ("deep", "nested more than 64 deep"),
         ("deep body", "malformed body metadata"),
         ("no path", "malformed body metadata"),
-        ("endless", "the body file /proc/self/pagemap is missing"),
-        ("device", "the body file /dev/zero cannot be read (this is not a regular file)"),
+        ("endless", "/proc/self/pagemap is missing"),
+        ("device", "/dev/zero cannot be read (this is not a regular file)"),
         ("server", "is not named by a path on this machine"),
         ("long", "is not named by a path on this machine"),
     ],
@@ -168,7 +168,7 @@ def test_a_damaged_file_is_rejected_by_name_with_its_damage(human, tmp_path, how
 
 @pytest.mark.parametrize(
     ("version", "message"),
-    [("4", "newer PrimDiffusion"), ("10", "newer PrimDiffusion"), ("one", "format version 'one'"), ("0", "'0'")],
+    [("4", "format 4"), ("10", "format 10"), ("one", "format version 'one'"), ("0", "'0'")],
 )
 def test_a_file_of_another_version_is_rejected_with_what_to_do(human, tmp_path, version, message):
     path = tmp_path / "other.human.safetensors"
@@ -229,7 +229,7 @@ def test_unknown_entries_of_the_provenance_are_saved(human, tmp_path):
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"betas": torch.full((10,), -5.5)}, "betas"), ({"provenance": {"edits": "many"}}, "edits")],
+    [({"betas": torch.full((10,), -5.5)}, "beta"), ({"provenance": {"edits": "many"}}, "edits")],
 )
 def test_what_could_not_be_read_again_is_not_written(human, tmp_path, change, message):
     with pytest.raises(ValueError, match=message):

@@ -8,7 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from primdiffusion.worker_process import THREAD_COUNTS, ProcessDied, each, run_in_process
+from primdiffusion.formats.regular_files import FileError, check_size
+from primdiffusion.worker_process import THREAD_COUNTS, each, run_in_process
 from support.errors import refused
 
 
@@ -20,10 +21,13 @@ def test_answers_and_errors_come_back():
     assert run_in_process(math.hypot, 3.0, 4.0, on_wait=nothing) == 5.0
     with refused(ValueError, "domain"):
         run_in_process(math.sqrt, -1.0, on_wait=nothing)
+    with refused(FileError, "a.npz") as caught:
+        run_in_process(check_size, "a.npz", 2**21, 2**20, on_wait=nothing)
+    assert (caught.value.path, caught.value.remedy) == ("a.npz", "use a smaller file")
 
 
 def test_a_process_that_dies_is_an_error():
-    with refused(ProcessDied, "_exit"):
+    with refused(ValueError, "_exit"):
         run_in_process(os._exit, 3, on_wait=nothing)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 import pytest
 from blend_tampering import COUNT, PROPERTIES, SECRET, Stage, build, in_preferences, panels_fault, person, tried
+from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.backend import environment
@@ -18,7 +19,6 @@ from blender_primdiffusion.places import EXTENSION, preference
 from blender_primdiffusion.scene import collect, merged
 from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import (
-    VolumeWriteError,
     armature_of,
     folder_of,
     humans_folder,
@@ -79,9 +79,9 @@ def test_an_edit_writes_nothing_through_a_link_in_place_of_the_humans_folder(pri
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     pristine.humans.mkdir()
     folder_of(person()).symlink_to(tmp_path / "outside")
-    with refused(VolumeWriteError):
+    with refused(FileError):
         replace_person(person(), prepare_now(pristine.source / "person.human.safetensors", replaced=person()))
-    with refused(VolumeWriteError):
+    with refused(FileError):
         merged.publish([pristine.source / "grid.vdb"], ["a"], merged.merged_folder(person()))
     assert not list((tmp_path / "outside").iterdir())
 

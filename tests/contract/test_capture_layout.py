@@ -141,7 +141,7 @@ def test_smpl_parameters_are_read_plain_and_as_the_released_code_does(tmp_path):
 def test_a_folder_is_claimed_once(tmp_path):
     capture_layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
     capture_layout.claim(tmp_path / "a", {"seed": 1, "size": (3, 4)})
-    with refused(FileError, "seed is 1", "wanted is 2"):
+    with refused(FileError, "seed is 1", "not 2"):
         capture_layout.claim(tmp_path / "a", {"seed": 2, "size": (3, 4)})
     (tmp_path / "b").mkdir()
     (tmp_path / "b" / "thesis.tex").touch()

@@ -253,11 +253,11 @@ def _check(content: bytes, found: list[dict[str, Any]]) -> None:
 
 
 def _is_answered(line: bytes) -> bool:
-    from primdiffusion.serve.rpc import MalformedRequest, parse_request
+    from primdiffusion.serve.rpc import RpcError, parse_request
 
     try:
         return bool(line.strip()) and parse_request(line).wants_response
-    except MalformedRequest:
+    except RpcError:
         return True
 
 

@@ -54,8 +54,8 @@ def load_body(
 
     Raises:
         FileNotFoundError: a file does not exist.
-        FileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range.
-        UnsafePickleError: a pickle names a global that a body model does not need.
+        FileError: a file is truncated, lacks an array, or holds one of the wrong shape, type or range, or a pickle
+            names a global that arrays do not need.
     """
     if not isinstance(path, FileContent) and not pathlib.Path(path).is_file():
         raise FileNotFoundError(f"There is no body model at {path}; give the path of an SMPL .pkl or .npz file.")
@@ -86,7 +86,7 @@ def load_body(
 
 
 def read_body_file(path: Source) -> FileContent:
-    """Read a file of a body, or of its texture coordinates, once. Raises TooLargeError and OSError."""
+    """Read a file of a body, or of its texture coordinates, once. Raises FileError and OSError."""
     return path if isinstance(path, FileContent) else FileContent.read(os.fspath(path), LARGEST_BODY_FILE)
 
 
@@ -96,7 +96,7 @@ class _ArrayFile:
     def __init__(self, file: FileContent) -> None:
         self.file, suffix = file, file.path.suffix
         if suffix not in (".pkl", ".npz"):
-            raise FileError(f"{file} ends in {suffix!r}; body models are .pkl or .npz files.")
+            raise FileError(file, f"ends in {suffix!r}, not in .pkl or .npz", "give a body model in SMPL's format")
         self._pickled = read_pickle(file) if suffix == ".pkl" else None
         self._names = _npz_names(file) if self._pickled is None else set(self._pickled)
 
@@ -104,7 +104,8 @@ class _ArrayFile:
         return name in self._names
 
     def wrong(self, name: str, complaint: str) -> FileError:
-        return FileError(f"{self.file}: {name!r} {complaint}; use an unchanged SMPL file or one in the same format.")
+        remedy = "use an unchanged SMPL file or one in the same format"
+        return FileError(self.file, f"cannot be used ({name!r} {complaint})", remedy)
 
     def raw(self, name: str) -> np.ndarray:
         if name not in self:
@@ -113,8 +114,10 @@ class _ArrayFile:
             if self._pickled is not None:
                 return as_array(self._pickled[name])
             return read_arrays(self.file, (name,))[name]
+        except FileError:
+            raise
         except (ValueError, OSError) as error:
-            raise self.wrong(name, f"cannot be read ({str(error).removeprefix(f'{self.file}: ')[:120]})") from error
+            raise self.wrong(name, f"cannot be read: {error!s:.120}") from error
 
     def shaped(self, name: str, shape: tuple[int | str, ...]) -> np.ndarray:
         array = self.raw(name)
@@ -165,7 +168,7 @@ def _texture_coordinates(
     arrays: _ArrayFile, uv: Source | tuple[Source, Source] | None, template: np.ndarray, faces: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     given = () if uv is None else tuple(map(read_body_file, uv if isinstance(uv, tuple) else (uv,)))
-    source = str(given[-1]) if given else str(arrays.file)
+    source: FileContent | str = given[-1] if given else arrays.file
     if len(given) == 2:
         coordinates, coordinate_faces = map(_numpy_file, given)
     elif given and given[0].path.suffix == ".npz":
@@ -181,13 +184,15 @@ def _texture_coordinates(
     numbers = coordinates.dtype.kind in "iuf" and coordinate_faces.dtype.kind in "iuf"
     if not numbers or coordinates.ndim != 2 or coordinates.shape[1] != 2 or coordinate_faces.shape != faces.shape:
         raise FileError(
-            f"{source}: texture coordinates of shapes {coordinates.shape} and {coordinate_faces.shape} do not fit a "
-            f"body of {len(faces)} faces; they must be numbers, T x 2 and {len(faces)} x 3, in the body's face order."
+            source,
+            f"has texture coordinates of shapes {coordinates.shape} and {coordinate_faces.shape}, which do not fit a "
+            f"body of {len(faces)} faces",
+            f"give numbers T x 2 and {len(faces)} x 3, in the body's face order",
         )
     coordinate_faces = coordinate_faces.astype(np.int64)
     if not all_finite(coordinates) or coordinate_faces.min() < 0 or coordinate_faces.max() >= len(coordinates):
         raise FileError(
-            f"{source}: texture coordinates are NaN or their numbers out of range; use the body's own UV file."
+            source, "has texture coordinates that are NaN or numbered out of range", "use the body's own UV file"
         )
     return coordinates.astype(np.float32), coordinate_faces
 
@@ -202,7 +207,7 @@ def _unwrapped(template: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.
 def _numpy_file(file: FileContent) -> np.ndarray:
     array = read_npy(file)
     if array.dtype.kind not in "iuf":
-        raise FileError(f"{file} does not hold one array of numbers; give the pair (vt.npy, ft.npy).")
+        raise FileError(file, "does not hold one array of numbers", "give the pair (vt.npy, ft.npy)")
     return array
 
 
@@ -222,9 +227,8 @@ def _obj_texture_coordinates(file: FileContent, faces: np.ndarray) -> tuple[np.n
         coordinate_faces = [[corner_of_face[frozenset(face)][v] for v in face] for face in faces.tolist()]
         return np.array(coordinates), np.array(coordinate_faces)
     except (ValueError, TypeError, IndexError, OverflowError) as error:
-        raise FileError(f"{file} is not an OBJ with texture coordinates in every face ({error!s:.100}).") from error
+        reason = f"is not an OBJ with texture coordinates in every face ({error!s:.100})"
+        raise FileError(file, reason, "use the OBJ made for this body") from error
     except KeyError as error:
-        raise FileError(
-            f"{file} lacks a face of the body (vertices {sorted(error.args[0])}, counted from 0); "
-            "use the OBJ made for this body."
-        ) from error
+        reason = f"lacks a face of the body (vertices {sorted(error.args[0])}, counted from 0)"
+        raise FileError(file, reason, "use the OBJ made for this body") from error

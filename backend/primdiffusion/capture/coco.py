@@ -86,7 +86,7 @@ def write_coco(
     Raises:
         FileNotFoundError, FileError: a pass or file is missing, or damaged.
         ValueError: attributes of a subject are not a mapping.
-        OutsideFolderError, OSError: a file cannot be written, or lies behind a link out of the captures.
+        FileError, OSError: a file cannot be written, or lies behind a link out of the captures.
     """
     if missing := [kind for kind in PASSES if kind not in captures.passes]:
         raise FileError(captures.root, f"has no {' and no '.join(missing)}", f"render with {', '.join(PASSES)}")

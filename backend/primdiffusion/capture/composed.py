@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,10 +15,10 @@ from primdiffusion.capture.reader import Subject
 from primdiffusion.capture.render import JPEG_QUALITY, srgb_bytes
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.removing import check_inside
 from primdiffusion.formats.whole_files import replacing
-from primdiffusion.geometry.pictures import PictureError, opened_picture
+from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.raster.textures import LINEAR_OF_BYTE
 
 FOLDER = "composed"
@@ -49,7 +50,7 @@ def write_composed(
 
     Raises:
         FileNotFoundError, FileError: an image or the background is missing or damaged.
-        OutsideFolderError, OSError: the file cannot be written, or lies behind a link out of the captures.
+        FileError, OSError: the file cannot be written, or lies behind a link out of the captures.
     """
     path, view = composed_path(subject, frame, camera), subject.views[camera]
     check_inside(path, subject.folder.parent)
@@ -98,13 +99,11 @@ def read_background(path: Path, width: int, height: int) -> UInt8[np.ndarray, "h
         FileNotFoundError: it does not exist.
         FileError: it is damaged.
     """
-    try:
-        with opened_picture(path, ("PNG", "JPEG", "WEBP")) as picture:
-            scale = min(picture.width / width, picture.height / height)
-            left, top = (picture.width - scale * width) / 2, (picture.height - scale * height) / 2
-            box = (left, top, left + scale * width, top + scale * height)
-            return np.asarray(picture.convert("RGB").resize((width, height), Image.Resampling.BICUBIC, box))
-    except FileNotFoundError:
-        raise FileNotFoundError(f"the background {path} does not exist: check the path") from None
-    except (OSError, PictureError) as e:
-        raise FileError(path, f"is not a picture for backgrounds ({e!s:.160})", "take it out of the folder") from e
+    if not os.path.lexists(path):
+        raise FileNotFoundError(f"the background {path} does not exist: check the path")
+    unusable = as_file_error(path, "is not a picture for backgrounds", "take it out of the folder", OSError)
+    with unusable, opened_picture(path, ("PNG", "JPEG", "WEBP")) as picture:
+        scale = min(picture.width / width, picture.height / height)
+        left, top = (picture.width - scale * width) / 2, (picture.height - scale * height) / 2
+        box = (left, top, left + scale * width, top + scale * height)
+        return np.asarray(picture.convert("RGB").resize((width, height), Image.Resampling.BICUBIC, box))

@@ -5,6 +5,7 @@ The reader of binary glTF 2.0 opens no other files. Sparse accessors and compres
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import re
@@ -19,8 +20,8 @@ from numpy.typing import NDArray
 from primdiffusion.body.model import BodyModel, J, default_body
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.json_files import JsonError, parse_json
-from primdiffusion.formats.regular_files import FileError, read_regular
+from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.regular_files import FileError, as_file_error, read_regular
 from primdiffusion.geometry.pictures import MOST_PIXELS, decoded, decoded_bytes, opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
@@ -59,10 +60,10 @@ class Glb:
         Raises:
             FileError: it does not exist, exceeds the file, or is sparse.
         """
-        try:
+        with as_file_error(self.path, f"has a damaged accessor {accessor!s:.20}", "export it again"):
             about = self.content["accessors"][accessor]
             if "sparse" in about or accessor < 0:
-                raise FileError(f"{self.path}: accessor {accessor} is sparse, which is not supported: export without")
+                raise FileError(self.path, f"has a sparse accessor {accessor}", "export it without sparse accessors")
             view = self.content["bufferViews"][about["bufferView"]]
             number, width, count = np.dtype(NUMBERS[about["componentType"]]), WIDTHS[about["type"]], int(about["count"])
             first = int(view.get("byteOffset", 0)) + int(about.get("byteOffset", 0))
@@ -70,10 +71,6 @@ class Glb:
             if min(first, count - 1, stride - number.itemsize * width) < 0:
                 raise ValueError("negative size")
             raw = np.frombuffer(self.binary, np.uint8, (count - 1) * stride + number.itemsize * width, first)
-        except FileError:
-            raise
-        except (LookupError, TypeError, ValueError, OverflowError) as e:
-            raise FileError(f"{self.path}: accessor {accessor} is damaged ({e!s:.160}): export the file again") from e
         rows = np.lib.stride_tricks.as_strided(raw, (count, number.itemsize * width), (stride, 1))
         values = np.ascontiguousarray(rows).view(number)
         if about.get("normalized") and number.kind in "iu":
@@ -86,29 +83,21 @@ class Glb:
         Raises:
             FileError: it does not exist, is not embedded, or cannot be decoded.
         """
-        try:
-            with opened_picture(io.BytesIO(self._image_bytes(image))) as picture:
-                return decoded(picture, "RGBA")
-        except (LookupError, TypeError, ValueError, OSError, OverflowError) as e:
-            raise self._unreadable_image(image, e) from e
+        with self._image_named(image), opened_picture(io.BytesIO(self._image_bytes(image))) as picture:
+            return decoded(picture, "RGBA")
 
     def picture_texels(self, image: int) -> int:
         """Number of an embedded image's pixels, from its header alone. Raises as `picture`."""
-        try:
-            with opened_picture(io.BytesIO(self._image_bytes(image))) as picture:
-                return picture.width * picture.height
-        except (LookupError, TypeError, ValueError, OSError, OverflowError) as e:
-            raise self._unreadable_image(image, e) from e
+        with self._image_named(image), opened_picture(io.BytesIO(self._image_bytes(image))) as picture:
+            return picture.width * picture.height
 
     def _image_bytes(self, image: int) -> bytes:
         view = self.content["bufferViews"][self.content["images"][image]["bufferView"]]
         first = int(view.get("byteOffset", 0))
         return self.binary[first : first + int(view["byteLength"])]
 
-    def _unreadable_image(self, image: int, reason: Exception) -> FileError:
-        return FileError(
-            f"{self.path}: image {image!s:.20} cannot be read ({reason!s:.160}): pack PNG or JPEG into the file"
-        )
+    def _image_named(self, image: int) -> contextlib.AbstractContextManager[None]:
+        return as_file_error(self.path, f"has an unreadable image {image!s:.20}", "pack PNG or JPEG into it", OSError)
 
 
 def read_glb(path: str | Path) -> Glb:
@@ -120,22 +109,20 @@ def read_glb(path: str | Path) -> Glb:
     """
     path = Path(path)
     data = read_regular(path, LARGEST_GLB)
-    try:
+    with as_file_error(path, "is not a complete .glb file", "write it again", struct.error):
         magic, version, length = struct.unpack_from("<4sII", data)
         if magic != MAGIC or version != 2:
-            raise FileError(f"{path} is not a binary glTF 2.0 file: export it as .glb")
+            raise FileError(path, "is not a binary glTF 2.0 file", "export it as .glb")
         if length > len(data):
-            raise FileError(f"{path} is truncated ({len(data)} of {length} bytes): write it again")
+            raise FileError(path, f"is truncated ({len(data)} of {length} bytes)", "write it again")
         chunks, at = {}, 12
         while at + 8 <= length:
             size, kind = struct.unpack_from("<I4s", data, at)
             chunks.setdefault(kind, data[at + 8 : at + 8 + size])
             at += 8 + size
         content = parse_json(chunks[JSON_CHUNK])
-    except (struct.error, KeyError, JsonError) as e:
-        raise FileError(f"{path} is not a complete .glb file ({e!s:.160}): write it again") from e
     if not isinstance(content, dict):
-        raise FileError(f"{path} contains no glTF object: write it again")
+        raise FileError(path, "contains no glTF object", "write it again")
     return Glb(path, content, chunks.get(BINARY_CHUNK, b""), len(data))
 
 
@@ -192,14 +179,8 @@ def read_person(path: str | Path) -> SkinnedPerson:
         FileError: it is not a complete .glb, not rigged with the 24 joints, or has no betas.
     """
     glb = read_glb(path)
-    try:
+    with as_file_error(path, "is not a human on the default body", "make it again"):
         return SkinnedPerson(TexturedMesh(_parts(glb)), _betas(glb))
-    except FileError:
-        raise
-    except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
-        raise FileError(
-            f"{path} is not a human on the default body ({type(e).__name__} {e!s:.80}): make it again"
-        ) from e
 
 
 def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
@@ -207,16 +188,14 @@ def _betas(glb: Glb) -> Float[np.ndarray, "n"]:
     places = [glb.content.get("asset", {}), *scenes]
     extras: Any = next((p["extras"][OURS] for p in places if OURS in (p.get("extras") or {})), None)
     if extras is None:
-        raise FileError(f"{glb.path} has no betas: only files from primdiffusion people can be read")
+        raise FileError(glb.path, "has no betas", "give a file that primdiffusion people wrote")
     if extras.get("body", "default") != "default":
-        raise FileError(f"{glb.path} is rigged on the body {extras['body']!r:.60}: only the default body is supported")
+        raise FileError(glb.path, f"is rigged on the body {extras['body']!r:.60}", "rig it on the default body")
     betas = np.asarray(extras["betas"], np.float64)
     components = default_body().shape_basis.shape[-1]
     if betas.ndim != 1 or len(betas) > components or not (np.abs(betas) <= LARGEST_BETA).all():
-        raise FileError(
-            f"{glb.path} has betas of shape {betas.shape}; at most {components}, within {LARGEST_BETA:g} of 0, are "
-            "supported: make the human again"
-        )
+        reason = f"has betas of shape {betas.shape}, not at most {components} within {LARGEST_BETA:g} of 0"
+        raise FileError(glb.path, reason, "make the human again")
     return betas
 
 
@@ -228,7 +207,7 @@ def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
         if "mesh" not in node:
             continue
         if "skin" not in node:
-            raise FileError(f"{glb.path}: the mesh {node.get('name')!r:.60} has no skin: make the human again")
+            raise FileError(glb.path, f"has no skin for the mesh {node.get('name')!r:.60}", "make the human again")
         joints = _joints(glb, node["skin"])
         for number, primitive in enumerate(glb.content["meshes"][node["mesh"]]["primitives"]):
             name = str(node.get("name", f"part {len(parts)}")) + (f" {number}" if number else "")
@@ -236,11 +215,12 @@ def _parts(glb: Glb) -> tuple[TexturedPart, ...]:
             corners += parts[-1].faces.size + parts[-1].vertices.size
             if len(parts) > MOST_PARTS or corners > most_corners:
                 raise FileError(
-                    f"{glb.path} has more than {MOST_PARTS} parts, or than the {most_corners} corners that a file of "
-                    "its size may have: make a simpler human"
+                    glb.path,
+                    f"has more than {MOST_PARTS} parts, or than the {most_corners} corners that its size allows",
+                    "make a simpler human",
                 )
     if not parts:
-        raise FileError(f"{glb.path} contains no mesh: make the human again")
+        raise FileError(glb.path, "contains no mesh", "make the human again")
     return tuple(parts)
 
 
@@ -248,7 +228,7 @@ def _joints(glb: Glb, skin: int) -> Int[np.ndarray, "n"]:
     """SMPL index of each joint of a skin."""
     names = [glb.content["nodes"][node].get("name") for node in glb.content["skins"][skin]["joints"]]
     if unknown := sorted({str(name) for name in names if name not in JOINT_NAMES}):
-        raise FileError(f"{glb.path} has joints {', '.join(unknown[:3])!s:.100}: rig it with SMPL's {J} joints")
+        raise FileError(glb.path, f"has joints {', '.join(unknown[:3])!s:.100}", f"rig it with SMPL's {J} joints")
     return np.array([JOINT_NAMES.index(name) for name in names], np.int32)
 
 
@@ -259,9 +239,8 @@ def _part(
     vertices = glb.array(attributes["POSITION"]).astype(np.float64)
     faces = glb.array(primitive["indices"]).astype(np.int64) if "indices" in primitive else np.arange(len(vertices))
     if primitive.get("mode", 4) != 4 or len(faces) % 3 or not ((faces >= 0) & (faces < len(vertices))).all():
-        raise FileError(
-            f"{glb.path}: the faces of {name!r:.60} are not triangles of its vertices: make the human again"
-        )
+        reason = f"has faces in {name!r:.60} that are not triangles of its vertices"
+        raise FileError(glb.path, reason, "make the human again")
     faces = faces.reshape(-1, 3).astype(np.int32)
     uv = glb.array(attributes["TEXCOORD_0"]) if "TEXCOORD_0" in attributes else np.zeros((len(vertices), 2), np.float32)
     index = joints[glb.array(attributes["JOINTS_0"]).astype(np.int64)]
@@ -270,11 +249,12 @@ def _part(
     weighted = (weight >= 0).all() and (total > 0).all() and (total < LARGEST_NUMBER).all()
     if not (np.abs(vertices) < FARTHEST).all() or not weighted:
         raise FileError(
-            f"{glb.path}: {name!r:.60} has vertices that are not finite, without joints, or {FARTHEST:g} m from "
-            "the origin: make the human again"
+            glb.path,
+            f"has vertices in {name!r:.60} that are not finite, without joints, or {FARTHEST:g} m from the origin",
+            "make the human again",
         )
     if not (np.abs(uv) <= LARGEST_UV).all():
-        raise FileError(f"{glb.path}: {name!r:.60} has texture coordinates out of range: make the human again")
+        raise FileError(glb.path, f"has texture coordinates out of range in {name!r:.60}", "make the human again")
     return TexturedPart(
         name=name,
         vertices=vertices,
@@ -313,10 +293,8 @@ class _Textures:
         if surface not in self._decoded:
             self._texels += 1 if surface.image is None else self._glb.picture_texels(surface.image)
             if self._texels > self._most_texels:
-                raise FileError(
-                    f"{self._glb.path} has textures of more than the {self._most_texels} texels that a file of its "
-                    "size may have: make a simpler human"
-                )
+                reason = f"has textures of more than the {self._most_texels} texels that its size allows"
+                raise FileError(self._glb.path, reason, "make a simpler human")
             self._decoded[surface] = _texture(self._glb, surface)
         return self._decoded[surface]
 

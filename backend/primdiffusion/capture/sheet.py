@@ -63,7 +63,7 @@ def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarr
     except FileNotFoundError:
         return body_joints(subject, default_body() if body is None else body)
     if joints.shape != (subject.frames, J, 3):
-        raise FileError(f"{path} has joints of shape {joints.shape} for {subject.frames} frames: render again")
+        raise FileError(path, f"has joints of shape {joints.shape} for {subject.frames} frames", "render again")
     return joints
 
 
@@ -93,9 +93,8 @@ def reprojection_error(subject: Subject) -> float:
     except FileNotFoundError:
         return 0.0
     if stored["pixel"].shape != (len(subject.views), *stored["world"].shape[:2], 2):
-        raise FileError(
-            f"{path} has joints of shape {stored['pixel'].shape} for {len(subject.views)} cameras: render again"
-        )
+        reason = f"has joints of shape {stored['pixel'].shape} for {len(subject.views)} cameras"
+        raise FileError(path, reason, "render again")
     errors = [
         view.project(stored["world"])[0] - pixel for view, pixel in zip(subject.views, stored["pixel"], strict=True)
     ]

@@ -13,7 +13,7 @@ from primdiffusion.body.model import BodyPose, J
 from primdiffusion.formats.arrays import all_finite, read_numbers, read_pickled_bytes
 from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 from primdiffusion.formats.motion_size import check_motion_size
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.formats.regular_files import FileError, as_file_error
 from primdiffusion.formats.smpl_pickle import array_of_objects, as_array, load_restricted
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
@@ -39,8 +39,7 @@ def read_smpl(subject: Path) -> SmplParameters:
 
     Raises:
         FileNotFoundError: neither file exists.
-        FileError: the file is damaged or has other contents.
-        FileError: its pickle is damaged or contains more than arrays.
+        FileError: the file is damaged or has other contents, or its pickle contains more than arrays.
     """
     plain, pickled = subject / SMPL_FOLDER / SMPL_PLAIN_FILE, subject / SMPL_FOLDER / SMPL_FILE
     if plain.is_file():
@@ -53,17 +52,13 @@ def read_smpl(subject: Path) -> SmplParameters:
 def _read_pickled(path: Path) -> dict[str, np.ndarray]:
     """Read the dictionary from a 0-d object array, without executing code from it."""
     pickled = read_pickled_bytes(path, "smpl")
-    try:
-        (content,) = array_of_objects(load_restricted(pickled, str(path)))
+    with as_file_error(path, "contains no dictionary of SMPL parameters", "download it again"):
+        (content,) = array_of_objects(load_restricted(pickled, path))
         if not isinstance(content, dict):
             raise ValueError(f"it contains a {type(content).__name__}")
+        if missing := [key for key in KEYS if key not in content]:
+            raise FileError(path, f"lacks {missing[0]!r}", "render the subject again, or download the file again")
         return {key: as_array(content[key]) for key in KEYS}
-    except FileError:
-        raise
-    except KeyError as e:
-        raise FileError(f"{path} lacks {e}: render the subject again, or download the file again") from e
-    except (ValueError, TypeError) as e:
-        raise FileError(f"{path} contains no dictionary of SMPL parameters ({e!s:.160}): download it again") from e
 
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
@@ -72,10 +67,10 @@ def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
     shapes = {"global_orient": (frames, 3), "body_pose": (frames, 3 * (J - 1)), "transl": (frames, 3)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
-            raise FileError(f"{path}: {name} has shape {arrays[name].shape}, not {shape}: render it again")
+            raise FileError(path, f"has {name} of shape {arrays[name].shape}, not {shape}", "render the subject again")
     betas = arrays["betas"].reshape(-1)
     if not all(map(all_finite, arrays.values())) or not frames or arrays["betas"].ndim > 2:
-        raise FileError(f"{path} has no frames, or NaN or infinite values: render the subject again")
+        raise FileError(path, "has no frames, or NaN or infinite values", "render the subject again")
     return SmplParameters(
         theta=np.concatenate([arrays["global_orient"], arrays["body_pose"]], axis=1).astype(np.float32),
         translation=arrays["transl"].astype(np.float32),

@@ -28,7 +28,6 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.group_places import MOST
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.schema import Range, check
 from primdiffusion.pose_file import read_motion
@@ -143,12 +142,12 @@ class RenderCaptures:
         return tuple({name: people[name] for name in part} for part in parts)
 
     def _poses(self) -> tuple[BodyPose, list[str]]:
-        """Return the poses, and the errors of unreadable motion files. Raises FileError if all are."""
+        """Return the poses, and the errors of unreadable motion files. Raises ValueError if all are."""
         if not self.pose_count:
             return read_motion(self.poses[0]), []
         motions, unread = read_motions(self.poses)
         if self.poses and not motions:
-            raise FileError(f"none of the {len(self.poses)} pose files can be used: {unread[-1]}")
+            raise ValueError(f"none of the {len(self.poses)} pose files can be used: {unread[-1]}")
         return choose_poses(motions, self.pose_count, self.seed), unread
 
 

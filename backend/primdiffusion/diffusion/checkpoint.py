@@ -7,7 +7,7 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -27,13 +27,13 @@ from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.arrays import LARGEST_NUMBER
-from primdiffusion.formats.json_files import JsonError, parse_json
+from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import FileError, as_file_error, open_regular, read_regular
-from primdiffusion.formats.schema import FieldError, Open, Range, read
+from primdiffusion.formats.schema import Open, Range, read
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
-from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, BodySetupError, find_body_setup
+from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, find_body_setup
 from primdiffusion.primitives.primitives import GRID, K
 
 FORMAT = "primdiffusion-checkpoint"
@@ -178,14 +178,9 @@ def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor],
     return {key: value.float() for key, value in tensors.items()}, file.metadata, file.sha256()
 
 
-@contextlib.contextmanager
-def mismatches_named(path: Path, *also: type[Exception]) -> Iterator[None]:
-    """Raise FileError for errors (and `also`) caused by tensors that contradict the file's own architecture."""
-    try:
-        yield
-    except (KeyError, TypeError, JsonError, FieldError, RuntimeError, *also) as error:
-        reason = f"{type(error).__name__}: {' '.join(str(error).split())[:160]}"
-        raise FileError(path, f"does not match its own description ({reason})", "download or train it again") from error
+def mismatches_named(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Raise FileError for errors caused by tensors that contradict the file's own architecture."""
+    return as_file_error(path, "does not match its own description", "download or train it again", RuntimeError)
 
 
 def file_hash(path: Path) -> str:
@@ -201,7 +196,7 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
     """
     path = checkpoint_file(path)
     metadata = read_metadata(path, (FORMAT, ENCODER_FORMAT))
-    with mismatches_named(path, AttributeError):
+    with mismatches_named(path):
         known = parse_json(metadata.get("architecture", "{}")).get("vocabulary")
         return parse_json(metadata["card"]) | ({"attributes": known} if known else {})
 
@@ -210,16 +205,15 @@ def load_checkpoint(path: Path | str | None = None, device: torch.device | str =
     """Load a model in float32, trained here or imported (`released`), from the file that `checkpoint_file` finds.
 
     Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
-    format or version, does not match its own architecture or holds values that are not finite; as `checkpoint_file`;
-    and for an imported one BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
+    format or version, does not match its own architecture or holds values that are not finite, and for a user's body
+    file that is missing or has changed, which an imported one needs; as `checkpoint_file`.
     """
     path = checkpoint_file(path)
     tensors, config, card = read_checkpoint(path)
-    if config.kind == RELEASED:
-        with mismatches_named(path):
-            return _released_model(tensors, config, card, path.parent).to(device)
-    with mismatches_named(path, ValueError, AttributeError):
-        return _model(tensors, config, card).to(device)
+    with mismatches_named(path):
+        released = config.kind == RELEASED
+        model = _released_model(tensors, config, card, path.parent) if released else _model(tensors, config, card)
+        return model.to(device)
 
 
 def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str, Any]) -> DiffusionModel:
@@ -318,7 +312,7 @@ def anchor_tensors(anchors: Anchors) -> dict[str, Tensor]:
 def stored_body_setup(tensors: Mapping[str, Tensor], body: str, folder: Path) -> BodySetup:
     """Load the body of a file in `folder` with its `anchor_tensors`; `body` is the JSON of `BodyFiles`.
 
-    Raises BodySetupError if a body file is missing or changed, or does not give these anchors; KeyError, ValueError.
+    Raises FileError if a body file is missing or changed; ValueError if it does not give these anchors; KeyError.
     """
     body_setup = find_body_setup(BodyFiles.from_json(body), tensors["stand.rest_half_extent"], [folder])
     anchors = body_setup.anchors
@@ -326,7 +320,7 @@ def stored_body_setup(tensors: Mapping[str, Tensor], body: str, folder: Path) ->
         torch.equal(anchors.face, tensors["stand.face"].long())
         and torch.allclose(anchors.barycentric, tensors["stand.barycentric"], atol=1e-5)
     ):
-        raise BodySetupError("the anchors differ from those that the checkpoint was imported with: import it again")
+        raise ValueError("the body gives other anchors than those that it was imported with")
     return body_setup
 
 

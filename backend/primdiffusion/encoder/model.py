@@ -151,21 +151,18 @@ def load_encoder(path: Path | str | None = None, device: torch.device | str = "c
     """Load an encoder in float32 (without a path: the one in the package).
 
     Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
-    format or version, does not match its own configuration or holds values that are not finite. An imported one raises
-    BodySetupError (a ValueError) if the user's body file that it needs is missing or changed.
+    format or version, does not match its own configuration or holds values that are not finite, and for a user's body
+    file that is missing or has changed, which an imported one needs.
     """
     path = default_encoder() if path is None else Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"there is no encoder at {path}: give the path of a .safetensors file")
     tensors, metadata, _ = read_tensors(path, (ENCODER_FORMAT,))
-    with mismatches_named(path, ValueError):
+    with mismatches_named(path):
         config = config_from_json(parse_json(metadata["config"]))
         anchors = {f"stand.{name}": value for name, value in under(tensors, "stand.").items()}
         weights = {name: value for name, value in tensors.items() if name not in anchors}
         encoder = load_network(lambda: Encoder(config), weights)
         card = parse_json(metadata["card"])
-    body_setup = None
-    if "body" in metadata:
-        with mismatches_named(path):
-            body_setup = stored_body_setup(anchors, metadata["body"], path.parent)
+        body_setup = stored_body_setup(anchors, metadata["body"], path.parent) if "body" in metadata else None
     return EncoderModel(encoder.eval().requires_grad_(False).to(device), card, body_setup)

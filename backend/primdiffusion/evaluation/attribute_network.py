@@ -48,7 +48,7 @@ class AttributeSpace:
 
     @classmethod
     def from_json(cls, text: str) -> AttributeSpace:
-        """Undo `to_json`. Raises JsonError, KeyError, TypeError, ValueError, AttributeError."""
+        """Undo `to_json`. Raises KeyError, TypeError, ValueError, AttributeError."""
         stated = parse_json(text)
         return cls(
             {name: tuple(values) for name, values in stated["categories"].items()},

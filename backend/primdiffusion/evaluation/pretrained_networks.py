@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion import tensor_file, torch_file
-from primdiffusion.formats.regular_files import FileError, TooLargeError
+from primdiffusion.formats.regular_files import FileError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -121,7 +121,7 @@ def read_weights(path: Path | str) -> dict[str, Tensor]:
         if path.suffix == ".safetensors":
             return tensor_file.read(path)[0]
         content = torch_file.load(path)
-    except TooLargeError:
+    except FileError:
         raise
     except torch_file.PICKLE_ERRORS as e:
         raise FileError(

@@ -53,6 +53,17 @@ Source = str | Path | FileContent
 """A file by its path, or as it was read before."""
 
 
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """Where an array is: a file of its own, or the member `name` of an archive."""
+
+    path: Source
+    name: str = ""
+
+    def error(self, reason: str, remedy: str) -> FileError:
+        return FileError(self.path, f"holds {self.name!r:.60}, which {reason}" if self.name else reason, remedy)
+
+
 def array_names(path: Source) -> list[str]:
     """Return the names of the arrays in an .npz. Raises FileError for a damaged file, and OSError."""
     with _archive(path) as archive:
@@ -63,10 +74,10 @@ def array_shape(path: str | Path, name: str) -> tuple[int, ...]:
     """Return the shape of an array without reading its values. Raises as `read_arrays`."""
     with _archive(path) as archive:
         member = _needed(archive, path, name)
-        what = f"{path}: {name!r}"
-        _check_size(member.file_size, what)
+        place = _Place(path, name)
+        _check_size(member.file_size, place)
         with archive.open(member) as stream:
-            return _header(stream, member.file_size, what)[0]
+            return _header(stream, member.file_size, place)[0]
 
 
 def read_arrays(
@@ -87,15 +98,15 @@ def read_arrays(
             if name in optional and _member(archive, name) is None:
                 continue
             member = _needed(archive, path, name)
-            total, packed = total + member.file_size, packed + member.compress_size
-            _check_size(total, f"{path}: {name!r}")
-            _check_ratio(total, packed, f"{path}: {name!r}")
+            total, packed, place = total + member.file_size, packed + member.compress_size, _Place(path, name)
+            _check_size(total, place)
+            _check_ratio(total, packed, place)
             with archive.open(member) as stream:
-                head = _header(stream, member.file_size, f"{path}: {name!r}")
+                head = _header(stream, member.file_size, place)
                 values += math.prod(head[0])
                 if most_values is not None and values > most_values:
-                    raise FileError(f"{path}: {name!r} makes it {values} values, more than {most_values}: cut it")
-                arrays[name] = _filled(stream, *head, f"{path}: {name!r}")
+                    raise place.error(f"makes it {values} values, more than {most_values}", "save fewer in a file")
+                arrays[name] = _filled(stream, *head, place)
     return arrays
 
 
@@ -106,9 +117,9 @@ def read_numbers(
     arrays = read_arrays(path, required, optional, most_values=most_values)
     for name, values in arrays.items():
         if values.dtype.kind not in "biuf":
-            raise FileError(f"{path}: {name!r} holds {values.dtype}, not numbers: save it as numbers")
+            raise FileError(path, f"holds {name!r} as {values.dtype}, not numbers", "save it as numbers")
         if not all_finite(values):
-            raise FileError(f"{path}: {name!r} holds NaN or infinite numbers: make it again")
+            raise FileError(path, f"holds NaN or infinite numbers in {name!r}", "make it again")
     return arrays
 
 
@@ -134,15 +145,16 @@ def check_shapes(
             fits = fits and size == (sizes.setdefault(expected, size) if isinstance(expected, str) else expected)
         if not fits:
             expected_shape = tuple(sizes.get(s, s) if isinstance(s, str) else s for s in shape)
-            raise FileError(
-                f"{path}: {name!r} holds {values.dtype} {values.shape} instead of numbers of shape {expected_shape}"
-            )
+            found = f"holds {name!r} as {values.dtype} {values.shape}, not as numbers {expected_shape}"
+            raise FileError(path, found, "make it again")
 
 
 def read_npy(path: Source) -> NDArray:
     """Read an .npy file. Raises as `read_arrays`."""
     with _npy(path) as (stream, size):
-        return _read(stream, size, str(path))
+        place = _Place(path)
+        _check_size(size, place)
+        return _filled(stream, *_header(stream, size, place), place)
 
 
 def map_npy(path: str | Path) -> NDArray:
@@ -150,7 +162,7 @@ def map_npy(path: str | Path) -> NDArray:
     with contextlib.closing(open_regular(path, 2**62)) as stream:
         size = stream.seek(0, io.SEEK_END)
         stream.seek(0)
-        shape, fortran, dtype = _header(stream, size, str(path))
+        shape, fortran, dtype = _header(stream, size, _Place(path))
         order = "F" if fortran else "C"
         # of the open file, whose header was checked: another one may have taken its name
         return np.memmap(stream, dtype, "r", stream.tell(), shape, order)  # type: ignore[call-overload]
@@ -159,12 +171,12 @@ def map_npy(path: str | Path) -> NDArray:
 def read_pickled_bytes(path: str | Path, name: str) -> bytes:
     """Return the pickle in an array of objects, for a reader that runs nothing of it. Raises as `read_arrays`."""
     with _archive(path) as archive:
-        member, what = _needed(archive, path, name), f"{path}: {name!r}"
-        _check_size(member.file_size, what)
+        member, place = _needed(archive, path, name), _Place(path, name)
+        _check_size(member.file_size, place)
         with archive.open(member) as stream:
-            _, _, dtype = _head(stream, what)
+            _, _, dtype = _head(stream, place)
             if not dtype.hasobject:
-                raise FileError(f"{what} holds {dtype}, not a dictionary of arrays: download it again")
+                raise place.error(f"is {dtype}, not a dictionary of arrays", "download it again")
             return b"".join(iter(lambda: stream.read(_CHUNK), b""))
 
 
@@ -191,13 +203,13 @@ def stored_members(file: BinaryIO, path: str | Path) -> dict[str, StoredMember]:
         end = file.seek(0, io.SEEK_END)
         for info in archive.infolist():
             if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
-                raise FileError(f"{path} is compressed, which torch.save never does: save it again")
+                raise FileError(path, "is compressed, which torch.save never does", "save it again")
             archive.open(info).close()  # compares its two headers; encrypted members are errors
             file.seek(info.header_offset)
             name_bytes, extra_bytes = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
             begin = info.header_offset + _LOCAL_HEADER.size + name_bytes + extra_bytes
             if begin + info.file_size > end:
-                raise FileError(f"{path}: {info.filename!r:.60} is cut short: copy or export it again")
+                raise FileError(path, f"holds only a part of {info.filename!r:.60}", "copy or export it again")
             members[info.filename] = StoredMember(begin, info.file_size, info.CRC)
         _check_names(path, [name.replace("\\", "/").lower() for name in archive.namelist()])
         return members
@@ -255,14 +267,14 @@ def _archive_in(file: BinaryIO, path: Source) -> Iterator[zipfile.ZipFile]:
     except FileError:
         raise
     except _UNREADABLE as e:
-        raise FileError(f"{path} is not a whole .npz file ({str(e)[:100]}): copy or export it again") from e
+        raise FileError(path, f"is not a whole archive of arrays ({str(e)[:100]})", "copy or export it again") from e
 
 
 def _check_names(path: Source, names: Sequence[str]) -> None:
     """Check that names differ: of two members of one name, readers choose different ones."""
     if len(set(names)) < len(names):
         twice = next(name for name, count in collections.Counter(names).items() if count > 1)
-        raise FileError(f"{path} holds {twice!r:.60} twice: save it again")
+        raise FileError(path, f"holds {twice!r:.60} twice", "save it again")
 
 
 @contextlib.contextmanager
@@ -280,26 +292,28 @@ def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo | None:
 def _needed(archive: zipfile.ZipFile, path: Source, name: str) -> zipfile.ZipInfo:
     member = _member(archive, name)
     if member is None:
-        raise FileError(f"{path} holds no array {name!r}: make it again")
+        raise FileError(path, f"holds no array {name!r}", "make it again")
+    place = _Place(path, name)
     if member.flag_bits & 1:
-        raise FileError(f"{path}: {name!r} is encrypted, which is not supported: save it without a password")
+        raise place.error("is encrypted", "save it without a password")
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack without a limit
-        raise FileError(f"{path}: {name!r} is compressed in another way than numpy's: save it with numpy.savez")
-    _check_ratio(member.file_size, member.compress_size, f"{path}: {name!r}")
+        raise place.error("is compressed in another way than numpy's", "save it with numpy.savez")
+    _check_ratio(member.file_size, member.compress_size, place)
     return member
 
 
-def _check_ratio(size: int, packed: int, what: str) -> None:
+def _check_ratio(size: int, packed: int, place: _Place) -> None:
     if size > max(MOST_REPEATED, LARGEST_RATIO * packed):
-        raise FileError(f"{what} unpacks to {size / 2**20:.0f} MB of the same: cut it")
+        raise place.error(f"unpacks to {size / 2**20:.0f} MB of the same", "split it into smaller files")
 
 
-def _check_size(size: int, what: str) -> None:
+def _check_size(size: int, place: _Place) -> None:
     if size > LARGEST_BYTES:
-        raise FileError(f"{what} unpacks to {size / 2**20:.0f} MB, more than {LARGEST_BYTES // 2**20}: cut it")
+        most = LARGEST_BYTES // 2**20
+        raise place.error(f"unpacks to {size / 2**20:.0f} MB, more than {most}", "split it into smaller files")
 
 
-def _head(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _head(stream: IO[bytes], place: _Place) -> tuple[tuple[int, ...], bool, np.dtype]:
     """Read the header of an array: shape, column-major, dtype."""
     try:
         start = stream.read(8)
@@ -316,38 +330,36 @@ def _head(stream: IO[bytes], what: str) -> tuple[tuple[int, ...], bool, np.dtype
         if len(shape) > 32 or not all(type(side) is int and 0 <= side < 2**62 for side in shape):
             raise ValueError("an impossible shape")
     except _HEADER_ERRORS as e:
-        raise FileError(f"{what} is not an array of numpy's format: save it with numpy.save or savez") from e
+        raise place.error("is not an array of numpy's format", "save it with numpy.save or savez") from e
     if not dtype.hasobject and (dtype.kind not in _KINDS or dtype.itemsize <= 0):  # sizes of long texts wrap
-        raise FileError(f"{what} holds {dtype!s:.60}, not numbers or text: save it as one of these")
+        raise place.error(f"is an array of {dtype!s:.60}, not of numbers or text", "save it as one of these")
     return shape, fortran, dtype
 
 
-def _header(stream: IO[bytes], size: int, what: str) -> tuple[tuple[int, ...], bool, np.dtype]:
+def _header(stream: IO[bytes], size: int, place: _Place) -> tuple[tuple[int, ...], bool, np.dtype]:
     """As `_head`, of numbers or text that fit into `size` bytes."""
-    shape, fortran, dtype = _head(stream, what)
+    shape, fortran, dtype = _head(stream, place)
     if dtype.hasobject:
-        raise FileError(f"{what} holds pickled Python objects, which are never read: save it as plain arrays")
+        raise place.error("is pickled, and pickles are never read", "save it as plain arrays")
     wanted = math.prod(shape) * dtype.itemsize
     if wanted > size:
-        promised = wanted if wanted < 2**63 else "countless"
-        raise FileError(f"{what} is cut short: its header promises {promised} bytes, {size} are there")
+        raise _cut_short(place, wanted if wanted < 2**63 else "countless", size)
     return shape, fortran, dtype
 
 
-def _read(stream: IO[bytes], size: int, what: str) -> NDArray:
-    """Read an array of `size` bytes including its header, which must agree with that size."""
-    _check_size(size, what)
-    return _filled(stream, *_header(stream, size, what), what)
+def _cut_short(place: _Place, promised: int | str, found: int) -> FileError:
+    reason = f"is cut short (its header promises {promised} bytes, {found} are there)"
+    return place.error(reason, "copy or export it again")
 
 
-def _filled(stream: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: np.dtype, what: str) -> NDArray:
+def _filled(stream: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: np.dtype, place: _Place) -> NDArray:
     """Read the values of an array, which follow its header."""
     raw = np.empty(math.prod(shape) * dtype.itemsize, np.uint8)  # memory is taken as it is filled
     filled = 0
     while filled < raw.size:
         chunk = stream.read(min(_CHUNK, raw.size - filled))
         if not chunk:
-            raise FileError(f"{what} is cut short: its header promises {raw.size} bytes, {filled} are there")
+            raise _cut_short(place, raw.size, filled)
         raw[filled : filled + len(chunk)] = np.frombuffer(chunk, np.uint8)
         filled += len(chunk)
     array = raw.view(dtype)

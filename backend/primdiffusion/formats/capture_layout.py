@@ -89,7 +89,8 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
     remove_abandoned(root, root / DATASET_FILE)
     if not (root / DATASET_FILE).exists():
         if root.is_dir() and any(not path.name.startswith(".") for path in root.iterdir()):
-            raise FileError(f"{root} is not empty and holds no {DATASET_FILE}: choose a new folder for the captures")
+            reason = f"is not empty and holds no {DATASET_FILE}"
+            raise FileError(root, reason, "choose a new folder for the captures")
         root.mkdir(parents=True, exist_ok=True)
         unlike = temporary_name(root / DATASET_FILE)
         try:  # a link fails where another process was first, which a rename would not
@@ -109,8 +110,9 @@ def claim(root: Path, about: Mapping[str, Any]) -> None:
     if differing:
         key = differing[0]
         raise FileError(
-            f"{root} holds other captures: its {key:.40} is {present.get(key)!r:.60}, wanted is "
-            f"{wanted.get(key)!r:.60}; choose another folder, or the same settings"
+            root,
+            f"holds captures whose {key:.40} is {present.get(key)!r:.60}, not {wanted.get(key)!r:.60}",
+            "choose another folder, or the same settings",
         )
 
 
@@ -119,14 +121,14 @@ def read_about(root: Path) -> dict[str, Any]:
     try:
         about = read_json(root / DATASET_FILE)
     except FileNotFoundError:
-        raise FileError(f"{root} holds no captures: there is no {DATASET_FILE} in it") from None
+        raise FileError(root, f"holds no captures (no {DATASET_FILE})", "choose a folder of captures") from None
     except (OSError, ValueError) as e:
-        raise FileError(f"{root / DATASET_FILE} cannot be read ({e!s:.160}): render the captures again") from e
+        raise FileError(root / DATASET_FILE, f"cannot be read ({e!s:.160})", "render the captures again") from e
     if not isinstance(about, dict) or about.get("format") != FORMAT:
-        raise FileError(f"{root / DATASET_FILE} is not the {DATASET_FILE} of captures: choose another folder")
+        raise FileError(root / DATASET_FILE, f"is not the {DATASET_FILE} of captures", "choose another folder")
     if about.get("version") != VERSION:
-        version = about.get("version")
-        raise FileError(f"{root} is of version {version!s:.20}: this program reads version {VERSION}")
+        reason = f"is of version {about.get('version')!s:.20}, not {VERSION}"
+        raise FileError(root, reason, "use the matching release, or render the captures again")
     return about
 
 
@@ -219,9 +221,8 @@ def _check_same_smpl(subject: Path, wanted: Mapping[str, NDArray]) -> None:
         return  # missing or truncated: it is written again
     for name, values in wanted.items():
         if present[name].shape != values.shape or not np.allclose(present[name], values, atol=1e-5):
-            raise FileError(
-                f"{subject} holds another human or other poses ({name} differs): choose another folder, or remove it"
-            )
+            reason = f"holds another human or other poses ({name} differs)"
+            raise FileError(subject, reason, "choose another folder, or remove it")
 
 
 def _inside(subject: Path, name: str) -> Path:

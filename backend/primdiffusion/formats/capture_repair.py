@@ -19,7 +19,7 @@ from .capture_layout import (
     write_list,
 )
 from .picture_files import is_whole_picture
-from .regular_files import FileError, TooLargeError
+from .regular_files import FileError
 from .removing import check_inside, remove_file
 from .whole_files import is_abandoned
 
@@ -41,7 +41,7 @@ def verify(root: Path, *, checksums: bool = True) -> dict[Path, str]:
     path, finished = root / LIST_FILE, finished_subjects(root)
     try:
         differing = set(read_list(root)).symmetric_difference(finished)
-    except (OSError, TooLargeError):
+    except (OSError, FileError):
         wrong[path] = "cannot be read"
     else:
         if differing:
@@ -52,7 +52,7 @@ def verify(root: Path, *, checksums: bool = True) -> dict[Path, str]:
 def repair(root: Path, wrong: Collection[Path]) -> None:
     """Remove the files that `verify` has found, with the completion marks of their subjects; rewrite the list.
 
-    The command that rendered the dataset then renders only those files again. Raises OutsideFolderError, before it
+    The command that rendered the dataset then renders only those files again. Raises FileError, before it
     removes anything, where one of them lies behind a link out of its folder, and OSError.
     """
     for path in wrong:
@@ -106,23 +106,18 @@ def is_complete_view(subject: Path, passes: Sequence[str], camera: int, frame: i
 
 
 def _read_checked(root: Path) -> dict[str, Any]:
-    about = read_about(root)
+    about, path, remedy = read_about(root), root / DATASET_FILE, "render into a new folder"
     rig, passes = about.get("rig"), about.get("passes")
     frames, cameras = about.get("frames"), rig.get("count") if isinstance(rig, dict) else None
     if not isinstance(frames, int) or not isinstance(cameras, int) or min(frames, cameras) < 1:
-        raise FileError(f"{root / DATASET_FILE} lacks the numbers of frames and cameras: render into a new folder")
+        raise FileError(path, "lacks the numbers of frames and cameras", remedy)
     if not isinstance(passes, list) or not all(isinstance(name, str) for name in passes):
-        raise FileError(f"{root / DATASET_FILE} names no passes: render into a new folder")
+        raise FileError(path, "names no passes", remedy)
     if not set(passes) <= set(ENDINGS) or len(passes) > len(ENDINGS):
-        raise FileError(
-            f"{root / DATASET_FILE} names passes that this program does not know: {passes!r:.80}; render into a "
-            "new folder"
-        )
+        raise FileError(path, f"names passes that this program does not know ({passes!r:.80})", remedy)
     if frames * cameras * len(passes) > MOST_PICTURES:
-        raise FileError(
-            f"{root / DATASET_FILE} names {frames} frames of {cameras} cameras, more than {MOST_PICTURES} pictures a "
-            "human: render into a new folder"
-        )
+        reason = f"names {frames} frames of {cameras} cameras, more than {MOST_PICTURES} pictures a human"
+        raise FileError(path, reason, remedy)
     return about
 
 

@@ -34,14 +34,14 @@ class Provenance(Open):
     edits: list[Edit] = dataclasses.field(default_factory=list)
 
 
-def version_fault(metadata: Mapping[str, str]) -> str | None:
-    """Why a file's version cannot be read, if so: the end of a sentence that begins with the file's name."""
+def version_fault(metadata: Mapping[str, str]) -> tuple[str, str] | None:
+    """Why a file's version cannot be read, if so: reason and remedy of a FileError."""
     version = metadata.get("format_version", "")
     newest = compact_human.FORMAT_VERSION
     if not (version.isascii() and version.isdecimal() and len(version) <= 9) or int(version) < 1:
-        return f"does not contain a valid human (format version {version!r:.9}): generate it again"
+        return f"does not contain a valid human (format version {version!r:.9})", "generate it again"
     if int(version) > newest:
-        return f"was written by a newer PrimDiffusion (format {version}, this one reads up to {newest}): update it"
+        return f"has format {version} of a newer PrimDiffusion, this one reads up to {newest}", "update PrimDiffusion"
     return None
 
 
@@ -60,14 +60,14 @@ def provenance_of(metadata: Mapping[str, str]) -> dict[str, Any]:
 
 
 def _no_json(error: ValueError) -> ValueError:
-    return ValueError(f"its provenance is not JSON ({error!s:.100}): generate the human again")
+    return ValueError(f"its provenance is not JSON ({error!s:.100})")
 
 
 def check_provenance(provenance: Any) -> None:
     """Raise ValueError, naming the entry, for one of a wrong type."""
     if not isinstance(provenance, Mapping):
-        raise ValueError(f"its provenance is {provenance!r:.60}, not a JSON object: generate the human again")
+        raise ValueError(f"its provenance is {provenance!r:.60}, not a JSON object")
     try:
         read(Provenance, provenance)
     except FieldError as error:
-        raise ValueError(f"{error.field!r} of its provenance is not valid: generate the human again") from error
+        raise ValueError(f"{error.field!r} of its provenance is not valid") from error

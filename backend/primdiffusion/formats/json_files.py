@@ -1,5 +1,6 @@
 """Read untrusted JSON: limited size, count of values, depth and numbers, so that readers of the result cannot overflow.
 
+Errors of a text are reasons without the file's name: "it is nested more than 64 deep".
 Needs no numpy.
 """
 
@@ -23,22 +24,18 @@ LARGEST_INTEGER = 2**63 - 1
 """Larger integers are read as floats, infinite beyond these: conversion to float would raise OverflowError."""
 
 
-class JsonError(ValueError):
-    """A text that is not JSON or exceeds a limit. The message is a reason without the file's name."""
-
-
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file as `parse_json` does. Raises JsonError, TooLargeError and OSError."""
+    """Read a JSON file as `parse_json` does. Raises ValueError, FileError and OSError."""
     return parse_json(read_regular(path, LARGEST_BYTES))
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Parse JSON whose numbers are all finite. Raises JsonError."""
+    """Parse JSON whose numbers are all finite. Raises ValueError."""
     return _checked(_parsed(text), finite=True)
 
 
 def parse_message(text: str | bytes) -> Any:
-    """Parse JSON whose numbers may be NaN or infinite, for readers that name the faulty parameter. Raises JsonError."""
+    """As `parse_json`, with numbers that may be NaN or infinite, for readers that name the faulty parameter."""
     return _checked(_parsed(text), finite=False)
 
 
@@ -51,7 +48,7 @@ def parse_pairs(text: bytes, deepest: int) -> Any:
 
     Unlike Python's parser it rejects NaN and infinite numbers, floats that overflow, halves of surrogate pairs, and
     values nested more than `deepest` levels. Integers outside 64 bits and -0 are floats. Of the limits of this module
-    none applies: the caller limits the length of the text. Raises JsonError.
+    none applies: the caller limits the length of the text. Raises ValueError.
     """
     try:
         decoded = text.decode("utf-8")
@@ -59,11 +56,11 @@ def parse_pairs(text: bytes, deepest: int) -> Any:
             decoded, object_pairs_hook=Pairs, parse_int=_integer, parse_float=_finite, parse_constant=_constant
         )
     except UnicodeDecodeError as e:
-        raise JsonError(f"it is not UTF-8 text: byte {e.start}") from e
+        raise ValueError(f"it is not UTF-8 text: byte {e.start}") from e
     except RecursionError as e:
-        raise JsonError(f"it is nested more than {deepest} deep") from e
+        raise ValueError(f"it is nested more than {deepest} deep") from e
     except ValueError as e:
-        raise JsonError(str(e)[:120]) from e
+        raise ValueError(str(e)[:120]) from e
     _check_pairs(tree, deepest, escapes="\\u" in decoded)
     return tree
 
@@ -98,7 +95,7 @@ def _check_pairs(tree: Any, deepest: int, *, escapes: bool) -> None:
         if depth == deepest:
             break
         level = [entry[1] if isinstance(container, Pairs) else entry for container in level for entry in container]
-    raise JsonError(f"it is nested more than {deepest} deep")
+    raise ValueError(f"it is nested more than {deepest} deep")
 
 
 def _check_strings(values: list[Any]) -> None:
@@ -107,26 +104,26 @@ def _check_strings(values: list[Any]) -> None:
         try:
             text.encode("utf-8")
         except UnicodeEncodeError as e:
-            raise JsonError(f"the text {text!r:.40} contains half of a surrogate pair") from e
+            raise ValueError(f"the text {text!r:.40} contains half of a surrogate pair") from e
 
 
 def _parsed(text: str | bytes) -> Any:
     if not isinstance(text, str | bytes):
-        raise JsonError(f"it is not text but {type(text).__name__}")
+        raise ValueError(f"it is not text but {type(text).__name__}")
     try:
         text = text if isinstance(text, str) else text.decode("utf-8")
     except UnicodeDecodeError as e:
-        raise JsonError(f"it is not UTF-8 text: byte {e.start}") from e
+        raise ValueError(f"it is not UTF-8 text: byte {e.start}") from e
     if len(text) > LARGEST_BYTES:
-        raise JsonError(f"it is longer than {LARGEST_BYTES // 2**20} MB")
+        raise ValueError(f"it is longer than {LARGEST_BYTES // 2**20} MB")
     if text.count("[") + text.count("{") > MOST_CONTAINERS or text.count(",") > MOST_VALUES:
-        raise JsonError(f"it holds more than {MOST_CONTAINERS} lists or {MOST_VALUES} values")
+        raise ValueError(f"it holds more than {MOST_CONTAINERS} lists or {MOST_VALUES} values")
     try:
         return json.loads(text, parse_int=_number)
     except RecursionError as e:
-        raise JsonError(f"it is nested more than {DEEPEST} deep") from e
+        raise ValueError(f"it is nested more than {DEEPEST} deep") from e
     except ValueError as e:
-        raise JsonError(str(e)[:120]) from e
+        raise ValueError(str(e)[:120]) from e
 
 
 def _number(digits: str) -> int | float:
@@ -139,7 +136,7 @@ def _checked(tree: Any, *, finite: bool) -> Any:
     level = [tree]
     for _ in range(DEEPEST + 1):
         if finite and any(isinstance(value, float) and not math.isfinite(value) for value in level):
-            raise JsonError("it holds NaN or infinite numbers")
+            raise ValueError("it holds NaN or infinite numbers")
         level = [
             entry
             for value in level
@@ -148,4 +145,4 @@ def _checked(tree: Any, *, finite: bool) -> Any:
         ]
         if not level:
             return tree
-    raise JsonError(f"it is nested more than {DEEPEST} deep")
+    raise ValueError(f"it is nested more than {DEEPEST} deep")

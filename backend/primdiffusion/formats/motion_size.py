@@ -20,7 +20,5 @@ def check_motion_size(path: str | Path, numbers: int) -> None:
     """Raise FileError for more `numbers` of poses than a file of this size may hold, and OSError."""
     most = max(UNBACKED_NUMBERS, NUMBERS_A_BYTE * os.stat(path).st_size)
     if numbers > most:
-        raise FileError(
-            f"{path} holds {numbers} numbers of poses, more than the {most} that a file of its size may have: cut the "
-            "motion into pieces"
-        )
+        reason = f"holds {numbers} numbers of poses, more than the {most} that a file of its size may have"
+        raise FileError(path, reason, "cut the motion into pieces")

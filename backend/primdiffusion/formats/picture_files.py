@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .regular_files import TooLargeError, open_regular
+from .regular_files import FileError, open_regular
 from .whole_files import replacing
 
 DEPTH_UNIT = 0.00025
@@ -108,7 +108,7 @@ def is_whole_picture(path: Path) -> bool:
             begins = file.read(len(head)) == head
             file.seek(-len(tail), os.SEEK_END)
             return begins and file.read() == tail
-    except (OSError, TooLargeError):
+    except (OSError, FileError):
         return False
 
 
@@ -126,5 +126,5 @@ def _is_whole_exr(path: Path) -> bool:
             file.seek(last + 4)
             (size,) = struct.unpack("<i", file.read(4))
             return file.seek(0, os.SEEK_END) == last + 8 + size
-    except (OSError, TooLargeError, struct.error, ValueError, OverflowError):
+    except (OSError, struct.error, ValueError, OverflowError):
         return False

@@ -26,25 +26,29 @@ COPIED_BYTES = 256 * 2**20
 class FileError(ValueError):
     """A file or folder that cannot be used: which one, what is wrong with it, and what to do."""
 
-    def __init__(self, path: Path | str, reason: str = "", remedy: str = ""):
-        """`reason` is a predicate ("is damaged"). A message alone stands for a path: processes send errors as text."""
-        self.path, self.reason, self.remedy = path, reason, remedy
-        super().__init__(f"{path} {reason}: {remedy}" if remedy else f"{path} {reason}".strip())
+    def __init__(self, path: Path | str | FileContent, reason: str, remedy: str):
+        """`reason` is a predicate ("is damaged"), `remedy` an imperative ("download it again")."""
+        self.path = path.path if isinstance(path, FileContent) else path
+        self.reason, self.remedy = reason, remedy
+        super().__init__(self.path, reason, remedy)  # by which it is pickled
 
-
-class TooLargeError(ValueError):
-    """A file is larger than its kind may be; the message names it."""
+    def __str__(self) -> str:
+        return f"{self.path} {self.reason}: {self.remedy}"
 
 
 @contextlib.contextmanager
-def as_file_error(path: Path | str, reason: str, remedy: str, *also: type[Exception]) -> Iterator[None]:
-    """Raise FileError, with the words of the error in brackets, for what damaged content raises, and for `also`."""
+def as_file_error(path: Path | str | FileContent, reason: str, remedy: str, *also: type[Exception]) -> Iterator[None]:
+    """Raise FileError, with the words of the error in brackets, for what damaged content raises, and for `also`.
+
+    A FileError passes: it says already what is wrong.
+    """
     try:
         yield
-    except TooLargeError:
+    except FileError:
         raise
     except (ValueError, TypeError, LookupError, AttributeError, OverflowError, *also) as error:
-        words = " ".join(str(error).removeprefix(f"{path}: ").split())
+        text = f"it lacks {error}" if isinstance(error, KeyError) else str(error).removeprefix(f"{path}: ")
+        words = " ".join(text.split())
         raise FileError(path, f"{reason} ({words:.160})", remedy) from error
 
 
@@ -94,7 +98,7 @@ class FileContent:
 
 
 def open_regular(path: str | Path | FileContent, limit: int) -> io.BufferedReader | io.BytesIO:
-    """Open a regular file of at most `limit` bytes for reading. Raises as `check_regular`, and TooLargeError.
+    """Open a regular file of at most `limit` bytes for reading. Raises as `check_regular`, and FileError.
 
     A file that states no size is read as empty: those of /proc may be endless.
     """
@@ -148,9 +152,9 @@ def read_regular(path: str | Path | FileContent, limit: int) -> bytes:
 
 
 def check_size(path: str | Path | FileContent, size: int, limit: int) -> None:
-    """Raise TooLargeError where `size` is over `limit`, bytes."""
+    """Raise FileError where `size` is over `limit`, bytes."""
     if size > limit:
-        raise TooLargeError(f"{path} is larger than {limit / 2**20:.0f} MB, the most for its kind: use a smaller file")
+        raise FileError(path, f"is larger than {limit / 2**20:.0f} MB, the most for its kind", "use a smaller file")
 
 
 def is_plain_path(path: str) -> bool:

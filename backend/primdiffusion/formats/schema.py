@@ -40,7 +40,10 @@ class FieldError(ValueError):
     def __init__(self, path: Names, problem: str):
         self.path, self.problem = path, problem
         self.field = "".join(map(_part, path)).removeprefix(".")
-        super().__init__(f"{self.field or 'it'} {problem}")
+        super().__init__(path, problem)  # by which it is pickled
+
+    def __str__(self) -> str:
+        return f"{self.field or 'it'} {self.problem}"
 
 
 def _part(name: str | int) -> str:

@@ -13,6 +13,7 @@ import io
 import pickle
 import pickletools
 import re
+from pathlib import Path
 
 import numpy as np
 
@@ -34,10 +35,6 @@ _DAMAGED = (
 )  # fmt: skip
 """What the unpickler raises where operations do not fit their values."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
-
-
-class UnsafePickleError(FileError):
-    """A pickle names a global that a body model does not need."""
 
 
 class Inert:
@@ -94,9 +91,7 @@ class _Reconstructed(Inert):
 
     def __new__(cls, kind: object, *_: object) -> Inert:
         if not (isinstance(kind, type) and issubclass(kind, Inert)):
-            raise UnsafePickleError(
-                f"The pickle rebuilds a {type(kind).__name__}, which is not an array; take the publisher's file again."
-            )
+            raise ValueError(f"it rebuilds a {type(kind).__name__}, which is not an array")
         return kind()
 
 
@@ -123,14 +118,19 @@ _GLOBALS: dict[tuple[str, str], type] = {
 
 
 class _Unpickler(pickle.Unpickler):
+    def __init__(self, data: bytes, path: str | Path) -> None:
+        super().__init__(io.BytesIO(data), encoding="latin1")
+        self._path = path
+
     def find_class(self, module: str, name: str) -> type:
-        """Return an inert record. Raises UnsafePickleError for other globals."""
+        """Return an inert record. Raises FileError for other globals."""
         try:
             return _GLOBALS[module, name]
         except KeyError:
-            raise UnsafePickleError(
-                f"it asks for the global {f'{module}.{name}':.80}, which a body model does not need, so nothing in "
-                "it was run; take the file from its publisher again, or convert it to .npz where you trust it."
+            raise FileError(
+                self._path,
+                f"asks for the global {f'{module}.{name}':.80}, which arrays do not need, so nothing in it was run",
+                "take it from its publisher again, or convert it to .npz where you trust it",
             ) from None
 
 
@@ -147,7 +147,7 @@ def _scan(data: bytes) -> None:
     for number, (operation, argument, _) in enumerate(pickletools.genops(_Scanned(data))):
         tuples += operation.name.startswith("TUPLE")
         if number >= MOST_OPERATIONS or tuples > MOST_TUPLES:
-            raise ValueError("it has more operations than a body model")
+            raise ValueError("it has more operations than arrays need")
         if operation.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) >= MOST_OPERATIONS:
             raise ValueError(f"it remembers a value as number {argument!s:.20}")
 
@@ -156,32 +156,30 @@ def read_pickle(file: FileContent) -> dict[str, object]:
     """Return the top-level dictionary of an SMPL pickle; convert values to arrays with `as_array`.
 
     Raises:
-        UnsafePickleError: the pickle names a global outside the list above.
-        FileError: it is not a pickle, is truncated, or does not hold a dictionary.
+        FileError: as `load_restricted`, or it does not hold a dictionary.
     """
-    content = load_restricted(file.content, str(file))
+    content = load_restricted(file.content, file.path)
     if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise FileError(
-            f"{file} holds no dictionary of named arrays but a {type(content).__name__}; is it an SMPL file?"
-        )
+        kind = type(content).__name__
+        raise FileError(file, f"holds no dictionary of named arrays but a {kind}", "use a body model in SMPL's format")
     return content
 
 
-def load_restricted(data: bytes, name: str) -> object:
-    """Load a pickle with inert records in place of objects; `name` identifies it in errors.
+def load_restricted(data: bytes, path: str | Path) -> object:
+    """Load a pickle, the content of the file `path`, with inert records in place of objects.
 
     Raises:
-        UnsafePickleError: the pickle names a global outside the list above.
-        FileError: it is not a pickle, is truncated, or exceeds MOST_OPERATIONS or MOST_TUPLES.
+        FileError: it names a global outside the list above, is not a pickle, is truncated, or exceeds MOST_OPERATIONS
+            or MOST_TUPLES.
     """
     try:
         _scan(data)
-        return _Unpickler(io.BytesIO(data), encoding="latin1").load()
-    except UnsafePickleError as error:
-        raise UnsafePickleError(f"{name}: {error}") from None
+        return _Unpickler(data, path).load()
+    except FileError:
+        raise
     except _DAMAGED as error:
         reason = " ".join(str(error).split())
-        raise FileError(f"{name} is not a whole pickle file ({reason:.80}); download it again.") from error
+        raise FileError(path, f"is not a whole pickle file ({reason:.80})", "download it again") from error
 
 
 def array_of_objects(value: object) -> list[object]:
@@ -203,9 +201,7 @@ def as_array(value: object, nesting: int = 0) -> np.ndarray:
         ValueError: the value is not a plain array of numbers, or its parts contradict each other.
     """
     if nesting > MAX_NESTING:
-        raise ValueError(
-            f"an array is made from arrays nested more than {MAX_NESTING} deep; the file is not a body model"
-        )
+        raise ValueError(f"an array is made from arrays nested more than {MAX_NESTING} deep")
     try:
         return _as_array(value, nesting)
     except (TypeError, LookupError, AttributeError, OverflowError, MemoryError) as error:

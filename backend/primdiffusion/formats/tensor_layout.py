@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from .json_files import JsonError, Pairs, parse_pairs
+from .json_files import Pairs, parse_pairs
 
 LENGTH_BYTES = 8
 """Size of the header's length in a file, and what writers pad the header to a multiple of."""
@@ -114,7 +114,7 @@ def parse_layout(header: bytes, data_bytes: int) -> TensorLayout:
     """The layout that a header describes, of a file with so many bytes of data. Raises ValueError."""
     try:
         tree = parse_pairs(header, _DEEPEST)
-    except JsonError as error:
+    except ValueError as error:
         raise ValueError(f"its header is not JSON ({error!s:.80})") from error
     if not isinstance(tree, Pairs):
         raise ValueError("its header is not a JSON object")

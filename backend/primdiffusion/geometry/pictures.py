@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from primdiffusion.formats.regular_files import check_regular, open_regular
+from primdiffusion.formats.regular_files import FileError, check_regular, open_regular
 
 MOST_PIXELS = 8192 * 8192
 """Most pixels of a picture: what scans have."""
@@ -42,20 +42,17 @@ _UNREADABLE = (
 )  # fmt: skip
 
 
-class PictureError(ValueError):
-    """A picture that cannot be decoded. The message is a reason without the file's name."""
-
-
 @contextlib.contextmanager
 def opened_picture(
     source: Path | BinaryIO, formats: tuple[str, ...] = ("PNG", "JPEG"), bytes_each: int = 4
 ) -> Iterator[Image.Image]:
-    """Open a picture of one of Pillow's `formats`; errors of decoding it in the block are PictureErrors too.
+    """Open a picture of one of Pillow's `formats`; errors of decoding it in the block are ValueErrors too.
 
     `bytes_each` is the number of bytes that the block makes of a pixel, by which large pictures of small files are
     rejected before anything is decoded.
 
-    Raises PictureError, and OSError for a file that cannot be opened.
+    Raises ValueError with a reason that does not name the file, FileError for a file that is too large, and OSError for
+    one that cannot be opened.
     """
     with contextlib.ExitStack() as stack:
         if isinstance(source, Path):
@@ -71,22 +68,22 @@ def opened_picture(
                     if picture.format == "JPEG":
                         _check_scans(file)
                     yield picture
-        except PictureError:
+        except FileError:
             raise
         except OSError as e:
             if e.errno is not None:
                 raise
-            raise PictureError(str(e)[:120]) from e
+            raise ValueError(str(e)[:120]) from e
         except _UNREADABLE as e:
-            raise PictureError(str(e)[:120]) from e
+            raise ValueError(str(e)[:120]) from e
 
 
 def check_pixels(width: int, height: int, file_size: int, bytes_each: int) -> None:
-    """Raise PictureError for more pixels than MOST_PIXELS, or than a file of this size may have (see the module)."""
+    """Raise ValueError for more pixels than MOST_PIXELS, or than a file of this size may have (see the module)."""
     if width * height > MOST_PIXELS:
-        raise PictureError(f"{width} x {height} pixels, more than {MOST_PIXELS}")
+        raise ValueError(f"{width} x {height} pixels, more than {MOST_PIXELS}")
     if width * height * bytes_each > decoded_bytes(file_size):
-        raise PictureError(f"{width} x {height} pixels in a file of only {file_size} bytes")
+        raise ValueError(f"{width} x {height} pixels in a file of only {file_size} bytes")
 
 
 def decoded_bytes(file_size: int) -> int:
@@ -119,4 +116,4 @@ def _check_scans(file: BinaryIO | io.BufferedReader | io.BytesIO) -> None:
         last = chunk[-1:]
     file.seek(place)
     if scans > MOST_SCANS:
-        raise PictureError(f"{scans} scans, more than {MOST_SCANS}")
+        raise ValueError(f"{scans} scans, more than {MOST_SCANS}")

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int, UInt8
 from PIL import Image
 from scipy.ndimage import binary_dilation, gaussian_filter
 
-from primdiffusion.people.assets import Assets, AssetsMissingError
+from primdiffusion.people.assets import Assets
 from primdiffusion.people.colours import bytes_from_lab, bytes_from_linear, lab_from_bytes, luminance
 from primdiffusion.people.fitting import uv_islands
 from primdiffusion.people.wardrobe import Sex, hair_path, stream
@@ -57,13 +57,13 @@ def draw_skin(assets: Assets, sex: Sex, draws: np.random.Generator) -> SkinColou
     """Draw a skin: uniform tone; detail from a texture of the sex and, if available, of the tone.
 
     Raises:
-        AssetsMissingError: there are no light skins of this sex or no dark skins.
+        FileNotFoundError: there are no light skins of this sex or no dark skins.
     """
     light = _textures(assets, f"lightskinned_{sex}")
     dark = _textures(assets, f"darkskinned_{sex}")
     any_dark = dark or _textures(assets, "darkskinned")
     if not light or not any_dark:
-        raise AssetsMissingError(
+        raise FileNotFoundError(
             f"no light {sex} skins or no dark skins in {assets.root / SKIN_FOLDER}: fetch the whole asset pack"
         )
     tone = float(draws.random())

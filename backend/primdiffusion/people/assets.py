@@ -21,17 +21,13 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from primdiffusion.formats.regular_files import open_regular, read_regular, real_path
-from primdiffusion.geometry.pictures import PictureError, decoded, opened_picture, strips
+from primdiffusion.formats.regular_files import as_file_error, open_regular, read_regular, real_path
+from primdiffusion.geometry.pictures import decoded, opened_picture, strips
 from primdiffusion.people.mhclo import ObjMesh, Proxy, read_pair
 
 ENVIRONMENT_VARIABLE = "PRIMDIFFUSION_ASSETS"
 SUBFOLDERS = ("clothes", "hair", "eyebrows", "eyelashes", "eyes", "skins")
 SOURCE = "https://github.com/makehumancommunity/makehuman-assets"
-
-
-class AssetsMissingError(FileNotFoundError):
-    """No asset folder, or files missing from it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,12 +48,12 @@ class Assets:
         """Load an image by path without extension, at most `size` pixels wide: read-only sRGB and alpha.
 
         Raises:
-            AssetsMissingError: the folder has no such image.
-            PictureError: it cannot be decoded.
+            FileNotFoundError: the folder has no such image.
+            FileError: it cannot be decoded.
         """
         path = _picture_path(self.root, name)
         if path is None:
-            raise AssetsMissingError(
+            raise FileNotFoundError(
                 f"{name}.png or .jpg is missing from the asset folder {self.root}: get it from {SOURCE} (with git-lfs)"
             )
         return _decoded(path, size)
@@ -86,17 +82,17 @@ def open_assets(folder: str | os.PathLike[str] | None = None, required: tuple[st
         required: meshes that must exist, as paths without extension; each needs a .mhclo and a .obj.
 
     Raises:
-        AssetsMissingError: no folder was given, it does not exist, or subfolders or required files are missing.
+        FileNotFoundError: no folder was given, it does not exist, or subfolders or required files are missing.
     """
     named = folder if folder is not None else os.environ.get(ENVIRONMENT_VARIABLE)
     if not named:
-        raise AssetsMissingError(
+        raise FileNotFoundError(
             f"no MakeHuman asset folder was given: pass one with --assets or set {ENVIRONMENT_VARIABLE}; "
             f"the pack is CC0: {SOURCE}, folder 'base'"
         )
     root = real_path(Path(named).expanduser())
     if not root.is_dir():
-        raise AssetsMissingError(
+        raise FileNotFoundError(
             f"the MakeHuman asset folder {root} does not exist: pass the folder with {', '.join(SUBFOLDERS)}"
         )
     missing = [name for name in SUBFOLDERS if not (root / name).is_dir()]
@@ -104,7 +100,7 @@ def open_assets(folder: str | os.PathLike[str] | None = None, required: tuple[st
     missing += [file for file in files if not (root / file).is_file()]
     if missing:
         listed = ", ".join(missing[:6]) + (", ..." if len(missing) > 6 else "")
-        raise AssetsMissingError(
+        raise FileNotFoundError(
             f"missing from the MakeHuman asset folder {root}: {listed}; get the pack's folder 'base' from {SOURCE}"
         )
     return Assets(root)
@@ -131,11 +127,8 @@ def _picture_path(root: Path, name: str) -> Path | None:
 @functools.lru_cache(maxsize=48)
 def _decoded(path: Path, size: int) -> UInt8[np.ndarray, "H W 4"]:
     """Decode and shrink an image; shrinking weights colour by alpha, so that edges keep their colour."""
-    try:
-        with opened_picture(path) as picture:
-            array = decoded(picture, "RGBA") if picture.width <= size else _shrunk(picture, size)
-    except (OSError, PictureError) as error:
-        raise PictureError(f"{path} cannot be decoded ({error!s:.160}): fetch it again") from error
+    with as_file_error(path, "cannot be decoded", "fetch it again", OSError), opened_picture(path) as picture:
+        array = decoded(picture, "RGBA") if picture.width <= size else _shrunk(picture, size)
     array.setflags(write=False)
     return array
 

@@ -25,7 +25,7 @@ from primdiffusion.body.model import default_body
 from primdiffusion.capture.people_files import LARGEST_GLB
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import TooLargeError, as_file_error, read_regular
+from primdiffusion.formats.regular_files import FileError, as_file_error, read_regular
 from primdiffusion.formats.removing import remove_folder
 from primdiffusion.formats.requests import Count, Seed, check_seed
 from primdiffusion.formats.schema import Checked
@@ -79,7 +79,7 @@ def make_people(assets: Assets, people: PeopleSet, workers: int) -> Iterator[int
 
     Raises:
         ValueError: the folder contains other samples; a worker process was killed.
-        AssetsMissingError, FileError: asset files are missing or damaged.
+        FileNotFoundError, FileError: asset files are missing or damaged.
         OSError: a file cannot be written.
     """
     if workers < 1:
@@ -140,7 +140,7 @@ def is_whole(folder: Path, seed: int) -> bool:
             and card["seed"] == seed
             and card["sha256"] == hashlib.sha256(read_regular(folder / GLB, LARGEST_GLB)).hexdigest()
         )
-    except (OSError, TooLargeError, KeyError):
+    except (OSError, FileError, KeyError):
         return False
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from primdiffusion.formats.regular_files import FileError, read_regular
+from primdiffusion.formats.regular_files import FileError, as_file_error, read_regular
 
 LARGEST_TEXT = 64 * 2**20
 """Bytes of a file."""
@@ -92,7 +92,7 @@ def parse_obj(text: str) -> ObjMesh:
     """Parse vertices, texture coordinates and faces; polygons become triangle fans; missing uv are (0, 0).
 
     Raises:
-        FileError: a face refers to a vertex that does not exist.
+        ValueError: a face refers to a vertex that does not exist, or a number is out of range.
     """
     vertices: list[list[float]] = []
     coordinates: list[list[float]] = [[0.0, 0.0]]
@@ -114,15 +114,14 @@ def parse_obj(text: str) -> ObjMesh:
                 faces.append((index[0], index[k], index[k + 1]))
                 face_coordinates.append((uv_index[0], uv_index[k], uv_index[k + 1]))
     if any(not abs(value) <= LARGEST_NUMBER for row in (*vertices, *coordinates) for value in row):
-        raise FileError(f"the .obj holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again")
+        raise ValueError(f"it holds numbers that are not finite or above {LARGEST_NUMBER:g}")
     if not faces or not vertices:
-        raise FileError("the .obj has no faces or no vertices: give a mesh of an asset pack")
+        raise ValueError("it has no faces or no vertices")
     face_array = np.array(faces, np.int32)
     uv_array = np.array(face_coordinates)
     if face_array.min() < 0 or face_array.max() >= len(vertices) or uv_array.max() >= len(coordinates):
-        raise FileError(
-            f"face indices of the .obj are outside its {len(vertices)} vertices and {len(coordinates) - 1} texture "
-            "coordinates: the file is damaged or uses relative indices, which are not supported"
+        raise ValueError(
+            f"a face refers to others than its {len(vertices)} vertices and {len(coordinates) - 1} texture coordinates"
         )
     return ObjMesh(np.array(vertices, np.float64), face_array, np.array(coordinates, np.float64)[uv_array])
 
@@ -131,7 +130,7 @@ def parse_mhclo(text: str) -> Proxy:
     """Parse a .mhclo file; unknown keys are ignored.
 
     Raises:
-        FileError: no vertices, or a line with a wrong number of values.
+        ValueError: no vertices, a line with a wrong number of values, or a number out of range.
     """
     reference: list[tuple[int, int, int]] = []
     weight: list[list[float]] = []
@@ -154,7 +153,7 @@ def parse_mhclo(text: str) -> Proxy:
             z_depth = int(words[1])
         elif key.isdigit() and section == "verts":
             if len(words) not in (1, 6, 9):
-                raise FileError(f"a vertex line of {name or 'the .mhclo'} has {len(words)} values, not 1, 6 or 9")
+                raise ValueError(f"a line of a vertex has {len(words)} values, not 1, 6 or 9")
             index = [int(word) for word in words[:3]] if len(words) > 1 else [int(key)] * 3
             reference.append((index[0], index[1], index[2]))
             weight.append([float(word) for word in words[3:6]] if len(words) > 1 else [1.0, 0.0, 0.0])
@@ -162,9 +161,9 @@ def parse_mhclo(text: str) -> Proxy:
         elif key.isdigit() and section == "delete_verts":
             deleted.extend(_vertex_ranges(words))
     if not reference:
-        raise FileError(f"{name or 'the .mhclo'} has no vertices after its line 'verts': the file is damaged")
+        raise ValueError("it has no vertices after its line 'verts'")
     if any(not abs(value) <= LARGEST_NUMBER for row in (*weight, *offset) for value in row):
-        raise FileError(f"the .mhclo holds numbers that are not finite or above {LARGEST_NUMBER:g}: fetch it again")
+        raise ValueError(f"it holds numbers that are not finite or above {LARGEST_NUMBER:g}")
     return Proxy(
         name=name,
         reference=np.array(reference, np.int64),
@@ -186,7 +185,7 @@ def _vertex_ranges(words: list[str]) -> list[int]:
         elif in_range:
             last = int(word)
             if last > MOST_VERTICES:
-                raise FileError(f"the .mhclo deletes vertex {last}, more than there are: fetch it again")
+                raise ValueError(f"it deletes vertex {last}, more than there are")
             numbers.extend(range(numbers[-1] + 1, last + 1))
             in_range = False
         else:
@@ -200,15 +199,11 @@ def read_pair(mhclo: Path, obj: Path) -> tuple[Proxy, ObjMesh]:
     Raises:
         FileError: the files are damaged or do not belong together.
     """
-    try:
+    with as_file_error(mhclo, "is not a binding of clothes", "fetch it again"):
         proxy = parse_mhclo(read_regular(mhclo, LARGEST_TEXT).decode("utf-8", errors="replace"))
+    with as_file_error(obj, "is not a mesh of an asset pack", "fetch it again"):
         mesh = parse_obj(read_regular(obj, LARGEST_TEXT).decode("utf-8", errors="replace"))
-    except FileError as error:
-        raise FileError(f"{mhclo}: {error}") from error
-    except (ValueError, IndexError, OverflowError) as error:
-        raise FileError(f"{mhclo.name} or {obj} has an unreadable line ({error!s:.60}): fetch both again") from error
     if len(proxy.reference) != len(mesh.vertices):
-        raise FileError(
-            f"{mhclo} binds {len(proxy.reference)} vertices but {obj} has {len(mesh.vertices)}: fetch both again"
-        )
+        reason = f"binds {len(proxy.reference)} vertices, but {obj.name} has {len(mesh.vertices)}"
+        raise FileError(mhclo, reason, "fetch both again")
     return proxy, mesh

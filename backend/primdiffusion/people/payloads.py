@@ -65,7 +65,7 @@ def make_payloads(
 
     Raises:
         ValueError: a count is not positive; a worker process was killed.
-        AssetsMissingError, FileError: asset files are missing or damaged.
+        FileNotFoundError, FileError: asset files are missing or damaged.
     """
     for name, value in (("count", count), ("variants", variants), ("workers", workers)):
         if value < 1:

@@ -54,7 +54,7 @@ def make_person(assets: Assets, base: BaseMesh, seed: int) -> Person:
     Takes about half a second once asset files are cached.
 
     Raises:
-        AssetsMissingError, FileError: asset files are missing or damaged.
+        FileNotFoundError, FileError: asset files are missing or damaged.
     """
     choice = choose(seed, femininity(base))
     return _coloured(assets, base, choice, _geometry(assets, base, choice, draw_face(stream(seed, "face"))), seed)

@@ -20,7 +20,7 @@ from primdiffusion.body.smpl_files import LARGEST_BODY_FILE, load_body, read_bod
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import (
     FileContent,
-    TooLargeError,
+    FileError,
     check_regular,
     check_size,
     is_plain_path,
@@ -30,10 +30,6 @@ from primdiffusion.formats.schema import read
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors, build_anchors
 from primdiffusion.primitives.primitives import K
-
-
-class BodySetupError(ValueError):
-    """A required body file is missing or has changed."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -92,8 +88,8 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
     """Load the body that a checkpoint or human refers to, with the rest extents stored there.
 
     Each file is searched at its recorded path, then by name in the folders `beside`; the content hash must match, and
-    what is loaded are the bytes that were hashed. Raises BodySetupError if a file is missing or has changed, and
-    FileError.
+    what is loaded are the bytes that were hashed. Raises FileError for a body file that is missing, has changed or is
+    damaged, and ValueError for impossible rest extents.
     """
     folders, wanted = tuple(beside), (files.smpl, *files.uv)
     paths = [_found(file, folders) for file in wanted]
@@ -106,7 +102,7 @@ def find_body_setup(files: BodyFiles, rest_half_extent: Float[Tensor, "k 3"], be
     while len(_loaded) > _KEPT:
         del _loaded[next(iter(_loaded))]
     if tuple(rest_half_extent.shape) != (K, 3) or not bool((rest_half_extent > 0).all()):
-        raise BodySetupError(f"the stored rest extents are not {K} x 3 positive: import or generate the file again")
+        raise ValueError(f"the stored rest extents are not {K} x 3 positive")
     return dataclasses.replace(
         body_setup, anchors=dataclasses.replace(body_setup.anchors, rest_half_extent=rest_half_extent), files=files
     )
@@ -119,7 +115,7 @@ _loaded: dict[tuple[tuple[str, str], ...], BodySetup] = {}
 
 def _load(smpl: FileContent, uv: tuple[FileContent, ...]) -> BodySetup:
     if not 1 <= len(uv) <= 2:
-        raise BodySetupError(f"{len(uv)} files of texture coordinates belong to the body {smpl!s:.120}, not 1 or 2")
+        raise FileError(smpl, f"has {len(uv)} files of texture coordinates", "give 1 or 2")
     body = load_body(smpl, uv=uv[0] if len(uv) == 1 else (uv[0], uv[1]))
     files = BodyFiles(FileFingerprint.of(smpl), tuple(map(FileFingerprint.of, uv)))
     return BodySetup(body, build_anchors(body, "released"), files)
@@ -134,7 +130,7 @@ def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
             stamp = _Stamp.of(path)
         except (FileNotFoundError, IsADirectoryError, NotADirectoryError):
             continue
-        except (OSError, TooLargeError) as error:
+        except (OSError, FileError) as error:
             problem = f"cannot be read ({getattr(error, 'strerror', None) or 'it is too large'})"
             continue
         if _sha256(stamp) == file.sha256:
@@ -142,25 +138,21 @@ def _found(file: FileFingerprint, folders: tuple[Path, ...]) -> Path:
         shown, problem = f"{path!s:.120}", "has changed"
     if problem == "has changed":
         raise _changed(shown, file)
-    raise BodySetupError(
-        f"the body file {shown} {problem} (sha256 {file.sha256[:12]}...): restore it, or put a copy beside the "
-        "file that refers to it"
-    )
+    reason = f"{problem} (a body file, sha256 {file.sha256[:12]}...)"
+    raise FileError(shown, reason, "restore it, or put a copy beside the file that refers to it")
 
 
 def _read(path: Path, file: FileFingerprint) -> FileContent:
-    """The file at `path`, read once. Raises BodySetupError where it is not the one that `file` describes, OSError."""
+    """The file at `path`, read once. Raises FileError where it is not the one that `file` describes, OSError."""
     content = read_body_file(path)
     if content.sha256 != file.sha256:
         raise _changed(f"{path!s:.120}", file)
     return content
 
 
-def _changed(shown: str, file: FileFingerprint) -> BodySetupError:
-    return BodySetupError(
-        f"the body file {shown} has changed (expected sha256 {file.sha256[:12]}...): restore it, or import the "
-        "checkpoint again with this file"
-    )
+def _changed(shown: str, file: FileFingerprint) -> FileError:
+    reason = f"has changed (a body file, sha256 was {file.sha256[:12]}...)"
+    return FileError(shown, reason, "restore it, or import the checkpoint again with this file")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,7 +165,7 @@ class _Stamp:
 
     @classmethod
     def of(cls, path: Path) -> _Stamp:
-        """Raises as `check_regular`, and TooLargeError; FileNotFoundError for an empty file."""
+        """Raises as `check_regular`, and FileError; FileNotFoundError for an empty file."""
         stat = check_regular(path)
         if not stat.st_size:  # also endless files of /proc
             raise FileNotFoundError(errno.ENOENT, "the file is empty", str(path))

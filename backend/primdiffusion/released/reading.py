@@ -13,7 +13,7 @@ from typing import Any, Literal
 from torch import Tensor
 
 from primdiffusion import torch_file
-from primdiffusion.formats.regular_files import TooLargeError
+from primdiffusion.formats.regular_files import FileError
 
 Fate = Literal["imported", "checked", "dropped"]
 """imported: in the new file; checked: validated, then not needed; dropped: not used by design."""
@@ -97,7 +97,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
 def _load(path: Path) -> object:
     try:
         return torch_file.load(path)
-    except TooLargeError:
+    except FileError:
         raise
     except torch_file.PICKLE_ERRORS as error:
         asked = re.search(r"GLOBAL:? (\S+)|global (\S+)", str(error))

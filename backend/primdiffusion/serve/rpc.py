@@ -26,12 +26,14 @@ JsonId = str | int | float | None
 
 
 class RpcError(Exception):
-    """The error of a response: a code, one sentence, and data for programs."""
+    """The error of a response: a code, one sentence, and data for programs.
 
-    def __init__(self, code: int, message: str, data: dict[str, Any] | None = None):
+    Of a line that is no request, `id` is the request's if it could be read, as JSON-RPC requires.
+    """
+
+    def __init__(self, code: int, message: str, data: dict[str, Any] | None = None, *, id: JsonId = None):
         super().__init__(message)
-        self.code = code
-        self.data = data
+        self.code, self.data, self.id = code, data, id
 
     def as_object(self) -> dict[str, Any]:
         """The `error` member of a response."""
@@ -50,38 +52,28 @@ class RpcRequest:
     """False for notifications, which have no `id` member at all."""
 
 
-class MalformedRequest(RpcError):
-    """A line that is not a request; `id` is that of the request if it could be read, as JSON-RPC requires."""
-
-    def __init__(self, code: int, message: str, id: JsonId = None):
-        super().__init__(code, message)
-        self.id = id
-
-
 def parse_request(line: bytes) -> RpcRequest:
-    """Parse a line. Raises MalformedRequest unless it is one JSON-RPC 2.0 request object."""
+    """Parse a line. Raises RpcError unless it is one JSON-RPC 2.0 request object."""
     try:
         message = parse_message(line)
     except ValueError as e:
-        raise MalformedRequest(
-            PARSE_ERROR, f"the line is not JSON in UTF-8 ({e!s:.160}): send one JSON object a line"
-        ) from e
+        raise RpcError(PARSE_ERROR, f"the line is not JSON in UTF-8 ({e!s:.160}): send one JSON object a line") from e
     if isinstance(message, list):
-        raise MalformedRequest(INVALID_REQUEST, "batches are not supported: send one request a line")
+        raise RpcError(INVALID_REQUEST, "batches are not supported: send one request a line")
     if not isinstance(message, dict):
-        raise MalformedRequest(INVALID_REQUEST, f"a request is a JSON object, not {type(message).__name__}")
+        raise RpcError(INVALID_REQUEST, f"a request is a JSON object, not {type(message).__name__}")
     id = message.get("id")
     if isinstance(id, bool) or not isinstance(id, str | int | float | None):
-        raise MalformedRequest(INVALID_REQUEST, f"a request's id is a string or a number, not {type(id).__name__}")
+        raise RpcError(INVALID_REQUEST, f"a request's id is a string or a number, not {type(id).__name__}")
     if isinstance(id, float) and not math.isfinite(id):
-        raise MalformedRequest(INVALID_REQUEST, f"a request's id is a finite number, not {id}")
+        raise RpcError(INVALID_REQUEST, f"a request's id is a finite number, not {id}")
     if message.get("jsonrpc") != "2.0":
-        raise MalformedRequest(INVALID_REQUEST, 'a request needs "jsonrpc": "2.0"', id)
+        raise RpcError(INVALID_REQUEST, 'a request needs "jsonrpc": "2.0"', id=id)
     method, params = message.get("method"), message.get("params", {})
     if not isinstance(method, str):
-        raise MalformedRequest(INVALID_REQUEST, "a request needs a method name", id)
+        raise RpcError(INVALID_REQUEST, "a request needs a method name", id=id)
     if not isinstance(params, dict):
-        raise MalformedRequest(INVALID_PARAMS, f"params of {method!r:.60} must be a JSON object with names", id)
+        raise RpcError(INVALID_PARAMS, f"params of {method!r:.60} must be a JSON object with names", id=id)
     return RpcRequest(method, params, id, "id" in message)
 
 

@@ -36,7 +36,6 @@ from primdiffusion.serve.rpc import (
     INTERNAL_ERROR,
     INVALID_PARAMS,
     METHOD_NOT_FOUND,
-    MalformedRequest,
     RpcError,
     RpcRequest,
     Wire,
@@ -131,7 +130,7 @@ class Server:
     def _dispatch(self, line: bytes) -> None:
         try:
             message = parse_request(line)
-        except MalformedRequest as e:
+        except RpcError as e:
             self._wire.fail(e.id, e)
             return
         try:

@@ -96,7 +96,7 @@ def _write_shard(path: Path, people: Sequence[PersonVariants]) -> None:
 
 
 def digest_of(path: Path) -> str:
-    """SHA-256 of a regular file, hexadecimal. Raises OSError and TooLargeError."""
+    """SHA-256 of a regular file, hexadecimal. Raises OSError and FileError."""
     with open_regular(path, LARGEST_SHARD) as file:
         return _digest(file)
 

@@ -7,10 +7,10 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 
-from ...console import CommandParser, UsageError
+from ...console import CommandParser
 from ...formats.regular_files import real_path
 from ...formats.requests import GenerateRequest
-from ...formats.schema import FieldError, read
+from ...formats.schema import read
 
 ENGINES = {"primdiffusion": "PRIMDIFFUSION", "cycles": "CYCLES"}
 """Names of render engines on the command line -> Blender's."""
@@ -23,7 +23,7 @@ _EPILOG = (
 
 
 def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
-    """The options of `generate`. Raises UsageError; SystemExit after --help."""
+    """The options of `generate`. Raises ValueError; SystemExit after --help."""
     made = _parser("generate", "Generate humans, a folder each: the human, its files for Blender, pictures.")
     add = made.add_argument
     add("--out", type=Path, required=True, help="folder for the humans; an unfinished one is resumed")
@@ -43,23 +43,20 @@ def parse_generate(argv: Sequence[str]) -> argparse.Namespace:
     add("--resume", action="store_true", help="keep humans in the folder that were generated with other settings")
     options = made.parse_args(list(argv))
     sampling = {field: getattr(options, field) for field in DECLARED}
-    try:
-        for seed in (options.seed, options.seed + options.count - 1):
-            read(GenerateRequest, {"seed": seed, "out_dir": options.out, **sampling})
-    except FieldError as error:
-        raise UsageError(str(error)) from error
+    for seed in (options.seed, options.seed + options.count - 1):
+        read(GenerateRequest, {"seed": seed, "out_dir": options.out, **sampling})
     if options.blend is not None and (Path(options.blend).name != options.blend or not options.blend.strip(".")):
-        raise UsageError(f"--blend {options.blend!r} is no file name: name one without folders")
+        raise ValueError(f"--blend {options.blend!r} is no file name: name one without folders")
     if options.blend is not None and not options.blend.endswith(".blend"):
         options.blend += ".blend"
     if (options.pose or options.motion) and options.blend is None:
-        raise UsageError("--pose and --motion move humans in .blend files: add --blend")
+        raise ValueError("--pose and --motion move humans in .blend files: add --blend")
     _check_files(options, "checkpoint", "pose", "motion")
     return options
 
 
 def parse_render(argv: Sequence[str]) -> argparse.Namespace:
-    """The options of `render`. Raises UsageError; SystemExit after --help."""
+    """The options of `render`. Raises ValueError; SystemExit after --help."""
     made = _parser("render", "Render a .blend, a human's file, or all humans in a folder.")
     add = made.add_argument
     add("source", type=Path, metavar="SOURCE", help=".blend, .human, .human.safetensors, or a folder of humans")
@@ -76,11 +73,11 @@ def parse_render(argv: Sequence[str]) -> argparse.Namespace:
     add("--resume", action="store_true", help="keep pictures in the folder that were rendered with other settings")
     options = made.parse_args(list(argv))
     if options.turntable and options.frames:
-        raise UsageError("--turntable and --frames ask for different pictures: give one of them")
+        raise ValueError("--turntable and --frames ask for different pictures: give one of them")
     if options.samples and options.engine == "primdiffusion":
-        raise UsageError("--samples is for --engine cycles; the marcher needs none")
+        raise ValueError("--samples is for --engine cycles; the marcher needs none")
     if not options.source.exists():
-        raise UsageError(f"there is no {options.source}: check the path")
+        raise ValueError(f"there is no {options.source}: check the path")
     _check_files(options, "pose", "motion")
     return options
 
@@ -107,11 +104,11 @@ def _add_python(made: argparse.ArgumentParser) -> None:
 
 def _check_files(options: argparse.Namespace, *names: str) -> None:
     if options.out.exists() and not options.out.is_dir():
-        raise UsageError(f"--out {options.out} is a file: name a folder")
+        raise ValueError(f"--out {options.out} is a file: name a folder")
     for name in names:
         path = getattr(options, name)
         if path is not None and not path.is_file():
-            raise UsageError(f"--{name} {path} is no file: check the path")
+            raise ValueError(f"--{name} {path} is no file: check the path")
 
 
 def _whole(least: int):

@@ -17,7 +17,7 @@ from pathlib import Path
 import bpy
 
 from ...backend.requests import Backend
-from ...console import Report, Stop
+from ...console import Report, Stop, Stopped
 from ...engine import studio
 from ...engine.engine import ENGINE
 from ...formats.regular_files import check_regular, exists_in_its_folder, real_path
@@ -40,7 +40,6 @@ from .people import (
 from .running import (
     Clock,
     Say,
-    Stopped,
     ask,
     attempt,
     backend_of,

@@ -15,7 +15,7 @@ from typing import Any
 
 import bpy
 
-from ...backend.environment import VARIABLE
+from ...backend.environment import VARIABLE, BackendNotFound
 from ...backend.requests import Backend, ChildRequest
 from ...console import (
     CANCELLED,
@@ -25,7 +25,7 @@ from ...console import (
     UNUSABLE,
     Report,
     Stop,
-    UsageError,
+    Stopped,
     duration,
     report_path,
     separate_stdout,
@@ -39,14 +39,6 @@ from ...formats.whole_files import remove_abandoned, temporary_folder, write_ato
 from ...places import EXTENSION, new_backend, preference
 
 _TICK_S = 0.03
-
-
-class NoBackend(RuntimeError):
-    """No Python runs the backend; the message names those that were tried."""
-
-
-class Stopped(Exception):
-    """The command was asked to stop."""
 
 
 @contextmanager
@@ -87,12 +79,12 @@ def absolute(program: Path) -> str:
 
 
 def check_backend(python: Path | None) -> None:
-    """Raises NoBackend where no child can be started."""
+    """Raises BackendNotFound where no child can be started."""
     with backend_of(python) as backend:
         try:
             backend.connect()
         except (RuntimeError, OSError) as error:
-            raise NoBackend(str(error)) from error
+            raise BackendNotFound(str(error)) from error
 
 
 def ask(
@@ -104,8 +96,8 @@ def ask(
 ) -> Any:
     """The child's answer, a record of `formats.answers`; `on_progress` is called with the request whenever it changes.
 
-    Raises NoBackend, RuntimeError with the child's error, and Stopped once `stop` is set, within a second; then no file
-    is left.
+    Raises BackendNotFound, RuntimeError with the child's error, and Stopped once `stop` is set, within a second; then
+    no file is left.
     """
     request = ChildRequest(backend, method, params)
     while not request.finished:
@@ -117,7 +109,8 @@ def ask(
     if request.state == "cancelled":
         raise Stopped
     if request.error is not None:
-        raise (NoBackend if request.error.kind in {"environment", "timeout"} else RuntimeError)(str(request.error))
+        kind = BackendNotFound if request.error.kind in {"environment", "timeout"} else RuntimeError
+        raise kind(str(request.error))
     return request.result
 
 
@@ -180,11 +173,11 @@ def run(
 ) -> int:
     """Run a command; returns its exit code. Blender's own messages on stdout are dropped.
 
-    `work` raises Stopped, NoBackend, and OSError or ValueError where nothing can be begun.
+    `work` raises Stopped, BackendNotFound, and OSError or ValueError where nothing can be begun.
     """
     try:
         options = parse(argv)
-    except UsageError as error:
+    except ValueError as error:
         return _failed(name, f"{error}; --help names all options", UNUSABLE)
     except SystemExit as asked_for_help:
         return int(asked_for_help.code or DONE)
@@ -194,7 +187,7 @@ def run(
         except Stopped:
             say("Stopped; the same command resumes from here.")
             return CANCELLED
-        except NoBackend as error:
+        except BackendNotFound as error:
             return _failed(name, str(error), NO_BACKEND)
         except (OSError, ValueError) as error:
             return _failed(name, str(error), UNUSABLE)
@@ -215,7 +208,7 @@ def begun(report: Report, claimed: Path, settings: Mapping[str, Any], whatever_i
     claim(claimed, settings, whatever_is_there)
     try:
         yield
-    except NoBackend:
+    except BackendNotFound:
         nothing = is_new and not (report.done or report.failed)
         raise
     finally:
@@ -263,14 +256,14 @@ def attempt(
 ) -> None:
     """Make a piece of a batch, and report it: one that fails must not end the batch of a night.
 
-    `make` returns whether anything was missing. Raises Stopped and NoBackend.
+    `make` returns whether anything was missing. Raises Stopped and BackendNotFound.
     """
     if stop.is_set():
         raise Stopped
     label = f"{which} {name}".strip()
     try:
         made = make()
-    except (NoBackend, Stopped):
+    except (BackendNotFound, Stopped):
         raise
     except Exception as error:
         report.fail(name, what, reason(error))

@@ -57,7 +57,7 @@ class SetUpSession:
             step = next(self._steps)
         except StopIteration as done:
             self._steps, self.notice = None, done.value
-        except (RuntimeError, OSError) as error:  # SetUpFailed is one
+        except (RuntimeError, OSError) as error:
             self._steps, self.error = None, sentence(error)
         else:
             self.message, self.fraction = step.message, step.fraction

@@ -15,7 +15,6 @@ from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.failures import MissingPackageError
 from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.smpl_pickle import UnsafePickleError
 from smplx.lbs import lbs
 from support.errors import refused
 
@@ -182,7 +181,7 @@ def test_hostile_pickle_is_rejected_by_name_and_does_not_run(tmp_path, protocol,
     trace = tmp_path / "trace"
     content = {**smpl_arrays(), where: Hostile(pathlib.os.mkdir, str(trace))}
     path = pickled(tmp_path, content, protocol)
-    with pytest.raises(UnsafePickleError, match=r"asks for the global (posix|nt)\.mkdir"):
+    with pytest.raises(FileError, match=r"(posix|nt)\.mkdir"):
         load_body(path)
     assert not trace.exists()
     pickle.loads(path.read_bytes())  # the same bytes do harm where nobody holds them back
@@ -203,7 +202,7 @@ def test_other_ways_to_reach_code_are_rejected(tmp_path, program):
     path = tmp_path / "SMPL_NEUTRAL.pkl"
     path.write_bytes(program)
     assert list(pickletools.genops(program))
-    with pytest.raises(UnsafePickleError):
+    with pytest.raises(FileError):
         load_body(path)
 
 

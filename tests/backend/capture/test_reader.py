@@ -24,8 +24,6 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import read_numbers
 from primdiffusion.formats.capture_repair import verify
 from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.removing import OutsideFolderError
-from primdiffusion.formats.smpl_pickle import UnsafePickleError
 from primdiffusion.raster.multisample import render_view
 from support.errors import refused
 
@@ -147,7 +145,7 @@ def test_a_pickle_that_would_run_code_is_rejected(root, tmp_path):
     as_released(root)
     path = root / NAME / capture_layout.SMPL_FOLDER / capture_layout.SMPL_FILE
     np.savez(path, smpl=np.array({"global_orient": Trap()}, dtype=object))
-    with refused(UnsafePickleError, "open"):
+    with refused(FileError, "open"):
         open_captures(root).subject(NAME)
     assert not (tmp_path / "trapped").exists()
 
@@ -182,7 +180,7 @@ def test_zip_paths_that_lead_out_are_not_followed(tmp_path):
 @pytest.mark.parametrize(
     ("arrays", "why"),
     [
-        ({"x": np.array([object()], dtype=object)}, "plain array"),
+        ({"x": np.array([object()], dtype=object)}, "pickled"),
         ({"x": np.array(["a"])}, "not numbers"),
         ({"x": np.array([np.nan])}, "NaN"),
         ({"y": np.zeros(2)}, "no array 'x'"),
@@ -215,7 +213,7 @@ def test_an_npz_that_claims_petabytes_is_rejected(tmp_path):
         ("cameras.json", b'{"camera0000": {"K": [[1]]}}', "not a list of cameras"),
         ("cameras.json", b"{}", "contains no camera"),
         ("cameras.json", b"{", "cannot be read"),
-        (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "not a whole .npz"),
+        (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "not a whole"),
     ],
 )
 def test_wrong_and_missing_files_are_named(root, file, content, why):
@@ -290,7 +288,7 @@ def test_depth_with_several_channels_is_rejected(root, mode):
 def test_a_pack_is_not_written_through_a_link(root, tmp_path):
     (tmp_path / "elsewhere").mkdir()
     (root / PACK_FOLDER).symlink_to(tmp_path / "elsewhere")
-    with pytest.raises(OutsideFolderError):
+    with pytest.raises(FileError):
         list(pack(open_captures(root)))
     assert not list((tmp_path / "elsewhere").iterdir())
 

@@ -251,7 +251,7 @@ def test_another_person_or_pose_in_the_same_folder_is_rejected(tmp_path):
 
 def test_other_settings_in_the_same_folder_are_rejected(tmp_path):
     captured(tmp_path, people=1)
-    with refused(FileError, "samples is 9", "wanted is 25"):
+    with refused(FileError, "samples is 9", "not 25"):
         list(render(small_job(tmp_path, people=1, samples=5)))
 
 

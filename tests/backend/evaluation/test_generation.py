@@ -19,7 +19,7 @@ from primdiffusion.evaluation.gallery import (
 )
 from primdiffusion.evaluation.generation import COLUMNS, compare, open_reference_set, real_vs_real, table
 from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, camera_of
-from primdiffusion.people.assets import AssetsMissingError, open_assets
+from primdiffusion.people.assets import open_assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def assets():
     try:
         return open_assets()
-    except AssetsMissingError as error:
+    except FileNotFoundError as error:
         pytest.skip(str(error))
 
 

@@ -255,5 +255,5 @@ def test_what_grows_beyond_the_limit_before_it_is_opened_is_not_read(tmp_path, m
     status = os.stat(path)
     path.write_bytes(bytes(30))
     monkeypatch.setattr(regular_files, "check_regular", lambda _: status)
-    with pytest.raises(regular_files.TooLargeError):
+    with pytest.raises(regular_files.FileError):
         regular_files.read_regular(path, 20)

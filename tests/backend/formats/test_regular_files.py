@@ -1,5 +1,7 @@
+import pickle
+
 import pytest
-from primdiffusion.formats.regular_files import FileError, TooLargeError, as_file_error, portable_name
+from primdiffusion.formats.regular_files import FileContent, FileError, as_file_error, portable_name
 from support.errors import refused
 
 
@@ -25,8 +27,24 @@ def test_what_damaged_content_raises_names_the_file_once_and_what_to_do(error):
     assert (caught.value.path, caught.value.remedy) == ("a.json", "write it again")
 
 
-@pytest.mark.parametrize(("error", "also"), [(TooLargeError, ()), (OSError, ()), (RuntimeError, (OSError,))])
-def test_sizes_and_errors_that_are_not_of_content_pass(error, also):
+def test_an_error_that_names_a_file_passes():
+    with pytest.raises(FileError) as caught, as_file_error("a.json", "is damaged", "write it again"):
+        raise FileError("b.npz", "is cut short", "copy it again")
+    assert (caught.value.path, caught.value.reason) == ("b.npz", "is cut short")
+
+
+def test_an_error_is_pickled_with_its_three_parts(tmp_path):
+    error = pickle.loads(pickle.dumps(FileError(tmp_path, "is damaged", "write it again")))
+    assert (error.path, error.reason, error.remedy) == (tmp_path, "is damaged", "write it again")
+    assert str(error) == f"{tmp_path} is damaged: write it again"
+
+
+def test_of_a_file_that_was_read_before_the_path_is_kept(tmp_path):
+    assert FileError(FileContent(tmp_path / "a", b"1"), "is damaged", "write it again").path == tmp_path / "a"
+
+
+@pytest.mark.parametrize(("error", "also"), [(OSError, ()), (RuntimeError, (OSError,))])
+def test_errors_that_are_not_of_content_pass(error, also):
     with pytest.raises(error) as caught, as_file_error("a.json", "is damaged", "write it again", *also):
         raise error("because")
     assert str(caught.value) == "because"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from PIL import Image
-from primdiffusion.geometry.pictures import PictureError
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.people.assets import _decoded
 from support.errors import refused
 
@@ -20,5 +20,5 @@ def test_a_picture_shrunk_in_strips_is_pillows(tmp_path, monkeypatch, mode):
 
 def test_a_picture_that_claims_more_than_its_file_can_hold_is_rejected(tmp_path):
     Image.new("1", (8000, 8000)).save(tmp_path / "a.png")
-    with refused(PictureError, "a.png", "8000"):
+    with refused(FileError, "a.png", "8000"):
         _decoded(tmp_path / "a.png", 50)

@@ -16,7 +16,7 @@ from primdiffusion.people import load_base_mesh, make_person, open_assets, recol
 from primdiffusion.people import payloads as payloads_module
 from primdiffusion.people import person as person_module
 from primdiffusion.people.appearance import SkinColours, skin_texture
-from primdiffusion.people.assets import ENVIRONMENT_VARIABLE, AssetsMissingError
+from primdiffusion.people.assets import ENVIRONMENT_VARIABLE
 from primdiffusion.people.fitting import shown_faces, under_hat, under_hem
 from primdiffusion.people.mhclo import parse_mhclo
 from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
@@ -48,12 +48,12 @@ def same_pictures(first, second):
 
 def test_no_folder_says_how_to_name_one(monkeypatch):
     monkeypatch.delenv(ENVIRONMENT_VARIABLE, raising=False)
-    with refused(AssetsMissingError, "--assets", ENVIRONMENT_VARIABLE):
+    with refused(FileNotFoundError, "--assets", ENVIRONMENT_VARIABLE):
         open_assets()
 
 
 def test_absent_folder_is_named(tmp_path):
-    with refused(AssetsMissingError, "nowhere"):
+    with refused(FileNotFoundError, "nowhere"):
         open_assets(tmp_path / "nowhere")
 
 
@@ -61,10 +61,10 @@ def test_incomplete_folder_says_what_it_lacks(tmp_path):
     for name in assets_module.SUBFOLDERS:
         (tmp_path / name).mkdir()
     assert open_assets(tmp_path).root == tmp_path.resolve()
-    with refused(AssetsMissingError, "eyes/low-poly/low-poly.mhclo"):
+    with refused(FileNotFoundError, "eyes/low-poly/low-poly.mhclo"):
         open_assets(tmp_path, ("eyes/low-poly/low-poly",))
     (tmp_path / "skins").rmdir()
-    with refused(AssetsMissingError):
+    with refused(FileNotFoundError):
         open_assets(tmp_path)
 
 

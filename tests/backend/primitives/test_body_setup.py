@@ -8,8 +8,9 @@ import shutil
 
 import numpy as np
 import pytest
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.primitives import body_setup as module
-from primdiffusion.primitives.body_setup import BodySetupError, body_setup_from_files, find_body_setup
+from primdiffusion.primitives.body_setup import body_setup_from_files, find_body_setup
 from released_files import body_arrays, save_body
 from support.errors import refused
 
@@ -108,7 +109,7 @@ def test_a_file_that_is_changed_in_place_under_the_same_times_and_size_is_reject
     for name, file in zip(NAMES, (fingerprints.smpl, *fingerprints.uv), strict=True):
         module._found(module.FileFingerprint(str(folder / name), file.sha256), ())  # is remembered by times and size
     overwrite(path, shuffled(path.read_bytes()))
-    with refused(BodySetupError, "SMPL_NEUTRAL.pkl"):
+    with refused(FileError, "SMPL_NEUTRAL.pkl"):
         found(folder, fingerprints, setup)
 
 
@@ -124,5 +125,5 @@ def test_a_human_names_one_or_two_files_of_texture_coordinates(files, count):
     folder, fingerprints, setup = files
     smpl = module.FileFingerprint(str(folder / NAMES[0]), fingerprints.smpl.sha256)
     uv = module.FileFingerprint(str(folder / NAMES[1]), fingerprints.uv[0].sha256)
-    with refused(BodySetupError, str(count)):
+    with refused(FileError, str(count)):
         find_body_setup(module.BodyFiles(smpl, (uv,) * count), setup.anchors.rest_half_extent, [])

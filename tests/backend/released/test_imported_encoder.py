@@ -13,9 +13,9 @@ from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.model import load_encoder, look_up
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
-from primdiffusion.primitives.body_setup import BodySetupError
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.released.imported import Reference, reference_extents
 from primdiffusion.released.stage_one import account_stage_one, encoder_tensors
@@ -150,7 +150,7 @@ def test_a_body_file_that_has_changed_is_named(folder, encoder_file, tmp_path):
     body["smpl"]["path"] = str(tmp_path / "none.pkl")
     tensors = safetensors.torch.load_file(encoder_file)
     safetensors.torch.save_file(tensors, copy, {**metadata, "body": json.dumps(body)})
-    with refused(BodySetupError, "none.pkl"):
+    with refused(FileError, "none.pkl"):
         load_encoder(copy)
     del tensors["stand.rest_half_extent"]
     safetensors.torch.save_file(tensors, copy, metadata)

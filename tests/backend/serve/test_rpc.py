@@ -8,7 +8,7 @@ import threading
 from hypothesis import given
 from hypothesis import strategies as st
 from primdiffusion.serve.rpc import (
-    MalformedRequest,
+    RpcError,
     RpcRequest,
     Wire,
     parse_request,
@@ -31,7 +31,7 @@ def test_any_line_is_a_request_or_an_error_that_can_be_sent(line):
     stream = io.BytesIO()
     try:
         request = parse_request(line)
-    except MalformedRequest as e:
+    except RpcError as e:
         Wire(stream).fail(e.id, e)
     else:
         assert isinstance(request, RpcRequest)

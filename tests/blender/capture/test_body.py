@@ -78,7 +78,7 @@ def test_betas_that_lack_are_zero_and_betas_too_many_are_rejected(body):
     few, _ = body.rest([1.0, -1.0])
     all_of_them, _ = body.rest([1.0, -1.0, *[0.0] * 30])
     np.testing.assert_array_equal(few, all_of_them)
-    with refused(FileError, "11 betas"):
+    with refused(ValueError, "11 betas"):
         body.rest(np.ones(11))
 
 

@@ -101,7 +101,7 @@ def test_blenders_own_export_comes_back(tmp_path, empty_scene):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda text: text.replace("mixamorig:LeftUpLeg", "Bone.017"), "no bone is known to be 'left_hip'"),
+        (lambda text: text.replace("mixamorig:LeftUpLeg", "Bone.017"), "'left_hip'"),
         (lambda text: text.replace("Zrotation", "Wrotation"), "the channel 'Wrotation' is unknown"),
         (lambda text: text[: len(text) - 900], "numbers are announced"),
         (lambda text: text.replace("Frames: 6", "Frames: 0"), "0 frames"),
@@ -118,9 +118,9 @@ def test_blenders_own_export_comes_back(tmp_path, empty_scene):
         (lambda text: text.replace("Time: 0.0083333", "Time: 1e-320"), "a frame time of"),
         (lambda text: text.replace("Time: 0.0083333", "Time: 1e300"), "a frame time of"),
         (lambda text: text.replace("Time: 0.0083333", "Time: nan"), "a frame time of"),
-        (lambda text: text.replace("0.0083333\n", "0.0083333\n1e300 "), "no angles or lengths"),
+        (lambda text: text.replace("0.0083333\n", "0.0083333\n1e300 "), "not angles or lengths"),
         (lambda text: text.replace("0.0083333\n", "0.0083333\nword "), "a word where"),
-        (lambda text: re.sub(r"OFFSET \S+", "OFFSET 1e200", text, count=1), "no angles or lengths"),
+        (lambda text: re.sub(r"OFFSET \S+", "OFFSET 1e200", text, count=1), "not angles or lengths"),
         (lambda text: text + "0 " * 2_000_000, "much more than the 6 frames of"),
         (lambda text: text.replace("MOTION", " JOINT a { " * 1001 + "MOTION"), "more than 1000 joints"),
     ],

@@ -7,11 +7,12 @@ import shutil
 
 import bpy
 import pytest
+from blender_primdiffusion.formats.regular_files import FileError
 from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
 from blender_primdiffusion.scene.collect import collect_files
-from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, humans_folder, person_file, volume_path
+from blender_primdiffusion.scene.human import folder_of, humans_folder, person_file, volume_path
 from blender_primdiffusion.scene.missing import missing_files
 
 ops = bpy.ops.primdiffusion
@@ -129,7 +130,7 @@ def test_a_full_disk_while_saving_or_collecting_leaves_people_as_they_are(person
     assert "humans of this file depend on files elsewhere" in capsys.readouterr().out
     before = {volume.name: volume.filepath for volume in bpy.data.volumes}
     copied.clear()
-    with refused(VolumeWriteError):
+    with refused(FileError):
         collect_files()
     copied.clear()
     with refused(RuntimeError, "space"):

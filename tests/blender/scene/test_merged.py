@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from support.errors import refused
 
@@ -16,7 +17,7 @@ from blender_primdiffusion.scene.attachment import attachment_before_merge, atta
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.copies import duplicate_human
-from blender_primdiffusion.scene.human import VolumeWriteError, folder_of, sequence_files, state_folder, volume_path
+from blender_primdiffusion.scene.human import folder_of, sequence_files, state_folder, volume_path
 from blender_primdiffusion.scene.material import (
     density_gain,
     person_material,
@@ -175,9 +176,9 @@ def test_files_of_earlier_merges_are_unused_and_those_of_a_shown_sequence_are_no
 def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
     digest = write_grid(grid(), tmp_path / "grid.vdb")
     (tmp_path / "file").write_text("in the way")
-    with refused(VolumeWriteError):
+    with refused(FileError):
         publish([tmp_path / "grid.vdb"], [digest], tmp_path / "file" / "folder")
-    with refused(VolumeWriteError):
+    with refused(FileError):
         publish([tmp_path / "grid.vdb", tmp_path / "missing.vdb"], [digest, "x"], tmp_path / "new")
     assert not list((tmp_path / "new").iterdir())
 
@@ -265,7 +266,7 @@ def test_links_in_place_of_merged_files_lose_nothing_outside(tmp_path, outside):
     folder.mkdir()
     for number in (1, 2):
         (folder / f"merged_{digest}_{number:04d}.vdb").symlink_to(mine.parent / outside)
-    with contextlib.suppress(VolumeWriteError):
+    with contextlib.suppress(FileError):
         publish(sources, ["a", "b"], folder)
     assert [path.name for path in mine.parent.iterdir()] == ["mine"]
     assert mine.read_text() == "mine"

@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..joints import JOINT_NAMES
-from ..regular_files import FileError, TooLargeError, read_regular
+from ..regular_files import FileError, as_file_error, read_regular
 from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion
-from .rigs import BoneMap, chosen_bones, map_bones, retarget
+from .rigs import MATCH_BONES, UNMATCHED, BoneMap, chosen_bones, map_bones, retarget
 from .rotation import about_axis
 from .skeleton import REST_JOINTS
 
@@ -91,12 +91,11 @@ def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motio
     other than the root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises FileError.
     """
     hierarchy = parse_bvh(path)
-    try:
-        names = bone_names(hierarchy)
+    names = bone_names(hierarchy)
+    with as_file_error(path, UNMATCHED, MATCH_BONES):
         bones = map_bones(names) if chosen is None else chosen_bones(names, chosen)
+    with as_file_error(path, "has no rest pose of a human", "export the motion again"):
         return _retarget(hierarchy, bones, path)
-    except ValueError as e:
-        raise FileError(f"{path}: {e}") from e
 
 
 def bone_names(hierarchy: Hierarchy) -> list[str]:
@@ -106,28 +105,25 @@ def bone_names(hierarchy: Hierarchy) -> list[str]:
 
 def parse_bvh(path: Path) -> Hierarchy:
     """Parse a BVH file. Raises FileError where it is no BVH file or truncated."""
-    try:
-        text = read_regular(path, LARGEST_BYTES).decode("utf-8", errors="replace")
-    except TooLargeError as e:
-        raise FileError(f"{path} is larger than {LARGEST_BYTES // 2**20} MB: cut the motion into pieces") from e
+    text = read_regular(path, LARGEST_BYTES).decode("utf-8", errors="replace")
     head, found, tail = text.partition("MOTION")
     if not found or "HIERARCHY" not in head:
-        raise FileError(f"{path} is not a BVH file: it has no HIERARCHY followed by MOTION")
+        raise FileError(path, "has no HIERARCHY followed by MOTION", "choose a BVH file")
     if len(head) > LONGEST_HIERARCHY:
-        raise FileError(f"{path} has a HIERARCHY of more than {LONGEST_HIERARCHY} characters: export it again")
+        reason = f"has a HIERARCHY of more than {LONGEST_HIERARCHY} characters"
+        raise FileError(path, reason, "export the motion again")
     try:
         names, parents, offsets, channels = _parse_hierarchy(head.split("HIERARCHY", 1)[1].split())
         values, frame_time = _parse_motion(tail, sum(map(len, channels)), len(names))
     except (ValueError, IndexError, KeyError, OverflowError) as e:
-        raise FileError(f"{path} is not a complete BVH file ({e!s:.120}): export it again") from e
+        raise FileError(path, f"is not a complete BVH file ({e!s:.120})", "export the motion again") from e
     if not (np.isfinite(values).all() and np.isfinite(offsets).all()):
-        raise FileError(f"{path} holds NaN or infinite numbers: export the motion again")
+        raise FileError(path, "holds NaN or infinite numbers", "export the motion again")
     if max(np.abs(values).max(initial=0), np.abs(offsets).max(initial=0)) > LARGEST_NUMBER:
-        raise FileError(
-            f"{path} holds numbers above {LARGEST_NUMBER:g}, which are no angles or lengths: export it again"
-        )
+        reason = f"holds numbers above {LARGEST_NUMBER:g}, which are not angles or lengths"
+        raise FileError(path, reason, "export the motion again")
     if not names:
-        raise FileError(f"{path} has no ROOT: export the motion again")
+        raise FileError(path, "has no ROOT", "export the motion again")
     return Hierarchy(names, parents, offsets, channels, values, frame_time)
 
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..arrays import array_names, read_arrays, read_npy
 from ..json_files import read_json
 from ..motion_size import check_motion_size
-from ..regular_files import FileError, TooLargeError, read_regular
+from ..regular_files import FileError, read_regular
 from ..smpl_pickle import as_array, load_restricted
 from . import mhr
 from .bvh import read_bvh
@@ -61,16 +61,16 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
     - .bvh: any rig that `rigs` knows.
 
     Without a frame rate it is `DEFAULT_FPS`, with a note. Raises FileError where there is no such file, or it
-    holds objects, NaN or other data.
+    holds objects, NaN or other data, and ValueError for another `up`.
     """
     path = Path(path)
     if not path.is_file():
-        raise FileError(f"there is no pose file {path}: check the path")
+        raise FileError(path, "does not exist", "check the path")
     if up not in UP_AXES:
-        raise FileError(f"the axis {up!r} cannot be up: give one of {_listed(list(UP_AXES[1:]))}")
+        raise ValueError(f"the axis {up!r} cannot be up: give one of {_listed(list(UP_AXES[1:]))}")
     suffix = path.suffix.lower()
     if suffix not in ENDINGS:
-        raise FileError(f"{path} is no pose file: {', '.join(ENDINGS[:-1])} and {ENDINGS[-1]} files are")
+        raise FileError(path, "is not a pose file", f"give a {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]} file")
     axes = np.eye(3)
     try:
         if suffix == ".bvh":
@@ -79,10 +79,8 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
             arrays = _READERS[suffix](path)
             motion = motion_from_arrays(arrays, path)
             detect_up = suffix == ".npz" and "trans" in arrays and ("poses" in arrays or "pose_body" in arrays)
-    except TooLargeError as e:
-        raise FileError(str(e)) from e
     except OSError as e:
-        raise FileError(f"{path} cannot be read ({e.strerror or e}): check that it may be opened") from e
+        raise FileError(path, f"cannot be read ({e.strerror or e})", "check that it may be opened") from e
     if up:
         return _turned(motion, axis_name(axes @ axis_direction(up)), up)
     return _upright(motion, axes) if detect_up else motion
@@ -106,7 +104,7 @@ def motion_from_numbers(content: Any, name: str) -> Motion:
     """
     arrays = _arrays(content, name)
     if not _holds_smpl(arrays):
-        raise FileError(f"{name} holds no poses: it needs 'pose', or 'global_orient' and 'body_pose'")
+        raise FileError(name, "holds no poses", "give 'pose', or 'global_orient' and 'body_pose'")
     check_numbers(arrays, name)
     rest, poses = first_of(arrays, _REST), first_of(arrays, _POSES)
     if rest is None:
@@ -122,13 +120,15 @@ def motion_from_numbers(content: Any, name: str) -> Motion:
                 root = root[:, None]  # a matrix a frame
             first = _matrices(root, name)[:, 0]
             if len(first) not in (1, len(rotations)):
-                raise FileError(f"{name}: {len(first)} frames of global_orient but {len(rotations)} of body_pose")
+                reason = f"holds {len(first)} frames of global_orient but {len(rotations)} of body_pose"
+                raise FileError(name, reason, "save as many of each")
             rotations[:, 0] = first
     frames = len(rotations)
     translations = first_of(arrays, _TRANSLATIONS)
     translations = np.zeros((frames, 3)) if translations is None else np.asarray(translations, np.float64)
     if translations.size not in (3, 3 * frames):
-        raise FileError(f"{name}: {frames} frames of poses but translations of shape {translations.shape}")
+        reason = f"holds {frames} frames of poses but translations of shape {translations.shape}"
+        raise FileError(name, reason, "save a translation for each frame")
     translations = np.array(np.broadcast_to(translations.reshape(-1, 3), (frames, 3)))
     stated = stated_rate(arrays, name)
     detected = Detected(rig=_BODIES.get(joints, f"{joints} joints"), up="y", fps=stated)
@@ -145,10 +145,9 @@ def _read_npz(path: Path) -> dict[str, NDArray]:
     arrays = read_arrays(path, optional=_KEYS)
     if not (_holds_smpl(arrays) or mhr.holds_some(arrays)):
         if "smpl" in names:
-            raise FileError(f"{path} holds pickled objects, which are never read: use the version with plain arrays")
-        raise FileError(
-            f"{path} holds no poses: it holds {_listed(names)} and needs 'poses', or 'global_orient' and 'body_pose'"
-        )
+            raise FileError(path, "holds pickled objects, which are never read", "use the version with plain arrays")
+        remedy = "give a file with 'poses', or with 'global_orient' and 'body_pose'"
+        raise FileError(path, f"holds no poses but {_listed(names)}", remedy)
     return arrays
 
 
@@ -160,13 +159,13 @@ def _read_json(path: Path) -> dict[str, NDArray]:
     try:
         content = read_json(path)
     except (ValueError, OSError) as e:
-        raise FileError(f"{path} is not JSON that can be read ({e!s:.120}): export it again") from e
+        raise FileError(path, f"is not JSON that can be read ({e!s:.120})", "export it again") from e
     return _arrays(_one_human(content, path), str(path))
 
 
 def _read_pickle(path: Path) -> dict[str, NDArray]:
     try:
-        content = _one_human(load_restricted(read_regular(path, LARGEST_PICKLE), str(path)), path)
+        content = _one_human(load_restricted(read_regular(path, LARGEST_PICKLE), path), path)
         if not isinstance(content, dict):
             raise ValueError(f"it contains a {type(content).__name__}")
         found = {key: content[key] for key in _KEYS if key in content}
@@ -174,7 +173,7 @@ def _read_pickle(path: Path) -> dict[str, NDArray]:
     except FileError:
         raise
     except (ValueError, TypeError) as e:
-        raise FileError(f"{path} is not a pickled dictionary of poses ({e!s:.160}): save it as .npz") from e
+        raise FileError(path, f"is not a pickled dictionary of poses ({e!s:.160})", "save it as .npz") from e
 
 
 _READERS = {".npz": _read_npz, ".npy": _read_npy, ".json": _read_json, ".pkl": _read_pickle}
@@ -196,7 +195,7 @@ def _arrays(content: Any, name: str) -> dict[str, NDArray]:
     try:
         return {key: np.asarray(content[key]) for key in _KEYS if key in content}
     except (ValueError, TypeError, OverflowError) as e:
-        raise FileError(f"{name} holds something else than lists of numbers of equal length ({e!s:.80})") from e
+        raise FileError(name, f"holds no lists of numbers of equal length ({e!s:.80})", "export it again") from e
 
 
 def _upright(motion: Motion, axes: NDArray) -> Motion:
@@ -232,10 +231,8 @@ def _rotations(given: NDArray, name: str, joints_before: int = 0) -> NDArray[np.
     elif count == _BODY_JOINTS or count > 24:
         taken = _BODY_JOINTS
     else:
-        raise FileError(
-            f"{name} holds poses of {count} joints (shape {given.shape}): needed are SMPL's 24, 22 without hands, or "
-            "those of SMPL-H or SMPL-X"
-        )
+        remedy = "give SMPL's 24 joints, 22 without hands, or those of SMPL-H or SMPL-X"
+        raise FileError(name, f"holds poses of {count} joints (shape {given.shape})", remedy)
     rotations = np.tile(np.eye(3), (len(given), 24, 1, 1))
     rotations[:, joints_before:taken] = given[:, : taken - joints_before]
     return rotations
@@ -248,18 +245,16 @@ def _matrices(values: NDArray, name: str, joints_before: int = 0) -> NDArray[np.
         given = values if values.ndim == 4 else values[None]
         improper = first_improper(given)
         if improper is not None:
-            raise FileError(
-                f"{name} holds {improper_text(improper[0], improper[1] + joints_before)}; export the poses again"
-            )
+            text = improper_text(improper[0], improper[1] + joints_before)
+            raise FileError(name, f"holds {text}", "export the poses again")
         return nearest(given)
     if values.ndim == 1:
         values = values[None]
     if values.ndim == 2 and values.shape[1] == 3 and values.shape[0] in (_BODY_JOINTS, 23, 24, 52, 55):
         values = values.reshape(1, -1)  # one pose, a row a joint
     if values.ndim not in (2, 3) or values.shape[-1] % 3 or (values.ndim == 3 and values.shape[-1] != 3):
-        raise FileError(
-            f"{name} holds poses of shape {values.shape}: needed are 72 axis-angle numbers a frame (24 joints x 3)"
-        )
+        remedy = "give 72 axis-angle numbers a frame (24 joints x 3)"
+        raise FileError(name, f"holds poses of shape {values.shape}", remedy)
     return from_axis_angle(values.reshape(len(values), -1, 3))
 
 

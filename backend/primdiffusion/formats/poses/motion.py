@@ -93,16 +93,14 @@ def check_numbers(arrays: Mapping[str, NDArray], name: str) -> None:
     """Raise FileError, which calls the file `name`, for arrays that are not the numbers of a motion."""
     for key, array in arrays.items():
         if array.dtype.kind not in "iuf":
-            raise FileError(f"{name}: {key!r} holds {array.dtype} instead of numbers")
+            raise FileError(name, f"holds {array.dtype} in {key!r} instead of numbers", "save it as numbers")
         if array.size == 0:
-            raise FileError(f"{name}: {key!r} holds no frame; export the motion again")
+            raise FileError(name, f"holds no frame in {key!r}", "export the motion again")
         if not np.isfinite(array).all():
-            raise FileError(f"{name}: {key!r} holds NaN or infinite numbers; export the motion again")
+            raise FileError(name, f"holds NaN or infinite numbers in {key!r}", "export the motion again")
         if array.size > MOST_NUMBERS or np.abs(array.astype(np.float64)).max() > LARGEST_NUMBER:
-            raise FileError(
-                f"{name}: {key!r} holds more than {MOST_NUMBERS} numbers, or one above {LARGEST_NUMBER:g}; cut the "
-                "motion into pieces, or export it again"
-            )
+            reason = f"holds more than {MOST_NUMBERS} numbers in {key!r}, or one above {LARGEST_NUMBER:g}"
+            raise FileError(name, reason, "cut the motion into pieces, or export it again")
 
 
 def stated_rate(arrays: Mapping[str, NDArray], name: str) -> float:
@@ -110,5 +108,5 @@ def stated_rate(arrays: Mapping[str, NDArray], name: str) -> float:
     rate = first_of(arrays, RATES)
     stated = float(rate.ravel()[0]) if rate is not None and rate.size == 1 and float(rate.ravel()[0]) > 0 else 0.0
     if stated and not SMALLEST_FPS <= stated <= LARGEST_FPS:
-        raise FileError(f"{name} states {stated:g} frames per second; export the motion again")
+        raise FileError(name, f"states {stated:g} frames per second", "export the motion again")
     return stated

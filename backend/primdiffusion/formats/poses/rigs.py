@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..joints import JOINT_NAMES, PARENTS
-from ..regular_files import FileError
 from .rotation import about_axis, between
 from .skeleton import REST_JOINTS, unchain
 
@@ -91,6 +90,9 @@ NEEDED = (
 )  # fmt: skip
 """A rig needs these to be posed, and one bone of spine, neck and head."""
 MANUAL = "chosen by hand"
+UNMATCHED = "has bones that cannot be matched to SMPL's joints"
+MATCH_BONES = "name them as in SMPL, Mixamo, Unreal, Rigify or RenderPeople, or choose one for each joint"
+"""What is wrong with a file where `map_bones` or `chosen_bones` fails, and what to do."""
 _TRUNK = ("spine1", "spine2", "spine3", "neck", "head")
 _LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist", "wrist": "hand"}
 """Parts whose direction towards the next part gives their rotation."""
@@ -112,7 +114,7 @@ class BoneMap:
 def map_bones(names: Iterable[str]) -> BoneMap:
     """The bones as the rig whose names fit best, with any prefix that they share.
 
-    Raises FileError where no rig matches; it names the missing joints and some of the bones.
+    Raises ValueError where no rig matches; it names the missing joints and some of the bones.
     """
     bones = list(names)
     plain = {}
@@ -122,10 +124,8 @@ def map_bones(names: Iterable[str]) -> BoneMap:
     best = max(found, key=lambda m: (len(m.joints), len(m.tips)), default=BoneMap("SMPL", {}, {}))
     missing = _missing_joints(best.joints)
     if missing:
-        raise FileError(
-            f"no bone is known to be {_listed(missing):.60} (nearest rig: {best.rig}); the bones are "
-            f"{_listed(bones):.80}: "
-            "name them as in SMPL, Mixamo, Unreal, Rigify or RenderPeople"
+        raise ValueError(
+            f"none is known to be {_listed(missing):.50}; nearest rig: {best.rig}; the bones are {_listed(bones):.60}"
         )
     return best
 
@@ -133,22 +133,19 @@ def map_bones(names: Iterable[str]) -> BoneMap:
 def chosen_bones(names: Iterable[str], joints: Mapping[str, str]) -> BoneMap:
     """A bone map chosen by the user, SMPL's joint -> bone; empty bones count as not chosen.
 
-    Raises FileError for a joint that SMPL does not have, a bone that is not among `names`, and a joint of
+    Raises ValueError for a joint that SMPL does not have, a bone that is not among `names`, and a joint of
     `NEEDED` without a bone.
     """
     bones = list(names)
     chosen = {joint: bone for joint, bone in joints.items() if bone}
     for joint, bone in chosen.items():
         if joint not in JOINT_NAMES:
-            raise FileError(f"the bone map names {joint!r}, which is no joint of SMPL: correct or remove it")
+            raise ValueError(f"{joint!r} of the bone map is not a joint of SMPL")
         if bone not in bones:
-            raise FileError(
-                f"the bone map has {bone!r} for {joint}, which is not in the file; its bones are "
-                f"{_listed(bones)}: choose one of them"
-            )
+            raise ValueError(f"{bone!r:.40}, chosen for {joint}, is not there; the bones are {_listed(bones):.60}")
     missing = _missing_joints(chosen)
     if missing:
-        raise FileError(f"the bone map has no bone for {_listed(missing)}: choose one for each")
+        raise ValueError(f"none is chosen for {_listed(missing)}")
     return BoneMap(MANUAL, chosen, {})
 
 

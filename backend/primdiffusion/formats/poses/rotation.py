@@ -188,6 +188,6 @@ def improper_text(frame: int | str, joint: int | str) -> str:
     """Describe a matrix that is not a rotation, as a part of a sentence."""
     name = JOINT_NAMES[joint] if isinstance(joint, int) and joint < _COMMON_JOINTS else joint
     return (
-        f"a matrix for joint {name} in frame {frame} that is not a rotation: orthonormal within {TOLERANCE:g}, "
-        "determinant 1"
+        f"a matrix for joint {name} in frame {frame} that is not a rotation (orthonormal within {TOLERANCE:g}, "
+        "determinant 1)"
     )

@@ -18,7 +18,7 @@ from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
 from blender_primdiffusion.scene.human import armature_of, humans, person_file, volume_path
 from blender_primdiffusion.ui.batch import execute
-from blender_primdiffusion.ui.batch.running import NoBackend, ask
+from blender_primdiffusion.ui.batch.running import ask
 
 pytestmark = pytest.mark.any_blender
 
@@ -158,7 +158,7 @@ def test_a_lost_backend_leaves_the_finished_humans_and_names_them(out, monkeypat
 
 
 def _no_backend(*_, **__):
-    raise NoBackend("No Python for the backend")
+    raise BackendNotFound("No Python for the backend")
 
 
 def test_a_folder_that_cannot_be_is_a_sentence(addon, tmp_path, capfd):
