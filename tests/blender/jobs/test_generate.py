@@ -119,15 +119,22 @@ def test_the_timer_builds_the_person_and_the_panel_shows_progress_then_the_resul
     assert any("Generated in" in text for text in panel_texts(addon))
 
 
-def test_a_cancel_while_the_child_is_being_started_ends_the_job_and_adds_nothing(addon):
+def test_a_cancel_while_the_child_is_importing_ends_the_job_and_keeps_the_child(addon, monkeypatch):
+    monkeypatch.setenv("FAKE_ORDER", "imports slowly")
     ask(addon, TAKES_LONG, 50)
-    for _ in range(20):
+    while queue.request is None or queue.request.message != "Loading PyTorch":
         follow()
         time.sleep(0.01)
+    follow()  # sends the request
+    child = queue.child_pid
     assert bpy.ops.primdiffusion.cancel() == {"FINISHED"}
     drive()
     assert (error_of("generate"), notice_of("generate")) == ("", "Cancelled")
     assert not humans(addon.scene)
+    ask(addon, 7, 2)  # waits until the child has dropped the first
+    drive()
+    assert len(humans(addon.scene)) == 1
+    assert queue.child_pid == child
 
 
 @pytest.mark.any_blender

@@ -267,6 +267,8 @@ for line in sys.stdin:
     id, method = request["id"], request["method"]
     if method == "hello":
         say(id=id, result={"version": "0-fake", "device_name": None})
+        if ORDER == "imports slowly":
+            time.sleep(LONG * STEP_S)
         about = {"ready": True, "problem": PROBLEM, "device": "cpu", "device_name": "fake device"}
         say(method="ready", params=about)
     elif method in ANSWERS:
