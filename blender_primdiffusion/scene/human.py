@@ -160,7 +160,7 @@ def new_state(home: Path) -> Path:
                 (home / f"{number:04d}").mkdir()
                 note_state(home / f"{number:04d}")
                 return home / f"{number:04d}"
-    except (OSError, FileError) as error:
+    except OSError as error:
         raise write_error(home, error) from error
     raise AssertionError("numbers do not end")
 
@@ -177,7 +177,7 @@ def remove_state(folder: Path) -> None:
 
 
 def write_error(folder: Path, error: BaseException) -> FileError:
-    """For errors of the system and of openvdb, and links that lead out of a human's folder."""
+    """For errors of the system and of openvdb."""
     remedy = "save the .blend in a folder with write permission and free space"
     return FileError(folder, f"cannot be written to ({error!s:.160})", remedy)
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import bpy
 
-from ..formats.regular_files import FileError, portable_name
+from ..formats.regular_files import portable_name
 from .attachment import volumes_may_wait
 from .human import (
     BODY_FILE,
@@ -97,7 +97,7 @@ def prepare(
             for number, k in enumerate(which):
                 yield number / len(which)
                 write_volume(grids, k, bpy.app.version, folder / volume_name(k))
-        except (OSError, RuntimeError, FileError) as error:  # openvdb reports a full disk as RuntimeError
+        except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
             raise write_error(home, error) from error
         undone.pop_all()
     return PreparedHuman(human, provenance, folder, began)

@@ -157,7 +157,7 @@ def test_wrong_files_are_one_sentence_and_the_conversation_goes_on(child, reques
         ({"width": 49}, "bad_input", "49 x 64 pixels need 62720"),
         ({"people": [missing]}, "missing_file", "nobody.human"),
         ({"people": [flat]}, "bad_input", "scale"),
-        ({"solids": str(tmp_path / "text.npz")}, "bad_input", "text.npz holds no solids"),
+        ({"solids": str(tmp_path / "text.npz")}, "bad_input", "text.npz is damaged"),
     ):
         answer, _ = ask(child, {**params, **changes})
         assert (answer["error"]["code"], answer["error"]["data"]["kind"]) == (DOMAIN_ERROR, kind)

@@ -209,7 +209,7 @@ def stored_members(file: BinaryIO, path: str | Path) -> dict[str, StoredMember]:
             name_bytes, extra_bytes = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
             begin = info.header_offset + _LOCAL_HEADER.size + name_bytes + extra_bytes
             if begin + info.file_size > end:
-                raise FileError(path, f"holds only a part of {info.filename!r:.60}", "copy or export it again")
+                raise FileError(path, f"holds only a part of {info.filename!r:.60}", "download it, or make it again")
             members[info.filename] = StoredMember(begin, info.file_size, info.CRC)
         _check_names(path, [name.replace("\\", "/").lower() for name in archive.namelist()])
         return members
@@ -267,7 +267,8 @@ def _archive_in(file: BinaryIO, path: Source) -> Iterator[zipfile.ZipFile]:
     except FileError:
         raise
     except _UNREADABLE as e:
-        raise FileError(path, f"is not a whole archive of arrays ({str(e)[:100]})", "copy or export it again") from e
+        reason = f"is damaged, or no archive of arrays ({str(e)[:100]})"
+        raise FileError(path, reason, "download it, or make it again") from e
 
 
 def _check_names(path: Source, names: Sequence[str]) -> None:
@@ -349,7 +350,7 @@ def _header(stream: IO[bytes], size: int, place: _Place) -> tuple[tuple[int, ...
 
 def _cut_short(place: _Place, promised: int | str, found: int) -> FileError:
     reason = f"is cut short (its header promises {promised} bytes, {found} are there)"
-    return place.error(reason, "copy or export it again")
+    return place.error(reason, "download it, or make it again")
 
 
 def _filled(stream: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: np.dtype, place: _Place) -> NDArray:

@@ -26,14 +26,17 @@ COPIED_BYTES = 256 * 2**20
 class FileError(ValueError):
     """A file or folder that cannot be used: which one, what is wrong with it, and what to do."""
 
-    def __init__(self, path: Path | str | FileContent, reason: str, remedy: str):
-        """`reason` is a predicate ("is damaged"), `remedy` an imperative ("download it again")."""
+    def __init__(self, path: Path | str | FileContent, reason: str = "", remedy: str = ""):
+        """`reason` is a predicate ("is damaged"), `remedy` an imperative ("download it again").
+
+        One text alone is the whole sentence: torch's data loader raises so the errors of its workers.
+        """
         self.path = path.path if isinstance(path, FileContent) else path
         self.reason, self.remedy = reason, remedy
         super().__init__(self.path, reason, remedy)  # by which it is pickled
 
     def __str__(self) -> str:
-        return f"{self.path} {self.reason}: {self.remedy}"
+        return f"{self.path} {self.reason}: {self.remedy}" if self.reason else str(self.path)
 
 
 @contextlib.contextmanager

@@ -172,7 +172,7 @@ def bad_file(path, kind):
     if kind == "truncated":
         save_released(path, {"betas": torch.zeros(5000)})
         path.write_bytes(path.read_bytes()[:-3000])
-        return "truncated"
+        return "damaged"
     if kind in ("empty", "text"):
         path.write_text("" if kind == "empty" else "hello world")
         return "not a torch file"

@@ -150,8 +150,8 @@ def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypat
     monkeypatch.setattr(volumes, "write_vdb", full)
     while deferred_volumes.work(0.0):
         pass
-    assert "could not be written" in deferred_volumes.error
-    assert capsys.readouterr().out.count("could not be written") == 1
+    assert "No space left" in deferred_volumes.error
+    assert capsys.readouterr().out.count("No space left") == 1
     assert not list(state_folder(person).glob(".*.partial*"))
     monkeypatch.undo()
     deferred_volumes.finish()

@@ -185,7 +185,7 @@ def test_a_folder_that_cannot_be_written_is_reported(addon, tmp_path):
     (tmp_path / "shot_humans").write_text("in the way")
     queue.add(addon, GenerateJob(7, {"steps": 1}))
     drive()
-    assert "could not be written" in error_of("generate")
+    assert "cannot be written to" in error_of("generate")
     assert not bpy.data.volumes
 
 

@@ -8,6 +8,7 @@ import bpy
 import pytest
 import synthetic
 import synthetic_shape
+from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.scene import attachment, build, states
@@ -91,7 +92,7 @@ def test_a_link_in_place_of_the_folder_is_not_followed(saved_scene, source, tmp_
     (tmp_path / "outside").mkdir()
     (tmp_path / "shot_humans").mkdir()
     (tmp_path / "shot_humans" / "Anna").symlink_to(tmp_path / "outside")
-    with refused(OSError, "Anna", "link"):
+    with refused(FileError, "Anna", "link"):
         prepare_now(source, "Anna")
     assert list((tmp_path / "outside").iterdir()) == []
 

@@ -216,7 +216,7 @@ def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature,
     assert {"Ann", "SMPL-H", "120", "z"} <= set(labels)
     assert "bones" not in settings
     (tmp_path / "bad.bvh").write_text("HIERARCHY")
-    assert "is not a BVH file" in " ".join(drawn(str(tmp_path / "bad.bvh"))[0])  # lines break where the path ends
+    assert "choose a BVH file" in " ".join(drawn(str(tmp_path / "bad.bvh"))[0])  # lines break where the path ends
     assert drawn("")[0] == ["Ann"]
     path = write_bvh(
         tmp_path / "m.bvh", REST_JOINTS, *motion_of(), {name: f"x{i}" for i, name in enumerate(JOINT_NAMES)}
