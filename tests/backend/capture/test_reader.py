@@ -213,7 +213,7 @@ def test_an_npz_that_claims_petabytes_is_rejected(tmp_path):
         ("cameras.json", b'{"camera0000": {"K": [[1]]}}', "not a list of cameras"),
         ("cameras.json", b"{}", "contains no camera"),
         ("cameras.json", b"{", "cannot be read"),
-        (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "not a whole"),
+        (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "is damaged"),
     ],
 )
 def test_wrong_and_missing_files_are_named(root, file, content, why):
