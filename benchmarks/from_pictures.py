@@ -17,7 +17,7 @@ over the figure and 8 pixels around it:
 The sheet has a row for each human: the given view, then two others beside the true ones.
 
 `python benchmarks/from_pictures.py seconds --assets DIR --json F` adds one_view_seconds_cpu to the figures in F, the
-mean wall time of a reconstruction from one view: it takes a minute, in which nothing else must compute.
+mean wall time of a reconstruction from one view. Run nothing else in the two minutes that it takes.
 """
 
 from __future__ import annotations

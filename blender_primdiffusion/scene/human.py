@@ -178,8 +178,9 @@ def remove_state(folder: Path) -> None:
 
 def write_error(folder: Path, error: BaseException) -> FileError:
     """For errors of the system and of openvdb."""
+    reason = getattr(error, "strerror", None) or str(error)
     remedy = "save the .blend in a folder with write permission and free space"
-    return FileError(folder, f"cannot be written to ({error!s:.160})", remedy)
+    return FileError(folder, f"cannot be written to ({reason:.160})", remedy)
 
 
 def person_file(collection: bpy.types.Collection) -> Path:

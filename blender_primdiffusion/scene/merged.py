@@ -105,6 +105,8 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
         for path in new:
             if path.is_file():
                 remove_file(path, folder)
+        if isinstance(error, FileError):  # a link, which it names
+            raise
         raise write_error(folder, error) from error
     return targets
 

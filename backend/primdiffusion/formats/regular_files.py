@@ -29,7 +29,7 @@ class FileError(ValueError):
     def __init__(self, path: Path | str | FileContent, reason: str = "", remedy: str = ""):
         """`reason` is a predicate ("is damaged"), `remedy` an imperative ("download it again").
 
-        One text alone is the whole sentence: torch's data loader raises so the errors of its workers.
+        A single argument is the whole sentence: torch's data loader raises a worker's error anew from its text.
         """
         self.path = path.path if isinstance(path, FileContent) else path
         self.reason, self.remedy = reason, remedy
@@ -43,7 +43,7 @@ class FileError(ValueError):
 def as_file_error(path: Path | str | FileContent, reason: str, remedy: str, *also: type[Exception]) -> Iterator[None]:
     """Raise FileError, with the words of the error in brackets, for what damaged content raises, and for `also`.
 
-    A FileError passes: it says already what is wrong.
+    A FileError passes through, because it already says what is wrong.
     """
     try:
         yield
