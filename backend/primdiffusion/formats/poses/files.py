@@ -12,12 +12,21 @@ from numpy.typing import NDArray
 
 from ..arrays import array_names, read_arrays, read_npy
 from ..json_files import read_json
-from ..motion_size import check_motion_size
 from ..regular_files import FileError, read_regular
 from ..smpl_pickle import as_array, load_restricted
 from . import mhr
 from .bvh import read_bvh
-from .motion import DEFAULT_FPS, NO_RATE, RATES, Detected, Motion, check_numbers, first_of, stated_rate
+from .motion import (
+    DEFAULT_FPS,
+    NO_RATE,
+    RATES,
+    Detected,
+    Motion,
+    check_motion_size,
+    check_numbers,
+    first_of,
+    stated_rate,
+)
 from .rotation import (
     axis_direction,
     axis_name,

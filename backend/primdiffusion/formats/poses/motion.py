@@ -1,9 +1,11 @@
-"""Motion: rotations of the 24 joints in each frame, for any body."""
+"""Motion: rotations of the 24 joints in each frame, for any body; and how much of it a file may hold."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +13,12 @@ from numpy.typing import NDArray
 from ..regular_files import FileError
 from .rotation import to_axis_angle
 from .skeleton import joint_positions
+
+UNBACKED_NUMBERS = 4_000_000
+"""Numbers of poses that a file may hold however small it is: 15 minutes of SMPL at 60 frames/s, standing still. A
+rotation takes 20 times as much memory as the numbers that it is made from."""
+NUMBERS_A_BYTE = 4
+"""Numbers for each byte of the file beyond that. Recorded motion has at most one, since noise does not compress."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,3 +118,11 @@ def stated_rate(arrays: Mapping[str, NDArray], name: str) -> float:
     if stated and not SMALLEST_FPS <= stated <= LARGEST_FPS:
         raise FileError(name, f"states {stated:g} frames per second", "export the motion again")
     return stated
+
+
+def check_motion_size(path: str | Path, numbers: int) -> None:
+    """Raise FileError for more `numbers` of poses than a file of this size may hold, and OSError."""
+    most = max(UNBACKED_NUMBERS, NUMBERS_A_BYTE * os.stat(path).st_size)
+    if numbers > most:
+        reason = f"holds {numbers} numbers of poses, more than the {most} that a file of its size may have"
+        raise FileError(path, reason, "cut the motion into pieces")
