@@ -22,8 +22,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..formats.json_files import read_json
-from ..formats.regular_files import check_regular
-from ..formats.removing import remove_file, remove_folder
+from ..formats.regular_files import check_regular, remove_file, remove_folder
 from ..formats.whole_files import write_atomically
 from .client import BackendClient
 from .environment import MARK, BackendPython, SetUpFolder, search, tried

@@ -22,8 +22,7 @@ from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
 from ..formats.poses.files import read_motion
 from ..formats.poses.motion import Motion
-from ..formats.regular_files import FileError
-from ..formats.removing import check_unlinked
+from ..formats.regular_files import FileError, check_unlinked
 from ..formats.requests import FLOAT_DEPTH
 from ..formats.whole_files import remove_abandoned, temporary_folder
 from ..motion.poses import built_in_poses, pick_poses

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.removing import remove_file, remove_folder
+from ..formats.regular_files import remove_file, remove_folder
 from ..formats.whole_files import has_ended, writer
 
 SHARED_MEMORY = Path("/dev/shm")

@@ -12,7 +12,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.removing import remove_file
+from ..formats.regular_files import remove_file
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from ..scene.triangles import is_solid, triangles_of

@@ -15,8 +15,7 @@ import numpy as np
 from ..engine.picture import pose_of
 from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
 from ..formats.poses.skeleton import unchain
-from ..formats.regular_files import exists_in_its_folder
-from ..formats.removing import remove_file
+from ..formats.regular_files import exists_in_its_folder, remove_file
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations

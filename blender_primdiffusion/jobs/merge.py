@@ -12,7 +12,7 @@ import numpy as np
 from ..engine.picture import pose_of
 from ..formats.answers import MergeAnswer, MergeFramesAnswer
 from ..formats.joints import JOINT_NAMES
-from ..formats.removing import remove_file
+from ..formats.regular_files import remove_file
 from ..scene.attachment import set_attachment
 from ..scene.human import armature_of
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid

@@ -17,8 +17,7 @@ import bpy
 from ..backend.client import Died, Silent
 from ..backend.environment import NOT_ABSOLUTE
 from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError
-from ..formats.regular_files import is_local_path
-from ..formats.removing import remove_folder
+from ..formats.regular_files import is_local_path, remove_folder
 from ..places import new_backend, preference
 from .remedies import defect_in_the_scene, error_in_the_scene
 

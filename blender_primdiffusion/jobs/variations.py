@@ -12,7 +12,7 @@ from typing import Any
 import bpy
 
 from ..formats.answers import VariationFiles, VariationsAnswer
-from ..formats.removing import remove_folder
+from ..formats.regular_files import remove_folder
 from ..scene.human import BODY_FILE, PERSON_FILE
 from .pictures import icons
 from .queue import Job, chosen_checkpoint

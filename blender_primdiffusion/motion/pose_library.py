@@ -21,8 +21,7 @@ from ..formats.arrays import all_finite
 from ..formats.joints import JOINT_NAMES
 from ..formats.json_files import read_json
 from ..formats.poses.rotation import from_axis_angle, matrix_to_quaternion, slerp, to_axis_angle
-from ..formats.regular_files import FileError, as_file_error
-from ..formats.removing import remove_file
+from ..formats.regular_files import FileError, as_file_error, remove_file
 from ..formats.whole_files import write_atomically
 from ..scene.armature import bone_bases, model_origin, rest_rotations
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend, points_to_blender

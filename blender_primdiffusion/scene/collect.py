@@ -17,8 +17,7 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
-from ..formats.regular_files import FileError, exists_in_its_folder, portable_name, real_path
-from ..formats.removing import remove_file
+from ..formats.regular_files import FileError, exists_in_its_folder, portable_name, real_path, remove_file
 from ..formats.whole_files import remove_empty
 from .blend_values import as_shown, stored_folder, stored_text
 from .earlier_files import EARLIER, earlier_volumes

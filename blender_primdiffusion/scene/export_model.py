@@ -17,7 +17,7 @@ import addon_utils
 import bpy
 
 from ..formats.joints import JOINT_NAMES
-from ..formats.removing import remove_folder
+from ..formats.regular_files import remove_folder
 from ..formats.whole_files import replacing
 
 

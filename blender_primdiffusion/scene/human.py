@@ -16,8 +16,15 @@ from typing import Any
 
 import bpy
 
-from ..formats.regular_files import FileError, check_regular, exists_in_its_folder, portable_name, real_path
-from ..formats.removing import check_inside, remove_folder
+from ..formats.regular_files import (
+    FileError,
+    check_inside,
+    check_regular,
+    exists_in_its_folder,
+    portable_name,
+    real_path,
+    remove_folder,
+)
 from ..formats.whole_files import written_whole
 from .blend_values import file_path, stored_folder, stored_record, stored_text
 

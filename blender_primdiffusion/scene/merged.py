@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite, check_shapes, read_arrays
-from ..formats.regular_files import FileError, as_file_error
-from ..formats.removing import remove_file
+from ..formats.regular_files import FileError, as_file_error, remove_file
 from .blend_values import stored_record
 from .human import armature_of, copy_file, home_of, state_of, stored_path, write_error
 from .material import person_material

@@ -20,7 +20,7 @@ from ..capture.command import MARK
 from ..console import CANCELLED, DONE
 from ..formats.answers import CapturesProgress
 from ..formats.json_files import parse_message
-from ..formats.removing import remove_folder
+from ..formats.regular_files import remove_folder
 from ..formats.schema import read
 
 PATIENCE_S = 0.7

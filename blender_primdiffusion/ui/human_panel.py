@@ -7,8 +7,7 @@ from pathlib import Path
 import bpy
 
 from ..backend.requests import error_text, sentence
-from ..formats.regular_files import FileError
-from ..formats.removing import remove_file
+from ..formats.regular_files import FileError, remove_file
 from ..formats.whole_files import remove_empty
 from ..jobs.deferred_volumes import deferred_volumes, keep_writing
 from ..jobs.edit import RegenerateJob, made_from_seed

@@ -33,8 +33,8 @@ ALLOWED = {
         "training/state.py",
     },
     "PIL.Image.open": {"geometry/pictures.py"},
-    "shutil.rmtree": {"formats/removing.py", "capture/launch.py"},  # launch: Blender's own folder
-    "unlink": {"formats/removing.py"},
+    "shutil.rmtree": {"formats/regular_files.py", "capture/launch.py"},  # launch: Blender's own folder
+    "unlink": {"formats/regular_files.py"},
     "os.unlink": {"backend/child_streams.py"},  # a temporary file while it is open
     "os.remove": set(),
     "read_text": {"formats/whole_files.py", "backend/packages.py", "machine.py"},  # facts about the machine

@@ -15,8 +15,7 @@ from primdiffusion.capture.reader import Subject
 from primdiffusion.capture.render import JPEG_QUALITY, srgb_bytes
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.formats.regular_files import as_file_error
-from primdiffusion.formats.removing import check_inside
+from primdiffusion.formats.regular_files import as_file_error, check_inside
 from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.raster.textures import LINEAR_OF_BYTE

@@ -32,8 +32,7 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import map_npy
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import LARGEST_BYTES, read_json
-from primdiffusion.formats.regular_files import FileError, read_regular
-from primdiffusion.formats.removing import check_inside
+from primdiffusion.formats.regular_files import FileError, check_inside, read_regular
 from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord

@@ -28,7 +28,7 @@ from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.editing.edit import with_payload
 from primdiffusion.editing.vary import vary_batch
 from primdiffusion.formats.answers import HumanAnswer, VariationFiles, VariationsAnswer
-from primdiffusion.formats.removing import check_unlinked
+from primdiffusion.formats.regular_files import check_unlinked
 from primdiffusion.formats.requests import GenerateRequest, VariationsRequest
 from primdiffusion.formats.whole_files import staged, staged_together
 from primdiffusion.human import Human, generate_batch, people_of

@@ -42,8 +42,7 @@ from numpy.typing import NDArray
 from .arrays import read_numbers
 from .camera_rig import View
 from .json_files import parse_json, read_json
-from .regular_files import FileError, open_regular, read_regular
-from .removing import check_inside, remove_file
+from .regular_files import FileError, check_inside, open_regular, read_regular, remove_file
 from .whole_files import remove_abandoned, temporary_name, write_atomically
 
 FORMAT, VERSION = "primdiffusion-captures", 1

@@ -19,8 +19,7 @@ from .capture_layout import (
     write_list,
 )
 from .picture_files import is_whole_picture
-from .regular_files import FileError
-from .removing import check_inside, remove_file
+from .regular_files import FileError, check_inside, remove_file
 from .whole_files import is_abandoned
 
 MOST_PICTURES = 1_000_000

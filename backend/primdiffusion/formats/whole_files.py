@@ -22,7 +22,7 @@ from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
-from .removing import remove_file, remove_folder
+from .regular_files import remove_file, remove_folder
 
 ABANDONED_AFTER_S = 86_400.0
 """Age of a temporary file, seconds, from which its writer counts as ended where that cannot be asked."""

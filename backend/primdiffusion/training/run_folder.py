@@ -30,8 +30,7 @@ from torch import Tensor
 
 from primdiffusion.failures import optional_package
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error, read_regular
-from primdiffusion.formats.removing import remove_file
+from primdiffusion.formats.regular_files import as_file_error, read_regular, remove_file
 from primdiffusion.formats.whole_files import (
     create_folders,
     remove_abandoned,

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from ...backend.requests import Backend, ChildRequest
 from ...console import Report, Stop, duration
-from ...formats.regular_files import real_path
-from ...formats.removing import check_unlinked
+from ...formats.regular_files import check_unlinked, real_path
 from ...jobs.queue import chosen_checkpoint
 from ...scene.human import PERSON_FILE
 from ..attributes import Attributes, parsed

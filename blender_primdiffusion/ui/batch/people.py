@@ -13,7 +13,7 @@ import numpy as np
 from ...engine.engine import ENGINE
 from ...formats.poses.files import read_motion
 from ...formats.poses.motion import Motion
-from ...formats.removing import remove_file
+from ...formats.regular_files import remove_file
 from ...scene.armature import keyframe_poses, pose_from_joint_rotations
 from ...scene.build import build_human
 from ...scene.cycles import frame_box, framing_distance, humans_extent, setup_cycles_preview

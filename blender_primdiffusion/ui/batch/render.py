@@ -20,8 +20,7 @@ from ...backend.requests import Backend
 from ...console import Report, Stop, Stopped
 from ...engine import studio
 from ...engine.engine import ENGINE
-from ...formats.regular_files import check_regular, exists_in_its_folder, real_path
-from ...formats.removing import remove_file, remove_folder
+from ...formats.regular_files import check_regular, exists_in_its_folder, real_path, remove_file, remove_folder
 from ...formats.whole_files import replacing
 from ...jobs.deferred_volumes import deferred_volumes
 from ...jobs.export import opened

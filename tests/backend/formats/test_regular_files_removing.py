@@ -3,8 +3,7 @@
 import os
 
 import pytest
-from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.removing import check_unlinked, remove_file, remove_folder
+from primdiffusion.formats.regular_files import FileError, check_unlinked, remove_file, remove_folder
 from support.errors import refused
 
 
