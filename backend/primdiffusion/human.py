@@ -22,8 +22,8 @@ from torch import Tensor
 
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
+from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.conditioning import Attributes
-from primdiffusion.diffusion.fixed_threads import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
@@ -87,7 +87,7 @@ def generate(
     """A new human, on the CPU, determined by model, seed, steps, sampler, attributes and guidance.
 
     On one kind of processor, with one version of torch, every bit is the same on any number of cores and threads
-    (`diffusion.fixed_threads`); otherwise, and in a batch, values differ by rounding (about 1e-5 of their range).
+    (`device.fixed_threads`); otherwise, and in a batch, values differ by rounding (about 1e-5 of their range).
 
     `attributes` condition the sample on attributes in `model.vocabulary`; those left open are drawn from the seed.
     `on_step` is called after each step; raise an exception from it to cancel.

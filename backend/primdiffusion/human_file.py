@@ -24,7 +24,7 @@ import torch
 from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyModel
-from primdiffusion.diffusion.fixed_threads import GRID_THREADS, fixed_threads
+from primdiffusion.device import GRID_THREADS, fixed_threads
 from primdiffusion.formats import compact_human
 from primdiffusion.formats.human_metadata import check_provenance, provenance_of, version_fault
 from primdiffusion.formats.regular_files import FileError, as_file_error

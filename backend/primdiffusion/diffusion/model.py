@@ -10,15 +10,10 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from primdiffusion.device import GRID_THREADS, SLAB_THREADS, each_with_fixed_threads, fixed_threads
 from primdiffusion.diffusion.codec import CellCodec, Codec
 from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.fixed_threads import (
-    GRID_THREADS,
-    SLAB_THREADS,
-    each_with_fixed_threads,
-    fixed_threads,
-)
 from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule, trailing_steps
 from primdiffusion.formats import requests

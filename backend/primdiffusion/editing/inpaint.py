@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from primdiffusion.diffusion.fixed_threads import on_fixed_threads
+from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddpm_step, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.diffusion.fixed_threads import on_fixed_threads
+from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddim
 from primdiffusion.diffusion.schedule import Schedule

@@ -7,7 +7,7 @@ from types import MappingProxyType
 
 import torch
 
-from primdiffusion.diffusion.fixed_threads import on_fixed_threads
+from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.editing.edit import (

@@ -4,14 +4,9 @@ import dataclasses
 
 import pytest
 import torch
+from primdiffusion.device import GRID_THREADS, SLAB_THREADS, each_with_fixed_threads, fixed_threads
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint, save_checkpoint
 from primdiffusion.diffusion.codec import WholeSlab
-from primdiffusion.diffusion.fixed_threads import (
-    GRID_THREADS,
-    SLAB_THREADS,
-    each_with_fixed_threads,
-    fixed_threads,
-)
 from primdiffusion.diffusion.local_unet import LocalUNetConfig
 from primdiffusion.diffusion.model import sample
 from support.errors import refused
