@@ -20,10 +20,9 @@ from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.consistency import check_codec, check_parts
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior
+from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior, check_codec, check_parts
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.arrays import LARGEST_NUMBER

@@ -1,4 +1,4 @@
-"""A loaded diffusion model: denoiser, schedule, codec and shape prior in one record."""
+"""A loaded diffusion model: denoiser, schedule, codec and shape prior in one record; whether parts from a file fit."""
 
 from __future__ import annotations
 
@@ -10,19 +10,23 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
+from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.device import GRID_THREADS, SLAB_THREADS, each_with_fixed_threads, fixed_threads
-from primdiffusion.diffusion.codec import CellCodec, Codec
+from primdiffusion.diffusion.codec import VALUES, CellCodec, Codec, LinearCodec
 from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.samplers import SAMPLERS, SamplerStep, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule, trailing_steps
 from primdiffusion.formats import requests
-from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.geometry.records import TensorRecord, check_shapes
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import GRID, K, Payload
 
 BETAS = 10
 """Shape coefficients of a sampled body."""
+LARGEST_ENTRY = 1.01
+"""Largest entry of a basis row of length 1 that a file rounds to half precision."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -217,3 +221,43 @@ def seeded(seed: int) -> torch.Generator:
     if not 0 <= seed < 2**63:
         raise ValueError(f"seed {seed} is out of range; choose an integer from 0 to {2**63 - 1}")
     return torch.Generator().manual_seed(seed)
+
+
+def check_codec(codec: LinearCodec) -> None:
+    """Raise ValueError unless the tensors of a codec fit each other and the primitives."""
+    check_shapes(codec)
+    if not bool((codec.weight > 0).all()) or bool((codec.basis.abs() > LARGEST_ENTRY).any()):
+        raise ValueError("a weight of the codec is not positive, or its basis has rows longer than 1")
+    if codec.region.shape != (K,) or not bool(((codec.region >= 0) & (codec.region < len(codec.basis))).all()):
+        raise ValueError(f"regions of the codec are not {K} numbers below {len(codec.basis)}")
+    if tuple(codec.mean.shape) != (K, VALUES):
+        raise ValueError(f"mean has shape {tuple(codec.mean.shape)}, not {K} x {VALUES}")
+
+
+def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, vocabulary: AttributeVocabulary) -> None:
+    """Raise ValueError unless prior, body shapes and vocabulary have the sizes and values of one model, with a codec
+    that passes `check_codec`."""
+    latents = (codec.channels, GRID, GRID)
+    if latents != tuple(prior.mean.shape):
+        raise ValueError(f"codec latents are {latents}, the network expects {tuple(prior.mean.shape)}")
+    check_shapes(codec, prior)
+    check_shapes(shapes)
+    _check_values(prior, shapes)
+    components, drawn = prior.basis.shape
+    if drawn % GRID**2 or not 0 < drawn <= prior.mean.numel():
+        raise ValueError(f"basis has rows of {drawn}, which are no whole channels of {tuple(prior.mean.shape)}")
+    if shapes.weight.shape[1] > components:
+        raise ValueError(f"body shapes depend on {shapes.weight.shape[1]} components of {components}")
+    if prior.kind.shape[-1] not in (0, vocabulary.width):
+        raise ValueError(f"parts are described by {prior.kind.shape[-1]} values, attributes by {vocabulary.width}")
+
+
+def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:
+    for name, values in (("rest_variance", prior.rest_variance), ("variance", prior.variance), ("limit", shapes.limit)):
+        if bool((values < 0).any()):
+            raise ValueError(f"{name} has negative values")
+    if bool((shapes.limit > LARGEST_BETA).any()):
+        raise ValueError(f"body shapes may have betas over {LARGEST_BETA:g}")
+    for name, rows in (("basis", prior.basis), ("axes", prior.axes)):
+        if bool((rows.abs() > LARGEST_ENTRY).any()):
+            raise ValueError(f"{name} has rows longer than 1")
