@@ -59,7 +59,7 @@ FUNCTIONS = {
     "inpaint": "edit:edit",
     "transfer": "edit:edit",
     "reconstruct": "reconstruct:reconstruct",
-    "fit_posture": "from_pictures:fit_posture",
+    "fit_posture": "reconstruct:fit_posture",
     "render": "render:render",
     "draw": "render:draw",
     "merge": "merge:merge",

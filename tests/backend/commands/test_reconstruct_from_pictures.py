@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 from primdiffusion import cli, from_pictures
 from primdiffusion.body.model import BodyPose
-from primdiffusion.commands.from_pictures import fit_posture
+from primdiffusion.commands.reconstruct import fit_posture
 from primdiffusion.commands.session import Session
 from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
 from primdiffusion.formats.schema import FieldError, read
