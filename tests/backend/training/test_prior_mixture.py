@@ -5,7 +5,7 @@ import torch
 from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE
 from primdiffusion.training.config import PriorConfig
-from primdiffusion.training.mixture import fit_mixture
+from primdiffusion.training.prior import fit_mixture
 
 WORDS = AttributeVocabulary(
     {
