@@ -16,9 +16,17 @@ import bpy
 import numpy as np
 
 from ..console import Report
-from ..formats.camera_files import write_layouts
 from ..formats.camera_rig import View, bounding_sphere
-from ..formats.capture_layout import RELEASED_REFERENCE, claim, complete, damage, view_seed, write_joints, write_smpl
+from ..formats.capture_layout import (
+    RELEASED_REFERENCE,
+    claim,
+    complete,
+    damage,
+    view_seed,
+    write_joints,
+    write_layouts,
+    write_smpl,
+)
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
 from ..formats.poses.files import read_motion
 from ..formats.poses.motion import Motion

@@ -13,7 +13,7 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.formats import camera_files, camera_rig, capture_layout, picture_files
+from primdiffusion.formats import camera_rig, capture_layout, picture_files
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.camera import look_at
 from scipy.spatial.transform import Rotation
@@ -87,8 +87,8 @@ def test_impossible_rigs_are_rejected(wrong):
 def test_colmaps_quaternions_and_nerfs_matrices_are_the_same_cameras(tmp_path):
     subject = tmp_path / "one"
     views = camera_rig.Rig("sphere", 9).views(np.zeros(3), 1.0)
-    camera_files.write_colmap(subject, views, 3)
-    camera_files.write_nerf(subject, views, 3)
+    capture_layout.write_colmap(subject, views, 3)
+    capture_layout.write_nerf(subject, views, 3)
     lines = (subject / "colmap/0003/images.txt").read_text().splitlines()[1::2]
     frames = json.loads((subject / "nerf/0003/transforms.json").read_text())["frames"]
     for i, (view, line, frame) in enumerate(zip(views, lines, frames, strict=True)):
@@ -151,7 +151,7 @@ def test_a_folder_is_claimed_once(tmp_path):
 
 def test_damage_is_found(tmp_path):
     views = SMALL.views(np.zeros(3), 1.0)
-    camera_files.write_cameras(tmp_path, views)
+    capture_layout.write_cameras(tmp_path, views)
     capture_layout.write_joints(tmp_path, views, np.zeros((2, 24, 3)))
     for camera in range(3):
         picture_files.write_png(capture_layout.picture_path(tmp_path, "mask", camera, 0), np.zeros((60, 40), np.uint8))

@@ -24,7 +24,7 @@ from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.together import turned
 from primdiffusion.failures import describe
-from primdiffusion.formats import camera_files, capture_layout, picture_files
+from primdiffusion.formats import capture_layout, picture_files
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.group_places import extent, first_frames, stand_together
@@ -167,7 +167,7 @@ def write_parameters(subject: Path, setup: CaptureSetup) -> None:
     theta = matrix_to_axis_angle(setup.poses.joint_rotation).numpy().reshape(len(setup.skinning), -1)
     capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], setup.betas, setup.poses.translation.numpy())
     capture_layout.write_joints(subject, setup.views, setup.joints)
-    camera_files.write_layouts(subject, setup.views, len(theta))
+    capture_layout.write_layouts(subject, setup.views, len(theta))
 
 
 def render_frames(
