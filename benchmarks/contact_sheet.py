@@ -18,7 +18,7 @@ import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.evaluation.portraits import PORTRAITS, camera_of
+from primdiffusion.evaluation.gallery import PORTRAITS, camera_of
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb

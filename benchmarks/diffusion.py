@@ -43,7 +43,15 @@ from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoi
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance
-from primdiffusion.evaluation.gallery import COLOURINGS, made_gallery, mesh_sources, payload_of
+from primdiffusion.evaluation.gallery import (
+    COLOURINGS,
+    PORTRAITS,
+    Portrait,
+    camera_of,
+    made_gallery,
+    mesh_sources,
+    payload_of,
+)
 from primdiffusion.evaluation.generation import (
     Comparison,
     ReferenceSet,
@@ -52,7 +60,6 @@ from primdiffusion.evaluation.generation import (
     real_vs_real,
     table,
 )
-from primdiffusion.evaluation.portraits import PORTRAITS, Portrait, camera_of
 from primdiffusion.evaluation.pretrained_networks import load_clip_vision, load_inception
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import place

@@ -9,8 +9,7 @@ from pathlib import Path
 import torch
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
-from primdiffusion.evaluation.gallery import payload_of
-from primdiffusion.evaluation.portraits import PORTRAITS, camera_of
+from primdiffusion.evaluation.gallery import PORTRAITS, camera_of, payload_of
 from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate_batch, place

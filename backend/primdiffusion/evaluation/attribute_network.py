@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion import tensor_file
-from primdiffusion.evaluation.portraits import PORTRAITS
+from primdiffusion.evaluation.gallery import PORTRAITS
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import written_whole

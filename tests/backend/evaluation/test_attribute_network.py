@@ -4,7 +4,7 @@ import pytest
 import torch
 from primdiffusion.evaluation.attribute_network import BANDS, detail_energies, features_of, fit_attribute_network
 from primdiffusion.evaluation.distances import frechet_distance
-from primdiffusion.evaluation.portraits import PORTRAITS
+from primdiffusion.evaluation.gallery import PORTRAITS
 from torch.nn import functional
 
 SIDE = 96

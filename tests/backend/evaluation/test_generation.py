@@ -8,7 +8,10 @@ from diffusion_people import write_people
 from primdiffusion.commands import evaluate as command
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.gallery import (
+    PORTRAITS,
+    SIDE,
     Source,
+    camera_of,
     made_gallery,
     mesh_sources,
     open_gallery,
@@ -18,7 +21,6 @@ from primdiffusion.evaluation.gallery import (
     read_seed,
 )
 from primdiffusion.evaluation.generation import COLUMNS, compare, open_reference_set, real_vs_real, table
-from primdiffusion.evaluation.portraits import PORTRAITS, SIDE, camera_of
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
 from primdiffusion.primitives.from_mesh import colour, surface_field
