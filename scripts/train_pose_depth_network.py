@@ -20,10 +20,10 @@ from jaxtyping import Float, UInt8
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.evaluation.attribute_network import attribute_loss, attribute_space
-from primdiffusion.evaluation.pose_depth_metrics import PCK_SHARE
 from primdiffusion.evaluation.pose_depth_network import (
     CELLS,
     INPUT,
+    PCK_SHARE,
     PoseDepthNetwork,
     cell_means,
     joint_positions,

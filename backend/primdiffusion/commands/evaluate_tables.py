@@ -24,8 +24,7 @@ from primdiffusion.evaluation.onnx_networks import (
     open_depth_network,
     open_pose_network,
 )
-from primdiffusion.evaluation.pose_depth_metrics import PCK_SHARE
-from primdiffusion.evaluation.pose_depth_network import load_pose_depth_network
+from primdiffusion.evaluation.pose_depth_network import PCK_SHARE, load_pose_depth_network
 from primdiffusion.evaluation.pretrained_networks import (
     ClipVision,
     Inception,

@@ -1,4 +1,5 @@
-"""A small network of joints, depth and attributes of a human in a picture, trained on renders of MakeHuman meshes.
+"""A small network of joints, depth and attributes of a human in a picture, trained on renders of MakeHuman meshes; and
+the errors of joints and depth that such networks are used to measure (PCKh, SPEC 7).
 
 It needs no weights of others: `weights/pose_depth.safetensors` ships with the package. Trained by
 scripts/train_pose_depth_network.py; its card states its errors on renders of held-out meshes.
@@ -13,7 +14,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -35,6 +36,10 @@ WINDOW = 2
 """Cells to each side of a heatmap's maximum over which the joint's position is averaged."""
 DETAIL_SIDE = 256
 """Size of the pictures whose fine detail is measured."""
+PCK_SHARE = 0.5
+"""A joint is correct within this share of the head size: PCKh@0.5."""
+FLAT = 1e-9
+"""Variance, relative to the mean's square, below which a map is constant."""
 
 
 class Seen(NamedTuple):
@@ -163,3 +168,41 @@ def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
         network = tensor_file.load_network(lambda: PoseDepthNetwork(space), tensors)
         network.card = dict(parse_json(metadata["card"]))
     return network.eval().requires_grad_(False)
+
+
+def correct_joints(
+    found: Float[Tensor, "k 2"], true: Float[Tensor, "k 2"], head_size: float, share: float = PCK_SHARE
+) -> Bool[Tensor, "k"]:
+    """Whether each joint is within `share` of the head size of the true one (PCKh, Andriluka et al. 2014).
+
+    Raises ValueError for different shapes or a head size that is not positive.
+    """
+    if found.shape != true.shape or found.ndim != 2 or found.shape[-1] != 2:
+        raise ValueError(f"joints have shapes {tuple(found.shape)} and {tuple(true.shape)}: give two of [k, 2]")
+    if not head_size > 0:
+        raise ValueError(f"the head size is {head_size} pixels: give the distance of two joints of the head")
+    return (found - true).norm(dim=-1) <= share * head_size
+
+
+def depth_error(
+    inverted: Float[Tensor, "h w"], true_depth: Float[Tensor, "h w"], mask: Bool[Tensor, "h w"]
+) -> float | None:
+    """Mean squared difference of inverted depths inside the mask, after aligning means and standard deviations.
+
+    Monocular networks predict inverted depth up to scale and offset, so both maps get mean 0 and variance 1 inside the
+    mask: the error is 0 for a positive affine map of 1 / `true_depth`, and 2 (1 - correlation) in general, 2 for a map
+    that is unrelated or constant. None where fewer than two pixels, or a flat surface, are left to compare.
+    """
+    seen = mask & torch.isfinite(true_depth) & (true_depth > 0) & torch.isfinite(inverted)
+    if int(seen.sum()) < 2:
+        return None
+    true, ours = 1 / true_depth[seen].double(), inverted[seen].double()
+    if float(true.var(correction=0)) <= FLAT * float(true.square().mean()):
+        return None
+    if float(ours.var(correction=0)) <= FLAT * float(ours.square().mean()):
+        return 2.0
+    return float((_standardised(true) - _standardised(ours)).square().mean())
+
+
+def _standardised(values: Float[Tensor, "n"]) -> Float[Tensor, "n"]:
+    return (values - values.mean()) / values.std(correction=0)

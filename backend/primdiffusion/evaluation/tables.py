@@ -17,10 +17,11 @@ from torch import Tensor
 
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
 from primdiffusion.evaluation.onnx_networks import DepthNetwork, PoseNetwork
-from primdiffusion.evaluation.pose_depth_metrics import correct_joints, depth_error
 from primdiffusion.evaluation.pose_depth_network import (
     PoseDepthNetwork,
     cell_means,
+    correct_joints,
+    depth_error,
     detail_of,
     joint_positions,
     shrunk,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.evaluation.onnx_networks import open_depth_network, open_onnx, open_pose_network
-from primdiffusion.evaluation.pose_depth_metrics import depth_error
+from primdiffusion.evaluation.pose_depth_network import depth_error
 from primdiffusion.evaluation.shots import SIDE, Shot
 from support.errors import refused
 

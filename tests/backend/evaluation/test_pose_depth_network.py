@@ -4,10 +4,10 @@ import importlib.resources
 
 import pytest
 import torch
-from primdiffusion.evaluation.pose_depth_metrics import PCK_SHARE
 from primdiffusion.evaluation.pose_depth_network import (
     CELLS,
     INPUT,
+    PCK_SHARE,
     cell_means,
     joint_positions,
     load_pose_depth_network,

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from primdiffusion.evaluation.pose_depth_metrics import correct_joints, depth_error
+from primdiffusion.evaluation.pose_depth_network import correct_joints, depth_error
 from support.errors import refused
 
 
