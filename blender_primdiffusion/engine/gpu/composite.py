@@ -9,9 +9,9 @@ import numpy as np
 from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
-from .caching import cache_until_exit
 from .march import GpuMarch
 from .relief import ReliefPicture
+from .shaders import cache_until_exit
 
 NO_PLANES: NDArray[np.float32] = np.zeros((1, 4), np.float32)
 _NOTHING = "1e9"

@@ -28,9 +28,8 @@ from numpy.typing import NDArray
 from ..boxes import Boxes
 from ..view import PinholeView
 from . import shaders
-from .caching import cache_until_exit
 from .relief import GpuRelief, relief_of
-from .shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER
+from .shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER, cache_until_exit
 
 STRIDES = [1, 2, 4]
 SAMPLES_PER_VOXEL = 2.0

@@ -16,10 +16,9 @@ from mathutils import Matrix
 from ..boxes import Boxes
 from ..solids import SceneSolids
 from ..view import NO_SURFACE_M, PinholeView, opengl_projection
-from .caching import cache_until_exit
 from .march import GpuMarch, GpuMarcher, GpuPayload
 from .relief import ReliefPicture
-from .shaders import TILE, compiled, shader_of
+from .shaders import TILE, cache_until_exit, compiled, shader_of
 
 _VERTEX = """
 void main()

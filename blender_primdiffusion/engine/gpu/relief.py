@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from ..boxes import Boxes
 from ..view import NO_SURFACE_M, PinholeView, opengl_projection
-from .caching import cache_until_exit
-from .shaders import BOXES_A_ROW, VOXELS, shader_of
+from .shaders import BOXES_A_ROW, VOXELS, cache_until_exit, shader_of
 
 VISIBLE = 0.3
 """Opacity along a box's normal from which on its surface is drawn: neighbours overlap where each is fainter."""

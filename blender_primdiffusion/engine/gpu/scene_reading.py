@@ -18,8 +18,8 @@ from ..boxes import Boxes, boxes_of
 from ..picture import PosedHuman, human_armatures, pose_of
 from ..solids import visible_instances
 from ..who_draws import Drawer, who_draws
-from .caching import cache_until_exit
 from .march import GpuPayload
+from .shaders import cache_until_exit
 
 PAYLOADS_KEPT = 4
 """Of humans that are no longer drawn; 4 MB each."""

@@ -1,7 +1,12 @@
 """The marcher's compute shaders (docs/design/marcher.md), in the GLSL that Blender translates for OpenGL, Vulkan and
-Metal. `march` documents the box records that they read."""
+Metal, and a cache of what is made once on the GPU. `march` documents the box records that they read."""
 
 from __future__ import annotations
+
+import atexit
+import functools
+from collections.abc import Callable
+from typing import TypeVar
 
 import gpu
 
@@ -220,6 +225,7 @@ void main()
   imageStore(image_1, ivec2(0), vec4(0.0));
 }
 """
+Made = TypeVar("Made")
 
 
 def list_shader() -> gpu.types.GPUShader:
@@ -288,3 +294,13 @@ def shader_of(info: gpu.types.GPUShaderCreateInfo) -> gpu.types.GPUShader:
         return gpu.shader.create_from_info(info)
     except Exception as error:  # Blender raises Exception itself
         raise RuntimeError(f"a shader does not compile on this GPU: {error}") from error
+
+
+def cache_until_exit(make: Callable[[], Made]) -> Callable[[], Made]:
+    """As `functools.cache`, for functions that make objects on the GPU: emptied when Python exits.
+
+    Blender 5.2 as a module frees its GPU before Python frees what modules still hold, and crashes.
+    """
+    cached = functools.cache(make)
+    atexit.register(cached.cache_clear)
+    return cached
