@@ -9,8 +9,8 @@ import bpy
 from ..backend.drawing import Drawing
 from ..formats.requests import RAY_STEP
 from . import studio
-from .frames import Frame
 from .picture import scene_content, solids_file
+from .studio import Frame
 from .view import PinholeView, blender_depth, camera_view, wanted_region
 from .viewport import Viewport
 from .who_draws import ENGINE

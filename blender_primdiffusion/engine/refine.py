@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 from ..backend.drawing import Drawing
-from .frames import Frame
+from .studio import Frame
 from .view import PinholeView
 
 COARSENESS = (4, 2, 1)

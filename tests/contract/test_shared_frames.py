@@ -3,7 +3,7 @@
 import pytest
 from primdiffusion.commands.frame_drawer import map_frame
 
-from blender_primdiffusion.engine.frames import SharedFrames
+from blender_primdiffusion.engine.studio import SharedFrames
 
 
 @pytest.fixture

@@ -207,7 +207,7 @@ EXTENSION = {
     "capture/scan_files.py": ("shape of a scan", "parameters of a scan", "Blender: scan"),
     "capture/stage.py": ("Blender: HDRI",),
     "capture/surfaces.py": ("Blender: picture of a scan",),
-    "engine/frames.py": OWN,
+    "engine/studio.py": OWN,
     "jobs/assets.py": ("Blender: preview",),
     "jobs/from_picture.py": OWN,
     "motion/pose_library.py": ("own pose",),

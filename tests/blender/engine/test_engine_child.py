@@ -24,7 +24,7 @@ import blender_primdiffusion
 from blender_primdiffusion.backend.environment import BackendPython
 from blender_primdiffusion.engine import studio
 from blender_primdiffusion.engine.engine import render_layer
-from blender_primdiffusion.engine.frames import CHANNELS, SharedFrames
+from blender_primdiffusion.engine.studio import CHANNELS, SharedFrames
 
 pytestmark = pytest.mark.any_blender
 
@@ -308,7 +308,7 @@ def test_threads_share_one_folder():
 
 
 def test_what_a_killed_blender_left_in_memory_is_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.engine.frames.SHARED_MEMORY", tmp_path)
+    monkeypatch.setattr("blender_primdiffusion.engine.studio.SHARED_MEMORY", tmp_path)
     dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
     left, ours = (
         tmp_path / f"primdiffusion_{writer().replace(str(os.getpid()), str(pid))}_x"
@@ -324,7 +324,7 @@ def test_what_a_killed_blender_left_in_memory_is_removed(tmp_path, monkeypatch):
 
 
 def test_a_full_memory_file_system_gives_way_to_the_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.engine.frames.SHARED_MEMORY", tmp_path)
+    monkeypatch.setattr("blender_primdiffusion.engine.studio.SHARED_MEMORY", tmp_path)
 
     def fallocate(descriptor: int, _start: int, _size: int) -> None:
         if str(tmp_path) in os.readlink(f"/proc/self/fd/{descriptor}"):
@@ -340,7 +340,7 @@ def test_a_full_memory_file_system_gives_way_to_the_disk(tmp_path, monkeypatch):
 def test_links_in_shared_memory_lose_nothing_outside(tmp_path, monkeypatch):
     memory = tmp_path / "memory"
     memory.mkdir()
-    monkeypatch.setattr("blender_primdiffusion.engine.frames.SHARED_MEMORY", memory)
+    monkeypatch.setattr("blender_primdiffusion.engine.studio.SHARED_MEMORY", memory)
     (tmp_path / "outside").mkdir()
     mine = tmp_path / "outside" / "mine"
     mine.write_text("mine")
