@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES, PARENTS
-from ..scene.body import body_of_file
 from ..scene.human_file import HumanPayload, file_version, read_sizes
+from ..scene.rest_human import body_of_file
 from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, stretch_of, tangent_frames
 from .picture import PosedHuman
 from .view import PinholeView

@@ -20,7 +20,6 @@ from ..formats.whole_files import written_whole
 from ..motion.pose_library import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
-from ..scene.body import body_of_file, shape_model_of
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import BODY_FILE, PERSON_FILE, armature_of, person_file
 from ..scene.human_file import (
@@ -36,7 +35,7 @@ from ..scene.human_file import (
 )
 from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
-from ..scene.rest_human import read_human
+from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
 from ..scene.surface import carrier_of, primitives_of
 from .generate import build_person

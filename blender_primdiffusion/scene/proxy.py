@@ -25,10 +25,10 @@ from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import FileError, as_file_error, portable_name
 from .armature import model_origin
 from .blend_values import as_numbers, stored_record
-from .body import shape_model_of
 from .build import build_body_mesh, floor_below
 from .convention import points_to_blender
 from .human import BETA_COUNT, BODY_MARK, ORIGIN, armature_of, own_data, state_of
+from .rest_human import shape_model_of
 from .shape import SAME_BETAS, ShapeModel
 
 PROXY_MARK = "primdiffusion_proxy"

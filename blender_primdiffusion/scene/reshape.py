@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
 from .armature import move_rest_joints
-from .body import shape_model_of
 from .build import floor_below
 from .convention import frames_to_blender, points_to_blender
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, ORIGIN, armature_of, body_of, own_data, volumes_of
 from .proxy import follow_shape, proxy_of
+from .rest_human import shape_model_of
 from .shape import Rest, generated_betas
 from .surface import scale_surface
 

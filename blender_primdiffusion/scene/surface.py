@@ -16,8 +16,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .body import shape_model_of
 from .human import armature_of, body_of, own_data, volumes_of
+from .rest_human import shape_model_of
 from .shape import ShapeModel, betas_of, generated_betas
 
 MARK = "primdiffusion_surface"

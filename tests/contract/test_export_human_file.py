@@ -8,7 +8,6 @@ from primdiffusion.human_file import load_human, save_human
 from primdiffusion.reshaping import reshaped as reshape_in_backend
 from support.errors import refused
 
-from blender_primdiffusion.scene.body import default_body
 from blender_primdiffusion.scene.human_file import (
     HumanMotion,
     motion_in,
@@ -17,6 +16,7 @@ from blender_primdiffusion.scene.human_file import (
     with_motion,
     write_tensors,
 )
+from blender_primdiffusion.scene.rest_human import default_body
 
 
 @pytest.fixture

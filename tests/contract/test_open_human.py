@@ -12,7 +12,6 @@ from primdiffusion.human_file import load_human, save_body, save_human
 from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
 
 from blender_primdiffusion.jobs.export import opened
-from blender_primdiffusion.scene.body import default_body
 from blender_primdiffusion.scene.human_file import (
     body_arrays,
     compacted,
@@ -21,7 +20,7 @@ from blender_primdiffusion.scene.human_file import (
     read_tensors,
     write_tensors,
 )
-from blender_primdiffusion.scene.rest_human import read_human
+from blender_primdiffusion.scene.rest_human import default_body, read_human
 
 
 @pytest.fixture(scope="module")

@@ -72,8 +72,8 @@ def make_body_file(folder: Path) -> Path:
 
 
 def read_body_file(path: Path) -> None:
-    from blender_primdiffusion.scene.body import _read_body
     from blender_primdiffusion.scene.human_file import file_version
+    from blender_primdiffusion.scene.rest_human import _read_body
 
     _read_body.cache_clear()
     finite_members(_read_body(file_version(path)))

@@ -211,7 +211,7 @@ EXTENSION = {
     "jobs/assets.py": ("Blender: preview",),
     "jobs/from_picture.py": OWN,
     "motion/pose_library.py": ("own pose",),
-    "scene/body.py": ("body file",),
+    "scene/rest_human.py": ("body file",),
     "scene/earlier_files.py": ("earlier body file",),
     "scene/human.py": ("human in Blender",),
     "scene/human_file.py": (

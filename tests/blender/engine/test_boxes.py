@@ -16,9 +16,9 @@ from support.errors import refused
 
 from blender_primdiffusion.engine.boxes import BoxRig, boxes_of
 from blender_primdiffusion.engine.picture import PosedHuman
-from blender_primdiffusion.scene.body import default_body
 from blender_primdiffusion.scene.human_file import HumanTensors, file_version, read_payload, read_sizes, read_tensors
 from blender_primdiffusion.scene.human_file import write_tensors as write
+from blender_primdiffusion.scene.rest_human import default_body
 
 pytestmark = pytest.mark.any_blender
 CASES = 20

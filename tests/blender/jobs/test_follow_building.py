@@ -16,8 +16,8 @@ from blender_primdiffusion.jobs.follow import building, follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.body import shape_model_of
 from blender_primdiffusion.scene.human import folder_of, humans, person_file, state_folder, volume_path
+from blender_primdiffusion.scene.rest_human import shape_model_of
 
 pytestmark = pytest.mark.any_blender
 

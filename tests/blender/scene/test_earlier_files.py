@@ -14,7 +14,6 @@ from human_stage import COUNT, named, places, whole
 from support import tensor_files
 
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
-from blender_primdiffusion.scene.body import shape_model_of
 from blender_primdiffusion.scene.collect import unused
 from blender_primdiffusion.scene.human import (
     HOME,
@@ -25,6 +24,7 @@ from blender_primdiffusion.scene.human import (
     volume_path,
     volumes_of,
 )
+from blender_primdiffusion.scene.rest_human import shape_model_of
 
 ops = bpy.ops.primdiffusion
 _PERSON, _BODY = "primdiffusion_person_file", "primdiffusion_body_file"

@@ -12,9 +12,9 @@ from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.scene import attachment, build, states
-from blender_primdiffusion.scene.body import shape_model_of
 from blender_primdiffusion.scene.build import build_human, build_prepared
 from blender_primdiffusion.scene.human import folder_of, new_state, person_file, remove_state, state_folder, volume_path
+from blender_primdiffusion.scene.rest_human import shape_model_of
 from blender_primdiffusion.scene.states import Preparation, next_folder, prepare_now
 
 

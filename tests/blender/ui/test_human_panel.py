@@ -18,7 +18,6 @@ from support.errors import refused
 from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.attachment import set_attachment
-from blender_primdiffusion.scene.body import shape_model_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import (
     BETAS,
@@ -31,6 +30,7 @@ from blender_primdiffusion.scene.human import (
     state_folder,
 )
 from blender_primdiffusion.scene.reshape import reshape
+from blender_primdiffusion.scene.rest_human import shape_model_of
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
 from blender_primdiffusion.scene.surface import node_inputs
 from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced

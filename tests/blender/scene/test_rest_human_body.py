@@ -12,10 +12,10 @@ from support import tensor_files
 from support.errors import refused
 
 from blender_primdiffusion.scene import collect
-from blender_primdiffusion.scene.body import body_of_file, shape_model_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.human import copy_file, folder_of, humans, remove_human, state_folder, volume_path
+from blender_primdiffusion.scene.rest_human import body_of_file, shape_model_of
 
 SPOILED = {
     "shape_basis": {"shape_basis": np.zeros((7, 3, 10))},
