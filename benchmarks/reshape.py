@@ -41,7 +41,7 @@ from record import command_line, report, run
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.reshape import reshape
+from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.rest_human import shape_model_of
 
 MOVES, QUICK_MOVES = 30, 5

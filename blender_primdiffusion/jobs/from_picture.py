@@ -21,9 +21,9 @@ from ..formats.json_files import read_json
 from ..formats.regular_files import as_file_error
 from ..motion.pose_library import check_posable, take_world_posture, world_posture
 from ..scene.blend_values import file_path
+from ..scene.edit import check_shapeable, reshape
 from ..scene.handles import handles_from_joints, joints_from_handles
 from ..scene.human import BODY_FILE, armature_of, state_folder
-from ..scene.reshape import check_shapeable, reshape
 from ..scene.shape import betas_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job, chosen_checkpoint

@@ -13,8 +13,8 @@ from ..backend.requests import sentence
 from ..jobs.target import selected_person
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from ..scene.copies import rename_human
+from ..scene.edit import check_shapeable, reshape
 from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, armature_of, humans
-from ..scene.reshape import check_shapeable, reshape
 from ..scene.rest_human import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP

@@ -13,8 +13,8 @@ from oracle import Z_UP, raised
 from blender_primdiffusion.engine.picture import pose_of
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.scene.reshape import reshape
 
 BETAS = np.array([1.5, -2.0, 1.0, 0, 0, 1.0, 0, 0, 0, 0])
 

@@ -12,8 +12,8 @@ import synthetic_shape
 from blender_primdiffusion.scene import cycles
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import current_overlap, max_overlap, overlap_warning
+from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import MARK
-from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.rest_human import read_human
 from blender_primdiffusion.scene.shape import generated_betas
 from blender_primdiffusion.ui.advanced_panel import details

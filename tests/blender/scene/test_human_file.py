@@ -13,10 +13,10 @@ from blender_primdiffusion.jobs.export import put
 from blender_primdiffusion.motion.pose_library import save_pose
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.collect import collect_before_saving, unused
+from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import copy_file, person_file
 from blender_primdiffusion.scene.human_file import HumanTensors, read_tensors, write_tensors
 from blender_primdiffusion.scene.missing import missing_files
-from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of
 
 COUNT = 12

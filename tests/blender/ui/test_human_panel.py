@@ -19,6 +19,7 @@ from blender_primdiffusion.scene import shape
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import (
     BETAS,
     MARK,
@@ -29,7 +30,6 @@ from blender_primdiffusion.scene.human import (
     person_file,
     state_folder,
 )
-from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.rest_human import shape_model_of
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, measure, slider_names
 from blender_primdiffusion.scene.surface import node_inputs

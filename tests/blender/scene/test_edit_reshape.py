@@ -18,8 +18,8 @@ from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.copies import rename_human
+from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import BETAS, MARK, ORIGIN, armature_of, body_of, humans
-from blender_primdiffusion.scene.reshape import reshape
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape
 from blender_primdiffusion.scene.surface import build_surface
 
