@@ -1,6 +1,6 @@
 """The child process and the conversation with it: JSON-RPC 2.0, a message a line. Nothing here waits for the child.
 
-`poll` reads what the child has written (see `child_streams`), sends what its input takes, and notices a death or a
+`poll` reads what the child has written (see `child_process`), sends what its input takes, and notices a death or a
 silence. All public methods are for one thread at a time.
 """
 
@@ -20,8 +20,7 @@ from typing import Any
 from ..formats.answers import ANSWERS, NOTIFICATIONS, ErrorData, Message
 from ..formats.json_files import parse_message
 from ..formats.schema import FieldError, read
-from .child_streams import LOG_LINES, LONGEST_LINE, Input, Output
-from .child_variables import COMPUTING, passed_on
+from .child_process import COMPUTING, LOG_LINES, LONGEST_LINE, Input, Output, passed_on
 
 PROGRAM = "primdiffusion"
 """The backend's package, and its command line."""
@@ -91,7 +90,7 @@ def is_program(path: Path) -> bool:
 
 
 def child_environment(module_path: Path | None, cache_dir: Path | None, extra: Mapping[str, str]) -> dict[str, str]:
-    """The environment of a backend process: the variables that `child_variables` passes on, ours, and `extra`.
+    """The environment of a backend process: the variables that `passed_on` gives, ours, and `extra`.
 
     `module_path` is the folder that holds the package `primdiffusion` (`bundled` in the zip); it goes before
     anything installed. `cache_dir` takes byte code and compiled kernels, so that the extension's folder stays as it is.

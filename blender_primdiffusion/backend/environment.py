@@ -13,7 +13,7 @@ from pathlib import Path
 
 from ..formats.json_files import parse_json
 from ..formats.regular_files import is_local_path
-from .child_streams import Output
+from .child_process import Output
 from .client import PROGRAM, child_environment, is_program
 
 VARIABLE = "PRIMDIFFUSION_PYTHON"

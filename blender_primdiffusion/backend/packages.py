@@ -16,7 +16,7 @@ from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..formats.regular_files import read_regular
-from .child_variables import NETWORK, passed_on
+from .child_process import NETWORK, passed_on
 
 CUDA_DRIVER = 580
 """The oldest NVIDIA driver that torch's CUDA 13 builds run on."""

@@ -19,7 +19,7 @@ from typing import Any
 import bpy
 import numpy as np
 
-from ..backend.child_streams import stdin_has_ended
+from ..backend.child_process import stdin_has_ended
 from ..console import (
     CANCELLED,
     DONE,

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import bpy
 
-from ..backend.child_streams import Output
-from ..backend.child_variables import BLENDER, COMPUTING, passed_on
+from ..backend.child_process import BLENDER, COMPUTING, Output, passed_on
 from ..capture import launch
 from ..capture.command import MARK
 from ..console import CANCELLED, DONE

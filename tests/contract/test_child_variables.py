@@ -8,15 +8,8 @@ import sys
 import pytest
 from waiting import BACKEND, PYTHON, wait_for
 
-from blender_primdiffusion.backend import child_variables
-from blender_primdiffusion.backend.child_variables import (
-    BLENDER,
-    COMPUTING,
-    NETWORK,
-    NEVER,
-    SYSTEM,
-    passed_on,
-)
+from blender_primdiffusion.backend import child_process
+from blender_primdiffusion.backend.child_process import BLENDER, COMPUTING, NETWORK, NEVER, SYSTEM, passed_on
 from blender_primdiffusion.backend.client import BackendClient, Notification, Response, child_environment
 from blender_primdiffusion.backend.environment import search
 from blender_primdiffusion.backend.packages import clean_environment
@@ -115,4 +108,4 @@ def test_no_table_lets_code_through():
 def test_every_variable_has_a_reason():
     for table in (SYSTEM, COMPUTING, NETWORK, BLENDER):
         assert all(reason and name == name.upper() for name, reason in table.items())
-    assert os.environ.get("PATH", "") == child_variables.passed_on().get("PATH", "")
+    assert os.environ.get("PATH", "") == child_process.passed_on().get("PATH", "")

@@ -10,7 +10,7 @@ import pytest
 from conversation import BUSY_STEPS
 from waiting import BACKEND, PYTHON, wait_for
 
-from blender_primdiffusion.backend.child_streams import LONGEST_LINE
+from blender_primdiffusion.backend.child_process import LONGEST_LINE
 from blender_primdiffusion.backend.client import (
     BackendClient,
     Died,

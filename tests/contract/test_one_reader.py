@@ -35,14 +35,14 @@ ALLOWED = {
     "PIL.Image.open": {"geometry/pictures.py"},
     "shutil.rmtree": {"formats/regular_files.py", "capture/launch.py"},  # launch: Blender's own folder
     "unlink": {"formats/regular_files.py"},
-    "os.unlink": {"backend/child_streams.py"},  # a temporary file while it is open
+    "os.unlink": {"backend/child_process.py"},  # a temporary file while it is open
     "os.remove": set(),
     "read_text": {"formats/whole_files.py", "backend/packages.py", "machine.py"},  # facts about the machine
     "read_bytes": set(),
     "resolve": set(),  # raises RuntimeError for links in a circle: `real_path` does not
     "open": {
         "formats/regular_files.py",
-        "backend/child_streams.py",
+        "backend/child_process.py",
         "capture/coco.py",
         "capture/dataset.py",
         "evaluation/gallery.py",

@@ -109,7 +109,7 @@ def make_answers(folder: Path) -> Path:
 
 def read_answers(path: Path) -> None:
     """By the extension's client, whose child has written this and ended: it dies once, whatever it has said."""
-    from blender_primdiffusion.backend.child_streams import Output
+    from blender_primdiffusion.backend.child_process import Output
     from blender_primdiffusion.backend.client import BackendClient, Died, Notification, Response
 
     client: Any = BackendClient(path)
