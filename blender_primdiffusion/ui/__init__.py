@@ -16,7 +16,6 @@ from ..jobs import copies, deferred_volumes, follow, missing_files, picture_in_v
 from ..scene import stand_in
 from . import (
     advanced_panel,
-    asset_operators,
     attributes,
     backend_state,
     batch,
@@ -34,7 +33,6 @@ from . import (
     motion_panel,
     picture_panel,
     pose_panel,
-    preferences,
     reconstruct_panel,
     render_panel,
     shape_panel,
@@ -43,9 +41,9 @@ from . import (
 )
 
 MODULES = (
-    *backend_state.MODULES, preferences, windows, follow, jobs_panel, attributes,
+    *backend_state.MODULES, windows, follow, jobs_panel, attributes,
     generate_panel, variations_panel, human_panel, shape_panel, edit_panel, missing_files, copies,
-    deferred_volumes, import_motion, motion_panel, pose_panel, picture_panel, asset_operators,
+    deferred_volumes, import_motion, motion_panel, pose_panel, picture_panel,
     render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
     captures_panel, reconstruct_panel, viewport_humans, picture_in_view, batch, manual, stand_in,
 )  # fmt: skip

@@ -45,7 +45,7 @@ OF_SCANS = {"primdiffusion_part"}
 """An attribute of meshes that captures make and render at once."""
 OPERATORS_OWN = {
     "scene/blend_values.py",
-    "ui/asset_operators.py", "ui/captures_panel.py", "ui/captures_settings.py", "ui/export_operators.py",
+    "ui/captures_panel.py", "ui/captures_settings.py", "ui/export_operators.py", "ui/export_panel.py",
     "ui/human_panel.py", "ui/import_motion.py", "ui/picture_panel.py", "ui/reconstruct_panel.py",
     "ui/setup/operators.py",
 }  # fmt: skip
