@@ -10,7 +10,7 @@ import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
-from ..motion.amass import write_amass
+from ..formats.poses.files import write_amass
 from ..motion.built_in_motions import built_in_motion
 from ..motion.pose_library import check_posable
 from ..scene.actions import action_curves

@@ -47,7 +47,7 @@ ALLOWED = {
         "capture/dataset.py",
         "evaluation/gallery.py",
         "formats/picture_files.py",
-        "motion/amass.py",
+        "formats/poses/files.py",
         "scene/human_file.py",
         "training/run_folder.py",
         "backend/packages.py",

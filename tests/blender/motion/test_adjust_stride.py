@@ -8,12 +8,11 @@ import json
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.joints import JOINT_NAMES
-from blender_primdiffusion.formats.poses.files import read_motion
+from blender_primdiffusion.formats.poses.files import read_motion, write_amass
 from blender_primdiffusion.formats.poses.motion import Detected, Motion
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, joint_positions
 
 from blender_primdiffusion.motion.adjust import scale_places, stride_ratio
-from blender_primdiffusion.motion.amass import write_amass
 from blender_primdiffusion.motion.built_in_motions import built_in_motion
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender

@@ -1,8 +1,10 @@
-"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, and SAM 3D Body's poses of MHR."""
+"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, and SAM 3D Body's poses of MHR; and the
+writer of AMASS."""
 
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,6 +16,7 @@ from ..arrays import array_names, read_arrays, read_npy
 from ..json_files import read_json
 from ..regular_files import FileError, read_regular
 from ..smpl_pickle import as_array, load_restricted
+from ..whole_files import replacing
 from . import mhr
 from .bvh import read_bvh
 from .motion import (
@@ -28,6 +31,7 @@ from .motion import (
     stated_rate,
 )
 from .rotation import (
+    about_axis,
     axis_direction,
     axis_name,
     find_up,
@@ -35,8 +39,10 @@ from .rotation import (
     from_axis_angle,
     improper_text,
     nearest,
+    to_axis_angle,
     turn_y_up,
 )
+from .skeleton import REST_JOINTS
 
 LARGEST_PICKLE = 64 * 2**20
 """Bytes of a .pkl."""
@@ -269,3 +275,28 @@ def _matrices(values: NDArray, name: str, joints_before: int = 0) -> NDArray[np.
 
 def _listed(names: list[str]) -> str:
     return ", ".join(f"{name[:16]!r}" for name in names[:8]) or "nothing"
+
+
+def write_amass(path: Path, motion: Motion, betas: NDArray, pelvis: NDArray = REST_JOINTS[0]) -> None:
+    """Write a motion in AMASS' format (72 numbers a frame, z up), with the body's shape [n] and rest pelvis [3].
+
+    As in AMASS, `trans` moves the body after its root has turned about the rest pelvis of its y-up body, so
+    pelvis + trans is the position of the pelvis. The file appears whole or not at all. Raises OSError.
+    """
+    up = about_axis(0, np.pi / 2)
+    turned = np.array(motion.rotations)
+    turned[:, 0] = up @ turned[:, 0]
+    places = (motion.translations + pelvis) @ up.T - pelvis
+    try:
+        os.stat(path.parent)  # a folder that is missing is a slip of the finger: `replacing` would make it
+        with replacing(path) as partial, partial.open("wb") as stream:
+            np.savez(
+                stream,
+                poses=to_axis_angle(turned).reshape(len(turned), -1),
+                trans=places,
+                betas=np.asarray(betas, np.float64),
+                gender=np.array("neutral"),
+                mocap_framerate=np.array(motion.fps),
+            )
+    except OSError as error:
+        raise OSError(f"the motion could not be written to {str(path)!r} ({error.strerror or error})") from error
