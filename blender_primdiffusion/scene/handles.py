@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from ..formats.poses.rotation import matrix_to_quaternion
 from .actions import action_curves, frames_in_use, loops, own_curves, repeat
-from .armature import add_keys, editing_bones, rest_rotations
+from .armature import CONTROLS, LIMBS, POLE_M, Limb, add_keys, editing_bones, place_controls, rest_rotations
 from .convention import continuous_quaternions
 from .export_model import scene_with_only
-from .limbs import CONTROLS, LIMBS, POLE_M, Limb, place_controls
 
 COLLECTION = "IK Handles"
 """Of bones: handles and poles."""

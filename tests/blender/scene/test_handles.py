@@ -15,6 +15,8 @@ from blender_primdiffusion.motion.pose_library import current_pose
 from blender_primdiffusion.motion.poses import LIBRARY
 from blender_primdiffusion.scene.actions import action_curves, loops, repeat
 from blender_primdiffusion.scene.armature import (
+    CONTROLS,
+    LIMBS,
     build_armature,
     keyframe_poses,
     move_rest_joints,
@@ -25,7 +27,6 @@ from blender_primdiffusion.scene.copies import duplicate_human, separate_copies
 from blender_primdiffusion.scene.cycles import posed_extent
 from blender_primdiffusion.scene.handles import add_handles, bake_handles, has_handles
 from blender_primdiffusion.scene.human import armature_of
-from blender_primdiffusion.scene.limbs import CONTROLS, LIMBS
 from blender_primdiffusion.scene.place import _extent
 
 MM = 1e-3

@@ -9,8 +9,8 @@ import synthetic
 from jobs_driven import shown
 
 from blender_primdiffusion.scene.actions import action_curves
+from blender_primdiffusion.scene.armature import CONTROLS, LIMBS
 from blender_primdiffusion.scene.handles import has_handles
-from blender_primdiffusion.scene.limbs import CONTROLS, LIMBS
 from blender_primdiffusion.ui import pose_panel
 
 ops = bpy.ops.primdiffusion
