@@ -190,8 +190,7 @@ class Lines(io.BytesIO):
 
 def answers(content: bytes) -> list[dict[str, Any]]:
     """What the server answers to lines, and after having run the requests in them."""
-    from primdiffusion.serve.rpc import Wire
-    from primdiffusion.serve.server import Server
+    from primdiffusion.serve.server import Server, Wire
 
     sent, lines = io.BytesIO(), Lines(content)
     lines.server = server = Server(lines, Wire(sent))
@@ -239,7 +238,7 @@ def read_lines(path: Path) -> None:
 
 
 def _check(content: bytes, found: list[dict[str, Any]]) -> None:
-    from primdiffusion.serve.rpc import INTERNAL_ERROR, RpcError
+    from primdiffusion.serve.server import INTERNAL_ERROR, RpcError
 
     expected = sum(map(_is_answered, content.split(b"\n")))
     if len(found) != expected:
@@ -253,7 +252,7 @@ def _check(content: bytes, found: list[dict[str, Any]]) -> None:
 
 
 def _is_answered(line: bytes) -> bool:
-    from primdiffusion.serve.rpc import RpcError, parse_request
+    from primdiffusion.serve.server import RpcError, parse_request
 
     try:
         return bool(line.strip()) and parse_request(line).wants_response

@@ -52,7 +52,7 @@ def finite_members(*records: Any) -> None:
 def said(error: BaseException) -> str | None:
     """The sentence that a user reads for this error; None for one that is shown with a traceback."""
     from primdiffusion.failures import describe
-    from primdiffusion.serve.rpc import RpcError
+    from primdiffusion.serve.server import RpcError
 
     if isinstance(error, RpcError):
         return str(error)
