@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..formats.regular_files import remove_file
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
-from ..scene.triangles import is_solid, triangles_of
+from ..scene.place import is_solid, triangles_of
 
 UNRELATED_TYPES = frozenset({"ARMATURE", "CAMERA", "VOLUME", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
 """Types of objects that are no solids; their children report changes of their own."""

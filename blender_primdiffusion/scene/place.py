@@ -1,4 +1,5 @@
-"""Where a new human stands: near the 3D cursor, at its height, clear of humans and solid objects, and seen."""
+"""Where a new human stands: near the 3D cursor, at its height, clear of humans and solid objects, and seen; and what is
+solid, with its triangles."""
 
 from __future__ import annotations
 
@@ -10,8 +11,9 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from .human import armature_of, humans
-from .triangles import is_solid, triangles_of
+from .human import BODY_MARK, armature_of, humans
+from .proxy import PROXY_MARK
+from .stand_in import STAND_IN
 
 GAP_M = 0.2
 """Between the hands of two humans in the T pose, and to solid objects that a human avoids."""
@@ -31,6 +33,8 @@ _CELL_M = 0.1
 _MOST_TRIED = 600
 """Places that are compared with solid objects."""
 _SEE_THROUGH = frozenset({"WIRE", "BOUNDS"})
+_SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
+_OF_HUMANS = (BODY_MARK, PROXY_MARK, STAND_IN)
 
 
 def stand_at_cursor(context: bpy.types.Context, collection: bpy.types.Collection, eye: Vector | None = None) -> None:
@@ -225,3 +229,27 @@ def _any_meets(corners: NDArray, low: NDArray, high: NDArray) -> bool:
     along = np.einsum("fcx,fax->fac", corners, axes)
     reach = np.abs(axes) @ half + 1e-9
     return bool(((along.min(2) <= reach) & (along.max(2) >= -reach)).all(1).any())
+
+
+def is_solid(obj: bpy.types.Object) -> bool:
+    """Whether an object has a surface and is no part of a human."""
+    return obj.type in _SOLID_TYPES and not any(mark in obj for mark in _OF_HUMANS)
+
+
+def triangles_of(obj: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]]:
+    """Vertices [V, 3] in the object's space, triangles [F, 3] and their material slots [F], where `is_solid`."""
+    mesh = obj.data if obj.type == "MESH" else obj.to_mesh()
+    if mesh is None:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
+    try:
+        mesh.calc_loop_triangles()
+        vertices = np.empty((len(mesh.vertices), 3), np.float32)
+        mesh.vertices.foreach_get("co", vertices.ravel())
+        triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
+        mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
+        slots = np.empty(len(triangles), np.int32)
+        mesh.loop_triangles.foreach_get("material_index", slots)
+    finally:
+        if obj.type != "MESH":
+            obj.to_mesh_clear()
+    return vertices, triangles, slots
