@@ -21,9 +21,8 @@ import numpy as np
 import torch
 from jaxtyping import Float, Int, UInt8
 from primdiffusion.diffusion.codec import DEAD_ZONE, SLAB_UNIT
-from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser, PersonNetworkConfig
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.local_unet import PersonNetworkConfig
 from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES

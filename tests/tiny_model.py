@@ -6,9 +6,8 @@ import torch
 from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.codec import SCALE_VALUE, CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.denoiser import DenoiserConfig, LocalUNetConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.local_unet import LocalUNetConfig
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.schedule import SCHEDULES
 from primdiffusion.primitives.primitives import GRID, K, S

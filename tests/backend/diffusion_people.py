@@ -9,9 +9,8 @@ import numpy as np
 import torch
 from primdiffusion.diffusion.codec import SCALE_VALUE, VALUES, CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
-from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
+from primdiffusion.diffusion.denoiser import DenoiserConfig, LocalUNetConfig, PersonDenoiser, PersonNetworkConfig
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.diffusion.local_unet import LocalUNetConfig, PersonNetworkConfig
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.primitives.primitives import GRID, K, S

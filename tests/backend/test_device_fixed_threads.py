@@ -7,7 +7,7 @@ import torch
 from primdiffusion.device import GRID_THREADS, SLAB_THREADS, each_with_fixed_threads, fixed_threads
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint, save_checkpoint
 from primdiffusion.diffusion.codec import WholeSlab
-from primdiffusion.diffusion.local_unet import LocalUNetConfig
+from primdiffusion.diffusion.denoiser import LocalUNetConfig
 from primdiffusion.diffusion.model import sample
 from support.errors import refused
 from thread_bytes import by_threads

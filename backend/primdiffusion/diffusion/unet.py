@@ -1,7 +1,7 @@
 """The paper's denoiser: a U-Net over the whole slab, with the parameter names of the ADM family (SPEC 3).
 
 The names and shapes are those of the released checkpoints' `diffusion.*` keys, so such weights load unchanged.
-956 GFLOP a call for one person: a network for GPUs. `local_unet` is the light one.
+956 GFLOP a call for one person: a network for GPUs. `denoiser` has the light one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from torch import Tensor, nn
 from torch.nn import functional
 
-from primdiffusion.diffusion.local_unet import TimeEmbedding, zeroed
+from primdiffusion.diffusion.denoiser import TimeEmbedding, zeroed
 
 
 @dataclasses.dataclass(frozen=True)

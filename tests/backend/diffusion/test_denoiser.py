@@ -1,8 +1,7 @@
 import pytest
 import torch
 from diffusion_people import CHANNELS, COMPONENTS, SMALL, random_prior
-from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
-from primdiffusion.diffusion.local_unet import step_features
+from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser, step_features
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet, UNetConfig
 
