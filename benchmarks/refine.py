@@ -32,8 +32,7 @@ from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.render.march import march
-from primdiffusion.training.refine import RefineSettings, refine
-from primdiffusion.training.refine_views import bare_body, meshed_person, view_psnr
+from primdiffusion.training.refine import RefineSettings, bare_body, meshed_person, refine, view_psnr
 from record import command_line, report
 
 SEED = 30_000_000

@@ -52,8 +52,7 @@ from primdiffusion.posture.fit import Posture
 from primdiffusion.posture.start import views_of
 from primdiffusion.reconstruction import reconstruct as reconstruct_human
 from primdiffusion.reconstruction import reconstruct_by_prior
-from primdiffusion.training.refine import RefineSettings, RefineStep, refine
-from primdiffusion.training.refine_views import bare_body, meshed_person, view_psnr
+from primdiffusion.training.refine import RefineSettings, RefineStep, bare_body, meshed_person, refine, view_psnr
 
 STAGES = 4
 """Load, read, encode, write."""

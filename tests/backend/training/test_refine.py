@@ -22,8 +22,7 @@ from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.primitives import K, Payload, S
 from primdiffusion.render.march import march
-from primdiffusion.training.refine import RefineSettings, refine
-from primdiffusion.training.refine_views import bare_body, view_psnr
+from primdiffusion.training.refine import RefineSettings, bare_body, refine, view_psnr
 from support.errors import refused
 
 QUICK = RefineSettings(steps=15, views=1, density_rate=0.01)
@@ -186,7 +185,7 @@ def test_pictures_too_large_for_memory_are_named(views, monkeypatch):
     def full(*_):
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] not enough memory: you tried to allocate 9 bytes")
 
-    monkeypatch.setattr("primdiffusion.training.refine_views.march", full)
+    monkeypatch.setattr("primdiffusion.training.refine.march", full)
     with refused(MemoryError, "40 x 40 pixels"):
         refine(person(2), views, QUICK)
 
