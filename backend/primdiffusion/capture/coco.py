@@ -4,6 +4,9 @@
     root/images.csv          a line for each human in an image: subject, frame, camera, attributes where they are known
     root/composed/           images over backgrounds, if pictures for them are given, and of humans who stand together
 
+Each human is captured alone; annotations put those who stand together into one image, so that one who is partly hidden
+has a whole mask too.
+
 All follow from the files of the captures (and these pictures) alone, so that the same captures give the same bytes.
 """
 
@@ -24,9 +27,9 @@ from primdiffusion.body.model import default_body
 from primdiffusion.capture.composed import Backgrounds, StoredView, composed_path, uncovered, write_composed
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import joints_of
-from primdiffusion.capture.together import groups
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.formats.regular_files import FileError
@@ -71,7 +74,7 @@ def write_coco(
 ) -> None:
     """Write annotations.json and images.csv into the captures' folder; both appear at the end or not at all.
 
-    With backgrounds, and of humans who stand together (`together`), composed images are written, which are annotated.
+    With backgrounds, and of humans who stand together (`groups`), composed images are written, which are annotated.
 
     Keypoints are indices of pixels as COCO's: the centre of the upper left pixel is (0, 0). Their visibility is COCO's:
     0 outside of the image or unknown, 1 hidden, 2 visible. The face's are known where the subject has the default body.
@@ -249,6 +252,23 @@ def _keypoints(pixels: Float[np.ndarray, "17 2"], visible: Sequence[int]) -> dic
         "num_keypoints": sum(v > 0 for v in visible),
         "keypoints": [value for (x, y), v in zip(indices, visible, strict=True) for value in (x, y, v)],
     }
+
+
+def groups(captures: Captures) -> list[tuple[Subject, ...]]:
+    """The finished subjects of each image: those with the same cameras if they stand together, else each alone."""
+    if captures.about.get("together") is None:
+        return [(captures.subject(name),) for name in captures.subjects]
+    found: dict[object, list[Subject]] = {}
+    for subject in map(captures.subject, captures.subjects):
+        cameras = [
+            (*array.round(4).ravel().tolist(), view.width, view.height)
+            for view in subject.views
+            for array in (view.intrinsics, view.rotation, view.translation)
+        ]
+        found.setdefault((subject.frames, *cameras), []).append(subject)
+    return [
+        tuple(members[first : first + MOST]) for members in found.values() for first in range(0, len(members), MOST)
+    ]
 
 
 def _images(captures: Captures, backgrounds: Backgrounds | None) -> Iterator[_Image]:

@@ -38,6 +38,13 @@ def read_motions(paths: Sequence[Path]) -> tuple[list[BodyPose], list[str]]:
     return motions, failures
 
 
+def turned(poses: BodyPose, yaw: Float[np.ndarray, "F"]) -> BodyPose:
+    """Turn the poses [F] about the vertical through the pelvis, radians."""
+    axis = torch.from_numpy(np.stack([0 * yaw, yaw, 0 * yaw], axis=-1)).to(poses.joint_rotation)
+    root = axis_angle_to_matrix(axis) @ poses.joint_rotation[:, 0]
+    return BodyPose(torch.cat([root[:, None], poses.joint_rotation[:, 1:]], dim=1), poses.translation)
+
+
 def choose_poses(motions: Sequence[BodyPose], count: int, seed: int) -> BodyPose:
     """Choose `count` poses: near T first, then those of `motions` (or the built-in ones) farthest from all before.
 

@@ -22,7 +22,7 @@ from PIL import Image
 
 from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.together import turned
+from primdiffusion.capture.poses import turned
 from primdiffusion.failures import describe
 from primdiffusion.formats import capture_layout, picture_files
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere

@@ -13,8 +13,8 @@ import torch
 from blender_primdiffusion.formats.camera_rig import Rig
 from capture_person import NamedPerson, files_of, load_painted, two_poses
 from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.coco import groups
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.capture.together import groups
 from support.errors import refused
 
 from blender_primdiffusion.capture.body import read_body

@@ -9,13 +9,12 @@ import torch
 from capture_scenes import small_job
 from PIL import Image
 from primdiffusion import cli
-from primdiffusion.capture.coco import KEYPOINTS, write_coco
+from primdiffusion.capture.coco import KEYPOINTS, groups, write_coco
 from primdiffusion.capture.composed import Backgrounds, StoredView, compose, uncovered
 from primdiffusion.capture.people_files import read_person
-from primdiffusion.capture.poses import built_in_poses
+from primdiffusion.capture.poses import built_in_poses, turned
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import render, set_up_together
-from primdiffusion.capture.together import groups, turned
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.group_places import GAP, places
