@@ -34,7 +34,7 @@ import numpy as np
 import psutil
 import torch
 from PIL import Image
-from primdiffusion.body.model import BodyPose
+from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.coco import write_coco
 from primdiffusion.capture.dataset import CaptureDataset, SampleSettings, batches, pack
 from primdiffusion.capture.people_files import find_people, read_person
@@ -49,7 +49,7 @@ from primdiffusion.capture.render import (
     srgb_bytes,
     write_parameters,
 )
-from primdiffusion.capture.sheet import default_joints, joints_of
+from primdiffusion.capture.sheet import body_joints, joints_of
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.people.assets import Assets, open_assets
@@ -266,7 +266,7 @@ def compare(captures: Captures, people: dict, samples: int) -> list[Difference]:
 
 def joint_error_px(subject: Subject) -> float:
     """The largest distance between joints saved with the captures and those of the backend's body, in pixels."""
-    saved, ours = joints_of(subject), default_joints(subject)
+    saved, ours = joints_of(subject), body_joints(subject, default_body())
     differences = [view.project(ours)[0] - view.project(saved)[0] for view in subject.views]
     return float(np.linalg.norm(differences, axis=-1).max())
 

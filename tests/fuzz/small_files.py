@@ -47,12 +47,13 @@ def read_shots(path: Path) -> object:
 def read_capture(kind: str) -> Callable[[Path], object]:
     def read(path: Path) -> object:
         from PIL import Image
-        from primdiffusion.capture.reader import _KINDS, read_picture
+        from primdiffusion.capture.reader import _KINDS, _opened, _read
 
         Image.MAX_IMAGE_PIXELS = None
         with Image.open(path) as opened:
             width, height = opened.size
-        return _KINDS[kind](read_picture(path, kind, width, height))
+        with _opened(path) as file:
+            return _KINDS[kind](_read(file, path, kind, width, height))
 
     return read
 

@@ -324,9 +324,10 @@ def make_picture(folder: Path) -> Path:
 
 
 def read_picture(path: Path) -> None:
-    from primdiffusion.capture.reader import read_picture
+    from primdiffusion.capture.reader import _opened, _read
 
-    read_picture(path, "img", 24, 24)
+    with _opened(path) as file:
+        _read(file, path, "img", 24, 24)
 
 
 def make_grid(folder: Path) -> Path:

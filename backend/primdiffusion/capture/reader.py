@@ -266,23 +266,16 @@ def as_camera(view: View) -> Camera:
     )
 
 
-def read_picture(path: Path, kind: str, width: int, height: int) -> np.ndarray:
-    """Read an image file: [H, W, 3] uint8 for img and normal, [H, W] uint8 for mask and part, uint16 for depth.
-
-    Raises:
-        FileNotFoundError: the file is missing.
-        FileError: it is damaged or has another size.
-    """
-    with _opened(path) as file:
-        return _read(file, path, kind, width, height)
-
-
 def _opened(path: Path) -> BinaryIO:
     with _named(path):
         return open_regular(path, LARGEST_FILE)
 
 
 def _read(file: BinaryIO, path: Path, kind: str, width: int, height: int) -> np.ndarray:
+    """Read an image: [H, W, 3] uint8 for img and normal, [H, W] uint8 for mask and part, uint16 for depth.
+
+    Raises FileError for a damaged file, or one of another size.
+    """
     with _named(path), opened_picture(file, bytes_each=_BYTES_OF_A_PIXEL.get(kind, 4)) as picture:
         size = picture.size
         if size == (width, height) and kind == "depth":

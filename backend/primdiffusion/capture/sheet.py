@@ -67,11 +67,6 @@ def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarr
     return joints
 
 
-def default_joints(subject: Subject) -> Float[np.ndarray, "F J 3"]:
-    """World positions of the default body's joints in the subject's shape and poses."""
-    return body_joints(subject, default_body())
-
-
 def body_joints(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]:
     """World positions of a body's joints in the subject's shape and poses."""
     smpl = subject.smpl

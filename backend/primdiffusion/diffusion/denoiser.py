@@ -272,7 +272,6 @@ class PersonDenoiser(nn.Module):
     component_std: Tensor
     picture_std: Tensor
     prior_parity: Tensor
-    prior_rest_variance: Tensor
 
     def __init__(self, config: DenoiserConfig, prior: PersonPrior, schedule: Schedule):
         super().__init__()

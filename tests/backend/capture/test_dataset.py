@@ -99,7 +99,7 @@ def test_packs_hold_the_same_samples_and_are_used(captures, monkeypatch):
     before = [CaptureDataset(captures, settings)[0, i] for i in range(9)]
     assert [packing.found for packing in pack(captures)] == [False] * 3
     assert [packing.found for packing in pack(captures)] == [True] * 3
-    monkeypatch.setattr("primdiffusion.capture.reader.read_picture", None)  # nothing is decoded any more
+    monkeypatch.setattr("primdiffusion.capture.reader._read", None)  # nothing is decoded any more
     after = [CaptureDataset(captures, settings)[0, i] for i in range(9)]
     assert all(same(one, other) for one, other in zip(before, after, strict=True))
 

@@ -14,12 +14,12 @@ import torch
 from capture_scenes import captured, small_job
 from PIL import Image
 from primdiffusion import cli
-from primdiffusion.body.model import BodyPose
+from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.capture.dataset import PACK_FOLDER, pack
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import render, set_up_capture
-from primdiffusion.capture.sheet import default_joints, draw_sheet, reprojection_error
+from primdiffusion.capture.sheet import body_joints, draw_sheet, reprojection_error
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import read_numbers
 from primdiffusion.formats.capture_repair import verify
@@ -63,7 +63,7 @@ def test_a_view_comes_back_as_it_was_drawn(root):
 def test_depth_and_camera_put_points_on_the_persons_surface(root):
     """Independent of joints: pixels lifted by depth lie on the box about the wrist that the part mask shows."""
     captures = open_captures(root)
-    joints = default_joints(captures.subject(NAME))
+    joints = body_joints(captures.subject(NAME), default_body())
     for camera in range(4):
         view = captures.view(NAME, 1, camera)
         seen = view.part == 1 + 20  # left wrist
@@ -82,7 +82,7 @@ def test_joints_project_to_where_the_file_says(root):
         subject = open_captures(root).subject(name)
         assert reprojection_error(subject) < 1e-3
         with np.load(subject.folder / "joints.npz") as noted:
-            np.testing.assert_allclose(default_joints(subject), noted["world"], atol=1e-5)
+            np.testing.assert_allclose(body_joints(subject, default_body()), noted["world"], atol=1e-5)
 
 
 @pytest.mark.parametrize("passes", [7, "img", [["img"]]])
