@@ -29,7 +29,9 @@ from chain_sets import HEAD_YAW, draw, held_out, rest_scene
 from PIL import Image
 from primdiffusion import tensor_file
 from primdiffusion.body.model import default_body
-from primdiffusion.formats import compact_human
+from primdiffusion.formats.human_layout import (
+    to_eight_bits,
+)
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.people.assets import open_assets
@@ -166,7 +168,7 @@ def spent(boxes: Primitives, camera: Camera) -> float:
 def sizes(payload: Payload, betas: np.ndarray) -> Mapping[str, int]:
     """Bytes of a human by where they are."""
     rest = {"delta_scale": payload.delta_scale, "betas": torch.from_numpy(betas).float()}
-    rgb, density, _ = compact_human.compact(payload.rgb.numpy(), payload.density.numpy())
+    rgb, density, _ = to_eight_bits(payload.rgb.numpy(), payload.density.numpy())
     compact = {"rgb": torch.from_numpy(rgb), "density": torch.from_numpy(density), **rest}
     return {
         "payload": sum(tensor.nbytes for tensor in (payload.rgb, payload.density, payload.delta_scale)),

@@ -10,7 +10,7 @@ A `.human.safetensors` file contains the tensors rgb, density, delta_scale and b
 
 A human on a body of the user's files has format version 2, the tensor rest_half_extent, and the metadata `body`: paths
 and checksums of these files, never their content. A compact file has format version 3, and rgb and density in eight
-bits (see `formats.compact_human`).
+bits (see `formats.human_layout`).
 """
 
 from __future__ import annotations
@@ -25,8 +25,16 @@ from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyModel
 from primdiffusion.device import GRID_THREADS, fixed_threads
-from primdiffusion.formats import compact_human
-from primdiffusion.formats.human_metadata import check_provenance, provenance_of, version_fault
+from primdiffusion.formats.human_layout import (
+    COMPACT_SCALES,
+    COMPACT_VERSION,
+    LARGEST_VALUE,
+    check_provenance,
+    from_eight_bits,
+    provenance_of,
+    to_eight_bits,
+    version_fault,
+)
 from primdiffusion.formats.regular_files import FileError, as_file_error
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human
@@ -73,9 +81,9 @@ def save_human(path: str | Path, human: Human, *, compact: bool = False) -> None
         tensors["rest_half_extent"] = human.body_setup.anchors.rest_half_extent.detach().cpu().contiguous()
         metadata |= {"body": human.body_setup.files.to_json()}
     if compact:
-        rgb, density, scales = compact_human.compact(payload.rgb.cpu().numpy(), payload.density.cpu().numpy())
+        rgb, density, scales = to_eight_bits(payload.rgb.cpu().numpy(), payload.density.cpu().numpy())
         tensors |= {"rgb": torch.from_numpy(rgb), "density": torch.from_numpy(density)}
-        metadata |= {"format_version": str(compact_human.FORMAT_VERSION), compact_human.METADATA: scales}
+        metadata |= {"format_version": str(COMPACT_VERSION), COMPACT_SCALES: scales}
     with written_whole(path) as unfinished:
         unfinished.write_bytes(tensor_file.save(tensors, metadata))
 
@@ -125,11 +133,11 @@ def _body_setup(path: Path, metadata: Mapping[str, str], tensors: Mapping[str, t
 
 def _expanded(path: Path, tensors: dict[str, torch.Tensor], metadata: Mapping[str, str]) -> dict[str, torch.Tensor]:
     """Tensors of a compact file in float32, others as they are."""
-    if compact_human.METADATA not in metadata:
+    if COMPACT_SCALES not in metadata:
         return tensors
     with as_file_error(path, "does not contain a valid human", "generate it again"):
         stored = {name: tensors[name].numpy() for name in ("rgb", "density") if name in tensors}
-        expanded = compact_human.expand(stored, metadata[compact_human.METADATA])
+        expanded = from_eight_bits(stored, metadata[COMPACT_SCALES])
     return {**tensors, **{name: torch.from_numpy(values) for name, values in expanded.items()}}
 
 
@@ -144,7 +152,7 @@ def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
             raise FileError(
                 path, f"does not contain a valid human ({name} is {given}, not {shape})", "generate it again"
             )
-        if name in _EXTENTS and float(tensors[name].abs().max()) > compact_human.LARGEST_VALUE:
+        if name in _EXTENTS and float(tensors[name].abs().max()) > LARGEST_VALUE:
             raise FileError(
                 path, f"does not contain a valid human ({name} holds impossible values)", "generate it again"
             )
@@ -152,7 +160,7 @@ def _check_shapes(path: Path, tensors: Mapping[str, torch.Tensor]) -> None:
 
 def _check_values(human: Human) -> None:
     for name, values in vars(human.payload).items():
-        if float(values.abs().max()) > compact_human.LARGEST_VALUE or (name == "density" and float(values.min()) < 0):
+        if float(values.abs().max()) > LARGEST_VALUE or (name == "density" and float(values.min()) < 0):
             raise ValueError(f"{name!r} holds impossible values")
     largest = float(human.betas.abs().max())
     if largest > LARGEST_BETA:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
-from ..formats.human_metadata import provenance_of as made_of
+from ..formats.human_layout import provenance_of as made_of
 from ..scene.attachment import in_viewport
 from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_warning_in

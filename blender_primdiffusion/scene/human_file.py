@@ -16,9 +16,15 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats import compact_human
 from ..formats.arrays import all_finite, check_shapes
-from ..formats.human_metadata import version_fault
+from ..formats.human_layout import (
+    COMPACT_SCALES,
+    COMPACT_VERSION,
+    LARGEST_VALUE,
+    from_eight_bits,
+    to_eight_bits,
+    version_fault,
+)
 from ..formats.json_files import parse_json
 from ..formats.poses.rotation import first_improper, improper_text
 from ..formats.regular_files import FileError, as_file_error, read_regular
@@ -134,7 +140,7 @@ def payload_in(human: HumanTensors, name: str, remedy: str = GENERATE_AGAIN) -> 
         check_shapes(name, arrays, shapes, {})
         if wrong := [field for field, values in arrays.items() if not all_finite(values)]:
             raise ValueError(f"{wrong[0]!r} holds NaN or infinite numbers")
-        if wrong := [field for field, values in arrays.items() if np.abs(values).max() > compact_human.LARGEST_VALUE]:
+        if wrong := [field for field, values in arrays.items() if np.abs(values).max() > LARGEST_VALUE]:
             raise ValueError(f"{wrong[0]!r} holds impossible values")
         if arrays["density"].min(initial=0) < 0:
             raise ValueError("'density' holds impossible values")
@@ -173,26 +179,26 @@ def reshaped(human: HumanTensors, betas: NDArray, growth: NDArray | None) -> Hum
 
 def compacted(human: HumanTensors) -> HumanTensors:
     """The human with 8-bit colours and densities, a quarter of the size. Raises ValueError for a damaged file."""
-    if compact_human.METADATA in human.metadata:
+    if COMPACT_SCALES in human.metadata:
         return human
     with as_file_error("the human's file", "is damaged", GENERATE_AGAIN):
-        rgb, density, scales = compact_human.compact(*(_loaded(*human.arrays[name]) for name in _EIGHT_BIT))
+        rgb, density, scales = to_eight_bits(*(_loaded(*human.arrays[name]) for name in _EIGHT_BIT))
     arrays = {
         name: ("U8", array.shape, array.tobytes()) for name, array in zip(_EIGHT_BIT, (rgb, density), strict=True)
     }
-    version = str(compact_human.FORMAT_VERSION)
-    metadata = {**human.metadata, "format_version": version, compact_human.METADATA: scales}
+    version = str(COMPACT_VERSION)
+    metadata = {**human.metadata, "format_version": version, COMPACT_SCALES: scales}
     return HumanTensors(metadata, {**human.arrays, **arrays})
 
 
 def expanded(human: HumanTensors) -> HumanTensors:
     """The inverse of `compacted`, up to rounding. Raises ValueError or KeyError for a damaged file."""
-    if compact_human.METADATA not in human.metadata:
+    if COMPACT_SCALES not in human.metadata:
         return human
-    metadata = {name: text for name, text in human.metadata.items() if name != compact_human.METADATA}
+    metadata = {name: text for name, text in human.metadata.items() if name != COMPACT_SCALES}
     metadata["format_version"] = "2" if "body" in metadata else "1"
     stored = {name: _loaded(*human.arrays[name]) for name in _EIGHT_BIT}
-    floats = compact_human.expand(stored, human.metadata[compact_human.METADATA])
+    floats = from_eight_bits(stored, human.metadata[COMPACT_SCALES])
     return HumanTensors(metadata, {**human.arrays, **{name: _stored(values) for name, values in floats.items()}})
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from ..formats.human_metadata import provenance_of as provenance_in
+from ..formats.human_layout import provenance_of as provenance_in
 from ..formats.regular_files import exists_in_its_folder, real_path
 from .blend_values import as_shown, stored_folder
 from .human import (

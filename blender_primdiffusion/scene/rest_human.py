@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import MOST_BODY_VALUES, check_shapes, read_arrays
 from ..formats.body_layout import body_data, half_extents, read_layout, stencils
-from ..formats.human_metadata import provenance_of
+from ..formats.human_layout import provenance_of
 from ..formats.regular_files import FileError, as_file_error, exists_in_its_folder
 from .cycles import max_overlap
 from .human import BODY_FILE, LARGEST_BETA, person_file
