@@ -10,7 +10,7 @@ import pytest
 import torch
 from primdiffusion import cli
 from primdiffusion.commands.view import COARSE, Viewer, camera_of, theta_of
-from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from primdiffusion.human import framing, generate, place
 from scipy.spatial.transform import Rotation
 from tiny_model import tiny_model

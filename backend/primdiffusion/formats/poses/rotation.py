@@ -8,8 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..joints import JOINT_NAMES
-from .skeleton import REST_JOINTS
+from .skeleton import JOINT_NAMES, REST_JOINTS
 
 TOLERANCE = 1e-3
 """Largest difference of a scalar product of two columns from that of a rotation."""
