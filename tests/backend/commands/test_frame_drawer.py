@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,12 @@ from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.failures import describe
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.reshaping import reshaped
-from support.errors import refused
 from tiny_model import tiny_model
 
 WIDTH, HEIGHT = 40, 56
@@ -182,23 +179,6 @@ def test_a_frame_of_another_size_is_rejected_and_left_alone(params, tmp_path):
     with pytest.raises(ValueError, match=f"{WIDTH} x {HEIGHT} pixels need {WIDTH * HEIGHT * 20}"):
         drawn(dataclasses.replace(params, frame=frame))
     assert np.isnan(np.fromfile(frame, np.float32)).all()
-
-
-def test_files_that_are_missing_or_hold_something_else_are_named(params, tmp_path):
-    nowhere = str(tmp_path / "nowhere")
-    person = dataclasses.replace(params.people[0], human=nowhere)
-    for wrong in ({"frame": nowhere}, {"solids": nowhere}, {"people": [person]}):
-        with pytest.raises(FileNotFoundError, match="nowhere"):
-            drawn(dataclasses.replace(params, **wrong))
-    (tmp_path / "text").write_text("no arrays")
-    np.savez(tmp_path / "others.npz", a=np.zeros(3))
-    objects = np.array([{}], dtype=object)
-    np.savez(tmp_path / "pickled.npz", corners=objects, colour=objects, holdout=objects)
-    shutil.copy(tmp_path / "others.npz", tmp_path / "cut.npz")
-    os.truncate(tmp_path / "cut.npz", 60)
-    for name in ("text", "others.npz", "pickled.npz", "cut.npz"):
-        with refused(FileError, name):
-            drawn(dataclasses.replace(params, solids=str(tmp_path / name)))
 
 
 def test_out_of_memory_names_the_resolution(params, monkeypatch):

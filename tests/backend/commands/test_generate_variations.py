@@ -112,14 +112,6 @@ def test_it_can_be_ended_at_every_report_and_then_leaves_nothing(checkpoint, tmp
         assert not (tmp_path / "out").exists()
 
 
-def test_a_person_that_is_not_there_is_named(checkpoint, tmp_path):
-    how = {"steps": 2, "checkpoint": checkpoint, "person": tmp_path / "nobody"}
-    request = VariationsRequest(seeds=[1], out_dir=tmp_path / "out", **how)
-    with pytest.raises(FileNotFoundError, match=r"there is no human file .*nobody"):
-        variations(request, Session(), lambda *_, **more: None)
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("changes", "field"),
     [

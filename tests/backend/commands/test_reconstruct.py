@@ -19,7 +19,7 @@ from primdiffusion.commands import session as session_module
 from primdiffusion.commands.session import Session
 from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
+from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 from primdiffusion.formats.requests import ReconstructRequest
 from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -171,26 +171,6 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
 )
 def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, capsys, words, sentence):
     assert sentence in failure(capsys, line, "--capture", dataset, *words)
-
-
-def test_a_missing_folder_picture_or_dataset_is_named(dataset, line, tmp_path, capsys):
-    assert "the folder of captures" in failure(capsys, line, "--capture", tmp_path / "nowhere")
-    (tmp_path / "empty").mkdir()
-    assert "no finished captures" in failure(capsys, line, "--capture", tmp_path / "empty")
-    damaged = shutil.copytree(dataset / FIRST, tmp_path / "damaged" / FIRST)
-    missing = picture_path(damaged, "mask", 2, 0)
-    missing.unlink()
-    assert f"{missing} is missing" in failure(capsys, line, "--capture", damaged)
-
-
-def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, tmp_path, capsys):
-    cut, other = tmp_path / "cut.safetensors", save_tiny_checkpoint(tmp_path / "diffusion.safetensors")
-    cut.write_bytes(checkpoint.read_bytes()[:-100])
-    for path, fault in ((cut, "is damaged"), (other, "has the format"), (tmp_path / "none", "there is no encoder at")):
-        line = ["reconstruct", "--capture", dataset / FIRST, "--checkpoint", path, "--out", tmp_path / "out"]
-        sentence = failure(capsys, [str(word) for word in line])
-        assert fault in sentence
-        assert str(path) in sentence
 
 
 def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):

@@ -114,15 +114,6 @@ def test_one_who_fails_is_named_and_the_others_are_made(tmp_path, capsys):
     assert [path.name for path in (tmp_path / "out").iterdir()] == [f"{SECOND}.npz"]
 
 
-def test_a_damaged_card_is_named(root, tmp_path):
-    (tmp_path / FIRST).mkdir()
-    (tmp_path / FIRST / "person.glb").write_bytes((root / "people" / FIRST / "person.glb").read_bytes())
-    assert read_cards(tmp_path) == {}
-    (tmp_path / FIRST / "person.json").write_text("{")
-    with refused(ValueError, "person.json"):
-        read_cards(tmp_path)
-
-
 @pytest.mark.parametrize("settings", [{"views": 0}, {"looks": 0}, {"refine_steps": -1}])
 def test_settings_that_cannot_be_are_rejected(settings):
     with refused(ValueError, next(iter(settings))):
