@@ -19,7 +19,6 @@ from primdiffusion.formats.requests import (
     TransferRequest,
     VaryRequest,
 )
-from primdiffusion.formats.schema import FieldError, read
 from tiny_model import save_tiny_checkpoint
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
@@ -173,11 +172,3 @@ def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp
     assert columns[:32].any()
     assert columns[32:].any()
     assert not columns[[0, 31, 32, 63]].any(), "nothing is cut off"
-
-
-@pytest.mark.parametrize("px", [-1, 1025])
-def test_sizes_out_of_range_are_rejected(tmp_path, px):
-    for record, needed in ((GenerateRequest, {"seed": 1}), (VaryRequest, {"person": tmp_path})):
-        with pytest.raises(FieldError) as error:
-            read(record, {"out_dir": tmp_path, "picture_px": px, **needed})
-        assert error.value.field == "picture_px"

@@ -12,14 +12,12 @@ from primdiffusion import cli, from_pictures
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.reconstruct import fit_posture
 from primdiffusion.commands.session import Session
-from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
-from primdiffusion.formats.schema import FieldError, read
+from primdiffusion.formats.requests import FitPostureRequest
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.posture.start import standing
 from primdiffusion.render.march import march
-from support.errors import refused
 from tiny_model import save_tiny_checkpoint, tiny_model
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "posture.json", "side.png"]
@@ -158,12 +156,3 @@ def test_impossible_requests_are_one_sentence_and_leave_nothing(line, picture, t
     assert "cameras.json" in failure(capsys, line, "--cameras", tmp_path / "cameras.json")
     assert "without refining" in failure(capsys, line, "--no-refine")
     assert "capture" in failure(capsys, line, "--capture", tmp_path)
-
-
-def test_requests_need_pictures_or_a_capture():
-    with refused(FieldError, "capture"):
-        read(ReconstructRequest, {"out_dir": "out"})
-    with refused(FieldError, "pictures"):
-        read(FitPostureRequest, {"out_dir": "out"})
-    with refused(FieldError, "seed"):
-        read(ReconstructRequest, {"out_dir": "out", "capture": "captures", "seed": 3})
