@@ -14,12 +14,7 @@ from primdiffusion.editing.vary import vary
 from primdiffusion.formats.requests import VariationsRequest
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
-from tiny_model import save_tiny_checkpoint
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory) -> str:
-    return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
+from support.runs import ended_at_each_report
 
 
 @pytest.fixture
@@ -90,22 +85,5 @@ def test_variants_of_a_person_are_those_that_vary_makes(checkpoint, model, tmp_p
 
 
 def test_it_can_be_ended_at_every_report_and_then_leaves_nothing(checkpoint, tmp_path):
-    class Stop(Exception):
-        pass
-
     request = VariationsRequest(seeds=[1, 2], out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint, size=16)
-    listener = Listener()
-    variations(request, Session(), listener)
-    for path in (tmp_path / "out").iterdir():
-        path.unlink()
-    (tmp_path / "out").rmdir()
-    for end in range(len(listener.reports)):
-        count = itertools.count()
-
-        def stop(*_, count=count, end=end, **more):
-            if next(count) == end:
-                raise Stop
-
-        with pytest.raises(Stop):
-            variations(request, Session(), stop)
-        assert not (tmp_path / "out").exists()
+    ended_at_each_report(lambda report: variations(request, Session(), report), tmp_path / "out")

@@ -19,7 +19,6 @@ from primdiffusion.formats.requests import (
     TransferRequest,
     VaryRequest,
 )
-from tiny_model import save_tiny_checkpoint
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "side.png"]
 
@@ -39,11 +38,6 @@ def clock(monkeypatch):
     clock = Clock()
     monkeypatch.setattr(output.time, "perf_counter", clock)
     return clock
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory) -> str:
-    return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
 
 
 @pytest.fixture

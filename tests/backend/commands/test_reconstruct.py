@@ -1,10 +1,8 @@
 """`primdiffusion reconstruct` and the child's job of the same name, without the child."""
 
 import dataclasses
-import itertools
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +23,7 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
 from primdiffusion.reconstruction import reconstruct
+from support.runs import ended_at_each_report
 from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
@@ -51,16 +50,6 @@ def checkpoint(tmp_path_factory):
 def line(checkpoint, tmp_path):
     """The start of a command line that writes to tmp_path / "out"."""
     return ["reconstruct", "--checkpoint", str(checkpoint), "--out", str(tmp_path / "out"), "--size", "32"]
-
-
-def failure(capsys, line, *more) -> str:
-    """The sentence that a line fails with, having left nothing."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([*line, *(str(word) for word in more)])
-    assert end.value.code == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert not Path(line[line.index("--out") + 1]).exists()
-    return lines[-1]
 
 
 def test_the_command_writes_what_generate_writes_and_says_where_it_comes_from(dataset, line, tmp_path, capsys):
@@ -168,8 +157,11 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
         (["--subject", FIRST, "--size", "0"], "size is 0"),
     ],
 )
-def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, capsys, words, sentence):
-    assert sentence in failure(capsys, line, "--capture", dataset, *words)
+def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, tmp_path, fails, words, sentence):
+    failed = fails(*line, "--capture", dataset, *words)
+    assert (failed.code, failed.err.count("\n")) == (1, 1)
+    assert sentence in failed.err
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):
@@ -187,9 +179,6 @@ def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint
 
 
 def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypatch):
-    class Stop(Exception):
-        pass
-
     folder = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
     request = ReconstructRequest(capture=folder, out_dir=tmp_path / "out", checkpoint=checkpoint, size=32)
     session, reports = Session(), []
@@ -199,14 +188,4 @@ def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypa
     assert result.subject == FIRST
     assert result.views == [0, 1, 2, 3]
     assert "is inside the masks" in result.warnings[0]
-    shutil.rmtree(tmp_path / "out")
-    for end in range(len(reports)):
-        count = itertools.count()
-
-        def stop(*_, count=count, end=end):
-            if next(count) == end:
-                raise Stop
-
-        with pytest.raises(Stop):
-            commands.reconstruct(request, session, stop)
-        assert not (tmp_path / "out").exists()
+    ended_at_each_report(lambda report: commands.reconstruct(request, session, report), tmp_path / "out")
