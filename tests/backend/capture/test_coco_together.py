@@ -172,13 +172,12 @@ def test_a_group_over_black_is_composed_and_a_single_human_is_not(root):
     assert np.abs(shown - np.maximum(*stored)).mean() < 6
 
 
-def test_a_damaged_human_is_rendered_again_to_the_same_bytes(root, whole):
+def test_a_damaged_human_is_rendered_again_to_the_same_bytes(root, whole, fails):
     job_root = root.parent
     shutil.copytree(whole.parent / "people", job_root / "people")
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     capture_layout.picture_path(root / NAMES[1], "depth", 2, 1).write_bytes(b"damaged")
-    with pytest.raises(SystemExit):
-        cli.main(["captures", "verify", str(root), "--repair"])
+    fails("captures", "verify", root, "--repair")
     command = ["captures", "render", "--people", str(job_root / "people"), "--out", str(root), "--pose-count", "3"]
     cli.main([*command, "--cameras", "4", "--size", "96", "--together", "3", "--shard", "1/5"])
     after = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
@@ -199,11 +198,10 @@ def test_backgrounds_go_behind_all_humans(root, tmp_path):
 @pytest.mark.parametrize(
     "words", [["--together", "0"], ["--together", "9"], ["--together", "2", "--released-reference"]]
 )
-def test_groups_that_cannot_be_are_refused(tmp_path, capsys, words):
+def test_groups_that_cannot_be_are_refused(tmp_path, fails, words):
     small_job(tmp_path, people=2)
-    with pytest.raises(SystemExit):
-        cli.main(["captures", "render", "--people", str(tmp_path / "people"), "--out", str(tmp_path / "out"), *words])
-    assert "together" in capsys.readouterr().err
+    line = ("captures", "render", "--people", tmp_path / "people", "--out", tmp_path / "out")
+    assert "together" in fails(*line, *words).err
     assert not (tmp_path / "out").exists()
 
 

@@ -181,16 +181,7 @@ def test_what_a_killed_process_left_half_written_goes(tmp_path):
 def test_workers_end_when_the_command_is_killed(tmp_path):
     save_person(tmp_path / "people" / "p0" / "person.glb")
     save_person(tmp_path / "people" / "p1" / "person.glb")
-    line = [
-        "captures",
-        "render",
-        "--people",
-        str(tmp_path / "people"),
-        "--out",
-        str(tmp_path / "out"),
-        "--workers",
-        "2",
-    ]
+    line = ["captures", "render", "--people", tmp_path / "people", "--out", tmp_path / "out", "--workers", "2"]
     process = subprocess.Popen([sys.executable, "-m", "primdiffusion.cli", *line], stdout=subprocess.DEVNULL)
     try:
         assert within(90, lambda: list((tmp_path / "out").glob("*/img/*/*.jpg")))
@@ -202,19 +193,14 @@ def test_workers_end_when_the_command_is_killed(tmp_path):
     assert within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
 
 
-def test_files_of_poses_that_cannot_be_read_are_left_out_and_reported(tmp_path, capsys):
+def test_files_of_poses_that_cannot_be_read_are_left_out_and_reported(tmp_path, fails):
     save_person(tmp_path / "people" / "p0" / "person.glb")
     np.save(tmp_path / "good.npy", np.random.default_rng(0).normal(0, 0.3, (3, 72)))
     np.save(tmp_path / "nan.npy", np.full((3, 72), np.nan))
     line = ["captures", "render", "--people", str(tmp_path / "people"), "--out", str(tmp_path / "out"), "--size", "24",
             "--cameras", "1", "--pose-count", "2", "--poses", str(tmp_path / "nan.npy")]  # fmt: skip
-    with pytest.raises(SystemExit):
-        cli.main(line)
-    assert "none of the 1 pose files" in capsys.readouterr().err
-    with pytest.raises(SystemExit) as end:
-        cli.main([*line, str(tmp_path / "good.npy")])
-    assert end.value.code == 1
-    assert "0 of 1 humans and 1 of 2 pose files failed" in capsys.readouterr().err
+    assert "none of the 1 pose files" in fails(*line).err
+    assert "0 of 1 humans and 1 of 2 pose files failed" in fails(*line, tmp_path / "good.npy").err
     report = json.loads((tmp_path / "out" / "report.json").read_text())
     assert report["done"] == ["p0"]
     assert "nan.npy" in report["failed"][0]["why"]
@@ -247,7 +233,7 @@ def test_other_settings_in_the_same_folder_are_rejected(tmp_path):
         list(render(small_job(tmp_path, people=1, samples=5)))
 
 
-def test_the_command_renders_a_shard_and_exits_with_1_on_failure(tmp_path, capsys):
+def test_the_command_renders_a_shard_and_exits_with_1_on_failure(tmp_path, fails):
     for number in range(3):
         save_person(tmp_path / "people" / f"p{number}" / "person.glb")
     line = ["captures", "render", "--people", str(tmp_path / "people"), "--out", str(tmp_path / "out"), "--size", "24",
@@ -255,10 +241,9 @@ def test_the_command_renders_a_shard_and_exits_with_1_on_failure(tmp_path, capsy
     cli.main([*line, "--shard", "0/2"])
     assert sorted(path.parent.name for path in (tmp_path / "out").glob("*/complete.json")) == ["p0", "p2"]
     (tmp_path / "people" / "p1" / "person.glb").write_bytes(b"")
-    with pytest.raises(SystemExit) as end:
-        cli.main([*line, "--shard", "1/2"])
-    assert end.value.code == 1
-    assert "1 of 2 humans failed" in capsys.readouterr().err
+    failed = fails(*line, "--shard", "1/2")
+    assert failed.code == 1
+    assert "1 of 2 humans failed" in failed.err
     assert (tmp_path / "out" / capture_layout.RELEASED_REFERENCE / "complete.json").exists()
     assert {path.name for path in (tmp_path / "out").glob("report*")} == {"report-0-of-2.json", "report-1-of-2.json"}
 

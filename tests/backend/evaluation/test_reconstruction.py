@@ -228,14 +228,14 @@ def test_the_command_line_evaluates_a_checkpoint(captures, tmp_path, capsys):
     assert "| novel views, novel poses | 2 | " in capsys.readouterr().out
 
 
-def test_command_tells_wrong_folders_and_numbers(captures, tmp_path, capsys):
-    for arguments, sentence in (
-        (["--captures", str(tmp_path / "none")], "the folder of captures"),
-        (["--captures", str(captures.root), "--people", "-1"], "people is -1"),
-        (["--captures", str(captures.root), "--checkpoint", str(tmp_path / "no.safetensors")], "no.safetensors"),
-        (["--captures", str(captures.root), "--lpips", str(tmp_path / "w.pth")], "w.pth"),
+def test_command_tells_wrong_folders_and_numbers(captures, tmp_path, fails):
+    line = ("evaluate", "reconstruction", "--captures", captures.root)
+    for words, named in (
+        (["--captures", tmp_path / "none"], "the folder of captures"),
+        (["--people", "-1"], "people is -1"),
+        (["--checkpoint", tmp_path / "no.safetensors"], "no.safetensors"),
+        (["--lpips", tmp_path / "w.pth"], "w.pth"),
     ):
-        with pytest.raises(SystemExit) as end:
-            cli.main(["evaluate", "reconstruction", *arguments])
-        assert end.value.code == 1
-        assert sentence in capsys.readouterr().err
+        failed = fails(*line, *words)
+        assert failed.code == 1
+        assert named in failed.err
