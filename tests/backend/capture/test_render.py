@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 import psutil
 import pytest
-from capture_scenes import box_person, captured, save_person, small_job
+from capture_scenes import captured, save_person, small_job
 from primdiffusion import cli
-from primdiffusion.capture.people_files import find_people, read_glb, read_person
 from primdiffusion.capture.render import render
 from primdiffusion.commands.captures import parse_shard
 from primdiffusion.formats import capture_layout
@@ -30,62 +29,6 @@ def everything(root: Path) -> dict[str, bytes]:
     """All files but zip archives, which hold the time."""
     files = sorted(path for path in root.rglob("*") if path.is_file() and path.suffix not in (".npz", ".json"))
     return {str(path.relative_to(root)): path.read_bytes() for path in files}
-
-
-def test_a_persons_file_is_read_as_it_was_written(tmp_path):
-    mesh = box_person()
-    person = read_person(save_person(tmp_path / "a.glb", mesh))
-    assert person.betas.tolist() == [0.0] * 10
-    for was, now in zip(mesh.parts, person.mesh.parts, strict=True):
-        assert now.name == was.name
-        np.testing.assert_allclose(now.vertices[now.faces], was.vertices[was.faces], atol=1e-6)
-        np.testing.assert_allclose(now.corner_uv, was.corner_uv, atol=1e-6)
-        assert np.array_equal(now.texture, was.texture)
-        assert (now.skin_index[:, 0] == was.skin_index[0, 0]).all()
-
-
-def change(path: Path, edit) -> None:
-    """Edit a .glb's JSON."""
-    glb = read_glb(path)
-    edit(glb.content)
-    text = json.dumps(glb.content).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = len(text).to_bytes(4, "little") + b"JSON" + text
-    chunks += len(glb.binary).to_bytes(4, "little") + b"BIN\0" + glb.binary
-    path.write_bytes(b"glTF" + (2).to_bytes(4, "little") + (12 + len(chunks)).to_bytes(4, "little") + chunks)
-
-
-@pytest.mark.parametrize(
-    ("edit", "why"),
-    [
-        (lambda c: c["accessors"][1].update(count=10**9), "accessor"),
-        (lambda c: c["accessors"][1].update(bufferView=99), "accessor"),
-        (lambda c: c["bufferViews"][1].update(byteOffset=-8), "accessor"),
-        (lambda c: c["nodes"][0].update(name="Hips"), "joints Hips"),
-        (lambda c: c["images"][0].update(uri="../../secret.png", bufferView=10**6), "image"),
-        (lambda c: (c["asset"].pop("extras"), c["scenes"][0].pop("extras")), "betas"),
-        (lambda c: c["asset"]["extras"]["primdiffusion"].update(body="smplx"), "smplx"),
-        (lambda c: c["asset"]["extras"]["primdiffusion"].update(betas=[1e6] * 10), "betas"),
-        (lambda c: c["asset"]["extras"]["primdiffusion"].update(betas=[0.0] * 5000), "betas"),
-        (lambda c: c["nodes"][24].update(skin=-7), "not a human"),
-        (lambda c: c.pop("nodes"), "not a human"),
-        (lambda c: c["nodes"].__setitem__(slice(24, None), []), "no mesh"),
-        (lambda c: c["nodes"][24].pop("skin"), "has no skin"),
-    ],
-)
-def test_files_without_a_human_are_rejected(tmp_path, edit, why):
-    path = save_person(tmp_path / "a.glb")
-    change(path, edit)
-    with pytest.raises(FileError, match=why):
-        read_person(path)
-
-
-def test_people_are_found_in_folders_of_their_own_and_as_files(tmp_path):
-    for path in ("people/b/person.glb", "people/a/person.glb", "c.glb", ".hidden/person.glb"):
-        save_person(tmp_path / path)
-    assert list(find_people(tmp_path)) == ["a", "b", "c"]
-    with refused(FileNotFoundError, "nowhere"):
-        find_people(tmp_path / "nowhere")
 
 
 def test_captures_have_the_layouts_files_and_are_whole(tmp_path):
