@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from capture_scenes import small_job
+from capture_scenes import decoded, small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.coco import KEYPOINTS, groups, write_coco
@@ -39,11 +39,6 @@ def whole(tmp_path_factory):
 def root(whole, tmp_path):
     shutil.copytree(whole, tmp_path / "captures")
     return tmp_path / "captures"
-
-
-def decoded(mask):
-    height, width = mask["size"]
-    return np.repeat(np.arange(len(mask["counts"])) % 2 == 1, mask["counts"]).reshape(width, height).T
 
 
 def test_places_are_apart_and_begin_in_the_middle():
@@ -114,14 +109,16 @@ def test_masks_of_a_group_are_what_nearer_humans_leave(root):
     assert [image["subjects"] for image in written["images"]] == [NAMES[:3]] * 12 + [NAMES[3:]] * 12
     for image in written["images"]:
         found = [one for one in written["annotations"] if one["image_id"] == image["id"]]
-        shown = [decoded(one["segmentation"]) for one in found]
+        shown = [decoded(one["segmentation"]["counts"], *one["segmentation"]["size"]) for one in found]
         assert np.sum(shown, axis=0).max() == 1
         where = image["frame"], image["camera"]
         stored = {name: captures.subject(name).pictures(("mask", "depth"), *where) for name in image["subjects"]}
         everyone = np.array([np.where(one["depth"] > 0, one["depth"], 65535) for one in stored.values()])
         for annotation, mask in zip(found, shown, strict=True):
             own = stored[annotation["subject"]]
-            assert np.array_equal(decoded(annotation["amodal"]), own["mask"] >= 128)
+            assert np.array_equal(
+                decoded(annotation["amodal"]["counts"], *annotation["amodal"]["size"]), own["mask"] >= 128
+            )
             assert not (mask & (own["mask"] < 128)).any()
             nearest = (own["depth"] > 0) & (own["depth"] == everyone.min(0))
             inside = np.min([(one["mask"] == 0) | (one["mask"] == 255) for one in stored.values()], axis=0)

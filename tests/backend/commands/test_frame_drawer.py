@@ -95,22 +95,6 @@ def test_a_region_is_the_part_of_the_picture_counted_from_the_bottom_left(params
     assert np.allclose(drawn(part).combined[::-1], whole[y : y + h, x : x + w], atol=1e-3)
 
 
-def test_reports_tell_the_rows_that_are_done_and_the_frame_is_filled_that_far(params):
-    reports = []
-
-    def report(*news):
-        reports.append(news)
-        rows = news[1]
-        assert np.isfinite(map_frame(params.frame, WIDTH, HEIGHT).combined[:rows]).all()
-
-    result = FrameDrawer(torch.device("cpu")).draw(params, report)
-    assert reports[0] == ("draw", 0, HEIGHT, None)
-    assert reports[-1] == ("draw", HEIGHT, HEIGHT, 0.0)
-    assert {(stage, total) for stage, _, total, _ in reports} == {("draw", HEIGHT)}
-    assert 0 < result.seconds_march < result.seconds
-    assert 0 < result.seconds_place < result.seconds
-
-
 def test_the_first_band_is_small_where_samples_or_people_are_many(params):
     def first_band(**changes) -> int:
         reports: list = []
@@ -174,13 +158,6 @@ def test_solids_come_from_a_file_of_plain_arrays_and_are_read_again_when_it_chan
     assert drawn(scene, drawer).combined[20, 20, 0] == 0
 
 
-def test_a_frame_of_another_size_is_rejected_and_left_alone(params, tmp_path):
-    frame = new_frame(tmp_path / "small", WIDTH, HEIGHT - 1)
-    with pytest.raises(ValueError, match=f"{WIDTH} x {HEIGHT} pixels need {WIDTH * HEIGHT * 20}"):
-        drawn(dataclasses.replace(params, frame=frame))
-    assert np.isnan(np.fromfile(frame, np.float32)).all()
-
-
 def test_out_of_memory_names_the_resolution(params, monkeypatch):
     def no_room(*_):
         torch.empty(10**15)
@@ -190,18 +167,6 @@ def test_out_of_memory_names_the_resolution(params, monkeypatch):
         drawn(params)
     failure = describe(error.value)
     assert (failure.kind, "resolution" in failure.remedy) == ("out_of_memory", True)
-
-
-def test_a_picture_can_be_stopped_at_every_report(params):
-    class Stop(Exception):
-        pass
-
-    def stop(_, rows, *__):
-        if rows > 0:
-            raise Stop
-
-    with pytest.raises(Stop):
-        FrameDrawer(torch.device("cpu")).draw(params, stop)
 
 
 @pytest.mark.parametrize("scale", [0.001, 0.03, 0.8, 300.0])

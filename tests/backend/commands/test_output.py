@@ -120,20 +120,6 @@ def test_generate_shows_what_the_person_will_look_like_and_leaves_no_pictures_be
         assert (plain / name).read_bytes() == (shown / name).read_bytes(), "looking changes nothing"
 
 
-def test_a_cancelled_job_leaves_no_picture(checkpoint, tmp_path, always):
-    class Stop(Exception):
-        pass
-
-    def stop(*_, **more):
-        if "picture" in more:
-            raise Stop
-
-    request = GenerateRequest(seed=5, out_dir=tmp_path / "out", steps=4, checkpoint=checkpoint, picture_px=16)
-    with pytest.raises(Stop):
-        generate(request, Session(), stop)
-    assert not (tmp_path / "out").exists()
-
-
 def test_every_edit_shows_its_guesses(checkpoint, tmp_path, always):
     session, people = Session(), []
     for seed in (1, 2):

@@ -147,23 +147,6 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
     assert torch.allclose(reconstruct(tiny_encoder(), person).payload.rgb, whole.payload.rgb, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ([], "contains several subjects: name one of them (person_000000, person_000001)"),
-        (["--subject", "anna"], "there is no subject 'anna'"),
-        (["--subject", FIRST, "--frame", "7"], "person_000000 has frames 0 to 1, not 7"),
-        (["--subject", FIRST, "--views", "0"], "views is 0"),
-        (["--subject", FIRST, "--size", "0"], "size is 0"),
-    ],
-)
-def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, tmp_path, fails, words, sentence):
-    failed = fails(*line, "--capture", dataset, *words)
-    assert (failed.code, failed.err.count("\n")) == (1, 1)
-    assert sentence in failed.err
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):
     loaded = []
     load = load_encoder
