@@ -31,10 +31,9 @@ def everything(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in files}
 
 
-def test_captures_have_the_layouts_files_and_are_whole(tmp_path):
-    root = captured(tmp_path)
-    assert (root / capture_layout.LIST_FILE).read_text().split() == NAMES
-    about = capture_layout.read_about(root)
+def test_captures_have_the_layouts_files_and_are_whole(whole):
+    assert (whole / capture_layout.LIST_FILE).read_text().split() == NAMES
+    about = capture_layout.read_about(whole)
     assert (about["renderer"], about["light"], about["frames"], about["rig"]["count"]) == (
         "rasteriser",
         "uniform",
@@ -42,7 +41,7 @@ def test_captures_have_the_layouts_files_and_are_whole(tmp_path):
         4,
     )
     for name in NAMES:
-        subject = root / name
+        subject = whole / name
         assert capture_layout.damage(subject) == {}
         for kind in ("img", "mask", "depth", "normal", "part"):
             pictures = [
@@ -54,13 +53,13 @@ def test_captures_have_the_layouts_files_and_are_whole(tmp_path):
         assert frames == {"0000", "0001", "0002"}
         with np.load(subject / "joints.npz") as joints:
             assert joints["pixel"].shape == (4, 3, 24, 2)
-    assert json.loads((root / "report.json").read_text()) == {"done": NAMES, "failed": [], "skipped": []}
+    assert json.loads((whole / "report.json").read_text()) == {"done": NAMES, "failed": [], "skipped": []}
 
 
-def test_two_workers_make_the_same_files_as_one(tmp_path):
-    one, two = captured(tmp_path / "one"), small_job(tmp_path / "two")
+def test_two_workers_make_the_same_files_as_one(whole, tmp_path):
+    two = small_job(tmp_path / "two")
     assert sorted(outcome.subject for outcome in render(two, workers=2)) == NAMES
-    assert everything(one) == everything(two.out)
+    assert everything(whole) == everything(two.out)
 
 
 @pytest.mark.slow
@@ -70,14 +69,13 @@ def test_few_people_are_shared_out_to_many_workers(tmp_path):
     assert everything(one) == everything(many.out)
 
 
-def test_what_is_there_is_kept_and_what_is_missing_is_made(tmp_path):
-    root = captured(tmp_path)
+def test_what_is_there_is_kept_and_what_is_missing_is_made(root):
     before = everything(root)
     lost = capture_layout.picture_path(root / NAMES[1], "depth", 2, 1)
     lost.unlink()
     kept = capture_layout.picture_path(root / NAMES[1], "depth", 2, 2)
     kept_at = kept.stat().st_mtime_ns
-    assert {outcome.subject: outcome.status for outcome in render(small_job(tmp_path))} == {
+    assert {outcome.subject: outcome.status for outcome in render(small_job(root.parent))} == {
         NAMES[0]: "skipped",
         NAMES[1]: "done",
     }
