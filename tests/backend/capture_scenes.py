@@ -53,18 +53,17 @@ def box_person() -> TexturedMesh:
     return TexturedMesh((box("body", half=0.3), box("hand", joints[LEFT_WRIST], 0.1, BLUE, LEFT_WRIST)))
 
 
-def body_mesh() -> TexturedMesh:
+def body_mesh(texture=((WHITE,),)) -> TexturedMesh:
     """The default body without clothes, each vertex on its four strongest joints."""
     body = default_body()
     weight, index = body.skin_weights.topk(4, dim=1)
-    faces = body.faces.numpy().astype(np.int32)
     return TexturedMesh((
         TexturedPart(
             name="body",
             vertices=body.template.double().numpy(),
-            faces=faces,
-            corner_uv=np.full((len(faces), 3, 2), 0.5, np.float32),
-            texture=np.full((1, 1, 4), 255, np.uint8),
+            faces=body.faces.int().numpy(),
+            corner_uv=body.uv[body.uv_faces].float().numpy(),
+            texture=np.asarray(texture, np.uint8),
             skin_index=index.numpy().astype(np.int32),
             skin_weight=(weight / weight.sum(1, keepdim=True)).double().numpy(),
         ),
@@ -93,3 +92,8 @@ def captured(root: Path, **more) -> Path:
     job = small_job(root, **more)
     assert {outcome.status for outcome in render(job)} == {"done"}
     return job.out
+
+
+def decoded(counts: list[int], height: int, width: int) -> np.ndarray:
+    """A mask from COCO's run lengths, without pycocotools."""
+    return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(width, height).T

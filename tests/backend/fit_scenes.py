@@ -9,13 +9,12 @@ from unittest import mock
 
 import numpy as np
 import pytest
-import torch
 from accelerate.state import AcceleratorState
+from capture_scenes import body_mesh
 from PIL import Image
-from primdiffusion.body.model import default_body
 from primdiffusion.cli import main
 from primdiffusion.encoder.config import PRESETS
-from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
+from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.training import fit as fit_module
 from primdiffusion.training.fit import MODEL
 from primdiffusion.training.fit_config import FitConfig
@@ -72,21 +71,10 @@ def flags(config: FitConfig) -> list[str]:
 
 def patched_person() -> TexturedMesh:
     """The default body in patches of colours that fade into each other."""
-    body = default_body()
     draws = np.random.default_rng(0).integers(60, 190, (12, 12, 4), np.uint8)
     draws[..., 3] = 255
     texture = Image.fromarray(draws).resize((256, 256), Image.Resampling.BICUBIC)
-    joints = body.skin_weights.topk(4, dim=-1)
-    part = TexturedPart(
-        name="body",
-        vertices=body.shape(torch.zeros(10)).vertices.double().numpy(),
-        faces=body.faces.int().numpy(),
-        corner_uv=body.uv[body.uv_faces].float().numpy(),
-        texture=np.asarray(texture),
-        skin_index=joints.indices.int().numpy(),
-        skin_weight=(joints.values / joints.values.sum(-1, keepdim=True)).double().numpy(),
-    )
-    return TexturedMesh((part,))
+    return body_mesh(texture)
 
 
 if __name__ == "__main__":  # a run in a process of its own, that a test may kill

@@ -213,23 +213,15 @@ def test_a_generated_human_stands_beside_a_mesh(tmp_path):
 
 def test_float_depth_is_written_only_if_asked_for_and_goes_on(whole, tmp_path):
     assert not (whole / "captures" / "ada" / "depth_float").exists()
-    words_of = [
-        *words(whole)[:5],
-        str(tmp_path / "out"),
-        *words(whole)[6:],
-        "--passes",
-        "img",
-        "depth",
-        "--float-depth",
-    ]
-    cli.main(words_of)
+    line = [*words(whole), "--out", str(tmp_path / "out"), "--passes", "img", "depth", "--float-depth"]
+    cli.main(line)
     assert capture_layout.read_about(tmp_path / "out")["passes"] == ["img", "depth", "depth_float"]
     before = everything(tmp_path / "out")
     for name in ("ada", "box"):
         path = capture_layout.picture_path(tmp_path / "out" / name, "depth_float", 1, 0)
         path.write_bytes(path.read_bytes()[:-3])
         (tmp_path / "out" / name / capture_layout.COMPLETE_FILE).unlink()
-    cli.main(words_of)
+    cli.main(line)
     after = everything(tmp_path / "out")
     assert {name for name in before if before[name] != after[name]} <= {"report.json"}
     cli.main(["captures", "verify", str(tmp_path / "out")])
@@ -237,19 +229,16 @@ def test_float_depth_is_written_only_if_asked_for_and_goes_on(whole, tmp_path):
 
 
 @pytest.mark.parametrize("passes", [["normal"], ["img", "part"]])
-def test_passes_that_volumes_do_not_have_are_refused(whole, tmp_path, capsys, passes):
-    with pytest.raises(SystemExit):
-        cli.main([*words(whole)[:5], str(tmp_path / "out"), "--passes", *passes])
-    assert "ada" in capsys.readouterr().err
+def test_passes_that_volumes_do_not_have_are_refused(whole, tmp_path, fails, passes):
+    assert "ada" in fails(*words(whole), "--out", tmp_path / "out", "--passes", *passes).err
     assert not (tmp_path / "out").exists()
 
 
-def test_a_damaged_human_fails_alone(tmp_path, capsys):
+def test_a_damaged_human_fails_alone(tmp_path, fails):
     save(tmp_path / "people" / "ada.human")
     save(tmp_path / "people" / "empty.human", density=0.0)
     (tmp_path / "people" / "cut.human").write_bytes((tmp_path / "people" / "ada.human").read_bytes()[:5000])
-    with pytest.raises(SystemExit):
-        cli.main(words(tmp_path))
+    fails(*words(tmp_path))
     report = json.loads((tmp_path / "captures" / "report.json").read_text())
     assert report["done"] == ["ada"]
     assert {failure["subject"]: failure["what"] for failure in report["failed"]} == {"cut": "render", "empty": "render"}

@@ -7,7 +7,7 @@ import pytest
 import torch
 from primdiffusion.body.measures import measure
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.human import Human, framing, generate, generate_batch, place, pose_body, render
+from primdiffusion.human import Human, framing, generate, place, pose_body, render
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import K
 from support.errors import refused
@@ -57,36 +57,12 @@ def test_a_person_is_as_tall_and_heavy_and_dressed_as_asked_for():
         generate(tiny_model(), seed=3, steps=3, guidance=math.nan)
 
 
-def test_people_of_a_batch_are_those_of_their_seeds():
-    alone = generate(tiny_model(), seed=4, steps=3)
-    together = generate_batch(tiny_model(), [3, 4], steps=3)
-    assert [person.provenance["seed"] for person in together] == [3, 4]
-    assert torch.allclose(together[1].payload.rgb, alone.payload.rgb, atol=1e-4)
-    assert torch.allclose(together[1].betas, alone.betas, atol=1e-4)
-
-
 def test_every_step_is_seen_in_order_and_the_last_is_the_person():
     steps = []
     model = tiny_model()
     person = generate(model, seed=3, steps=5, on_step=steps.append)
     assert [(step.index, step.total) for step in steps] == [(i, 5) for i in range(5)]
     assert torch.equal(model.decode(steps[-1].x0).rgb[0], person.payload.rgb)
-
-
-def test_an_exception_of_the_watcher_ends_the_sampling():
-    class Stop(Exception):
-        pass
-
-    seen = []
-
-    def stop_at_third(step):
-        seen.append(step.index)
-        if step.index == 2:
-            raise Stop
-
-    with pytest.raises(Stop):
-        generate(tiny_model(), seed=3, steps=100, on_step=stop_at_third)
-    assert seen == [0, 1, 2]
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"steps": 0}, {"steps": 1001}, {"sampler": "magic"}])

@@ -32,26 +32,6 @@ def test_a_translation_comes_along(tmp_path):
     assert_same(read_pose(path), translation=(1.0, 2.0, 3.0))
 
 
-def test_a_frame_of_an_amass_file_is_read_without_its_hands(tmp_path):
-    path = tmp_path / "amass.npz"
-    poses, trans = np.zeros((7, 156)), np.zeros((7, 3))
-    poses[4, :66], poses[4, 66:], trans[4] = THETA[:66], 9.0, (0.1, 0.2, 0.3)
-    np.savez(path, poses=poses, trans=trans, gender=np.array("neutral"))
-    assert_same(read_pose(path, frame=4), np.pad(THETA[:66], (0, 6)), translation=(0.1, 0.2, 0.3))
-
-
-def test_an_npz_that_would_run_code_is_rejected(tmp_path):
-    class Trap:
-        def __reduce__(self):
-            return (open, (str(tmp_path / "trapped"), "w"))
-
-    path = tmp_path / "trap.npz"
-    np.savez(path, poses=np.array([Trap()], dtype=object))
-    with refused(ValueError, "trap.npz"):
-        read_pose(path)
-    assert not (tmp_path / "trapped").exists()
-
-
 @pytest.mark.parametrize(
     "content", [[1, 2, 3], {"theta": None}, {"pose": "up"}, {}, [[0, 0, 0]] * 23, [math.nan] * 72, None, {"pose": []}]
 )
@@ -60,22 +40,8 @@ def test_numbers_that_are_no_pose_are_rejected_by_name(content):
         pose_from_numbers(content, "my pose")
 
 
-def test_a_frame_beyond_the_end_and_a_missing_file_are_errors(tmp_path):
+def test_a_frame_beyond_the_end_is_rejected(tmp_path):
     path = tmp_path / "one.npz"
     np.savez(path, poses=np.zeros((2, 72)))
     with refused(ValueError, "one.npz"):
         read_pose(path, frame=2)
-    with refused(FileNotFoundError, "none"):
-        read_pose(tmp_path / "none.json")
-    (tmp_path / "text.json").write_text("{")
-    with refused(ValueError, "text.json"):
-        read_pose(tmp_path / "text.json")
-
-
-@pytest.mark.parametrize("number", ["1e300", "1e30", "1e999", "NaN", "1" * 400, "true"])
-def test_numbers_that_become_no_rotation_are_rejected(tmp_path, number):
-    path = tmp_path / "pose.json"
-    path.write_text(f"[{','.join([number] * 72)}]")
-    with refused(ValueError, "pose.json") as caught:
-        read_pose(path)
-    assert len(str(caught.value)) < 300

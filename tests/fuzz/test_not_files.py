@@ -1,4 +1,4 @@
-"""What is no regular file in place of any input is rejected in a sentence, without waiting for it.
+"""What is no regular file, no file at all or a damaged one in place of any input is rejected in a sentence, at once.
 
 `MODULES` lists every module of both programs that reads a file, with the kinds of files that try it.
 """
@@ -10,7 +10,7 @@ import contextlib
 import os
 import signal
 import socket
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import bpy  # noqa: F401  before the rest, which it would otherwise load anew
@@ -56,6 +56,14 @@ KINDS = {
     "endless": lambda path: path.symlink_to("/proc/self/pagemap"),
     "circle": lambda path: path.symlink_to(path.name),
 }
+DAMAGED = {
+    "absent": None,
+    "empty": lambda content: b"",
+    "text": lambda content: b"hello world",
+    "half": lambda content: content[: len(content) // 2],
+    "head": lambda content: content[:20],
+}
+"""What is there instead of a file's content; None for no file."""
 
 
 def outcome(target: Target, path: Path, folder: Path) -> str:
@@ -88,6 +96,17 @@ AS_MISSING = {
     ("Blender: HDRI", "endless"),
 }  # fmt: skip
 """A link that leads nowhere is replaced where the program writes such a file; a file of /proc counts as empty."""
+NOT_THERE_YET = {
+    "batch settings", "run: settings", "run: starts", "run: metrics", "captures: settings", "captures: joints",
+    "captures: picture",
+}  # fmt: skip
+"""Files that the program writes where they are absent, or reads no more than it needs of."""
+ANY_CONTENT = {
+    "licences", "shape of a scan", "captures: completion mark", "captures: pack", "captures: about a pack",
+    "run: metrics", "material of an asset", "Blender: HDRI", "Blender: picture of a scan", "Blender: scan",
+}  # fmt: skip
+"""Lines of any text, what Blender shows as well as it can, and what is made again or not used where it is damaged."""
+STILL_VALID = {("captures: list", "head"), ("captures: picture", "half")}
 LENIENT = {"dataset.json", "complete.json", "cameras.json"}
 """Their reading in `targets` goes on after sentences; `captures: ...` do not."""
 TOGETHER = "readers of"
@@ -100,30 +119,65 @@ FILES = [
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("files")
+def valid(tmp_path_factory) -> Callable[[Target], tuple[Path, bytes]]:
+    """Where the file of a kind lies, which is made once and below which a test may put anything, and its content."""
+    root, found = tmp_path_factory.mktemp("files"), {}
+
+    def valid(target: Target) -> tuple[Path, bytes]:
+        folder = root / str(FILES.index(target))
+        folder.mkdir(exist_ok=True)
+        os.chdir(folder)
+        if target.name not in found:
+            path = target.make(folder)
+            found[target.name] = path, path.read_bytes()
+        return found[target.name]
+
+    return valid
+
+
+def remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        path.rmdir()
+    else:
+        path.unlink(missing_ok=True)
+
+
+each_kind = pytest.mark.parametrize("target", FILES, ids=lambda target: target.name)
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
-@pytest.mark.parametrize("target", FILES, ids=lambda target: target.name)
-def test_what_is_no_file_is_rejected_at_once(target, place, monkeypatch):
-    folder = place / str(FILES.index(target))
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    path = target.make(folder)
+@each_kind
+def test_what_is_no_file_is_rejected_at_once(target, valid, monkeypatch):
+    monkeypatch.chdir(".")  # back in the end
+    path, _ = valid(target)
     found = {}
     for kind, put in KINDS.items():
-        if path.is_dir() and not path.is_symlink():
-            path.rmdir()
-        else:
-            path.unlink()
+        remove(path)
         put(path)
-        found[kind] = outcome(target, path, folder)
+        found[kind] = outcome(target, path, Path.cwd())
     missing = {kind for kind in KINDS if target.name in OPTIONAL or (target.name, kind) in AS_MISSING}
     wrong = {
         kind: what for kind, what in found.items() if what != "rejected" and not (kind in missing and what == "read")
     }
     assert not wrong
+
+
+@each_kind
+def test_what_is_absent_or_damaged_is_rejected_by_name(target, valid, monkeypatch):
+    monkeypatch.chdir(".")
+    path, content = valid(target)
+    read = set()
+    for kind, change in DAMAGED.items():
+        remove(path)
+        if change:
+            path.write_bytes(change(content))
+        found = outcome(target, path, Path.cwd())
+        assert found in ("rejected", "read"), kind
+        read |= {kind} if found == "read" else set()
+    if target.name in ANY_CONTENT:
+        return
+    may = {"absent"} if target.name in OPTIONAL | NOT_THERE_YET else set()
+    assert read <= may | {kind for name, kind in STILL_VALID if name == target.name}
 
 
 def test_the_interruption_ends_what_waits_for_a_pipe(tmp_path, monkeypatch):

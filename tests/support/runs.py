@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 import torch
 from primdiffusion.failures import describe
 from safetensors.torch import load_file
@@ -35,6 +37,29 @@ def sentence(error: BaseException) -> str:
     assert failure is not None
     assert "\n" not in str(failure)
     return str(failure)
+
+
+class Ended(Exception):
+    """By its owner."""
+
+
+def ended_at_each_report(work: Callable[[Callable[..., None]], object], out: Path) -> None:
+    """Do work that writes a folder, and again, ended at each of its reports in turn: then there is no folder."""
+    reports = []
+    work(lambda *report, **_: reports.append(report))
+    shutil.rmtree(out)
+    assert len(reports) > 1
+    for end in range(len(reports)):
+        left = [None] * end
+
+        def report(*_: object, left=left, **__: object) -> None:
+            if not left:
+                raise Ended
+            left.pop()
+
+        with pytest.raises(Ended):
+            work(report)
+        assert not out.exists()
 
 
 def rows(run: Path) -> list[dict]:

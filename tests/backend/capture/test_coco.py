@@ -2,13 +2,12 @@
 
 import csv
 import json
-import shutil
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from capture_scenes import body_mesh, captured, save_person
+from capture_scenes import body_mesh, decoded, save_person
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
@@ -40,24 +39,8 @@ def bodies(tmp_path_factory):
     return job.out
 
 
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("whole"))
-
-
-@pytest.fixture
-def root(whole, tmp_path):
-    shutil.copytree(whole, tmp_path / "captures")
-    return tmp_path / "captures"
-
-
 def annotations(root) -> dict:
     return json.loads((root / "annotations.json").read_text())
-
-
-def decoded(counts, height, width):
-    """A mask from run lengths, without pycocotools."""
-    return np.repeat(np.arange(len(counts)) % 2 == 1, counts).reshape(width, height).T
 
 
 def test_pycocotools_reads_the_rendered_masks_and_boxes(bodies):
@@ -222,9 +205,8 @@ def test_the_table_has_a_line_for_each_image_and_the_attributes_of_its_human(roo
     assert [rows[-1][name] for name in ("hat", "height", "sex")] == ["none, at all", "", ""]
 
 
-def test_attributes_come_from_the_folder_of_people(root, whole):
+def test_attributes_come_from_the_folder_of_people(root):
     people = root.parent / "people"
-    shutil.copytree(whole.parent / "people", people)
     (people / NAME / "person.json").write_text(json.dumps({"seed": 0, "attributes": {"outfit": "suit"}}))
     cli.main(["captures", "coco", str(root), "--people", str(people)])
     assert (root / "images.csv").read_text().splitlines()[1].endswith(",suit")

@@ -6,7 +6,7 @@ import shutil
 import numpy as np
 import pytest
 import torch
-from capture_scenes import small_job
+from capture_scenes import decoded, small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.coco import KEYPOINTS, groups, write_coco
@@ -39,11 +39,6 @@ def whole(tmp_path_factory):
 def root(whole, tmp_path):
     shutil.copytree(whole, tmp_path / "captures")
     return tmp_path / "captures"
-
-
-def decoded(mask):
-    height, width = mask["size"]
-    return np.repeat(np.arange(len(mask["counts"])) % 2 == 1, mask["counts"]).reshape(width, height).T
 
 
 def test_places_are_apart_and_begin_in_the_middle():
@@ -114,14 +109,16 @@ def test_masks_of_a_group_are_what_nearer_humans_leave(root):
     assert [image["subjects"] for image in written["images"]] == [NAMES[:3]] * 12 + [NAMES[3:]] * 12
     for image in written["images"]:
         found = [one for one in written["annotations"] if one["image_id"] == image["id"]]
-        shown = [decoded(one["segmentation"]) for one in found]
+        shown = [decoded(one["segmentation"]["counts"], *one["segmentation"]["size"]) for one in found]
         assert np.sum(shown, axis=0).max() == 1
         where = image["frame"], image["camera"]
         stored = {name: captures.subject(name).pictures(("mask", "depth"), *where) for name in image["subjects"]}
         everyone = np.array([np.where(one["depth"] > 0, one["depth"], 65535) for one in stored.values()])
         for annotation, mask in zip(found, shown, strict=True):
             own = stored[annotation["subject"]]
-            assert np.array_equal(decoded(annotation["amodal"]), own["mask"] >= 128)
+            assert np.array_equal(
+                decoded(annotation["amodal"]["counts"], *annotation["amodal"]["size"]), own["mask"] >= 128
+            )
             assert not (mask & (own["mask"] < 128)).any()
             nearest = (own["depth"] > 0) & (own["depth"] == everyone.min(0))
             inside = np.min([(one["mask"] == 0) | (one["mask"] == 255) for one in stored.values()], axis=0)
@@ -172,13 +169,12 @@ def test_a_group_over_black_is_composed_and_a_single_human_is_not(root):
     assert np.abs(shown - np.maximum(*stored)).mean() < 6
 
 
-def test_a_damaged_human_is_rendered_again_to_the_same_bytes(root, whole):
+def test_a_damaged_human_is_rendered_again_to_the_same_bytes(root, whole, fails):
     job_root = root.parent
     shutil.copytree(whole.parent / "people", job_root / "people")
     before = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
     capture_layout.picture_path(root / NAMES[1], "depth", 2, 1).write_bytes(b"damaged")
-    with pytest.raises(SystemExit):
-        cli.main(["captures", "verify", str(root), "--repair"])
+    fails("captures", "verify", root, "--repair")
     command = ["captures", "render", "--people", str(job_root / "people"), "--out", str(root), "--pose-count", "3"]
     cli.main([*command, "--cameras", "4", "--size", "96", "--together", "3", "--shard", "1/5"])
     after = {path: path.read_bytes() for path in root.rglob("*") if path.is_file()}
@@ -199,11 +195,10 @@ def test_backgrounds_go_behind_all_humans(root, tmp_path):
 @pytest.mark.parametrize(
     "words", [["--together", "0"], ["--together", "9"], ["--together", "2", "--released-reference"]]
 )
-def test_groups_that_cannot_be_are_refused(tmp_path, capsys, words):
+def test_groups_that_cannot_be_are_refused(tmp_path, fails, words):
     small_job(tmp_path, people=2)
-    with pytest.raises(SystemExit):
-        cli.main(["captures", "render", "--people", str(tmp_path / "people"), "--out", str(tmp_path / "out"), *words])
-    assert "together" in capsys.readouterr().err
+    line = ("captures", "render", "--people", tmp_path / "people", "--out", tmp_path / "out")
+    assert "together" in fails(*line, *words).err
     assert not (tmp_path / "out").exists()
 
 

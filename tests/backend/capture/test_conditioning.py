@@ -112,14 +112,6 @@ def test_a_frame_that_was_not_captured_is_rejected(dataset, frame):
         captured_person(dataset, FIRST, frame)
 
 
-def test_a_missing_picture_is_named(folder):
-    path = picture_path(folder / FIRST, "img", 2, 1)
-    path.unlink()
-    with refused(FileNotFoundError, str(path)):
-        captured_person(folder, FIRST, 1)
-    assert captured_person(folder, FIRST, 0).cameras == (0, 1, 2, 3)
-
-
 def test_a_mask_of_another_size_is_named(folder):
     path = picture_path(folder / FIRST, "mask", 1, 0)
     Image.new("L", (16, 32), 255).save(path)

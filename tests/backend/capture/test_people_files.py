@@ -1,12 +1,12 @@
-"""Meshes of humans that are whole glTF and hold what no mesh has."""
+"""Humans read from .glb files: what was written, and whole glTF that holds no human or what no mesh has."""
 
 import json
 import struct
 
 import numpy as np
 import pytest
-from capture_scenes import save_person
-from primdiffusion.capture.people_files import read_person
+from capture_scenes import box_person, save_person
+from primdiffusion.capture.people_files import find_people, read_person
 from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
@@ -27,6 +27,44 @@ def write(path, tree, binary):
     text += b" " * (-len(text) % 4)
     chunks = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+
+
+def test_a_persons_file_is_read_as_it_was_written(tmp_path):
+    mesh = box_person()
+    person = read_person(save_person(tmp_path / "a.glb", mesh))
+    assert person.betas.tolist() == [0.0] * 10
+    for was, now in zip(mesh.parts, person.mesh.parts, strict=True):
+        assert now.name == was.name
+        np.testing.assert_allclose(now.vertices[now.faces], was.vertices[was.faces], atol=1e-6)
+        np.testing.assert_allclose(now.corner_uv, was.corner_uv, atol=1e-6)
+        assert np.array_equal(now.texture, was.texture)
+        assert (now.skin_index[:, 0] == was.skin_index[0, 0]).all()
+
+
+@pytest.mark.parametrize(
+    ("edit", "why"),
+    [
+        (lambda c: c["accessors"][1].update(count=10**9), "accessor"),
+        (lambda c: c["accessors"][1].update(bufferView=99), "accessor"),
+        (lambda c: c["bufferViews"][1].update(byteOffset=-8), "accessor"),
+        (lambda c: c["nodes"][0].update(name="Hips"), "joints Hips"),
+        (lambda c: c["images"][0].update(uri="../../secret.png", bufferView=10**6), "image"),
+        (lambda c: (c["asset"].pop("extras"), c["scenes"][0].pop("extras")), "betas"),
+        (lambda c: c["asset"]["extras"]["primdiffusion"].update(body="smplx"), "smplx"),
+        (lambda c: c["asset"]["extras"]["primdiffusion"].update(betas=[1e6] * 10), "betas"),
+        (lambda c: c["asset"]["extras"]["primdiffusion"].update(betas=[0.0] * 5000), "betas"),
+        (lambda c: c["nodes"][24].update(skin=-7), "not a human"),
+        (lambda c: c.pop("nodes"), "not a human"),
+        (lambda c: c["nodes"].__setitem__(slice(24, None), []), "no mesh"),
+        (lambda c: c["nodes"][24].pop("skin"), "has no skin"),
+    ],
+)
+def test_files_without_a_human_are_rejected(person, edit, why):
+    path, tree, binary = person
+    edit(tree)
+    write(path, tree, binary)
+    with refused(FileError, "person.glb", why):
+        read_person(path)
 
 
 @pytest.mark.parametrize(
@@ -80,3 +118,11 @@ def test_textures_that_a_file_of_its_size_cannot_have_are_not_decoded(person, mo
     monkeypatch.setattr("primdiffusion.capture.people_files.Glb.picture_texels", lambda *_: 2)
     with refused(FileError, "1 texels"):
         read_person(path)
+
+
+def test_people_are_found_in_folders_of_their_own_and_as_files(tmp_path):
+    for path in ("people/b/person.glb", "people/a/person.glb", "c.glb", ".hidden/person.glb"):
+        save_person(tmp_path / path)
+    assert list(find_people(tmp_path)) == ["a", "b", "c"]
+    with refused(FileNotFoundError, "nowhere"):
+        find_people(tmp_path / "nowhere")

@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 import pytest
 import torch
-from capture_scenes import captured, small_job
+from capture_scenes import small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose, default_body
@@ -28,17 +28,6 @@ from primdiffusion.raster.multisample import render_view
 from support.errors import refused
 
 NAME = "person_000000"
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory):
-    return captured(tmp_path_factory.mktemp("whole"), people=2)
-
-
-@pytest.fixture
-def root(whole, tmp_path):
-    shutil.copytree(whole.parent, tmp_path / "copy")
-    return tmp_path / "copy" / whole.name
 
 
 def test_a_view_comes_back_as_it_was_drawn(root):
@@ -178,55 +167,25 @@ def test_zip_paths_that_lead_out_are_not_followed(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("arrays", "why"),
-    [
-        ({"x": np.array([object()], dtype=object)}, "pickled"),
-        ({"x": np.array(["a"])}, "not numbers"),
-        ({"x": np.array([np.nan])}, "NaN"),
-        ({"y": np.zeros(2)}, "no array 'x'"),
-    ],
-)
-def test_npz_files_of_other_things_are_rejected(tmp_path, arrays, why):
-    np.savez(tmp_path / "a.npz", **arrays)
-    with pytest.raises(FileError, match=why):
-        read_numbers(tmp_path / "a.npz", ("x",))
-
-
-def test_an_npz_that_claims_petabytes_is_rejected(tmp_path):
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive, archive.open("x.npy", "w") as member:
-        about = {"descr": "<f8", "fortran_order": False, "shape": (1 << 50,)}
-        np.lib.format.write_array_header_1_0(member, about)
-    with refused(FileError, "a.npz"):
-        read_numbers(tmp_path / "a.npz", ("x",))
-
-
-@pytest.mark.parametrize(
     ("file", "content", "why"),
     [
-        ("img/camera0002/0001.jpg", None, "missing"),
-        ("img/camera0002/0001.jpg", 200, "not a complete image"),
-        ("mask/camera0002/0001.png", b"", "not a complete image"),
+        ("mask/camera0002/0001.png", None, "missing"),
         ("mask/camera0002/0001.png", "small", "5 x 5 pixels, its camera 32 x 32"),
-        ("depth/camera0002/0001.png", 60, "not a complete image"),
-        ("cameras.json", None, "missing"),
+        ("depth/camera0002/0001.png", b"cut", "not a complete image"),
         ("cameras.json", b"[1, 2]", "not a list of cameras"),
         ("cameras.json", b'{"camera0000": {"K": [[1]]}}', "not a list of cameras"),
         ("cameras.json", b"{}", "contains no camera"),
-        ("cameras.json", b"{", "cannot be read"),
-        (f"{capture_layout.SMPL_FOLDER}/{capture_layout.SMPL_PLAIN_FILE}", 100, "is damaged"),
     ],
 )
 def test_wrong_and_missing_files_are_named(root, file, content, why):
     path = root / NAME / file
-    if content is None:
-        path.unlink()
-    elif content == "small":
+    path.unlink()
+    if content == "small":
         Image.new("L", (5, 5)).save(path)
-    else:
-        path.write_bytes(path.read_bytes()[:content] if isinstance(content, int) else content)
-    with pytest.raises((ValueError, FileNotFoundError), match=why) as error:
+    elif content:
+        path.write_bytes(content)
+    with refused((FileError, FileNotFoundError), str(path), why):
         open_captures(root).view(NAME, 1, 2)
-    assert str(path) in str(error.value)
 
 
 def test_no_captures_are_no_captures(tmp_path):
@@ -242,7 +201,7 @@ def test_frames_and_cameras_that_are_not_there_are_rejected(root):
             open_captures(root).view(NAME, frame, camera)
 
 
-def test_damage_is_found_and_repaired_so_that_only_it_is_made_again(root, capsys):
+def test_damage_is_found_and_repaired_so_that_only_it_is_made_again(root, fails):
     cli.main(["captures", "verify", str(root)])
     cut, altered, stray = (
         root / NAME / file
@@ -256,10 +215,7 @@ def test_damage_is_found_and_repaired_so_that_only_it_is_made_again(root, capsys
     os.utime(stray, (0, 0))  # old: its writer has ended
     assert list(verify(root)) == [cut, altered, stray]
     assert list(verify(root, checksums=False)) == [cut, stray]
-    with pytest.raises(SystemExit) as end:
-        cli.main(["captures", "verify", str(root), "--repair"])
-    assert end.value.code == 1
-    assert str(cut) in capsys.readouterr().out
+    assert str(cut) in fails("captures", "verify", root, "--repair").out
     assert not any(path.exists() for path in (cut, altered, stray))
     assert capture_layout.picture_path(root / NAME, "img", 0, 0).exists()
     assert open_captures(root).subjects == ("person_000001",)

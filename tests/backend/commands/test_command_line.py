@@ -7,7 +7,7 @@ from typing import Annotated
 import pytest
 from primdiffusion.commands.command_line import parse
 from primdiffusion.commands.options import OPTIONS, GenerateCommand
-from primdiffusion.formats.requests import Attributes, InpaintRequest
+from primdiffusion.formats.requests import Attributes
 from primdiffusion.formats.schema import FieldError, Option, Range
 
 
@@ -58,13 +58,6 @@ def test_a_value_out_of_range_is_named(level):
     with pytest.raises(FieldError) as error:
         parse(Settings, ["a", "--out", "b", "--level", level], "settle")
     assert error.value.field == "level"
-
-
-@pytest.mark.parametrize("words", [[], ["--region", "top", "--weights", "w.npz"]])
-def test_a_region_is_given_in_one_way(words):
-    with pytest.raises(FieldError) as error:
-        parse(InpaintRequest, ["a", "--out", "b", *words], "inpaint")
-    assert error.value.field == "region"
 
 
 def test_the_last_seed_is_within_the_limit_too():

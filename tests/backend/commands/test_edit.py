@@ -4,12 +4,9 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from editing_people import anybody
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
-from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.editing.regions import region_from_weights, region_of
 from primdiffusion.human_file import load_human, save_human
 from tiny_model import save_tiny_checkpoint, tiny_model
 
@@ -42,11 +39,6 @@ def line(folder, tmp_path):
     return line
 
 
-def same(one, two, where=slice(None)) -> bool:
-    fields = ("rgb", "density", "delta_scale")
-    return all(torch.equal(getattr(one.payload, name)[where], getattr(two.payload, name)[where]) for name in fields)
-
-
 @pytest.mark.parametrize(
     ("command", "edit"),
     [
@@ -60,6 +52,10 @@ def same(one, two, where=slice(None)) -> bool:
             ["transfer", "--source", "bob.human.safetensors", "--region", "top"],
             {"edit": "transfer_texture", "region": ["top"]},
         ),
+        (
+            ["transfer", "--source", "bob.human.safetensors", "--region", "top", "--harmonise", "0.4", "--steps", "2"],
+            {"edit": "harmonise"},
+        ),
     ],
 )
 def test_each_command_writes_a_whole_person_who_tells_what_was_done(line, tmp_path, capsys, command, edit):
@@ -70,112 +66,28 @@ def test_each_command_writes_a_whole_person_who_tells_what_was_done(line, tmp_pa
     assert capsys.readouterr().out.startswith(f"{tmp_path / 'out'}  {edit['edit']}, ")
 
 
-def test_inpaint_changes_the_painted_region_and_not_a_bit_besides(line, folder, tmp_path):
-    cli.main(line("inpaint", "--weights", "painted.npz", "--steps", "2"))
-    ann, edited = (
-        load_human(path) for path in (folder / "ann.human.safetensors", tmp_path / "out" / "person.human.safetensors")
-    )
-    with np.load(folder / "painted.npz") as stored:
-        painted = region_from_weights(torch.from_numpy(stored["weights"]))
-    assert same(ann, edited, ~painted)
-    assert not same(ann, edited, painted)
-    assert torch.equal(ann.betas, edited.betas)
-
-
-def test_transfer_of_a_garment_copies_shape_too_and_harmonising_changes_it_within_the_region(line, folder, tmp_path):
-    shoes = region_of(["shoes"])
-    take = ["transfer", "--source", "bob.human.safetensors", "--region", "shoes", "--what", "garment"]
-    bob, ann = (load_human(folder / f"{name}.human.safetensors") for name in ("bob", "ann"))
-    cli.main(line(*take))
-    exact = load_human(tmp_path / "out" / "person.human.safetensors")
-    assert same(exact, bob, shoes)
-    cli.main(line(*take, "--harmonise", "0.4", "--steps", "2"))
-    harmonised = load_human(tmp_path / "out" / "person.human.safetensors")
-    assert not same(harmonised, bob, shoes)
-    assert same(harmonised, ann, ~shoes)
-    assert [edit["edit"] for edit in harmonised.provenance["edits"]] == ["transfer_garment", "harmonise"]
-
-
-def test_a_transfer_needs_no_checkpoint(line, tmp_path):
-    take = ["transfer", "--source", "bob.human.safetensors", "--region", "top"]
-    cli.main(line(*take, "--checkpoint", "nowhere"))
-    assert (tmp_path / "out" / "person.human.safetensors").exists()
-
-
 @pytest.mark.parametrize(
     ("command", "code", "sentence"),
     [
-        (["vary", "--seed", "seven"], 2, "seven"),
-        (["vary", "--attributes", "tall"], 2, "'tall' is not an attribute"),
         (["vary", "--attributes", "species=cat"], 1, "knows no attribute 'species'"),
-        (["interpolate", "nobody.human.safetensors"], 1, "there is no human file"),
-        (["interpolate", "tiny.safetensors"], 1, "without a human"),
         (["inpaint"], 1, "region and weights"),
-        (["inpaint", "--region", "top", "--weights", "painted.npz"], 1, "region and weights"),
-        (["inpaint", "--region", "hat"], 1, "'hat': choose from face"),
-        (["inpaint", "--region", "clothes", "skin", "hair"], 1, "the region is the whole human"),
-        (["inpaint", "--weights", "nothing.npz"], 1, "nothing.npz"),
-        (["inpaint", "--weights", "ann.human.safetensors"], 1, "ann.human.safetensors"),
         (["inpaint", "--region", "top", "--checkpoint", "bob.human.safetensors"], 1, "choose another file"),
         (["transfer", "--region", "top"], 2, "source"),
-        (["transfer", "--source", "bob.human.safetensors", "--region", "top", "--harmonise", "2"], 1, "harmonise is 2"),
     ],
 )
-def test_bad_input_is_one_sentence_and_nothing_is_written(line, tmp_path, capsys, command, code, sentence):
-    with pytest.raises(SystemExit) as end:
-        cli.main(line(*command))
-    stderr = capsys.readouterr().err
-    assert end.value.code == code
-    assert sentence in stderr
-    assert code == 2 or stderr.splitlines()[-1].startswith("primdiffusion: ")
-    assert "Traceback" not in stderr
+def test_bad_input_is_one_sentence_and_nothing_is_written(line, tmp_path, fails, command, code, sentence):
+    failed = fails(*line(*command))
+    assert failed.code == code
+    assert sentence in failed.err
+    assert code == 2 or failed.err.count("\n") == 1
     assert not (tmp_path / "out").exists()
 
 
-def test_paint_of_another_body_is_rejected_with_the_number_of_vertices(line, folder, tmp_path, capsys):
+def test_paint_of_another_body_is_rejected_with_the_number_of_vertices(line, folder, fails):
     np.savez(folder / "other_body.npz", weights=np.ones(6890, np.float32))
-    with pytest.raises(SystemExit):
-        cli.main(line("inpaint", "--weights", "other_body.npz"))
-    error = capsys.readouterr().err
+    error = fails(*line("inpaint", "--weights", "other_body.npz")).err
     assert "12196 vertices" in error
     assert "other_body.npz" in error
-    np.savez(folder / "texts.npz", weights=np.array(["a", "b"]))
-    with pytest.raises(SystemExit):
-        cli.main(line("inpaint", "--weights", "texts.npz"))
-    assert "texts.npz holds 'weights'" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize(
-    "command", [["vary"], ["inpaint", "--region", "top"], ["interpolate", "bob.human.safetensors"]]
-)
-def test_memory_that_runs_out_mid_sample_leaves_nothing_and_names_what_to_lower(
-    line, tmp_path, capsys, monkeypatch, command
-):
-    calls, denoise = [], DiffusionModel.denoise
-
-    def small_card(self, x, t, *more):
-        calls.append(t)
-        if len(calls) == 3:
-            raise RuntimeError("[enforce fail at alloc_cpu.cpp:75] DefaultCPUAllocator: not enough memory: you tried")
-        return denoise(self, x, t, *more)
-
-    monkeypatch.setattr(DiffusionModel, "denoise", small_card)
-    with pytest.raises(SystemExit) as end:
-        cli.main(line(*command, "--steps", "6"))
-    assert (end.value.code, len(calls)) == (1, 3)
-    assert "ran out of memory: close other programs, or choose a smaller checkpoint" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
-
-
-def test_an_interrupt_mid_sample_leaves_nothing(line, tmp_path, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(DiffusionModel, "denoise", interrupted)
-    with pytest.raises(SystemExit) as end:
-        cli.main(line("vary", "--steps", "2"))
-    assert end.value.code == 130
-    assert not (tmp_path / "out").exists()
 
 
 def test_info_tells_all_that_a_file_says_of_a_person(line, tmp_path, capsys):
@@ -189,9 +101,7 @@ def test_info_tells_all_that_a_file_says_of_a_person(line, tmp_path, capsys):
     assert len(about["edits"][0]["checkpoint_sha256"]) == 64
 
 
-def test_info_of_a_damaged_person_says_so_and_not_that_it_is_no_checkpoint(folder, tmp_path, capsys):
+def test_info_of_a_damaged_person_says_so_and_not_that_it_is_no_checkpoint(folder, tmp_path, fails):
     path = tmp_path / "cut.human.safetensors"
     path.write_bytes((folder / "ann.human.safetensors").read_bytes()[:-10])
-    with pytest.raises(SystemExit):
-        cli.main(["info", str(path)])
-    assert "generate the human again" in capsys.readouterr().err
+    assert "generate the human again" in fails("info", path).err

@@ -1,26 +1,13 @@
 """The exported graph computes what the denoiser does."""
 
 import json
-import sys
 
 import pytest
 import torch
 from primdiffusion import cli
-from primdiffusion.commands.export_onnx import export_denoiser
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.failures import MissingPackageError, describe
 from support.errors import refused
-from tiny_model import save_tiny_checkpoint, tiny_model
-
-
-def test_without_the_package_one_sentence_has_the_line_that_installs_it(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(MissingPackageError) as error:
-        export_denoiser(tmp_path / "a.onnx", tiny_model())
-    assert str(describe(error.value)) == (
-        'this needs onnx, which is not installed: run pip install "primdiffusion[onnx]"'
-    )
-    assert not list(tmp_path.iterdir())
+from tiny_model import save_tiny_checkpoint
 
 
 @pytest.mark.parametrize("weights", ["tiny", pytest.param("default", marks=pytest.mark.slow)])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import shutil
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,12 @@ from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.failures import describe
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.reshaping import reshaped
-from support.errors import refused
 from tiny_model import tiny_model
 
 WIDTH, HEIGHT = 40, 56
@@ -98,22 +95,6 @@ def test_a_region_is_the_part_of_the_picture_counted_from_the_bottom_left(params
     assert np.allclose(drawn(part).combined[::-1], whole[y : y + h, x : x + w], atol=1e-3)
 
 
-def test_reports_tell_the_rows_that_are_done_and_the_frame_is_filled_that_far(params):
-    reports = []
-
-    def report(*news):
-        reports.append(news)
-        rows = news[1]
-        assert np.isfinite(map_frame(params.frame, WIDTH, HEIGHT).combined[:rows]).all()
-
-    result = FrameDrawer(torch.device("cpu")).draw(params, report)
-    assert reports[0] == ("draw", 0, HEIGHT, None)
-    assert reports[-1] == ("draw", HEIGHT, HEIGHT, 0.0)
-    assert {(stage, total) for stage, _, total, _ in reports} == {("draw", HEIGHT)}
-    assert 0 < result.seconds_march < result.seconds
-    assert 0 < result.seconds_place < result.seconds
-
-
 def test_the_first_band_is_small_where_samples_or_people_are_many(params):
     def first_band(**changes) -> int:
         reports: list = []
@@ -177,30 +158,6 @@ def test_solids_come_from_a_file_of_plain_arrays_and_are_read_again_when_it_chan
     assert drawn(scene, drawer).combined[20, 20, 0] == 0
 
 
-def test_a_frame_of_another_size_is_rejected_and_left_alone(params, tmp_path):
-    frame = new_frame(tmp_path / "small", WIDTH, HEIGHT - 1)
-    with pytest.raises(ValueError, match=f"{WIDTH} x {HEIGHT} pixels need {WIDTH * HEIGHT * 20}"):
-        drawn(dataclasses.replace(params, frame=frame))
-    assert np.isnan(np.fromfile(frame, np.float32)).all()
-
-
-def test_files_that_are_missing_or_hold_something_else_are_named(params, tmp_path):
-    nowhere = str(tmp_path / "nowhere")
-    person = dataclasses.replace(params.people[0], human=nowhere)
-    for wrong in ({"frame": nowhere}, {"solids": nowhere}, {"people": [person]}):
-        with pytest.raises(FileNotFoundError, match="nowhere"):
-            drawn(dataclasses.replace(params, **wrong))
-    (tmp_path / "text").write_text("no arrays")
-    np.savez(tmp_path / "others.npz", a=np.zeros(3))
-    objects = np.array([{}], dtype=object)
-    np.savez(tmp_path / "pickled.npz", corners=objects, colour=objects, holdout=objects)
-    shutil.copy(tmp_path / "others.npz", tmp_path / "cut.npz")
-    os.truncate(tmp_path / "cut.npz", 60)
-    for name in ("text", "others.npz", "pickled.npz", "cut.npz"):
-        with refused(FileError, name):
-            drawn(dataclasses.replace(params, solids=str(tmp_path / name)))
-
-
 def test_out_of_memory_names_the_resolution(params, monkeypatch):
     def no_room(*_):
         torch.empty(10**15)
@@ -210,18 +167,6 @@ def test_out_of_memory_names_the_resolution(params, monkeypatch):
         drawn(params)
     failure = describe(error.value)
     assert (failure.kind, "resolution" in failure.remedy) == ("out_of_memory", True)
-
-
-def test_a_picture_can_be_stopped_at_every_report(params):
-    class Stop(Exception):
-        pass
-
-    def stop(_, rows, *__):
-        if rows > 0:
-            raise Stop
-
-    with pytest.raises(Stop):
-        FrameDrawer(torch.device("cpu")).draw(params, stop)
 
 
 @pytest.mark.parametrize("scale", [0.001, 0.03, 0.8, 300.0])

@@ -12,15 +12,9 @@ from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.editing.vary import vary
 from primdiffusion.formats.requests import VariationsRequest
-from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
-from tiny_model import save_tiny_checkpoint
-
-
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory) -> str:
-    return str(save_tiny_checkpoint(tmp_path_factory.mktemp("checkpoint") / "tiny.safetensors"))
+from support.runs import ended_at_each_report
 
 
 @pytest.fixture
@@ -91,54 +85,5 @@ def test_variants_of_a_person_are_those_that_vary_makes(checkpoint, model, tmp_p
 
 
 def test_it_can_be_ended_at_every_report_and_then_leaves_nothing(checkpoint, tmp_path):
-    class Stop(Exception):
-        pass
-
     request = VariationsRequest(seeds=[1, 2], out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint, size=16)
-    listener = Listener()
-    variations(request, Session(), listener)
-    for path in (tmp_path / "out").iterdir():
-        path.unlink()
-    (tmp_path / "out").rmdir()
-    for end in range(len(listener.reports)):
-        count = itertools.count()
-
-        def stop(*_, count=count, end=end, **more):
-            if next(count) == end:
-                raise Stop
-
-        with pytest.raises(Stop):
-            variations(request, Session(), stop)
-        assert not (tmp_path / "out").exists()
-
-
-def test_a_person_that_is_not_there_is_named(checkpoint, tmp_path):
-    how = {"steps": 2, "checkpoint": checkpoint, "person": tmp_path / "nobody"}
-    request = VariationsRequest(seeds=[1], out_dir=tmp_path / "out", **how)
-    with pytest.raises(FileNotFoundError, match=r"there is no human file .*nobody"):
-        variations(request, Session(), lambda *_, **more: None)
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("changes", "field"),
-    [
-        ({"seeds": []}, "seeds"),
-        ({"seeds": list(range(65))}, "seeds"),
-        ({"seeds": [1, "2"]}, "seeds[1]"),
-        ({"seeds": [True]}, "seeds[0]"),
-        ({"seeds": [-1]}, "seeds[0]"),
-        ({"seeds": [4, 5, 4]}, "seeds"),
-        ({"steps": 0}, "steps"),
-        ({"size": 1}, "size"),
-        ({"size": 5000}, "size"),
-        ({"out_dir": ""}, "out_dir"),
-        ({"person": ""}, "person"),
-        ({"amount": 1.5}, "amount"),
-        ({"guidance": float("nan")}, "guidance"),
-    ],
-)
-def test_what_cannot_be_is_rejected_before_any_work(changes, field):
-    with pytest.raises(FieldError) as error:
-        read(VariationsRequest, {"seeds": [1], "out_dir": "out", **changes})
-    assert error.value.field == field
+    ended_at_each_report(lambda report: variations(request, Session(), report), tmp_path / "out")

@@ -13,12 +13,11 @@ from primdiffusion.commands.session import Session
 from primdiffusion.export.merged_file import upright_grid
 from primdiffusion.formats.answers import MergeAnswer, MergeFramesAnswer
 from primdiffusion.formats.requests import MergeFramesRequest, MergeRequest, PosedPerson
-from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.merge import merge
 from primdiffusion.reshaping import reshaped
-from primdiffusion.serve.server import FUNCTIONS, Cancelled
+from primdiffusion.serve.server import Cancelled
 from tiny_model import tiny_model
 
 VOXEL = 0.03
@@ -104,24 +103,3 @@ def test_a_cancelled_merge_leaves_no_file(person, tmp_path):
     with pytest.raises(Cancelled):
         done(MergeRequest(people=[person], out=tmp_path / "grid.npz", voxel=VOXEL), cancelled)
     assert not list(tmp_path.glob("*grid*"))
-
-
-@pytest.mark.parametrize(
-    ("record", "wrong", "name"),
-    [
-        (MergeRequest, {"people": [], "out": "grid.npz"}, "people"),
-        (MergeRequest, {"out": ""}, "out"),
-        (MergeRequest, {"out": "grid.npz", "voxel": 0.0}, "voxel"),
-        (MergeFramesRequest, {"people": [], "out_dir": "folder"}, "people"),
-        (MergeFramesRequest, {"out_dir": ""}, "out_dir"),
-        (MergeFramesRequest, {"out_dir": "folder", "voxel": float("inf")}, "voxel"),
-    ],
-)
-def test_a_wrong_parameter_is_named(record, wrong, name):
-    person = {"human": "h", "object": STILL, "joints": [STILL] * 24}
-    with pytest.raises(FieldError, match=name):
-        read(record, {"people": [person], **wrong})
-
-
-def test_the_child_knows_the_methods():
-    assert {"merge", "merge_frames"} <= set(FUNCTIONS)

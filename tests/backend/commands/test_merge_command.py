@@ -38,17 +38,6 @@ def grid_of(path: Path) -> dict[str, np.ndarray]:
         return dict(arrays)
 
 
-def test_a_person_becomes_a_grid_that_stands_upright(saved, tmp_path, capsys):
-    out = tmp_path / "anna.npz"
-    cli.run(["merge", str(saved), "--out", str(out), *COARSE])
-    assert capsys.readouterr().out.strip() == str(out)
-    grid = grid_of(out)
-    height = grid["density"].shape[2] * 0.03
-    assert 1.2 < height < 2.6
-    assert grid["density"].shape[1] * 0.03 < 1.0  # arms are stretched out to the sides: x
-    assert grid["colour"].shape == (*grid["density"].shape, 3)
-
-
 def test_several_stand_side_by_side(saved, tmp_path):
     cli.run(["merge", str(saved), str(saved), "--apart", "3", "--out", str(tmp_path / "two.npz"), *COARSE])
     cli.run(["merge", str(saved), "--out", str(tmp_path / "one.npz"), *COARSE])

@@ -1,10 +1,8 @@
 """`primdiffusion reconstruct` and the child's job of the same name, without the child."""
 
 import dataclasses
-import itertools
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,13 +17,13 @@ from primdiffusion.commands import session as session_module
 from primdiffusion.commands.session import Session
 from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE, picture_path
+from primdiffusion.formats.capture_layout import LIST_FILE, SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 from primdiffusion.formats.requests import ReconstructRequest
-from primdiffusion.formats.schema import FieldError, read
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
 from primdiffusion.reconstruction import reconstruct
+from support.runs import ended_at_each_report
 from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
 from tiny_model import save_tiny_checkpoint
 
@@ -52,16 +50,6 @@ def checkpoint(tmp_path_factory):
 def line(checkpoint, tmp_path):
     """The start of a command line that writes to tmp_path / "out"."""
     return ["reconstruct", "--checkpoint", str(checkpoint), "--out", str(tmp_path / "out"), "--size", "32"]
-
-
-def failure(capsys, line, *more) -> str:
-    """The sentence that a line fails with, having left nothing."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([*line, *(str(word) for word in more)])
-    assert end.value.code == 1
-    lines = capsys.readouterr().err.splitlines()
-    assert not Path(line[line.index("--out") + 1]).exists()
-    return lines[-1]
 
 
 def test_the_command_writes_what_generate_writes_and_says_where_it_comes_from(dataset, line, tmp_path, capsys):
@@ -159,40 +147,6 @@ def test_a_camera_that_has_the_person_at_its_back_changes_nothing(dataset, tmp_p
     assert torch.allclose(reconstruct(tiny_encoder(), person).payload.rgb, whole.payload.rgb, atol=1e-4)
 
 
-@pytest.mark.parametrize(
-    ("words", "sentence"),
-    [
-        ([], "contains several subjects: name one of them (person_000000, person_000001)"),
-        (["--subject", "anna"], "there is no subject 'anna'"),
-        (["--subject", FIRST, "--frame", "7"], "person_000000 has frames 0 to 1, not 7"),
-        (["--subject", FIRST, "--views", "0"], "views is 0"),
-        (["--subject", FIRST, "--size", "0"], "size is 0"),
-    ],
-)
-def test_impossible_wishes_are_one_sentence_and_leave_nothing(dataset, line, capsys, words, sentence):
-    assert sentence in failure(capsys, line, "--capture", dataset, *words)
-
-
-def test_a_missing_folder_picture_or_dataset_is_named(dataset, line, tmp_path, capsys):
-    assert "the folder of captures" in failure(capsys, line, "--capture", tmp_path / "nowhere")
-    (tmp_path / "empty").mkdir()
-    assert "no finished captures" in failure(capsys, line, "--capture", tmp_path / "empty")
-    damaged = shutil.copytree(dataset / FIRST, tmp_path / "damaged" / FIRST)
-    missing = picture_path(damaged, "mask", 2, 0)
-    missing.unlink()
-    assert f"{missing} is missing" in failure(capsys, line, "--capture", damaged)
-
-
-def test_a_missing_damaged_or_foreign_checkpoint_is_named(dataset, checkpoint, tmp_path, capsys):
-    cut, other = tmp_path / "cut.safetensors", save_tiny_checkpoint(tmp_path / "diffusion.safetensors")
-    cut.write_bytes(checkpoint.read_bytes()[:-100])
-    for path, fault in ((cut, "is damaged"), (other, "has the format"), (tmp_path / "none", "there is no encoder at")):
-        line = ["reconstruct", "--capture", dataset / FIRST, "--checkpoint", path, "--out", tmp_path / "out"]
-        sentence = failure(capsys, [str(word) for word in line])
-        assert fault in sentence
-        assert str(path) in sentence
-
-
 def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint, tmp_path, monkeypatch):
     loaded = []
     load = load_encoder
@@ -208,9 +162,6 @@ def test_the_encoder_stays_loaded_until_another_is_asked_for(dataset, checkpoint
 
 
 def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypatch):
-    class Stop(Exception):
-        pass
-
     folder = captured(tmp_path, people=1, frames=1, passes=("img", "mask"))
     request = ReconstructRequest(capture=folder, out_dir=tmp_path / "out", checkpoint=checkpoint, size=32)
     session, reports = Session(), []
@@ -220,20 +171,4 @@ def test_the_request_can_be_ended_at_every_report(tmp_path, checkpoint, monkeypa
     assert result.subject == FIRST
     assert result.views == [0, 1, 2, 3]
     assert "is inside the masks" in result.warnings[0]
-    shutil.rmtree(tmp_path / "out")
-    for end in range(len(reports)):
-        count = itertools.count()
-
-        def stop(*_, count=count, end=end):
-            if next(count) == end:
-                raise Stop
-
-        with pytest.raises(Stop):
-            commands.reconstruct(request, session, stop)
-        assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize("wrong", [{"frame": -1}, {"views": 0}, {"size": 0}, {"capture": ""}, {"out_dir": ""}])
-def test_impossible_parameters_are_rejected(wrong):
-    with pytest.raises(FieldError, match=next(iter(wrong))):
-        read(ReconstructRequest, {"capture": "captures", "out_dir": "out", **wrong})
+    ended_at_each_report(lambda report: commands.reconstruct(request, session, report), tmp_path / "out")

@@ -2,7 +2,6 @@
 
 import json
 import shutil
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,15 +11,14 @@ from primdiffusion import cli, from_pictures
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.reconstruct import fit_posture
 from primdiffusion.commands.session import Session
-from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
-from primdiffusion.formats.schema import FieldError, read
+from primdiffusion.formats.requests import FitPostureRequest
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.posture.start import standing
 from primdiffusion.render.march import march
-from support.errors import refused
-from tiny_model import save_tiny_checkpoint, tiny_model
+from support.runs import ended_at_each_report
+from tiny_model import tiny_model
 
 FILES = ["depth.png", "front.png", "person.human.safetensors", "posture.json", "side.png"]
 COLOURS = torch.tensor([30.0, -20.0, 5.0])
@@ -48,34 +46,10 @@ def picture(tmp_path_factory):
     return path
 
 
-@pytest.fixture(scope="module")
-def checkpoint(tmp_path_factory):
-    return save_tiny_checkpoint(tmp_path_factory.mktemp("model") / "tiny.safetensors")
-
-
 @pytest.fixture
 def line(picture, checkpoint, tmp_path):
-    return [
-        "reconstruct",
-        str(picture),
-        "--checkpoint",
-        str(checkpoint),
-        "--out",
-        str(tmp_path / "out"),
-        "--size",
-        "32",
-    ]
-
-
-def failure(capsys, line, *more) -> str:
-    """The sentence that a line fails with, having left nothing."""
-    with pytest.raises(SystemExit) as end:
-        cli.main([*line, *(str(word) for word in more)])
-    assert end.value.code == 1
-    assert not Path(line[line.index("--out") + 1]).exists()
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[-1].startswith("primdiffusion: ")
-    return lines[-1]
+    options = ["--checkpoint", str(checkpoint), "--out", str(tmp_path / "out"), "--size", "32"]
+    return ["reconstruct", str(picture), *options]
 
 
 def test_a_picture_becomes_a_human_and_its_posture(line, tmp_path, capsys):
@@ -131,39 +105,21 @@ def test_a_fit_alone_writes_the_posture_and_can_be_cancelled_at_every_report(pic
     assert answer.posture.is_file()
     assert not any("sides" in warning for warning in answer.warnings)  # a fit makes none
     assert [report[0] for report in reports[:2]] == ["read", "load"]
-    shutil.rmtree(tmp_path / "out")
-    for end in range(len(reports)):
-        left = iter(range(end))
-
-        def stop(*_, left=left):
-            next(left)
-
-        with pytest.raises(StopIteration):
-            fit_posture(request, Session(), stop)
-        assert not (tmp_path / "out").exists()
+    ended_at_each_report(lambda report: fit_posture(request, Session(), report), tmp_path / "out")
 
 
-def test_impossible_requests_are_one_sentence_and_leave_nothing(line, picture, tmp_path, capsys):
-    plain = tmp_path / "plain.jpg"
+def test_impossible_requests_are_one_sentence_and_leave_nothing(line, picture, tmp_path, fails):
+    plain, poses, cameras = (tmp_path / name for name in ("plain.jpg", "poses.npz", "cameras.json"))
     Image.open(picture).convert("RGB").save(plain)
-    assert "mask" in failure(capsys, ["reconstruct", str(plain), *line[2:]])
-    other = tmp_path / "other.npz"
-    np.savez(other, poses=np.zeros((1, 60)))
-    assert str(other) in failure(capsys, line, "--pose", other)
-    np.savez(other, poses=np.zeros((3, 72)))
-    assert "3 poses for 1 pictures" in failure(capsys, line, "--pose", other)
-    assert "nowhere.npz" in failure(capsys, line, "--pose", tmp_path / "nowhere.npz")
-    assert "cameras.json" in failure(capsys, line, "--cameras", tmp_path / "cameras.json")
-    (tmp_path / "cameras.json").write_text("[]")
-    assert "cameras.json" in failure(capsys, line, "--cameras", tmp_path / "cameras.json")
-    assert "without refining" in failure(capsys, line, "--no-refine")
-    assert "capture" in failure(capsys, line, "--capture", tmp_path)
-
-
-def test_requests_need_pictures_or_a_capture():
-    with refused(FieldError, "capture"):
-        read(ReconstructRequest, {"out_dir": "out"})
-    with refused(FieldError, "pictures"):
-        read(FitPostureRequest, {"out_dir": "out"})
-    with refused(FieldError, "seed"):
-        read(ReconstructRequest, {"out_dir": "out", "capture": "captures", "seed": 3})
+    np.savez(poses, poses=np.zeros((3, 72)))
+    cameras.write_text("[]")
+    for words, named in (
+        (["reconstruct", plain, *line[2:]], "mask"),
+        ([*line, "--pose", poses], "3 poses for 1 pictures"),
+        ([*line, "--cameras", cameras], "cameras.json"),
+        ([*line, "--no-refine"], "without refining"),
+    ):
+        failed = fails(*words)
+        assert failed.code == 1
+        assert named in failed.err.splitlines()[-1]
+        assert not (tmp_path / "out").exists()

@@ -2,13 +2,11 @@
 
 import dataclasses
 import math
-import sys
 import types
 
 import numpy as np
 import pytest
 import torch
-from primdiffusion import cli
 from primdiffusion.commands.view import COARSE, Viewer, camera_of, theta_of
 from primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from primdiffusion.human import framing, generate, place
@@ -101,13 +99,3 @@ def test_the_real_server_takes_sliders_and_the_scene(human):
         assert not viewer.draw()
     finally:
         server.stop()
-
-
-def test_without_the_package_one_sentence_has_the_line_that_installs_it(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "viser", None)
-    with pytest.raises(SystemExit) as end:
-        cli.main(["view", "nobody.human.safetensors"])
-    assert end.value.code == 1
-    assert capsys.readouterr().err == (
-        'primdiffusion: this needs viser, which is not installed: run pip install "primdiffusion[viewer]"\n'
-    )

@@ -70,15 +70,6 @@ def test_symmetric_person_components_are_stored_by_half(path):
     assert sizes[0] - sizes[1] == pytest.approx(basis.numel(), abs=200)
 
 
-def test_a_checkpoint_with_a_detail_decoder_is_rejected_with_what_reads_it(path):
-    def with_detail(metadata):
-        return metadata | {"architecture": json.dumps(json.loads(metadata["architecture"]) | {"detail": {}})}
-
-    rewrite(path, change_metadata=with_detail)
-    with refused(FileError):
-        load_checkpoint(path)
-
-
 def test_a_codec_of_before_weights_is_read_as_it_was(path):
     rewrite(path, lambda t: {k: v for k, v in t.items() if k not in ("codec.weight", "codec.dead_zone")})
     codec = load_checkpoint(path).codec.codec
@@ -99,15 +90,6 @@ def test_a_codec_of_before_regions_has_one_basis(path):
     assert torch.equal(older.decode(latents), codec.decode(latents))
 
 
-def test_a_codec_of_another_network_is_named(path):
-    def narrow(tensors):
-        return {k: v[:, :-1].contiguous() if k in ("codec.basis", "codec.parity") else v for k, v in tensors.items()}
-
-    rewrite(path, narrow)
-    with refused(FileError, "(3, 32, 32)", "(4, 32, 32)"):
-        load_checkpoint(path)
-
-
 def without(tree: str, key: str) -> str:
     return json.dumps({k: v for k, v in json.loads(tree).items() if k != key})
 
@@ -125,28 +107,10 @@ def test_a_slab_network_is_saved_and_loaded(tmp_path):
     assert loaded.codec.shape == (56, 256, 256)
 
 
-def test_a_missing_file_is_named(tmp_path):
-    with refused(FileNotFoundError, "nothing"):
-        load_checkpoint(tmp_path / "nothing.safetensors")
-
-
-@pytest.mark.parametrize("keep", [0, 6, 500, 0.5, 0.999])
-def test_a_truncated_file_is_rejected(path, keep):
-    content = path.read_bytes()
-    path.write_bytes(content[: keep if isinstance(keep, int) else int(keep * len(content))])
-    with refused(FileError):
-        load_checkpoint(path)
-
-
-def test_a_file_of_another_kind_is_rejected(path):
-    rewrite(path, change_metadata=lambda m: {"format": "pt"})
-    with refused(FileError, "pt"):
-        load_checkpoint(path)
-
-
-def test_another_version_is_rejected(path):
-    rewrite(path, change_metadata=lambda m: m | {"format_version": "99"})
-    with refused(FileError, "version 99"):
+@pytest.mark.parametrize(("entry", "text"), [("format", "pt"), ("format_version", "99")])
+def test_a_file_of_another_kind_or_version_is_rejected(path, entry, text):
+    rewrite(path, change_metadata=lambda m: m | {entry: text})
+    with refused(FileError, text):
         load_checkpoint(path)
 
 
@@ -160,8 +124,6 @@ def test_weights_that_are_not_numbers_are_named(path):
     "damage",
     [
         lambda t: {k: v for k, v in t.items() if k != "denoiser.person.outer.weight"},
-        lambda t: t | {"denoiser.person.outer.weight": torch.zeros(3, 3)},
-        lambda t: {k: v for k, v in t.items() if k != "codec.basis"},
         lambda t: t | {"denoiser.prior_surplus": torch.zeros(1)},
     ],
 )
@@ -174,10 +136,10 @@ def test_weights_that_do_not_fit_are_rejected(path, damage):
 @pytest.mark.parametrize(
     "changes",
     [
+        {"detail": {}},  # a decoder that is no longer read
         {"full_density": -200.0},
         {"full_density": "200"},
         {"vocabulary": {"categories": "sex", "scalars": {}}},
-        {"vocabulary": {"categories": {}, "scalars": {"height": [1.7, 0]}}},
         {"vocabulary": {"categories": {}, "scalars": {"height": [1.7]}}},
     ],
 )

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
-from primdiffusion.diffusion.samplers import RELEASED_END, SAMPLERS, ddim, ddpm, dpmpp_2m, gaussian_noise
+from primdiffusion.diffusion.samplers import RELEASED_END, ddim, ddpm, dpmpp_2m, gaussian_noise
 from primdiffusion.diffusion.schedule import (
     CLEAN,
     Schedule,
@@ -177,10 +177,6 @@ def test_an_exact_denoiser_gives_back_its_gaussian(sampler, steps, tolerance):
     x = last(sampler(exact, schedule, x, trailing_steps(1000, steps), generator)).x
     assert x.mean().item() == pytest.approx(mean, abs=0.03)
     assert x.std().item() == pytest.approx(std, rel=tolerance)
-
-
-def test_samplers_are_found_by_name():
-    assert {"ddpm": ddpm, "ddim": ddim, "dpmpp_2m": dpmpp_2m} == SAMPLERS
 
 
 @every_sampler

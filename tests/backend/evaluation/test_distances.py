@@ -169,11 +169,3 @@ def test_network_is_stored_with_its_attributes(trained, tmp_path):
     pictures, _ = painted(4, 2)
     near = features_of(trained, pictures)
     assert torch.allclose(features_of(again, pictures), near, atol=2e-2 * float(near.abs().max()))
-
-
-def test_another_file_is_no_network(tmp_path):
-    with refused(FileNotFoundError, "none.safetensors"):
-        load_attribute_network(tmp_path / "none.safetensors")
-    (tmp_path / "other.safetensors").write_bytes(b"nothing")
-    with refused(ValueError, "other.safetensors"):
-        load_attribute_network(tmp_path / "other.safetensors")

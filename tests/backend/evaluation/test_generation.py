@@ -17,7 +17,6 @@ from primdiffusion.evaluation.gallery import (
     open_gallery,
     payload_of,
     payload_sources,
-    read_attributes,
     read_seed,
 )
 from primdiffusion.evaluation.generation import COLUMNS, compare, open_reference_set, real_vs_real, table
@@ -114,10 +113,8 @@ def test_portraits_of_meshes_and_of_their_payloads_show_the_same_people(assets, 
     assert drawn.attributes[1]["outfit"] == people[1].attributes["outfit"]
 
 
-def test_a_file_without_attributes_is_named(tmp_path):
+def test_a_file_without_a_seed_is_named(tmp_path):
     (tmp_path / "person.npz").write_bytes(b"nothing")
-    with refused(ValueError, "person.npz"):
-        read_attributes(tmp_path / "person.npz")
     with refused(ValueError, "person.npz"):
         read_seed(tmp_path / "person.npz")
 

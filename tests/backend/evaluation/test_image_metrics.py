@@ -165,13 +165,7 @@ def test_files_of_another_network_are_rejected(tmp_path):
         load_lpips([alex])
 
 
-def test_damaged_missing_and_foreign_files_are_named(tmp_path):
-    with refused(FileNotFoundError, "nothing.pth"):
-        load_lpips([tmp_path / "nothing.pth"])
-    for name, held in (("half.pth", b"PK\x03\x04"), ("empty.pth", b""), ("half.safetensors", b"12345678{")):
-        (tmp_path / name).write_bytes(held)
-        with pytest.raises(FileError, match=name):
-            load_lpips([tmp_path / name])
+def test_files_of_no_weights_are_named(tmp_path):
     torch.save(nn.Linear(2, 2), tmp_path / "pickled.pth")
     with refused(FileError, "state_dict"):
         load_lpips([tmp_path / "pickled.pth"])

@@ -15,7 +15,6 @@ from primdiffusion.evaluation.pose_depth_network import (
 )
 from primdiffusion.evaluation.shots import JOINTS
 from primdiffusion.people.assets import open_assets
-from support.errors import refused
 
 from scripts.train_pose_depth_network import (
     SWAPPED,
@@ -103,12 +102,6 @@ def test_training_is_deterministic_and_survives_its_file(tmp_path):
     pictures = shots.pictures.float() / 255
     expected, found = networks[0](pictures), loaded(pictures)
     assert torch.allclose(expected.heatmaps, found.heatmaps, atol=0.05)
-
-
-def test_a_file_of_another_network_is_named(tmp_path):
-    (tmp_path / "own.safetensors").write_bytes(b"no weights")
-    with refused(ValueError, "own.safetensors"):
-        load_pose_depth_network(tmp_path / "own.safetensors")
 
 
 def test_the_weights_that_ship_are_small_and_as_good_as_their_card_says():

@@ -119,8 +119,6 @@ def test_a_file_of_another_network_is_named(load, tmp_path):
     save_file({"layer.weight": torch.zeros(3)}, tmp_path / "other.safetensors")
     with refused(FileError, "other.safetensors"):
         load(tmp_path / "other.safetensors")
-    with pytest.raises(FileNotFoundError):
-        load(tmp_path / "none.pth")
 
 
 def test_names_of_layers_follow_torchvision():

@@ -10,10 +10,6 @@ from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.conditioning import spread_cameras
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.commands import evaluate as command
-from primdiffusion.encoder.config import EncoderConfig
-from primdiffusion.encoder.model import EncoderModel, save_encoder
-from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.reconstruction import (
     SPLITS,
     EvaluationSettings,
@@ -31,6 +27,7 @@ from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import K, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
 from support.errors import refused
+from tiny_encoder import save_tiny_encoder
 
 COARSE = MarchSettings(step=0.016)
 
@@ -194,48 +191,26 @@ def test_summary_averages_each_part_alone():
     assert rows[5] == "| given views, novel poses | 0 | - | - | - | - | - | - |"
 
 
-def test_command_prints_the_table_and_writes_all_scores(captures, tmp_path, capsys, monkeypatch):
-    paths = []
-
-    def load(path, device):
-        paths.append(path)
-        return Grey()
-
-    monkeypatch.setattr(command, "load_encoder", load)
-
-    line = ["--captures", str(captures.root), "--people", "1", "--views", "2", "--size", "32", "--json"]
-    command.run(["reconstruction", *line, str(tmp_path / "new" / "scores.json")])
-    assert paths == [None]
-    assert capsys.readouterr().out.splitlines()[2].startswith("| all views, all poses | 12 | ")
-    record = json.loads((tmp_path / "new" / "scores.json").read_text())
-    assert record["checkpoint"] == Grey().card
-    assert record["settings"]["subjects"] == [captures.subjects[0]]
-    assert record["means"]["all"]["pictures"] == len(record["pictures"]) == 12
-
-
 def test_the_command_line_evaluates_a_checkpoint(captures, tmp_path, capsys):
-    small = EncoderConfig(
-        stem=(4, 4, 4), grid=(4, 4), motion=4, attention_width=8, attention_heads=2, fused=4, colour=(4, 4),
-        density=(4, 4), finest=4, scale=(4, 4)
-    )  # fmt: skip
-    path = tmp_path / "small.safetensors"
-    save_encoder(path, EncoderModel(Encoder(small), {"name": "small"}))
+    path, scores = save_tiny_encoder(tmp_path / "tiny.safetensors"), tmp_path / "new" / "scores.json"
     line = ["--captures", str(captures.root), "--people", "1", "--views", "3", "--size", "16"]
-    cli.run(["evaluate", "reconstruction", *line, "--checkpoint", str(path), "--json", str(tmp_path / "scores.json")])
-    record = json.loads((tmp_path / "scores.json").read_text())
-    assert record["checkpoint"] == {"name": "small"}
+    cli.run(["evaluate", "reconstruction", *line, "--checkpoint", str(path), "--json", str(scores)])
+    record = json.loads(scores.read_text())
+    assert record["checkpoint"] == {"name": "tiny encoder"}
+    assert record["settings"]["subjects"] == [captures.subjects[0]]
+    assert len(record["pictures"]) == 12
     assert [part["pictures"] for part in record["means"].values()] == [12, 3, 1, 6, 2]
     assert "| novel views, novel poses | 2 | " in capsys.readouterr().out
 
 
-def test_command_tells_wrong_folders_and_numbers(captures, tmp_path, capsys):
-    for arguments, sentence in (
-        (["--captures", str(tmp_path / "none")], "the folder of captures"),
-        (["--captures", str(captures.root), "--people", "-1"], "people is -1"),
-        (["--captures", str(captures.root), "--checkpoint", str(tmp_path / "no.safetensors")], "no.safetensors"),
-        (["--captures", str(captures.root), "--lpips", str(tmp_path / "w.pth")], "w.pth"),
+def test_command_tells_wrong_folders_and_numbers(captures, tmp_path, fails):
+    line = ("evaluate", "reconstruction", "--captures", captures.root)
+    for words, named in (
+        (["--captures", tmp_path / "none"], "the folder of captures"),
+        (["--people", "-1"], "people is -1"),
+        (["--checkpoint", tmp_path / "no.safetensors"], "no.safetensors"),
+        (["--lpips", tmp_path / "w.pth"], "w.pth"),
     ):
-        with pytest.raises(SystemExit) as end:
-            cli.main(["evaluate", "reconstruction", *arguments])
-        assert end.value.code == 1
-        assert sentence in capsys.readouterr().err
+        failed = fails(*line, *words)
+        assert failed.code == 1
+        assert named in failed.err

@@ -17,7 +17,6 @@ from primdiffusion.formats.schema import (
     Range,
     Shape,
     descriptions,
-    field_types,
     read,
     written,
 )
@@ -149,19 +148,3 @@ def test_a_records_own_values_are_read_again_as_a_command_line_gives_them():
 
 def test_the_strings_below_fields_are_their_descriptions():
     assert descriptions(Settings) == {"count": "How many, at most."}
-
-
-@pytest.mark.parametrize("method", REQUESTS)
-def test_defaults_of_requests_are_within_their_own_limits(method):
-    record = REQUESTS[method]
-    given = {"seed": 1, "seeds": [1], "id": 1, "region": ["top"], "voxel": 0.01, "width": 8, "height": 8}
-    given |= dict.fromkeys(("person", "other", "source", "out_dir", "capture", "human", "frame"), "a")
-    matrix = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]]
-    given |= {"world_to_camera": matrix, "intrinsics": [[5.0, 0, 4], [0, 5.0, 4], [0, 0, 1]]}
-    given |= {"people": [{"human": "a", "object": matrix, "joints": [matrix] * 24}]}
-    given |= {"out": {"gaussians": "a.ply", "merge": "a.npz"}.get(method, "a.png")}
-    required = [field.name for field in dataclasses.fields(record) if field.default is dataclasses.MISSING]
-    either = {"reconstruct": {"capture": "a"}, "fit_posture": {"pictures": ["a"]}}.get(method, {})
-    made = read(record, {name: given[name] for name in required if name in given} | either)
-    assert read(record, json.loads(json.dumps(written(made)))) == made
-    assert set(field_types(record)) == set(vars(made))

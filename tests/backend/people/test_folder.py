@@ -14,9 +14,8 @@ import numpy as np
 import psutil
 import pytest
 from primdiffusion.formats.whole_files import writer
-from primdiffusion.people import assets as assets_module
 from primdiffusion.people import folder as folder_module
-from primdiffusion.people import load_base_mesh, make_person, open_assets
+from primdiffusion.people import load_base_mesh, make_person
 from primdiffusion.people.assets import licence_of
 from primdiffusion.people.fitting import cover
 from primdiffusion.people.folder import PeopleSet, is_whole, make_people
@@ -123,15 +122,6 @@ def test_licences_are_read_from_headers_lists_and_materials(tmp_path):
         "e.png": "CC-BY-4.0",
         "f.png": "unknown",
     }
-
-
-def test_damaged_pictures_are_named(assets, tmp_path):
-    for room in assets_module.SUBFOLDERS:
-        (tmp_path / room).mkdir()
-    source = next((assets.root / "skins/textures").glob("*.jpg"))
-    (tmp_path / "skins/half.jpg").write_bytes(source.read_bytes()[:5000])
-    with refused(ValueError, "half.jpg"):
-        open_assets(tmp_path).picture("skins/half", 64)
 
 
 def test_faces_differ_between_people_of_one_body(assets):

@@ -1,13 +1,9 @@
 """Whole people: these need a MakeHuman asset folder and skip without one."""
 
-import dataclasses
 import json
 import os
-import subprocess
-import sys
 
 import numpy as np
-import psutil
 import pytest
 import torch
 from primdiffusion.geometry.srgb import encode_srgb
@@ -27,7 +23,6 @@ from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.inverse import InverseSettings
 from primdiffusion.render.march import march
 from support.errors import refused
-from support.runs import within
 
 SEEDS = range(6)
 
@@ -275,11 +270,6 @@ def test_counts_that_make_nothing_are_rejected(tmp_path):
         make_payloads(assets_module.Assets(tmp_path), tmp_path, 1, 0, 0, 1)
 
 
-def test_person_is_frozen(people):
-    with pytest.raises(dataclasses.FrozenInstanceError):
-        people[0].betas = None
-
-
 @pytest.mark.slow
 def test_processes_make_the_same_files_as_one(assets, tmp_path):
     environment = dict(os.environ)
@@ -295,18 +285,3 @@ def test_processes_make_the_same_files_as_one(assets, tmp_path):
     for first, second in zip(alone, together, strict=True):
         with np.load(first) as a, np.load(second) as b:
             assert np.array_equal(a["voxels"], b["voxels"])
-
-
-@pytest.mark.slow
-def test_workers_end_when_the_command_is_killed(assets, tmp_path):
-    command = [sys.executable, "-m", "primdiffusion.cli", "payloads", "--assets", str(assets.root)]
-    options = ["--out", str(tmp_path), "--count", "50", "--workers", "2", "--making", "from_mesh"]
-    process = subprocess.Popen([*command, *options], stdout=subprocess.DEVNULL)
-    try:
-        assert within(60, lambda: any(tmp_path.glob("*.npz")))
-        workers = psutil.Process(process.pid).children(recursive=True)
-        assert len(workers) >= 2
-    finally:
-        process.kill()
-        process.wait()
-    assert within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))

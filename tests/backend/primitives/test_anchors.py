@@ -1,7 +1,5 @@
 """The default body's anchors and the frames they have on it."""
 
-import dataclasses
-
 import torch
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.formats.body_layout import (
@@ -181,13 +179,6 @@ def test_vertices_that_are_not_finite_are_rejected():
     vertices[17, 1] = torch.nan
     with refused(ValueError, "pose"):
         attach(ANCHORS, vertices, BODY.faces)
-
-
-def test_anchors_convert_as_one():
-    double = ANCHORS.to(dtype=torch.float64)
-    assert double.stencil_du.dtype == torch.float64
-    assert double.face.dtype == torch.int64
-    assert dataclasses.replace(double).barycentric.dtype == torch.float64
 
 
 def test_boxes_follow_the_skin_where_a_pose_stretches_it():

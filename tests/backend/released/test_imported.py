@@ -230,7 +230,7 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
         ("unknown tensor", "'diffusion.label_emb.weight'"),
     ],
 )
-def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(tmp_path, capsys, change, message):
+def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(tmp_path, fails, change, message):
     prepared(tmp_path)
     weights, smpl, uv = (tmp_path / name for name in ("primdiffusion.pt", "SMPL_NEUTRAL.pkl", "smpl_uv.obj"))
     if change == "truncated":
@@ -242,12 +242,9 @@ def test_what_cannot_be_imported_is_rejected_in_a_sentence_and_nothing_written(t
         (smpl if "smpl" in change else uv).write_bytes(b"hello")
     else:
         (smpl if "smpl" in change else uv).unlink()
-    with pytest.raises(SystemExit) as end:
-        cli.main(line(tmp_path))
-    error = capsys.readouterr().err.strip()
-    assert end.value.code == 1
-    assert message in error
-    assert "\n" not in error
+    failed = fails(*line(tmp_path))
+    assert (failed.code, failed.err.count("\n")) == (1, 1)
+    assert message in failed.err
     assert not (tmp_path / "imported.safetensors").exists()
 
 

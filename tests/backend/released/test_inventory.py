@@ -169,13 +169,6 @@ def bad_file(path, kind):
     if kind == "hostile pickle":
         path.write_bytes(pickle.dumps({"model_state_dict": Hostile()}, 2))
         return "not a torch file|nothing was executed"
-    if kind == "truncated":
-        save_released(path, {"betas": torch.zeros(5000)})
-        path.write_bytes(path.read_bytes()[:-3000])
-        return "damaged"
-    if kind in ("empty", "text"):
-        path.write_text("" if kind == "empty" else "hello world")
-        return "not a torch file"
     contents = {
         "a list": ([1, 2], "list"),
         "other keys": ({"epoch": 3, "net": {"a": torch.zeros(1)}}, "'epoch'.* is a int.*'model_state_dict'"),
@@ -191,7 +184,7 @@ def bad_file(path, kind):
 
 
 @pytest.mark.parametrize(
-    "kind", ["hostile torch file", "hostile pickle", "truncated", "empty", "text", "a list", "a sparse tensor",
+    "kind", ["hostile torch file", "hostile pickle", "a list", "a sparse tensor",
              "other keys", "no tensors", "a tensor", "another network", "nothing"]
 )  # fmt: skip
 def test_what_is_no_released_checkpoint_is_rejected_in_one_sentence(tmp_path, monkeypatch, kind):
@@ -202,8 +195,3 @@ def test_what_is_no_released_checkpoint_is_rejected_in_one_sentence(tmp_path, mo
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
     assert not (tmp_path / "ran").exists()
-
-
-def test_a_missing_file_is_said_to_be_missing(tmp_path):
-    with refused(FileNotFoundError, "checkpoint"):
-        read_weights(tmp_path / "none.pt")

@@ -3,6 +3,7 @@ import itertools
 import json
 import os
 import pathlib
+import shutil
 
 import numpy as np
 import pytest
@@ -41,9 +42,13 @@ def packed(folder, tmp_path_factory):
 
 @pytest.fixture
 def copied(packed, tmp_path):
-    for path in packed.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
-    return tmp_path
+    return shutil.copytree(packed, tmp_path, dirs_exist_ok=True)
+
+
+def change_index(packed, change) -> None:
+    content = json.loads((packed / INDEX).read_text())
+    change(content)
+    (packed / INDEX).write_text(json.dumps(content))
 
 
 def same(one, other):
@@ -122,15 +127,13 @@ def test_an_index_that_cannot_be_used_is_rejected(copied, content):
 
 
 def test_shards_without_people_are_named(copied):
-    index = json.loads((copied / INDEX).read_text())
-    (copied / INDEX).write_text(json.dumps({**index, "shards": []}))
+    change_index(copied, lambda index: index["shards"].clear())
     with refused(FileNotFoundError, "0 humans"):
         open_people(copied)
 
 
 def test_a_damaged_person_is_named_and_leaves_no_index(folder, tmp_path):
-    for path in folder.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     path = tmp_path / "person_000003.npz"
     content = bytearray(path.read_bytes())
     content[len(content) // 2] ^= 255
@@ -173,8 +176,7 @@ def test_packing_again_removes_what_a_kill_left_beside_the_finished_shards(folde
 
 
 def test_people_of_several_densities_are_rejected(folder, tmp_path):
-    for path in folder.iterdir():
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
     with np.load(tmp_path / "person_000001.npz") as file:
         np.savez(tmp_path / "person_000001.npz", **{**file, "full_density": np.array(25.5)})
     with refused(ValueError, "25.5", "100"):
@@ -197,9 +199,7 @@ def test_the_index_is_plain_json_with_all_known_attributes(packed):
 
 @pytest.mark.parametrize("name", ["../shard_0000.safetensors", "/proc/self/pagemap", "a/b", "C:\\x", "", "..", 3])
 def test_an_index_names_only_files_beside_it(copied, name):
-    index = json.loads((copied / INDEX).read_text())
-    index["shards"][0]["file"] = name
-    (copied / INDEX).write_text(json.dumps(index))
+    change_index(copied, lambda index: index["shards"][0].update(file=name))
     with refused(FileError, "index"):
         PackedPeople(copied)
 
@@ -216,32 +216,19 @@ def test_a_shard_with_the_right_checksum_and_other_tensors_is_rejected(copied, n
     path = copied / "shard_0000.safetensors"
     tensors, _ = tensor_file.read(path)
     path.write_bytes(tensor_file.save({**tensors, name: value}))
-    index = json.loads((copied / INDEX).read_text())
-    index["shards"][0]["sha256"] = shards.digest_of(path)
-    (copied / INDEX).write_text(json.dumps(index))
+    change_index(copied, lambda index: index["shards"][0].update(sha256=shards.digest_of(path)))
     with refused(FileError, "shard_0000"):
         PackedPeople(copied).person(0)
 
 
-def test_a_shard_that_is_listed_twice_is_rejected(tmp_path):
-    index = _changed_index(tmp_path, lambda shards: shards.append(shards[0]))
+def test_a_shard_that_is_listed_twice_is_rejected(copied):
+    change_index(copied, lambda index: index["shards"].append(index["shards"][0]))
     with refused(FileError, "shard_0000.safetensors"):
-        PackedPeople(index.parent)
+        PackedPeople(copied)
 
 
 @pytest.mark.parametrize("variants", [0, -3, 1.5, "1", True])
-def test_a_number_of_colourings_that_is_none_is_rejected(tmp_path, variants):
-    index = _changed_index(tmp_path, lambda shards: shards[0]["people"][0].update(variants=variants))
+def test_a_number_of_colourings_that_is_none_is_rejected(copied, variants):
+    change_index(copied, lambda index: index["shards"][0]["people"][0].update(variants=variants))
     with refused(FileError, "colourings"):
-        PackedPeople(index.parent)
-
-
-def _changed_index(folder: pathlib.Path, change) -> pathlib.Path:
-    write_people(folder / "people", 2, variants=1)
-    for _ in pack_people(folder / "people", folder / "packed", people_each=1):
-        pass
-    path = folder / "packed" / INDEX
-    content = json.loads(path.read_text(encoding="utf-8"))
-    change(content["shards"])
-    path.write_text(json.dumps(content), encoding="utf-8")
-    return path
+        PackedPeople(copied)

@@ -46,15 +46,12 @@ def test_the_average_lags_behind_the_weights():
     assert 0 < lagged < moved
 
 
-def test_a_damaged_or_foreign_state_is_rejected(tmp_path):
+def test_a_state_of_another_network_is_rejected(tmp_path):
     state = state_of_a_line()
     other = TrainingState(torch.nn.Linear(2, 2), PhaseConfig(steps=1, batch=1), accelerator_of())
     state.save(tmp_path / "state")
     with pytest.raises(ValueError, match="does not fit"):
         other.load(tmp_path / "state")
-    (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:100])
-    with refused(ValueError, "damaged"):
-        state_of_a_line().load(tmp_path / "state")
 
 
 @pytest.mark.parametrize("number", [float("nan"), 1e30])
