@@ -126,7 +126,7 @@ def test_exported_translations_are_of_smpls_own_body_wherever_the_armature_has_i
         np.testing.assert_allclose(pelvis + arrays["trans"][0], upright, atol=1e-6)
 
 
-def test_export_counts_constraints_and_rejects_where_it_cannot_write(addon, armature, tmp_path):
+def test_export_counts_constraints_and_rejects_an_empty_range(addon, armature, tmp_path):
     constraint = armature.pose.bones["head"].constraints.new("LIMIT_ROTATION")
     constraint.use_limit_y = True
     constraint.owner_space = "LOCAL"
@@ -134,10 +134,6 @@ def test_export_counts_constraints_and_rejects_where_it_cannot_write(addon, arma
     ops.export_motion(filepath=str(tmp_path / "m.npz"), first=1, last=1)
     turn = read_motion(tmp_path / "m.npz").axis_angle()[0]
     assert np.abs(turn).max() < 1e-4
-    with pytest.raises(RuntimeError, match="there is no folder"):
-        ops.export_motion(filepath=str(tmp_path / "none" / "m.npz"), first=1, last=1)
-    with pytest.raises(RuntimeError, match="name a file to export to"):
-        ops.export_motion(first=1, last=1)
     with pytest.raises(RuntimeError, match="last frame 2 is before the first, 5"):
         ops.export_motion(filepath=str(tmp_path / "m.npz"), first=5, last=2)
 
