@@ -159,9 +159,7 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
 
 
 @pytest.mark.any_blender
-@pytest.mark.parametrize(
-    ("order", "message"), [("fails", "checkpoint is damaged"), ("gives garbage", "damaged"), ("dies", "ended")]
-)
+@pytest.mark.parametrize(("order", "message"), [("gives garbage", "damaged"), ("dies", "ended")])
 @pytest.mark.parametrize("what", ["POSE", "FRAMES"])
 def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypatch, order, message, what):
     monkeypatch.setenv("FAKE_ORDER", order)
