@@ -88,14 +88,10 @@ AS_MISSING = {
     ("Blender: HDRI", "endless"),
 }  # fmt: skip
 """A link that leads nowhere is replaced where the program writes such a file; a file of /proc counts as empty."""
-LENIENT = {"dataset.json", "complete.json", "cameras.json"}
-"""Their reading in `targets` goes on after sentences; `captures: ...` do not."""
 TOGETHER = "readers of"
 """Targets of this name compare several readers, each of which is tried alone as well."""
 FILES = [
-    one
-    for one in (*TARGETS, *other_files.TARGETS)
-    if one.is_file and one.name not in LENIENT and not one.name.startswith(TOGETHER)
+    one for one in dict.fromkeys((*TARGETS, *other_files.TARGETS)) if one.is_file and not one.name.startswith(TOGETHER)
 ]
 
 
