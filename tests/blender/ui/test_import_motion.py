@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -16,6 +15,7 @@ from blender_primdiffusion.formats.poses.files import read_motion
 from blender_primdiffusion.formats.poses.rotation import about_axis
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from bvh_files import motion_of, write_bvh
+from jobs_driven import Layout
 from support.errors import refused
 
 from blender_primdiffusion.motion.pose_library import current_pose
@@ -187,15 +187,11 @@ def test_files_are_dropped_onto_the_import(addon):
 
 def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature, tmp_path):
     def drawn(path: str, **settings) -> tuple[list[str], list[str]]:
-        layout = MagicMock()
-        layout.box.return_value.column.return_value = layout
-        layout.split.return_value = layout.column.return_value = layout
         values = {"filepath": path, "person": "", "into": "NEW", "bones": "AUTO", **settings}
-        operator = SimpleNamespace(layout=layout, axis=lambda: "", **values)
+        operator = SimpleNamespace(layout=Layout(), axis=lambda: "", **values)
         operator._draw_found = lambda *a: PRIMDIFFUSION_OT_import_motion._draw_found(operator, *a)
         PRIMDIFFUSION_OT_import_motion.draw(operator, addon)
-        labels = [call.kwargs["text"] for call in layout.label.call_args_list]
-        return labels, [call.args[1] for call in layout.prop.call_args_list]
+        return operator.layout.of("text"), operator.layout.of("prop")
 
     labels, settings = drawn(write_amass(tmp_path / "m.npz"))
     assert {"Ann", "SMPL-H", "120", "z"} <= set(labels)
