@@ -204,7 +204,7 @@ PARTS: dict[str, Part] = {
     ),
     "fuzz": Part(
         ("fuzz_inputs", "fuzz_tracebacks", "fuzz_garbage", "fuzz_hangs", "fuzz_over_500mb", "executions"),
-        lambda given: tool("-m", "tests.fuzz", "--forget", "--inputs", str(given.fuzz_inputs)),
+        lambda given: tool("-m", "tests.fuzz", "--inputs", str(given.fuzz_inputs)),
     ),
     "verdicts": Part(
         ("reader_verdicts_compared", "reader_verdicts_accepted", "reader_verdicts_differ"),

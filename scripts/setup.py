@@ -96,7 +96,7 @@ def test_all(arguments: Sequence[str]) -> None:
 
 
 def fuzz(arguments: Sequence[str]) -> None:
-    """feed damaged files and messages to every reader for MINUTES=30, guided by coverage; see tests/fuzz"""
+    """feed damaged files and messages to every reader for MINUTES=30; see tests/fuzz"""
     ready_to_test()
     run([program(VENV), "-m", "tests.fuzz", "--minutes", MINUTES, *arguments], **ONE_THREAD)
 

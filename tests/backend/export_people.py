@@ -3,8 +3,12 @@
 import functools
 
 import torch
+from primdiffusion.export.proxy import MeshProxy, mesh_proxy
+from primdiffusion.formats.requests import ProxySettings
 from primdiffusion.human import Human, place
 from primdiffusion.primitives.primitives import K, Payload, Primitives, S
+
+SMALL = ProxySettings(spacing=0.012, triangles=4000, texture_px=256)
 
 
 @functools.cache
@@ -17,6 +21,12 @@ def person() -> Human:
     left = place(human).position[:, 0] > 0
     payload.rgb[left, 0], payload.rgb[~left, 2] = 0.8, 0.8
     return human
+
+
+@functools.cache
+def proxy() -> MeshProxy:
+    """Their mesh, coarse."""
+    return mesh_proxy(person(), SMALL)
 
 
 def ball(radius: float = 0.3, hollow: float = 0.0, centre: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Primitives:

@@ -37,19 +37,42 @@ def notice_of(kind: str) -> str:
     return queue.outcomes[kind].notice
 
 
+class Layout:
+    """Takes the calls of a UILayout, and remembers what they show; sections are closed unless they are `opened`."""
+
+    def __init__(self, opened: bool = False, calls: list[tuple[str, str]] | None = None) -> None:
+        self.opened, self.calls = opened, [] if calls is None else calls
+
+    def _inside(self, **_: object) -> Layout:
+        return Layout(self.opened, self.calls)
+
+    row = column = box = split = grid_flow = _inside
+
+    def panel(self, *_: object, **__: object) -> tuple[Layout, Layout | None]:
+        return self._inside(), self._inside() if self.opened else None
+
+    def label(self, text: str = "", **_: object) -> None:
+        self.calls.append(("text", text))
+
+    progress = label
+
+    def operator(self, idname: str, **_: object) -> MagicMock:
+        self.calls.append(("button", idname))
+        return MagicMock()
+
+    def prop(self, _owner: object, name: str, **_: object) -> None:
+        self.calls.append(("prop", name))
+
+    def __getattr__(self, name: str) -> MagicMock:
+        return MagicMock()  # menus, lists and separators
+
+    def of(self, *kinds: str) -> list[str]:
+        """What was shown of "text", "button" (operators) and "prop" (names), in the order of drawing."""
+        return [shown for kind, shown in self.calls if kind in kinds]
+
+
 def shown(panel, context, *, opened: bool = False) -> list[str]:
     """Operators and texts that a panel draws; `opened` with its closed sections."""
-    texts: list[str] = []
-
-    def layout() -> MagicMock:
-        made = MagicMock()
-        made.operator.side_effect = lambda idname, **kw: texts.append(idname) or MagicMock()
-        made.label.side_effect = lambda **kw: texts.append(kw.get("text", ""))
-        made.progress.side_effect = lambda **kw: texts.append(kw["text"])
-        made.panel.side_effect = lambda *_, **__: (layout(), layout() if opened else None)
-        for part in ("row", "column", "box", "grid_flow"):
-            getattr(made, part).side_effect = lambda **_: layout()
-        return made
-
-    panel.draw(SimpleNamespace(layout=layout()), context)
-    return texts
+    layout = Layout(opened)
+    panel.draw(SimpleNamespace(layout=layout), context)
+    return layout.of("text", "button")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 import zipfile
@@ -17,6 +18,7 @@ from support import kernels
 from support.errors import refused
 
 import build_addon
+import build_manual
 
 ROOT = Path(__file__).resolve().parents[2]
 WEIGHTS = ROOT / "backend" / "primdiffusion" / "weights" / "default.safetensors"
@@ -51,6 +53,18 @@ def test_the_zip_holds_addon_backend_and_licence_and_nothing_stray(archive):
     assert wanted <= set(names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".nbi", ".nbc"))]
     assert WEIGHTS.is_file() == ("bundled/primdiffusion/weights/default.safetensors" in names)
+
+
+@pytest.mark.any_blender
+def test_the_zip_holds_pages_whose_links_and_pictures_are_there(archive):
+    names = zipfile.ZipFile(archive).namelist()
+    assert {"manual/api.html", "manual/batch.html"} <= set(names)
+    for name, content in build_manual.manual().items():
+        if not name.endswith(".html"):
+            continue
+        text = content.decode()
+        for target in re.findall(r'(?:href|src)="([^":#]+)', text):
+            assert f"manual/{target}" in names, f"{name} leads to {target}"
 
 
 @pytest.mark.parametrize(

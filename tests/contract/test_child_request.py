@@ -49,12 +49,12 @@ def start(backend, checkpoint, tmp_path):
 
 
 def test_a_request_runs_from_a_cold_start_to_its_files(start):
-    request = start(200)
+    request = start(60)
     assert (request.state, request.fraction, request.message) == ("starting", 0.0, "Starting the backend")
     etas = []
     states = follow(request, lambda request: etas.append(request.eta_s) or request.finished)
     assert states == ["starting", "running", "done"]
-    assert request.step == request.total == 200
+    assert request.step == request.total == 60
     assert request.fraction == 1.0
     assert request.error is None
     assert request.result.person.exists()

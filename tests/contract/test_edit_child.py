@@ -112,10 +112,9 @@ def test_attributes_tells_what_generate_can_be_asked_for(child, checkpoint, aske
     assert not torch.equal(first.payload.rgb, second.payload.rgb)
 
 
-@pytest.mark.parametrize("method", EDITS)
-def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, slow_checkpoint, asked, method):
+def test_a_cancel_ends_an_edit_within_a_step_and_leaves_nothing(child, people, slow_checkpoint, asked):
     changes = {"steps": BUSY_STEPS, "checkpoint": str(slow_checkpoint)}
-    child.send(8, method, **{**asked, **parameters(method, people), **changes})
+    child.send(8, "inpaint", **{**asked, **parameters("inpaint", people), **changes})
     child.until(
         lambda m: m.get("method") == "progress" and m["params"]["stage"] == "sample" and m["params"]["step"] > 1
     )

@@ -48,6 +48,11 @@ def provenance(text: str) -> Callable[[Tensors, dict[str, str]], object]:
         (lambda tensors, _: tensors.update(rest_half_extent=torch.ones(3)), False),
         (lambda tensors, _: tensors.update(rest_half_extent=torch.full((1024, 3), 1e6)), False),
         (lambda tensors, _: tensors.update(betas=torch.full((10,), 5.5)), False),
+        (lambda tensors, _: tensors.pop("density"), False),
+        (lambda tensors, _: tensors.update(density=tensors["density"][:512]), False),
+        (lambda tensors, _: tensors.update(density=tensors["density"].reshape(512, 2, 8, 8, 8)), False),
+        (lambda tensors, _: tensors.update(density=tensors["density"].int()), False),
+        (lambda tensors, _: tensors["density"].view(-1)[:1].fill_(torch.nan), False),
     ],
 )
 def test_both_readers_give_one_verdict(whole, tmp_path, change, is_read):

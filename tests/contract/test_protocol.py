@@ -203,12 +203,6 @@ def test_a_folder_that_cannot_be_written_to_is_rejected_before_any_step(child, c
         assert not any(m.get("method") == "progress" for m in seen)
 
 
-def test_the_child_ends_when_its_input_does(own_child):
-    own_child.until(lambda m: m.get("method") == "ready")
-    own_child.process.stdin.close()
-    assert own_child.process.wait(10.0) == 0
-
-
 def test_the_child_ends_within_a_step_and_tidies_up_when_its_parent_goes_while_it_samples(
     own_child, slow_checkpoint, tmp_path
 ):

@@ -180,18 +180,14 @@ def _alive(process: psutil.Process) -> bool:
         return False
 
 
-def test_an_environment_without_its_mark_is_not_used(place):
-    done(place.from_folder())
-    (place.folder.environment / MARK).unlink()
-    assert state_of(place.folder)[0] == "broken"
-    assert [source for source, _ in candidates(None, place.folder.environment)] == ["Blender's own Python"]
-
-
-def test_an_environment_whose_blender_is_gone_is_recognised(place, tmp_path):
+def test_an_environment_whose_blender_or_mark_is_gone_is_not_used(place, tmp_path):
     done(place.from_folder())
     mark = place.folder.environment / MARK
     mark.write_text(json.dumps({**json.loads(mark.read_text()), "base": str(tmp_path / "old blender/python")}))
     assert state_of(place.folder)[0] == "broken"
+    mark.unlink()
+    assert state_of(place.folder)[0] == "broken"
+    assert [source for source, _ in candidates(None, place.folder.environment)] == ["Blender's own Python"]
 
 
 def test_an_environment_that_fails_its_self_test_is_not_ready(place):

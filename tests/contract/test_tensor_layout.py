@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzz.verdicts import COUNT, HUMAN, compare, verdicts
+from fuzz.verdicts import HUMAN, compare, verdicts
 from primdiffusion import tensor_file
 from primdiffusion.formats import tensor_layout
 from primdiffusion.formats.tensor_layout import DTYPES, LARGEST_HEADER, MOST_DIMENSIONS, parse_layout
@@ -20,11 +20,15 @@ from blender_primdiffusion.ui.attributes import read_vocabulary
 READERS = {"extension": human_file.read_tensors, "backend": tensor_file.opened, "vocabulary": read_vocabulary}
 
 
-def test_ten_thousand_damaged_files_get_the_librarys_verdict():
-    figures = compare()
-    assert figures["reader_verdicts_compared"] == COUNT == 10_000
+FILES = 2500
+"""Each weaker rule below shows within 900; `python -m tests.fuzz --verdicts` compares 10,000."""
+
+
+def test_damaged_files_get_the_librarys_verdict():
+    figures = compare(FILES)
+    assert figures["reader_verdicts_compared"] == FILES
     assert figures["reader_verdicts_differ"] == 0
-    assert figures["reader_verdicts_accepted"] > COUNT / 4
+    assert figures["reader_verdicts_accepted"] > FILES / 4
 
 
 @pytest.mark.parametrize(
@@ -34,7 +38,7 @@ def test_ten_thousand_damaged_files_get_the_librarys_verdict():
         (
             "tensor_layout",
             "_are_sizes",
-            lambda values: type(values) is list and all(isinstance(v, int) for v in values),
+            lambda sizes: type(sizes) is list and all(isinstance(v, int) for v in sizes),
         ),
         ("tensor_layout", "_DEEPEST", 64),
         ("tensor_layout", "_WORD", 2**70),
@@ -46,7 +50,7 @@ def test_ten_thousand_damaged_files_get_the_librarys_verdict():
 def test_another_rule_is_another_verdict(monkeypatch, module, rule, weaker):
     for package in ("primdiffusion", "blender_primdiffusion"):
         monkeypatch.setattr(f"{package}.formats.{module}.{rule}", weaker)
-    assert any(reason for _, _, reason in verdicts(COUNT))
+    assert any(reason for _, _, reason in verdicts(FILES))
 
 
 def written(path: Path, header: object, data: bytes) -> Path:

@@ -23,14 +23,6 @@ def test_variations_name_each_picture_as_it_appears_and_whom_it_shows(child, che
     assert len(list(out.iterdir())) == 4
 
 
-def test_wrong_seeds_are_rejected_in_a_sentence(child, tmp_path):
-    error = child.ask(2, "variations", seeds=[1, 1], out_dir=str(tmp_path))["error"]
-    assert error["code"] == -32602
-    assert "variations.seeds" in error["message"]
-    error = child.ask(3, "generate", seed=1, out_dir=str(tmp_path), picture_px=-5)["error"]
-    assert "generate.picture_px" in error["message"]
-
-
 def test_a_long_generation_shows_pictures_and_cancelling_removes_them(child, slow_checkpoint, tmp_path):
     out = tmp_path / "person"
     params = {"seed": 1, "steps": BUSY_STEPS, "out_dir": str(out), "checkpoint": str(slow_checkpoint)}

@@ -8,13 +8,10 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fuzz.corpus import CASES
-from fuzz.run import ROOT, run
+from fuzz.findings import CASES
+from fuzz.run import run
 from fuzz.small_inputs import figures
 from fuzz.verdicts import compare
-
-CORPUS = ROOT / "fuzz_out"
-"""What runs have learned."""
 
 
 def main() -> None:
@@ -24,7 +21,6 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="+", default=[""], help="parts of names of kinds of input")
     parser.add_argument("--processes", type=int, default=os.cpu_count() or 1)
-    parser.add_argument("--forget", action="store_true", help=f"use and keep nothing in {CORPUS.name}")
     parser.add_argument("--verdicts", action="store_true", help="only compare readers of safetensors files")
     parser.add_argument("--small", action="store_true", help="only measure small files that claim much")
     arguments = parser.parse_args()
@@ -36,13 +32,11 @@ def main() -> None:
         print(json.dumps(figures()))
         return
     report = run(
-        arguments.seed, arguments.inputs, minutes=arguments.minutes, only=arguments.only, processes=arguments.processes,
-        corpus=None if arguments.forget else CORPUS,
-    )  # fmt: skip
+        arguments.seed, arguments.inputs, minutes=arguments.minutes, only=arguments.only, processes=arguments.processes
+    )
     if not report.counts["inputs"]:
         sys.exit(f"no input was tried: is there a kind of input whose name contains {' or '.join(arguments.only)}?")
-    inputs, lines, findings = report.counts["inputs"], len(report.lines), len(report.findings)
-    print(f"{inputs} inputs tried, {lines} lines of the programs reached, {findings} findings")
+    print(f"{report.counts['inputs']} inputs tried, {len(report.findings)} findings")
     print(json.dumps(report.figures()))
     if report.findings:
         sys.exit(f"the inputs of findings are in {CASES}: mend what they show, and keep them")

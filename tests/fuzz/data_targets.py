@@ -6,6 +6,8 @@ import json
 import pickle
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -90,11 +92,11 @@ def make_weights(folder: Path) -> Path:
 
 
 def read_weights(path: Path) -> None:
-    from primdiffusion.editing.regions import read_weights, region_from_weights
+    from primdiffusion.commands.edit import _region
+    from primdiffusion.editing.regions import read_weights
 
-    weights = read_weights(path)
-    finite(weights)
-    region_from_weights(weights)
+    finite(read_weights(path))
+    _region(cast(Any, SimpleNamespace(weights=path)), cast(Any, SimpleNamespace(body_setup=None)))
 
 
 def make_solids(folder: Path) -> Path:

@@ -1,7 +1,4 @@
-"""Feed damaged files to their readers, in processes that are watched, and count what comes of it.
-
-An input that reaches lines of the programs in a new order is kept, and others are made from it (`coverage`, `corpus`).
-"""
+"""Feed damaged files to their readers, in processes that are watched, and count what comes of it."""
 
 from __future__ import annotations
 
@@ -25,12 +22,9 @@ from typing import Any
 import numpy as np
 import psutil
 
-from fuzz import corpus as corpora
-from fuzz.combinations import combined
-from fuzz.corpus import CASES, Corpus
-from fuzz.coverage import ROOT, Coverage
-from fuzz.mutations import pick
+from fuzz.findings import CASES, folder_of, keep, shrunk
 
+ROOT = Path(__file__).resolve().parents[2]
 LONGEST_SENTENCE = 300
 """Characters without the folder of the file, which is the user's."""
 LONGEST_TOTAL_CPU_S, LONGEST_WALL_S = 30.0, 180.0
@@ -47,11 +41,10 @@ ORDINARY = {"read", "sentences"}
 
 @dataclasses.dataclass
 class Report:
-    """Counts, a line for each finding, and the lines of the programs that were reached."""
+    """Counts, and a line for each finding."""
 
     counts: Counter[str] = dataclasses.field(default_factory=Counter)
     findings: list[str] = dataclasses.field(default_factory=list)
-    lines: set[str] = dataclasses.field(default_factory=set)
     causes: set[tuple[str, ...]] = dataclasses.field(default_factory=set)
     """Of findings, each of which is counted and kept once."""
 
@@ -68,13 +61,11 @@ class Report:
 
 
 def run(
-    seed: int, inputs: int, *, minutes: float | None = None, only: Sequence[str] = ("",), processes: int = 1,
-    corpus: Path | None = None,
-) -> Report:  # fmt: skip
+    seed: int, inputs: int, *, minutes: float | None = None, only: Sequence[str] = ("",), processes: int = 1
+) -> Report:
     """Try `inputs` damaged inputs, or as many as fit into `minutes`; a process that hangs or dies is replaced.
 
-    Kinds of inputs, those whose names contain one of `only`, are shared out among the processes. What reaches new lines
-    is kept in the folder `corpus`, if given.
+    Kinds of inputs, those whose names contain one of `only`, are shared out among the processes.
     """
     report, end = Report(), None if minutes is None else time.monotonic() + 60 * minutes
 
@@ -82,7 +73,7 @@ def run(
         number, last = 0, 10**9 if end is not None else -(-inputs // processes)
         while number < last and (end is None or time.monotonic() < end):
             options = {"seed": seed, "only": list(only), "place": place, "processes": processes, "last": last}
-            options |= {"first": number, "corpus": corpus and str(corpus), "found": list(report.causes)}
+            options |= {"first": number, "found": list(report.causes)}
             number = _run_child(report, options, end)
 
     with concurrent.futures.ThreadPoolExecutor(processes) as pool:
@@ -110,7 +101,7 @@ def _run_child(report: Report, options: dict[str, Any], end: float | None) -> in
         if (cause := (reading["target"], f"ended ({ended})")) not in report.causes:
             report.causes.add(cause)
             path = Path(reading["path"])
-            case = corpora.keep(CASES / corpora.folder_of(cause[0]), path.read_bytes(), path.suffix)
+            case = keep(CASES / folder_of(cause[0]), path.read_bytes(), path.suffix)
             outcome = "hangs" if ended is None else "tracebacks"
             report.find(outcome, f"{cause[0]}: the process {cause[1]} [{case.relative_to(CASES)}]")
     return now + 1
@@ -141,7 +132,6 @@ def _listen(
             else:
                 now += 1
                 report.counts["inputs"] += 1
-                report.lines.update(message["lines"])
                 _note(report, message)
         if ended is not None:
             return ended, now, reading
@@ -163,11 +153,9 @@ def _note(report: Report, message: dict[str, Any]) -> None:
             report.find(outcome, message["what"])
 
 
-def damaged(target: Any, content: bytes, seed: int, number: int, others: Sequence[bytes] = ()) -> bytes:
-    """Input `number` of a target, in part also one of `others`: the same for the same seed."""
+def damaged(target: Any, content: bytes, seed: int, number: int) -> bytes:
+    """Input `number` of a target: the same for the same seed."""
     rng = np.random.default_rng([seed, number])
-    if others and rng.random() < 0.25:
-        content = combined(content, pick(rng, others), rng)
     for _ in range(1 + int(rng.random() < 0.2)):
         mutation = target.mutations[int(rng.integers(len(target.mutations)))]
         try:
@@ -178,36 +166,19 @@ def damaged(target: Any, content: bytes, seed: int, number: int, others: Sequenc
 
 
 class Tried:
-    """A kind of input that is being tried: its corpus, and the time that its inputs have taken."""
+    """A kind of input that is being tried: a valid one, and the time that its inputs have taken."""
 
-    def __init__(self, target: Any, path: Path, corpus: str | None) -> None:
-        self.target, self.path, self.seconds = target, path, 0.0
-        self.corpus = Corpus(path.read_bytes(), Path(corpus, corpora.folder_of(target.name)) if corpus else None)
+    def __init__(self, target: Any, path: Path) -> None:
+        self.target, self.path, self.valid, self.seconds = target, path, path.read_bytes(), 0.0
 
-    def next_input(self, seed: int, number: int) -> bytes:
-        """One of an earlier run, or one that is made of those that have reached something new."""
-        content = self.corpus.waiting()
-        if content is not None:
-            return content
-        chosen = self.corpus.chosen(np.random.default_rng([number, seed]))
-        return damaged(self.target, chosen, seed, number, self.corpus.contents)
-
-    def learn(self, content: bytes, coverage: Coverage) -> tuple[list[str], str]:
-        """As `outcome`; the input is kept if it reaches something new and finds nothing."""
-        coverage.has_news = False
-        outcome, about = self.outcome(content, coverage)
-        if coverage.has_news and set(outcome) <= ORDINARY:
-            self.corpus.learn(content)
-        return outcome, about
-
-    def outcome(self, content: bytes, coverage: Coverage | None = None) -> tuple[list[str], str]:
+    def outcome(self, content: bytes) -> tuple[list[str], str]:
         """What comes of an input, as `_outcome` says."""
         self.path.write_bytes(content)
-        return _outcome(self.target, self.path, coverage)
+        return _outcome(self.target, self.path)
 
 
 def _serve(
-    seed: int, only: Sequence[str], place: int, processes: int, first: int, last: int, corpus: str | None, folder: str,
+    seed: int, only: Sequence[str], place: int, processes: int, first: int, last: int, folder: str,
     found: Sequence[Sequence[str]],
 ) -> None:  # fmt: skip
     from fuzz.targets import TARGETS
@@ -217,23 +188,21 @@ def _serve(
     targets = [target for target in TARGETS if any(part in target.name for part in only)][place::processes]
     os.chdir(folder)
     tried: dict[str, Tried] = {}
-    coverage, causes = Coverage(), set(map(tuple, found))
+    causes = set(map(tuple, found))
     for number in range(first, last if targets else first):
         target = min(targets, key=lambda one: tried[one.name].seconds if one.name in tried else -1.0)
         if target.name not in tried:
             _say(number=number, loads=True)
             made = Path(folder, str(number))
             made.mkdir()
-            tried[target.name] = Tried(target, target.make(made), corpus)
-            target.read(tried[target.name].path)  # what is not damaged is read; once without lines of imports
-            with coverage:
-                target.read(tried[target.name].path)
+            tried[target.name] = Tried(target, target.make(made))
+            target.read(tried[target.name].path)  # what is not damaged is read
         one = tried[target.name]
-        content = one.next_input(seed, number)
+        content = damaged(target, one.valid, seed, number)
         _say(number=number, target=target.name, path=str(one.path))
         began = time.process_time()
         events.clear()
-        outcome, about = one.learn(content, coverage)
+        outcome, about = one.outcome(content)
         if set(outcome) & {"hangs", "over_500mb"}:  # once more alone: another program may have slowed it down
             outcome, about = one.outcome(content)
         if events or Path("CANARY").exists():
@@ -244,13 +213,12 @@ def _serve(
         if is_new:
             causes.add(cause)
             if set(outcome) <= {"tracebacks", "garbage"}:
-                content = corpora.shrunk(content, lambda less: _cause(one, *one.outcome(less)) == cause)  # noqa: B023
-            case = corpora.keep(CASES / corpora.folder_of(target.name), content, one.path.suffix)
+                content = shrunk(content, lambda less: _cause(one, *one.outcome(less)) == cause)  # noqa: B023
+            case = keep(CASES / folder_of(target.name), content, one.path.suffix)
             about = f"{about} [{case.relative_to(CASES)}]"
-        lines = coverage.new_lines() if coverage.has_news else []
         one.seconds += time.process_time() - began
         what = f"{target.name}, seed {seed}, input {number}: {about}"
-        _say(number=number, outcome=outcome, what=what, is_new=is_new, cause=cause, lines=lines)
+        _say(number=number, outcome=outcome, what=what, is_new=is_new, cause=cause)
 
 
 def _cause(one: Tried, outcome: list[str], about: str) -> tuple[str, ...]:
@@ -263,7 +231,7 @@ def _cause(one: Tried, outcome: list[str], about: str) -> tuple[str, ...]:
     return one.target.name, *outcome, where[0] if where else re.sub(r"'[^']*'|/\S+|\d+", "", about)[:150]
 
 
-def _outcome(target: Any, path: Path, coverage: Coverage | None = None) -> tuple[list[str], str]:
+def _outcome(target: Any, path: Path) -> tuple[list[str], str]:
     """What came of reading a damaged file, and more about it."""
     from fuzz.target import Garbage, said
 
@@ -272,8 +240,7 @@ def _outcome(target: Any, path: Path, coverage: Coverage | None = None) -> tuple
     with contextlib.suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
     try:
-        with coverage or contextlib.nullcontext():
-            target.read(path)
+        target.read(path)
     except Garbage as error:
         outcome, about = ["garbage"], str(error)
     except Exception as error:

@@ -3,35 +3,16 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from fuzz import data_targets, extension_targets, mutations, reader_targets, served
-from fuzz.target import Garbage, Target, finite, finite_members, said
+from fuzz import data_targets, extension_targets, mutations, other_files, reader_targets, served
+from fuzz.target import Garbage, Target, finite, finite_members
 
 # --- humans and models
-
-
-def tiny_human():
-    from primdiffusion.human import generate
-    from tiny_model import tiny_model
-
-    return generate(tiny_model(), seed=3, steps=2)
-
-
-def make_human(folder: Path, compact: bool = False) -> Path:
-    from primdiffusion.human_file import save_human
-
-    save_human(folder / "a.human.safetensors", tiny_human(), compact=compact)
-    return folder / "a.human.safetensors"
-
-
-def make_compact(folder: Path) -> Path:
-    return make_human(folder, compact=True)
 
 
 def read_human(path: Path) -> None:
@@ -139,16 +120,13 @@ def opcodes(content: bytes, rng: np.random.Generator) -> bytes:
     return content[:place] + mutations.pick(rng, HOSTILE) + (content[place:] if rng.random() < 0.5 else b"")
 
 
-def make_pose(folder: Path) -> Path:
-    pose = np.random.default_rng(0).normal(0, 0.3, (24, 3)).round(3).tolist()
-    (folder / "pose.json").write_text(json.dumps({"pose": pose, "translation": [0, 0.5, 0]}))
-    return folder / "pose.json"
+def make_pose(place: str) -> Callable[[Path], Path]:
+    def make(folder: Path) -> Path:
+        pose = np.random.default_rng(0).normal(0, 0.3, (24, 3)).round(3).tolist()
+        (folder / "pose.json").write_text(json.dumps({"pose": pose, place: [0, 0.5, 0]}))
+        return folder / "pose.json"
 
-
-def make_own_pose(folder: Path) -> Path:
-    pose = np.random.default_rng(0).normal(0, 0.3, (24, 3)).round(3).tolist()
-    (folder / "pose.json").write_text(json.dumps({"pose": pose, "transl": [0, 0.5, 0]}))
-    return folder / "pose.json"
+    return make
 
 
 def read_pose_file(path: Path) -> None:
@@ -249,53 +227,6 @@ def read_glb_person(path: Path) -> None:
             raise Garbage("weights below zero, or faces without vertices")
 
 
-_DATASET: dict[str, Path] = {}
-
-
-def of_dataset(name: str) -> Callable[[Path], Path]:
-    def make(folder: Path) -> Path:
-        from capture_scenes import captured
-
-        if "root" not in _DATASET:
-            _DATASET["root"] = captured(folder / "dataset", people=1, frames=1)
-        shutil.copytree(_DATASET["root"], folder / name.replace("/", "_") / "captures")
-        return next((folder / name.replace("/", "_") / "captures").rglob(name))
-
-    return make
-
-
-def read_dataset(path: Path) -> None:
-    from primdiffusion.formats.capture_repair import verify
-
-    root = next(parent for parent in path.parents if parent.name == "captures")
-    for each in (verify, view_of, pose_of):
-        try:
-            each(root)
-        except Garbage:
-            raise
-        except Exception as error:
-            if not said(error):
-                raise
-
-
-def person_in(root: Path) -> Path:
-    return next(path for path in sorted(root.iterdir()) if (path / "img").is_dir())
-
-
-def pose_of(root: Path) -> None:
-    from primdiffusion.capture.smpl_parameters import read_smpl
-
-    finite(read_smpl(person_in(root)).pose(0).translation)
-
-
-def view_of(root: Path) -> None:
-    from primdiffusion.capture.reader import open_captures
-
-    captures = open_captures(root)
-    view = captures.view(person_in(root).name, 0, 0)
-    finite_members(view)
-
-
 def make_mhclo(folder: Path) -> Path:
     head = ["name x", "obj_file x.obj", "x_scale 1 2 0.1", "verts 0"]
     fits = [f"{n} {n + 1} {n + 2} 0.3 0.3 0.4 0 0 0.1" for n in range(9)]
@@ -345,22 +276,19 @@ def read_merged(path: Path) -> None:
 
 
 TARGETS = (
-    Target("human", make_human, mutations.SAFETENSORS, read_human),
-    Target("compact human", make_compact, mutations.SAFETENSORS, read_human),
+    Target("human", extension_targets.make_human, mutations.SAFETENSORS, read_human),
+    Target("compact human", extension_targets.make_compact, mutations.SAFETENSORS, read_human),
     Target("checkpoint", make_checkpoint, mutations.SAFETENSORS, read_checkpoint),
     Target("released checkpoint", make_released, mutations.TORCH, read_released),
     Target("SMPL .npz", make_smpl_npz, mutations.NPZ, read_body),
     Target("SMPL .pkl", make_smpl_pickle, (*mutations.PLAIN, opcodes, opcodes), read_body),
     Target("UV .obj", make_uv, mutations.TEXT, read_uv),
-    Target("pose", make_pose, mutations.JSON, read_pose_file),
-    Target("own pose", make_own_pose, mutations.JSON, read_own_pose),
+    Target("pose", make_pose("translation"), mutations.JSON, read_pose_file),
+    Target("own pose", make_pose("transl"), mutations.JSON, read_own_pose),
     Target("BVH", make_bvh, mutations.TEXT, read_motion_file),
     Target("AMASS", make_amass, mutations.NPZ, read_motion_file),
     Target("payload", make_payload, mutations.NPZ, read_payload),
     Target("glb", make_glb, (*mutations.PLAIN, glb_header, glb_header, glb_header, glb_numbers), read_glb_person),
-    Target("dataset.json", of_dataset("dataset.json"), mutations.JSON, read_dataset),
-    Target("complete.json", of_dataset("complete.json"), mutations.JSON, read_dataset),
-    Target("cameras.json", of_dataset("cameras.json"), mutations.JSON, read_dataset),
     Target("mhclo", make_mhclo, mutations.TEXT, read_proxy),
     Target("obj", make_obj, mutations.TEXT, read_proxy),
     Target("picture", make_picture, mutations.PLAIN, read_picture),
@@ -369,4 +297,5 @@ TARGETS = (
     *extension_targets.TARGETS,
     *reader_targets.TARGETS,
     *served.TARGETS,
+    *(one for one in other_files.TARGETS if one.mutations),
 )

@@ -107,14 +107,10 @@ ANY_CONTENT = {
 }  # fmt: skip
 """Lines of any text, what Blender shows as well as it can, and what is made again or not used where it is damaged."""
 STILL_VALID = {("captures: list", "head"), ("captures: picture", "half")}
-LENIENT = {"dataset.json", "complete.json", "cameras.json"}
-"""Their reading in `targets` goes on after sentences; `captures: ...` do not."""
 TOGETHER = "readers of"
 """Targets of this name compare several readers, each of which is tried alone as well."""
 FILES = [
-    one
-    for one in (*TARGETS, *other_files.TARGETS)
-    if one.is_file and one.name not in LENIENT and not one.name.startswith(TOGETHER)
+    one for one in dict.fromkeys((*TARGETS, *other_files.TARGETS)) if one.is_file and not one.name.startswith(TOGETHER)
 ]
 
 

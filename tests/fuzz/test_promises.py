@@ -71,7 +71,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "tests/backend/diffusion/test_checkpoint.py::test_a_network_larger_than_its_file_is_not_built",
             "tests/backend/diffusion/test_checkpoint.py::test_weights_that_are_not_numbers_are_named",
-            "tests/contract/test_tensor_layout.py::test_ten_thousand_damaged_files_get_the_librarys_verdict",
+            "tests/contract/test_tensor_layout.py::test_damaged_files_get_the_librarys_verdict",
         ),
     ),
     "torch's `.pt`, `.pth`": (

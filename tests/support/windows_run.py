@@ -13,12 +13,11 @@ UNDER_THE_RULES = (
     "tests/backend/formats",
     "tests/contract/test_capture_layout.py",
     "tests/contract/test_client.py",
-    "tests/contract/test_client_messages.py",
     "tests/contract/test_shared_frames.py",
     "tests/backend/capture/test_render.py::test_captures_have_the_layouts_files_and_are_whole",
     "tests/backend/capture/test_render.py::test_what_is_there_is_kept_and_what_is_missing_is_made",
 )
-TOO_LONG = ("many_deaths", "cancel_fails", "killed_child_is_one", "a_poll_ends", "heartbeats", "silence", "from_hello")
+TOO_LONG = ("many_deaths", "a_poll_ends", "heartbeats", "silence")
 """They pass too, but wait for a minute, and touch no files that the others do not."""
 
 

@@ -3,7 +3,6 @@
 import pickle
 
 import numpy as np
-import pytest
 import smplx
 import torch
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
@@ -11,9 +10,6 @@ from primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from smplx.lbs import lbs
 from support.errors import refused
-
-FLIP = torch.tensor([-1.0, 1.0, 1.0])
-TWIN_JOINT = [0, 2, 1, 3, 5, 4, 6, 8, 7, 9, 11, 10, 12, 14, 13, 15, 17, 16, 19, 18, 21, 20, 23, 22]
 
 
 def small_body(vertex_count: int = 40, dtype: torch.dtype = torch.float64) -> BodyModel:
@@ -36,14 +32,6 @@ def small_body(vertex_count: int = 40, dtype: torch.dtype = torch.float64) -> Bo
         uv=random(9, 2),
         uv_faces=torch.randint(9, (12, 3), generator=g),
     )
-
-
-@pytest.fixture(scope="module")
-def mirror_twin() -> torch.Tensor:
-    """For each vertex of the default body the one at its mirror image, found by place."""
-    template = default_body().template.numpy()
-    number = {tuple(p): i for i, p in enumerate(template)}
-    return torch.tensor([number[tuple(p)] for p in template * FLIP.numpy() + 0.0])
 
 
 def random_people(count: int, seed: int, dtype: torch.dtype = torch.float32) -> tuple[torch.Tensor, ...]:
@@ -120,16 +108,6 @@ def test_turning_the_pelvis_turns_the_whole_body_rigidly():
     moved_pelvis = turn @ (pelvis + translation[0])
     turned = shaped.pose(BodyPose(turned_rotation, moved_pelvis - pelvis))
     torch.testing.assert_close(turned.vertices, shaped.pose(pose).vertices @ turn.T, atol=2e-6, rtol=0)
-
-
-def test_mirrored_pose_gives_the_mirrored_body(mirror_twin):
-    betas, theta, _ = random_people(1, seed=7)
-    shaped = default_body().shape(betas[0])
-    vectors = theta[0].reshape(J, 3)
-    mirrored = vectors[TWIN_JOINT] * torch.tensor([1.0, -1.0, -1.0])
-    posed = shaped.pose(BodyPose.from_axis_angle(vectors.flatten())).vertices
-    posed_mirrored = shaped.pose(BodyPose.from_axis_angle(mirrored.flatten())).vertices
-    torch.testing.assert_close(posed_mirrored, posed[mirror_twin] * FLIP, atol=3e-6, rtol=0)
 
 
 def test_batches_of_bodies_and_poses_broadcast():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from primdiffusion.body.model import J, default_body
+from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from primdiffusion.people.base_mesh import load_base_mesh
 
@@ -37,6 +37,15 @@ def test_every_array_is_its_own_mirror_image(twin):
     np.testing.assert_array_equal(body.shape_basis.numpy()[twin] * FLIP[:, None], body.shape_basis.numpy())
     np.testing.assert_array_equal(body.skin_weights.numpy()[twin][:, TWIN_JOINT], body.skin_weights.numpy())
     np.testing.assert_array_equal(body.joint_regressor.numpy()[TWIN_JOINT][:, twin], body.joint_regressor.numpy())
+
+
+def test_mirrored_pose_gives_the_mirrored_body(twin):
+    generator = torch.Generator().manual_seed(7)
+    shaped = default_body().shape(torch.randn(10, generator=generator))
+    vectors = 0.6 * torch.randn(J, 3, generator=generator)
+    mirrored = vectors[TWIN_JOINT] * torch.tensor([1.0, -1.0, -1.0])
+    posed, other = (shaped.pose(BodyPose.from_axis_angle(v.flatten())).vertices.numpy() for v in (vectors, mirrored))
+    np.testing.assert_allclose(other, posed[twin] * FLIP, atol=3e-6)
 
 
 def test_every_face_has_a_mirror_twin_with_the_opposite_turn(twin):

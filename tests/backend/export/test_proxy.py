@@ -1,13 +1,12 @@
 """The textured, skinned mesh of a person, judged by what the marcher draws."""
 
-import functools
 import io
 
 import numpy as np
 import pytest
 import torch
 import trimesh
-from export_people import person
+from export_people import SMALL, person, proxy
 from PIL import Image
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.export.proxy import (
@@ -29,13 +28,6 @@ from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchor
 from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.render.merge import merge
-
-SMALL = ProxySettings(spacing=0.012, triangles=4000, texture_px=256)
-
-
-@functools.cache
-def proxy():
-    return mesh_proxy(person(), SMALL)
 
 
 def test_it_is_closed_and_as_fine_as_asked_for():

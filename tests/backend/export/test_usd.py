@@ -5,22 +5,15 @@ import zipfile
 
 import numpy as np
 import pytest
-from export_people import person
+from export_people import proxy
 from PIL import Image
-from primdiffusion.export.proxy import mesh_proxy
 from primdiffusion.export.usd import ALIGNMENT, LOCAL_HEADER, STAGE, TEXTURE, write_proxy_usdz
-from primdiffusion.formats.requests import ProxySettings
 
 
 @pytest.fixture(scope="module")
-def proxy():
-    return mesh_proxy(person(), ProxySettings(spacing=0.012, triangles=4000, texture_px=256))
-
-
-@pytest.fixture(scope="module")
-def archive(proxy, tmp_path_factory):
+def archive(tmp_path_factory):
     path = tmp_path_factory.mktemp("usd") / "person.usdz"
-    write_proxy_usdz(path, proxy, {"seed": 7, "name": 'A "quoted" name'})
+    write_proxy_usdz(path, proxy(), {"seed": 7, "name": 'A "quoted" name'})
     return path
 
 
@@ -37,13 +30,13 @@ def test_it_is_stored_uncompressed_with_the_stage_first_and_files_on_64_bytes(ar
         assert (entry.header_offset + LOCAL_HEADER + lengths) % ALIGNMENT == 0
 
 
-def test_the_texture_is_the_proxys(archive, proxy):
+def test_the_texture_is_the_proxys(archive):
     with zipfile.ZipFile(archive) as opened:
-        assert np.array_equal(np.asarray(Image.open(io.BytesIO(opened.read(TEXTURE)))), proxy.texture)
+        assert np.array_equal(np.asarray(Image.open(io.BytesIO(opened.read(TEXTURE)))), proxy().texture)
 
 
-def test_a_file_that_cannot_be_written_leaves_nothing(proxy, tmp_path):
+def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path):
     (tmp_path / "person.usdz").mkdir()
     with pytest.raises(OSError):
-        write_proxy_usdz(tmp_path / "person.usdz", proxy, {})
+        write_proxy_usdz(tmp_path / "person.usdz", proxy(), {})
     assert [path.name for path in tmp_path.iterdir()] == ["person.usdz"]

@@ -1,3 +1,5 @@
+"""The plain rasteriser: by hand, and against Embree's rays."""
+
 import dataclasses
 import math
 
@@ -5,17 +7,18 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from capture_scenes import BLUE, GREEN, RED, WHITE, square
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.raster.rasterise import OrthographicView, rasterise, view_along
 from support.errors import refused
 
 
-def part(vertices, faces, texture=((255, 255, 255, 255),), corner_uv=None, name="part") -> TexturedPart:
+def part(vertices, faces, texture=(WHITE,), corner_uv=None) -> TexturedPart:
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int32)
     texture = np.asarray(texture, np.uint8)
     return TexturedPart(
-        name=name,
+        name="part",
         vertices=vertices,
         faces=faces,
         corner_uv=np.zeros((len(faces), 3, 2), np.float32) if corner_uv is None else np.asarray(corner_uv, np.float32),
@@ -25,24 +28,10 @@ def part(vertices, faces, texture=((255, 255, 255, 255),), corner_uv=None, name=
     )
 
 
-def square(z: float, texture, side: float = 1.0) -> TexturedPart:
-    """An upright square in the plane z, texture upright as seen from +z."""
-    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * side / 2
-    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
-    faces = [[0, 1, 2], [0, 2, 3]]
-    return part(np.c_[corners, np.full(4, z)], faces, texture, uv[np.array(faces)], name=f"square at {z}")
-
-
 FRONT = OrthographicView(  # looks along -z, 8 x 8 pixels over [-1/2, 1/2]^2, from z = 2
     np.array([[1.0, 0, 0, 0.5], [0, -1.0, 0, 0.5], [0, 0, -1.0, 2]]), pixel_size=1 / 8, width=8, height=8
 )
-RED, GREEN, BLUE, WHITE, HOLE = (
-    (255, 0, 0, 255),
-    (0, 255, 0, 255),
-    (0, 0, 255, 255),
-    (255, 255, 255, 255),
-    (9, 9, 9, 0),
-)
+HOLE = (9, 9, 9, 0)
 
 
 def knot() -> trimesh.Trimesh:
@@ -64,18 +53,18 @@ def test_a_triangle_covers_the_pixels_whose_centres_it_holds():
 
 def test_row_zero_of_a_texture_is_at_the_top():
     texture = np.array([[RED, GREEN], [BLUE, WHITE]])
-    picture = rasterise(TexturedMesh((square(0, texture.repeat(4, 0).repeat(4, 1)),)), FRONT)
+    picture = rasterise(TexturedMesh((square(texture.repeat(4, 0).repeat(4, 1)),)), FRONT)
     corners = picture.rgb[[1, 1, 6, 6], [1, 6, 1, 6]]
     np.testing.assert_allclose(corners, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], atol=0)
 
 
 def test_colours_are_linear():
-    picture = rasterise(TexturedMesh((square(0, [[(188, 188, 188, 255)]]),)), FRONT)
+    picture = rasterise(TexturedMesh((square([[(188, 188, 188, 255)]]),)), FRONT)
     np.testing.assert_allclose(picture.rgb, ((188 / 255 + 0.055) / 1.055) ** 2.4, rtol=1e-6)
 
 
 def test_the_nearer_part_wins_whatever_the_order():
-    near, far = square(0.5, [[RED]], side=0.5), square(-0.5, [[GREEN]])
+    near, far = square([[RED]], 0.5, 0.5), square([[GREEN]], -0.5)
     for parts, number_of_near in (((near, far), 0), ((far, near), 1)):
         picture = rasterise(TexturedMesh(parts), FRONT)
         assert picture.part[4, 4] == number_of_near
@@ -85,8 +74,8 @@ def test_the_nearer_part_wins_whatever_the_order():
 
 
 def test_what_fails_the_alpha_test_is_seen_through():
-    leaf = square(0.5, np.array([[RED, HOLE], [HOLE, RED]]))
-    picture = rasterise(TexturedMesh((leaf, square(-0.5, [[GREEN]]))), FRONT)
+    leaf = square([[RED, HOLE], [HOLE, RED]], 0.5)
+    picture = rasterise(TexturedMesh((leaf, square([[GREEN]], -0.5))), FRONT)
     np.testing.assert_array_equal(picture.part[:, 0], [0, 0, 0, 0, 1, 1, 1, 1])
     np.testing.assert_array_equal(picture.rgb[0, 3], [1, 0, 0])  # the hole's colour tints nothing
     np.testing.assert_array_equal(picture.rgb[0, 4], [0, 1, 0])
@@ -94,7 +83,7 @@ def test_what_fails_the_alpha_test_is_seen_through():
 
 def test_supersampling_counts_covered_samples():
     view = OrthographicView(np.array([[1.0, 0, 0, 0.5], [0, -1.0, 0, 0.5], [0, 0, -1.0, 2]]), 1.0, 1, 1)
-    half = TexturedMesh((square(0, [[RED]], side=0.5),))
+    half = TexturedMesh((square([[RED]], side=0.5),))
     picture = rasterise(half, view, supersample=8)
     assert picture.alpha[0, 0] == pytest.approx(0.25)
     np.testing.assert_allclose(picture.rgb[0, 0], [0.25, 0, 0])
@@ -153,7 +142,7 @@ def test_silhouette_and_depth_agree_with_embree(kind):
 
 def test_the_same_mesh_gives_the_same_bits():
     shape = knot()
-    mesh = TexturedMesh((part(shape.vertices, shape.faces), square(0, [[RED]], side=3)))
+    mesh = TexturedMesh((part(shape.vertices, shape.faces), square([[RED]], side=3)))
     view = view_along((0.3, -0.2, -1), mesh.bounds, 0.02)
     first, second = rasterise(mesh, view, 2), rasterise(mesh, view, 2)
     for field in dataclasses.fields(first):

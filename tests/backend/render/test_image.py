@@ -1,7 +1,6 @@
 """sRGB and picture files."""
 
 import math
-import os
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from PIL import Image
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.image import depth_to_png, to_png
-from support.errors import refused
 
 KNOWN = {0.0: 0.0, 0.0031308: 0.04044994, 0.2140411: 0.5, 0.5: 0.7353570, 1.0: 1.0}
 
@@ -67,21 +65,6 @@ def test_over_a_background_colours_mix_in_linear_light(tmp_path):
 def test_the_default_background_is_black(tmp_path):
     to_png(tmp_path / "a.png", rendering((0.25, 0.0, 0.0), 0.5))
     assert pixels(tmp_path / "a.png")[0].tolist() == [[137, 0, 0], [0, 0, 0]]
-
-
-def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path, monkeypatch):
-    path = tmp_path / "a.png"
-    to_png(path, rendering((0.25, 0.0, 0.0), 0.5))
-    before = path.read_bytes()
-
-    def full_disk(*_):
-        raise OSError("no space left")
-
-    monkeypatch.setattr(os, "replace", full_disk)
-    with refused(OSError, "space"):
-        to_png(path, rendering((0.9, 0.0, 0.0), 1.0))
-    assert path.read_bytes() == before
-    assert [entry.name for entry in tmp_path.iterdir()] == ["a.png"]
 
 
 def test_written_pictures_can_be_read_by_others(tmp_path):

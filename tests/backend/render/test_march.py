@@ -180,6 +180,10 @@ def test_broken_scenes_are_rejected_with_a_way_out(dtype):
     boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
     with refused(ValueError, "rotation"):
         march(dataclasses.replace(boxes, rotation=boxes.rotation * 2), camera)
+    with refused(ValueError, "density is -1"):
+        march(dataclasses.replace(boxes, density=boxes.density * 0 - 1), camera)
+    with refused(ValueError, "half_extent"):
+        march(dataclasses.replace(boxes, half_extent=boxes.half_extent * -torch.inf), camera)
     with refused(ValueError, "broadcast"):
         march(people(0, 1).to(dtype=dtype), views(3).to(dtype=dtype))
     with refused(ValueError, "dimensions"):
@@ -212,6 +216,10 @@ def test_broken_scenes_are_rejected_with_a_way_out(dtype):
 def test_cameras_whose_rays_start_nowhere_are_rejected(dtype):
     boxes, camera = random_boxes(3).to(dtype=dtype), camera_at((0.0, 0.0, 0.5)).to(dtype=dtype)
     flat = torch.tensor([1.0, 1.0, 0.0], dtype=dtype)[:, None]
+    with refused(ValueError, "0 x 20 pixels"):
+        march(boxes, dataclasses.replace(camera, width=0))
+    with refused(ValueError, "camera.intrinsics"):
+        march(boxes, dataclasses.replace(camera, intrinsics=camera.intrinsics * torch.nan))
     for change in (2.0, 0.0, flat):
         with refused(ValueError, "world_to_camera"):
             march(boxes, dataclasses.replace(camera, world_to_camera=camera.world_to_camera * change))

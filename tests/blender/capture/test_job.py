@@ -170,12 +170,6 @@ def test_truncated_files_are_rendered_again_even_without_repair(copy, whole, emp
     assert verify(copy) == {}
 
 
-def test_an_unfinished_subject_is_reported(copy):
-    (copy / "bert" / COMPLETE_FILE).unlink()
-    picture_path(copy / "bert", "part", 0, 0).unlink()
-    assert verify(copy)[copy / "bert"] == "not finished: 19 of 20 pictures are there"
-
-
 def test_a_picture_that_the_mark_does_not_name_is_missed(copy):
     mark = copy / "anna" / COMPLETE_FILE
     files = json.loads(mark.read_text())

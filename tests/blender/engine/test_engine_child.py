@@ -231,18 +231,6 @@ def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage,
     assert studio.drawing_child().pid not in (None, pid)
 
 
-def test_blender_exits_while_the_engine_is_the_active_one():
-    program = (
-        "import bpy, blender_primdiffusion as b; b.register(); scene = bpy.context.scene;"
-        "scene.render.engine = 'PRIMDIFFUSION'; from blender_primdiffusion.engine import studio;"
-        "print(studio.frames.folder)"
-    )
-    root = Path(__file__).parents[3]
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=60, check=True)
-    assert not Path(done.stdout.strip().splitlines()[-1]).exists()
-
-
 EXIT_WHILE_DRAWING = """
 import sys, os, threading, time
 from pathlib import Path

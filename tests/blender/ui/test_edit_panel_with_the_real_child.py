@@ -9,7 +9,6 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES
-from support.errors import refused
 
 from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans, person_file
 
@@ -102,18 +101,3 @@ def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_t
         anna = humans(bpy.context.scene)[0]
         assert files(anna) == state
         assert all(Path(bpy.path.abspath(volume.filepath)).is_file() for volume in bpy.data.volumes)
-
-
-def test_what_the_child_rejects_is_one_sentence(people):
-    rejected = {
-        "1 steps were requested": lambda: ops.blend(human="Human", other="Human.001", steps=1),
-        "knows no attribute 'wings'": lambda: ops.redress(human="Human", attributes="wings=two", steps=2),
-    }
-    before = files(people[0])
-    for sentence, edit in rejected.items():
-        with pytest.raises(RuntimeError, match=sentence):
-            edit()
-    bpy.context.scene.objects["Human_body"].vertex_groups.new(name="dot").add([0], 0.1, "REPLACE")
-    with refused(RuntimeError, "larger"):
-        ops.redress(human="Human", vertex_group="dot", steps=2)
-    assert files(people[0]) == before

@@ -96,27 +96,18 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
     ("operator", "properties", "sentence"),
     [
         ("export", {"filepath": "OUT/a.stl"}, "another ending"),
-        ("export", {"filepath": "OUT/none/a.glb"}, "there is no folder"),
-        ("export", {"filepath": ""}, "name a file"),
         ("export", {"filepath": "OUT/a.glb", "human": "Bert"}, "'Bert' is not in the scene"),
         ("export", {"filepath": "OUT/a.glb", "format": "PLY"}, "another ending than .ply"),
-        ("export", {"filepath": "OUT/none/a.human"}, "there is no folder"),
-        ("export", {"filepath": "OUT/none/a.vdb"}, "there is no folder"),
         ("export", {"filepath": "OUT/a.vdb", "first": 5, "last": 2}, "before the first"),
         ("show_proxy", {"shown": "MESH"}, "no mesh proxy"),
         ("show_proxy", {"shown": "REMOVED"}, "no mesh proxy"),
         ("add_proxy", {"human": "Bert"}, "'Bert' is not in the scene"),
-        ("import_human", {"filepath": "OUT/none.human"}, "there is no file"),
     ],
 )
 def test_an_impossible_export_is_reported_in_a_sentence(anna, out, operator, properties, sentence):
     given = {name: v.replace("OUT", str(out)) if isinstance(v, str) else v for name, v in properties.items()}
     assert_rejected(sentence, getattr(OPERATORS, operator), **given)
     assert not list(out.iterdir())
-
-
-def test_without_a_human_there_is_nothing_to_export(store, out):
-    assert_rejected("poll", OPERATORS.export, filepath=str(out / "a.glb"))
 
 
 def test_a_missing_persons_file_is_named(anna, out):
@@ -223,18 +214,6 @@ def test_a_person_is_put_where_they_were_dropped(store):
     person = humans(bpy.context.scene)[0]
     assert armature_of(person).location.xy[:] == pytest.approx((1.0, 2.0))
     assert person.name == "person"
-
-
-@pytest.mark.any_blender
-@pytest.mark.parametrize("damage", ["short", "text", "cut", "other"])
-def test_a_file_that_holds_no_person_is_rejected_before_any_work(store, out, damage):
-    path = out / "a.human"
-    exporting.write_person(path)
-    whole = path.read_bytes()
-    path.write_bytes({"short": b"abc", "text": b"not a person at all", "cut": whole[:-8], "other": whole.replace(
-        b"primdiffusion.human", b"primdiffusion.model")}[damage])  # fmt: skip
-    assert_rejected("contains no human .*choose a .human file", OPERATORS.import_human, filepath=str(path))
-    assert not humans(bpy.context.scene)
 
 
 def test_without_an_extension_the_panels_format_is_written(anna, out):

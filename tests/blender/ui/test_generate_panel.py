@@ -7,12 +7,11 @@ import random
 import re
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
 import pytest
-from jobs_driven import drive, notice_of, shown
+from jobs_driven import Layout, drive, notice_of, shown
 from support.errors import refused
 from support.fake_child import FAILS, request_of
 
@@ -158,13 +157,13 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
     addon, panel_settings, monkeypatch
 ):
     def drawn() -> list[str]:
-        layout = MagicMock()
+        layout = Layout()
         generate_panel.PRIMDIFFUSION_PT_generate.draw(SimpleNamespace(layout=layout), addon)
-        return [call.args[1] for call in layout.column().prop.call_args_list]
+        return layout.of("prop")
 
-    assert drawn() == ["count", "quality"]
+    assert drawn() == ["seed", "keep_seed", "count", "quality"]
     panel_settings.quality = "CUSTOM"
-    assert drawn() == ["count", "quality", "steps", "sampler"]
+    assert drawn() == ["seed", "keep_seed", "count", "quality", "steps", "sampler"]
     monkeypatch.setattr(generate_panel, "draw_set_up", lambda layout: layout.label(text="not set up"))
     texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
     assert texts[:2] == ["not set up", "primdiffusion.add_from_gallery"]

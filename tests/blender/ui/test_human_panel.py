@@ -228,12 +228,6 @@ def test_choosing_a_person_makes_their_armature_active(person, other, addon):
         ops.select_human(human="Eve")
 
 
-def test_a_person_outside_the_view_layer_cannot_be_selected(person, addon):
-    addon.view_layer.layer_collection.children["Human"].exclude = True
-    with refused(RuntimeError, "layer"):
-        ops.select_human()
-
-
 def test_a_view_is_needed_to_frame_a_human(person, addon):
     for window in addon.window_manager.windows:
         for area in window.screen.areas:
@@ -321,20 +315,6 @@ def linked(tmp_path):
         wanted.collections = ["Human"]
     bpy.context.scene.collection.children.link(wanted.collections[0])
     return wanted.collections[0]
-
-
-@pytest.mark.parametrize(
-    ("name", "given", "way"),
-    [
-        ("duplicate_human", {}, "Make Local"),
-        ("delete_human", {}, "Unlink"),
-        ("reshape", {"to": "GENERATED"}, "Make Local"),
-    ],
-)
-def test_linked_people_are_rejected_with_what_to_do(person, tmp_path, name, given, way):
-    linked(tmp_path)
-    with refused(RuntimeError, "Human", "linked", way):
-        getattr(ops, name)(**given)
 
 
 def test_a_linked_person_keeps_their_name(person, tmp_path, capsys):

@@ -1,4 +1,4 @@
-"""The manual as its readers meet it: every panel's page, every picture and section is there, and pictures are small."""
+"""The manual as its readers meet it: every picture and section is there, and pictures are small."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 import build_manual
-from blender_primdiffusion.ui import manual
 
 pytestmark = pytest.mark.any_blender
 
@@ -16,10 +15,6 @@ ROOT = Path(__file__).resolve().parents[3]
 MANUAL = ROOT / "docs" / "manual"
 PAGES = sorted(MANUAL.glob("*.md"))
 LINK = re.compile(r"(!?)\[[^\]]*\]\(([^)\s]+)\)")
-BUTTON = re.compile(
-    r"draw_manual_button\(\s*[\w.]+,\s*\"(\w+)\"(?:,\s*\"([\w-]+)\")?\)"
-    r"|manual_page(?:, manual_section)? = \"(\w+)\"(?:, \"([\w-]+)\")?"
-)
 
 
 def links(page: Path) -> list[str]:
@@ -40,19 +35,6 @@ def test_links_pictures_and_sections_are_there(page):
         assert path.exists(), f"{page.name} leads to {target}"
         if section:
             assert section in headings(path), f"{page.name} leads to {target}"
-
-
-def test_every_question_mark_of_a_panel_has_its_page_and_section():
-    asked = {
-        (found[0] or found[2], found[1] or found[3])
-        for file in (ROOT / "blender_primdiffusion").rglob("*.py")
-        for found in BUTTON.findall(file.read_text(encoding="utf-8"))
-    }
-    assert {"first_human", "editing", "posing", "motion", "rendering", "captures", "export"} <= {p for p, _ in asked}
-    for page, section in asked:
-        path = manual.page_file(page)
-        assert path is not None, page
-        assert not section or section in headings(path), f"{page}#{section}"
 
 
 def test_the_list_of_pages_names_all_of_them():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import bpy
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 import synthetic
 from amass_files import feet, write_amass
 from blender_primdiffusion.formats.poses.files import read_motion
+from jobs_driven import Layout
 
 from blender_primdiffusion.motion.pose_library import current_pose
 from blender_primdiffusion.scene.actions import action_curves, last_key, loops
@@ -126,7 +126,7 @@ def test_exported_translations_are_of_smpls_own_body_wherever_the_armature_has_i
         np.testing.assert_allclose(pelvis + arrays["trans"][0], upright, atol=1e-6)
 
 
-def test_export_counts_constraints_and_rejects_where_it_cannot_write(addon, armature, tmp_path):
+def test_export_counts_constraints_and_rejects_an_empty_range(addon, armature, tmp_path):
     constraint = armature.pose.bones["head"].constraints.new("LIMIT_ROTATION")
     constraint.use_limit_y = True
     constraint.owner_space = "LOCAL"
@@ -134,23 +134,14 @@ def test_export_counts_constraints_and_rejects_where_it_cannot_write(addon, arma
     ops.export_motion(filepath=str(tmp_path / "m.npz"), first=1, last=1)
     turn = read_motion(tmp_path / "m.npz").axis_angle()[0]
     assert np.abs(turn).max() < 1e-4
-    with pytest.raises(RuntimeError, match="there is no folder"):
-        ops.export_motion(filepath=str(tmp_path / "none" / "m.npz"), first=1, last=1)
-    with pytest.raises(RuntimeError, match="name a file to export to"):
-        ops.export_motion(first=1, last=1)
     with pytest.raises(RuntimeError, match="last frame 2 is before the first, 5"):
         ops.export_motion(filepath=str(tmp_path / "m.npz"), first=5, last=2)
 
 
 def texts(cls, context) -> list[str]:
-    layout = MagicMock()
-    layout.box.return_value.column.return_value = layout
-    layout.split.return_value = layout.row.return_value = layout
-    panel = SimpleNamespace(layout=layout, _draw_action=lambda *a: cls._draw_action(None, *a))
+    panel = SimpleNamespace(layout=Layout(), _draw_action=lambda *a: cls._draw_action(None, *a))
     cls.draw(panel, context)
-    labels = [call.kwargs["text"] for call in layout.label.call_args_list]
-    labels += [call.args[1] for call in layout.prop.call_args_list]
-    return labels + [call.args[0] for call in layout.operator.call_args_list]
+    return panel.layout.of("text", "prop", "button")
 
 
 def test_the_panel_shows_what_was_found(addon, armature, tmp_path):

@@ -75,12 +75,7 @@ def test_a_picture_becomes_the_background_of_a_camera_of_its_size(chosen, pictur
     bpy.ops.ed.undo_push(message="after")
 
 
-def test_what_is_no_picture_or_is_stored_turned_leaves_nothing(addon, tmp_path, picture):
-    (tmp_path / "no.png").write_bytes(b"nothing")
-    with refused(RuntimeError, "no.png"):
-        bpy.ops.primdiffusion.choose_picture(filepath=str(tmp_path / "no.png"))
-    with refused(RuntimeError):
-        bpy.ops.primdiffusion.choose_picture(filepath=str(tmp_path / "nowhere.png"))
+def test_what_is_stored_turned_leaves_nothing(addon, tmp_path, picture):
     tiff = b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHH", 1, 0x0112, 3, 1, 6, 0) + bytes(4)
     turned = tmp_path / "turned.jpg"
     turned.write_bytes(b"\xff\xd8\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff)

@@ -62,11 +62,6 @@ def test_the_panels_subject_is_not_looked_for_in_another_folder(addon, captures)
     assert "subject" not in asked_of_the_child(humans(addon.scene)[0])
 
 
-def test_the_operator_cannot_be_redone_with_a_slider():
-    options = reconstruct_panel.PRIMDIFFUSION_OT_human_from_captures.bl_options
-    assert not {"REGISTER", "UNDO"} & options
-
-
 def test_without_a_folder_a_script_gets_an_error_and_a_user_the_file_browser(addon):
     with refused(RuntimeError, "captures"):
         bpy.ops.primdiffusion.human_from_captures()

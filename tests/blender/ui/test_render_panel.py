@@ -23,7 +23,6 @@ from blender_primdiffusion.scene.human import (
     armature_of,
     folder_of,
     humans,
-    person_file,
     remove_human,
     sequence_files,
     volume_path,
@@ -160,9 +159,7 @@ def test_the_frames_of_a_sequence_are_written_one_at_a_tick(person, monkeypatch)
 
 
 @pytest.mark.any_blender
-@pytest.mark.parametrize(
-    ("order", "message"), [("fails", "checkpoint is damaged"), ("gives garbage", "damaged"), ("dies", "ended")]
-)
+@pytest.mark.parametrize(("order", "message"), [("gives garbage", "damaged"), ("dies", "ended")])
 @pytest.mark.parametrize("what", ["POSE", "FRAMES"])
 def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypatch, order, message, what):
     monkeypatch.setenv("FAKE_ORDER", order)
@@ -179,18 +176,6 @@ def test_a_human_removed_meanwhile_is_not_merged(person):
     drive()
     assert "was removed" in error_of("merge")
     assert not bpy.data.volumes
-
-
-def test_a_renamed_bone_is_rejected_with_what_to_do(person):
-    armature_of(person).data.bones["left_knee"].name = "knee"
-    with refused(RuntimeError, "left_knee"):
-        ops.merge()
-
-
-def test_a_missing_file_of_the_person_is_named(person):
-    person_file(person).unlink()
-    with refused(RuntimeError, "person.human.safetensors"):
-        ops.merge()
 
 
 def test_set_attachment_reports_what_stands_in_the_way(person):
@@ -263,10 +248,3 @@ def test_a_camera_is_added_that_sees_the_whole_person(person):
         assert 0 < y < 1
         assert depth > 0
     assert any(light.type == "SUN" for light in bpy.data.lights)
-
-
-def test_a_scene_without_humans_is_rejected(addon):
-    with refused(RuntimeError, "human"):
-        ops.add_camera()
-    assert not ops.merge.poll()
-    assert not bpy.data.cameras
