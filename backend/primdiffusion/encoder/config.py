@@ -72,9 +72,12 @@ class EncoderConfig(Checked):
     """Channels of the delta-scale network."""
     scale_outputs: Annotated[int, Range(3)] = 3
     """Its output channels; only the last three are used: the released code has six unused ones before (SPEC 1.7)."""
-    extent: tuple[float, float, float] = (0.85, 0.85, 0.6)
+    extent: tuple[float, float, float] = (0.85, 0.85, 0.45)
     """Initial delta scales along T, B, N: the anchors' boxes are large enough for loose clothing, and most of a human
     is sharper with smaller ones."""
+    thickness: Literal["hull", "constant"] = "hull"
+    """hull: a box whose outer voxels the masks cover (hair, a skirt) starts thicker than `extent`, up to the anchor's;
+    constant: all start with `extent`."""
     scale_gain: float = 0.02
     """delta scale = extent exp(gain x)."""
     colour_gain: float = 0.06
@@ -133,6 +136,7 @@ PAPER = EncoderConfig(
     density=(32, 16),
     scale=(64, 128, 64, 64),
     extent=(1.0, 1.0, 1.0),
+    thickness="constant",
     scale_gain=0.01,
     colour_gain=25 / 255,
     density_gain=25 / 255,
@@ -164,7 +168,7 @@ PRESETS: Mapping[str, EncoderConfig] = {
 """Encoders by name: ours and the paper's, each with three ablations (paper Table 3), and that of the paper's code."""
 
 
-_ADDED: Mapping[str, Any] = {"masks": "whole", "compat": "none", "grid_outputs": 0}
+_ADDED: Mapping[str, Any] = {"masks": "whole", "compat": "none", "grid_outputs": 0, "thickness": "constant"}
 """Settings that older files lack, with the values that these files imply."""
 
 

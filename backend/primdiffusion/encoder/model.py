@@ -27,12 +27,12 @@ from primdiffusion.diffusion.checkpoint import (
 from primdiffusion.encoder.config import EncoderConfig, config_from_json
 from primdiffusion.encoder.network import Encoder, motion_of
 from primdiffusion.encoder.texture import eroded, unproject_texture
-from primdiffusion.encoder.unproject import Unprojected, unproject_texels, unproject_voxels
+from primdiffusion.encoder.unproject import Unprojected, extents_of_hull, unproject_texels, unproject_voxels
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.body_setup import BodySetup
-from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.primitives.primitives import Frames, K, Payload, Primitives
 from primdiffusion.tensor_file import load_network, save
 
 FORMAT_VERSION = 1
@@ -97,12 +97,15 @@ def look_up(
     vertices, frames = frames_of(config, betas, views.pose, body_setup)
     if config.masks == "eroded":
         views = eroded(views)
+    extent = torch.tensor(config.extent).repeat(K, 1)
     if config.appearance == "texture":
-        return unproject_texture(views, vertices, body)
+        return dataclasses.replace(unproject_texture(views, vertices, body), extent=extent)
     if config.appearance == "texels":
-        return unproject_texels(views, vertices, config.facing, body)
-    frames = dataclasses.replace(frames, half_extent=frames.half_extent * vertices.new_tensor(config.extent))
-    return unproject_voxels(views, vertices, frames, config.facing, body)
+        return dataclasses.replace(unproject_texels(views, vertices, config.facing, body), extent=extent)
+    if config.thickness == "hull":
+        largest = torch.tensor((*config.extent[:2], 1.0)).repeat(K, 1)
+        extent = extents_of_hull(unproject_voxels(views, vertices, frames, largest, config.facing, body), config.extent)
+    return unproject_voxels(views, vertices, frames, extent, config.facing, body)
 
 
 def frames_of(

@@ -118,7 +118,7 @@ class Encoder(nn.Module):
         rgb, filled = decode_srgb(voxels(colour, 3)), config.full_density * voxels(density, 1)[:, :, 0]
         if config.compat == "released":
             rgb, filled, logarithm = rgb.flip(B_AXIS), filled.flip(B_AXIS), -logarithm
-        return Payload(rgb, filled, logarithm.exp().flatten(2).mT * logarithm.new_tensor(config.extent))
+        return Payload(rgb, filled, logarithm.exp().flatten(2).mT * found.extent)
 
     def read(self, found: Unprojected) -> tuple[Float[Tensor, "b c h w"], Float[Tensor, "b 32 h w"]]:
         """Input of the image encoder, and base values of colours (d, c) and densities (d); sRGB-encoded, 0 ... 1.

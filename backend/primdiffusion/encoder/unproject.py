@@ -35,6 +35,9 @@ TOLERANCE = 0.020
 """Depth behind the body surface, metres, up to which a point counts as visible (SPEC 2)."""
 COVERED = 128
 """Smallest mask value (of 255) of a pixel whose colour is used."""
+HULL_SHARE, HULL_MARGIN = 0.1, 0.06
+"""Part of a layer of voxels that the masks must cover for a box to contain it, and how far the box reaches beyond it,
+in half extents."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,6 +50,8 @@ class Unprojected(TensorRecord):
     """255 times the fraction of the views' weight that sees the point."""
     covered: UInt8[Tensor, "*b d h w"]
     """Least mask value at the point, of 255: below 128, some view sees past it. 255 if it is outside all images."""
+    extent: Float32[Tensor, "*b k 3"]
+    """Delta scales along T, B, N from which the encoder starts; those of the boxes whose voxels these are."""
 
 
 def unproject_texels(
@@ -70,13 +75,19 @@ def unproject_texels(
     points = surface_points(vertices, body.faces, face, barycentric)
     normals = surface_points(vertex_normals(vertices, body.faces), body.faces, face, barycentric)
     points = torch.where(known[:, None], points, torch.nan)
-    return _look_up(views, vertices, body, points[None], normals[None], facing)
+    return _look_up(views, vertices, body, points[None], normals[None], facing, torch.ones(K, 3))
 
 
 def unproject_voxels(
-    views: Views, vertices: Float[Tensor, "V 3"], frames: Frames, facing: int, body: BodyModel | None = None
+    views: Views,
+    vertices: Float[Tensor, "V 3"],
+    frames: Frames,
+    extent: Float32[Tensor, "k 3"],
+    facing: int,
+    body: BodyModel | None = None,
 ) -> Unprojected:
-    """Sample the images at every voxel of the boxes in `frames` (unbatched, at rest size): S layers, from inside out.
+    """Sample the images at every voxel of the boxes: S layers, from inside out. `frames` are unbatched and of rest
+    size, `extent` are the boxes' delta scales.
 
     Layer d, row ny * 8 + h, column nx * 8 + w is voxel (d, h, w) of primitive ny * 32 + nx. Views are
     weighted as in `unproject_texels`, by the box's normal; a voxel in front of the body surface is visible too.
@@ -89,14 +100,29 @@ def unproject_voxels(
     if tuple(frames.position.shape) != (K, 3):
         raise ValueError(f"the boxes' positions have the shape {tuple(frames.position.shape)}: give one human's {K}")
     local = torch.linspace(-1, 1, S, dtype=vertices.dtype, device=vertices.device)
-    t, b, n = (frames.rotation * frames.half_extent[:, None, :]).unbind(-1)
+    t, b, n = (frames.rotation * (frames.half_extent * extent)[:, None, :]).unbind(-1)
     columns = local[:, None, None] * b[:, None, None] + local[None, :, None] * t[:, None, None]  # k h w 3
     columns = (columns + frames.position[:, None, None]).unflatten(0, (GRID, GRID)).transpose(1, 2)  # ny h nx w 3
     out = n.unflatten(0, (GRID, GRID))[:, None, :, None]
     points = (columns + local[:, None, None, None, None, None] * out).flatten(-3, -2).flatten(1, 2)
     normals = frames.rotation[..., 2].unflatten(0, (GRID, GRID))
     normals = normals.repeat_interleave(S, 0).repeat_interleave(S, 1).expand(S, -1, -1, -1)
-    return _look_up(views, vertices, body, points.flatten(1, 2), normals.flatten(1, 2), facing)
+    return _look_up(views, vertices, body, points.flatten(1, 2), normals.flatten(1, 2), facing, extent)
+
+
+def extents_of_hull(found: Unprojected, least: tuple[float, float, float]) -> Float32[Tensor, "k 3"]:
+    """Delta scales with which boxes reach along N as far as the masks' hull, from `least` to those of `found`.
+
+    `found` are the voxels of the largest boxes. Tight clothes get thin boxes, hence small voxels; hair and skirts get
+    thick ones, which contain them.
+    """
+    inside = (found.covered >= COVERED).unflatten(-1, (GRID, S)).unflatten(-3, (GRID, S))  # d ny h nx w
+    share = inside[:, :, 1:-1, :, 1:-1].float().mean((2, 4)).flatten(1)  # d k; neighbours share the outer columns
+    layer = torch.linspace(-1, 1, S)[:, None]
+    outermost = torch.where(share > HULL_SHARE, layer, -1).amax(0)
+    extent = torch.tensor(least).repeat(K, 1)
+    extent[:, 2] = (found.extent[:, 2] * (outermost + HULL_MARGIN)).clamp(least[2]).minimum(found.extent[:, 2])
+    return extent
 
 
 @functools.lru_cache(maxsize=4)
@@ -117,13 +143,14 @@ def _look_up(
     points: Float[Tensor, "d n 3"],
     normals: Float[Tensor, "d n 3"],
     facing: int,
+    extent: Float32[Tensor, "k 3"],
 ) -> Unprojected:
     depth = body_depth(views, vertices, body.faces)
     rgb, seen, covered = (
         torch.from_numpy(found).unflatten(0, (len(points), SIDE, SIDE))
         for found in sample(views, depth, points.flatten(0, 1), normals.flatten(0, 1), facing)
     )
-    return Unprojected(rgb.movedim(-1, 1).contiguous(), seen, covered).to(views.rgba.device)
+    return Unprojected(rgb.movedim(-1, 1).contiguous(), seen, covered, extent.cpu()).to(views.rgba.device)
 
 
 def check(views: Views, vertices: Tensor, body: BodyModel) -> None:

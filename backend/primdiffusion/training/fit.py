@@ -136,8 +136,7 @@ class EncoderTask(Task):
         payload = payload.to(dtype=torch.float32)
         if number < config.hold_scale:
             # Multiplied by zero, because distributed training needs a gradient of every parameter.
-            start = payload.delta_scale.new_tensor(PRESETS[config.encoder].extent)
-            payload = dataclasses.replace(payload, delta_scale=start + 0 * payload.delta_scale)
+            payload = dataclasses.replace(payload, delta_scale=sample.found.extent + 0 * payload.delta_scale)
         timer.lap("forward")
         primitives = Primitives.place(sample.frames, payload)
         views = primitives.map(lambda tensor: tensor[:, None])

@@ -62,9 +62,9 @@ def test_voxels_are_looked_up_where_the_marcher_will_draw_them():
     payload = tiny_encoder().encode(views, betas)
     vertices, _ = frames_of(encoder.config, betas, views.pose)
     drawn = tiny_encoder().place(payload, betas, views.pose)
-    start = drawn.half_extent / payload.delta_scale * torch.tensor(encoder.config.extent)
-    assert (drawn.half_extent / start - 1).abs().max() < 0.1  # nothing is learned yet
-    there = unproject_voxels(views, vertices, Frames(drawn.position, drawn.rotation, start), encoder.config.facing)
     found = look_up(encoder.config, views, betas)
+    assert (payload.delta_scale / found.extent - 1).abs().max() < 0.1  # nothing is learned yet
+    rest = Frames(drawn.position, drawn.rotation, drawn.half_extent / payload.delta_scale)
+    there = unproject_voxels(views, vertices, rest, found.extent, encoder.config.facing)
     for name in ("rgb", "seen", "covered"):  # but for what a rounded bit puts on the other side of an edge
         assert (getattr(found, name) != getattr(there, name)).float().mean() < 1e-3, name

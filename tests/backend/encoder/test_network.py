@@ -35,7 +35,7 @@ def seen_from(config: EncoderConfig, people: int = 1, seed: int = 0) -> Unprojec
     rgb, seen, covered = draws.mul(255).to(torch.uint8).split([3 * config.layers, config.layers, config.layers], 1)
     seen = torch.where(seen > 127, seen, 0)
     rgb = rgb.unflatten(1, (config.layers, 3)) * (seen > 0)[:, :, None]
-    return Unprojected(rgb, seen, covered)
+    return Unprojected(rgb, seen, covered, torch.tensor(config.extent).expand(people, K, 3))
 
 
 def poses(people: int = 1, seed: int = 0) -> torch.Tensor:

@@ -7,7 +7,16 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
 from primdiffusion.capture.dataset import Views, stack
-from primdiffusion.encoder.unproject import COVERED, SIDE, TOLERANCE, unproject_texels, unproject_voxels
+from primdiffusion.encoder.unproject import (
+    COVERED,
+    HULL_MARGIN,
+    SIDE,
+    TOLERANCE,
+    Unprojected,
+    extents_of_hull,
+    unproject_texels,
+    unproject_voxels,
+)
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.surface import surface_points, vertex_normals
@@ -17,6 +26,7 @@ from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.march import march
 
 BODY = default_body()
+ONES = torch.ones(K, 3)
 RED, BLUE = (255, 0, 0, 255), (0, 0, 255, 255)
 
 
@@ -175,6 +185,13 @@ def person_views() -> Views:
     return views_of(pictures, cameras)
 
 
+def silhouettes(vertices: torch.Tensor, cameras) -> Views:
+    """White pictures whose masks are those of a body."""
+    corners = vertices[BODY.faces].double().numpy()
+    inside = [np.isfinite(nearest_triangles(corners, camera).depth) for camera in cameras]
+    return views_of(np.stack([np.repeat(255 * mask[..., None], 4, -1) for mask in inside]).astype(np.uint8), cameras)
+
+
 def twin(point, normal, views: Views, depths, facing: int):
     """What `unproject` finds at one point, in float64 (SPEC 2); None where rounding could turn a decision."""
     total, possible, colour, least = 0.0, 0.0, np.zeros(3), 255.0
@@ -245,7 +262,7 @@ def test_texels_are_those_of_the_slow_twin(facing):
 
 def test_voxels_are_those_of_the_slow_twin_in_the_payloads_order():
     views = person_views()
-    found = unproject_voxels(views, POSED, FRAMES, 2)
+    found = unproject_voxels(views, POSED, FRAMES, ONES, 2)
     draws = np.random.default_rng(2)
     k, d, h, w = np.concatenate([draws.integers(0, K, (1, 250)), draws.integers(0, S, (3, 250))])
     local = torch.from_numpy(np.stack([w, h, d], -1) / (S - 1) * 2 - 1).float()
@@ -256,7 +273,7 @@ def test_voxels_are_those_of_the_slow_twin_in_the_payloads_order():
 
 def test_voxels_in_front_of_the_body_are_seen_and_those_inside_are_not():
     views = views_of([plain(RED, 40)] * 2, [body_camera(0.0), body_camera(math.pi)])
-    seen = unproject_voxels(views, POSED, FRAMES, 2).seen.unflatten(-1, (GRID, S)).unflatten(-3, (GRID, S))
+    seen = unproject_voxels(views, POSED, FRAMES, ONES, 2).seen.unflatten(-1, (GRID, S)).unflatten(-3, (GRID, S))
     torso = (default_anchors().chart == CHARTS.index("torso")).reshape(GRID, GRID)
     across = FRAMES.rotation[:, 2, 2].reshape(GRID, GRID).abs() > 0.8
     inside, outside = (seen[d, :, 3].movedim(-1, 0)[3][torso & across] for d in (0, S - 1))
@@ -286,12 +303,36 @@ def test_what_the_marcher_draws_of_a_voxel_is_found_at_this_voxel():
     camera = look_at(FRAMES.position[chest] + 2 * normal, FRAMES.position[chest], vertical_fov=0.1, width=96, height=96)
     picture = march(Primitives.place(FRAMES, Payload(rgb, density, torch.ones(K, 3))), camera)
     rgba = torch.cat([encode_srgb(picture.rgb), picture.alpha[..., None]], -1).clamp(0, 1).mul(255).round()
-    found = unproject_voxels(views_of(rgba[None], [camera]), POSED, FRAMES, 2)
+    found = unproject_voxels(views_of(rgba[None], [camera]), POSED, FRAMES, ONES, 2)
     ny, nx, inner = chest // GRID, chest % GRID, slice(1, S - 1)
     cell = found.rgb[S - 1, :, ny * S : (ny + 1) * S, nx * S : (nx + 1) * S].float() / 255
     wanted = encode_srgb(rgb[chest, :, S - 1])
     # A level of the ramp is 0.06 or more apart; perspective and the marcher's interpolation move them by a third of it.
     assert (cell - wanted)[:, inner, inner].abs().max() < 0.03
+
+
+def test_boxes_are_as_thick_as_the_masks_hull():
+    covered = torch.zeros(S, GRID, S, GRID, S, dtype=torch.uint8)
+    covered[:, 0, :, 0] = 255  # a box inside a skirt
+    covered[:5, 0, :, 1] = 255  # skin, somewhat in front of the middle
+    covered[:7, 0, :, 2] = 255  # cloth
+    covered[:, 0, 0, 3] = 255  # only an outer row, which is the neighbour's
+    blank = torch.zeros(S, SIDE, SIDE, dtype=torch.uint8)
+    found = Unprojected(blank[:, None].expand(-1, 3, -1, -1), blank, covered.flatten(1, 2).flatten(2), ONES)
+    extent = extents_of_hull(found, (0.85, 0.85, 0.45))
+    assert torch.allclose(extent[:5, 2], torch.tensor([1, 0.45, 5 / 7 + HULL_MARGIN, 0.45, 0.45]))
+    assert (extent[:, :2] == 0.85).all()
+
+
+def test_a_persons_boxes_contain_the_hull_of_the_masks():
+    """Of a body that is 4 cm thicker than that which carries the boxes, as in loose clothes."""
+    vertices = POSED + 0.04 * vertex_normals(POSED, BODY.faces)
+    cameras = [body_camera(angle, 160) for angle in (0.0, math.pi / 2, math.pi, -math.pi / 2)]
+    found = unproject_voxels(silhouettes(vertices, cameras), POSED, FRAMES, ONES, 2)
+    thin = unproject_voxels(silhouettes(POSED, cameras), POSED, FRAMES, ONES, 2)
+    thicker, exact = (extents_of_hull(views, (0.85, 0.85, 0.45))[:, 2] for views in (found, thin))
+    assert (thicker >= exact).all()
+    assert thicker.mean() > exact.mean() + 0.2
 
 
 # What is rejected.
@@ -302,7 +343,7 @@ def assert_rejected(
 ) -> None:
     views = person_views() if views is None else views
     look_up = (lambda: unproject_texels(views, vertices, 2, body)) if frames is None else (
-        lambda: unproject_voxels(views, vertices, frames, 2)
+        lambda: unproject_voxels(views, vertices, frames, ONES, 2)
     )  # fmt: skip
     with pytest.raises(ValueError, match=message):
         look_up()

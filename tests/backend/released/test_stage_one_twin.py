@@ -8,7 +8,7 @@ from primdiffusion.body.model import J
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.encoder.unproject import SIDE, Unprojected
-from primdiffusion.primitives.primitives import Payload
+from primdiffusion.primitives.primitives import K, Payload
 from primdiffusion.released.stage_one import encoder_tensors
 from released_files import random_stage_one, template
 from stage_one_twin import Slabs, StageOneTwin
@@ -30,7 +30,9 @@ def inputs(seed: int = 1) -> tuple[torch.Tensor, torch.Tensor]:
 
 def run(encoder: Encoder, texture: torch.Tensor, theta: torch.Tensor) -> Payload:
     whole = torch.full((1, 1, SIDE, SIDE), 255, dtype=torch.uint8)
-    return encoder(Unprojected(texture[None, None], whole, whole), theta[None]).map(lambda value: value[0])
+    return encoder(Unprojected(texture[None, None], whole, whole, torch.ones(1, K, 3)), theta[None]).map(
+        lambda value: value[0]
+    )
 
 
 def converted(slabs: Slabs) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
