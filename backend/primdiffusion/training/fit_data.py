@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from pathlib import Path
 
 import torch
 from jaxtyping import Float, Int64
@@ -28,6 +29,7 @@ from primdiffusion.encoder.unproject import Unprojected
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Frames
 from primdiffusion.training.fit_config import FitConfig
+from primdiffusion.training.fit_voxels import FittedVoxels, read_fitted, resampled
 
 CAUGHT = "Caught "
 """Start of the messages with which torch's loader wraps errors of workers; their traceback follows."""
@@ -44,6 +46,8 @@ class FitSample(TensorRecord):
     frames: Frames
     """Frames of the boxes in the pose of the targets, before delta scales."""
     target: Views
+    fitted: FittedVoxels | None
+    """Voxels fitted to all images of the subject, if they are a term of the loss."""
     subject: Int64[Tensor, "*b"]
     frame: Int64[Tensor, "*b"]
     """Frame of the targets."""
@@ -56,9 +60,12 @@ Batch = tuple[FitSample, Position]
 class FitDataset(SampleSet[FitSample]):
     """Samples of a `CaptureDataset`, unprojected in the workers that load them."""
 
-    def __init__(self, samples: CaptureDataset, encoder: EncoderConfig) -> None:
-        """Raises as `betas_of`, so that invalid subjects are errors before training starts."""
-        self.samples, self.encoder = samples, encoder
+    def __init__(self, samples: CaptureDataset, encoder: EncoderConfig, fitted: Path | None = None) -> None:
+        """`fitted` is the folder of fitted voxels, if they are wanted.
+
+        Raises as `betas_of`, so that invalid subjects are errors before training starts.
+        """
+        self.samples, self.encoder, self.fitted = samples, encoder, fitted
         self.betas = betas_of(samples.captures)
 
     def __len__(self) -> int:
@@ -66,14 +73,19 @@ class FitDataset(SampleSet[FitSample]):
         return len(self.samples)
 
     def __getitem__(self, position: tuple[int, int]) -> FitSample:
-        """Load the sample at a position. Raises as `CaptureDataset`."""
+        """Load the sample at a position. Raises as `CaptureDataset` and `read_fitted`."""
         sample = self.samples[position]
         given, target, betas = sample.conditioning, sample.target, self.betas[int(sample.subject)]
+        found, fitted = look_up(self.encoder, given, betas), None
+        if self.fitted is not None:
+            name = self.samples.captures.subjects[int(sample.subject)]
+            fitted = resampled(read_fitted(self.fitted, name), found.extent)
         return FitSample(
-            found=look_up(self.encoder, given, betas),
+            found=found,
             axis_angle=motion_of(given.pose.joint_rotation),
             frames=frames_of(self.encoder, betas, target.pose)[1],
             target=eroded(target) if self.encoder.masks == "eroded" else target,
+            fitted=fitted,
             subject=sample.subject,
             frame=sample.frame,
         )
@@ -92,7 +104,8 @@ def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
 def fit_dataset(captures: Captures, config: FitConfig) -> FitDataset:
     """Return the dataset of a run."""
     settings = SampleSettings(config.views, config.targets, config.size, config.framing, config.conditioning_frame)
-    return FitDataset(CaptureDataset(captures, settings, config.seed), PRESETS[config.encoder])
+    fitted = config.fitted if config.loss.voxels else None
+    return FitDataset(CaptureDataset(captures, settings, config.seed), PRESETS[config.encoder], fitted)
 
 
 def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: ProcessRank) -> Iterator[Batch]:
