@@ -4,7 +4,8 @@
 evaluates those of the checkpoints full, shared_scale, template_rt, no_attention and full_at_equal_steps (.safetensors)
 that the folder contains; without --models, the package's encoder. Each person is encoded from eight views of one pose
 and compared in all views (or --cameras of them) and poses at 512 x 512; figures with `_novel` are of views and poses
-that the encoder was not given. As in the paper, psnr_shared_scale and similar figures are of training people. Without
+that the encoder was not given; those with `_fitted` are of voxels fitted to the very images of held-out people that
+are compared, in the boxes the encoder starts from: no encoder with these boxes can do much better. As in the paper, psnr_shared_scale and similar figures are of training people. Without
 capture folders, held-out people are made from MakeHuman's assets (--assets), with seeds that training does not use.
 --quick evaluates one person. Times are the best or median of several; names with `processor` are processor time, the
 others wall time.
@@ -35,8 +36,9 @@ import torch
 from march import best_ms, from_script
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
+from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.conditioning import captured_person, conditioning_views, default_betas, spread_cameras
-from primdiffusion.capture.dataset import batches
+from primdiffusion.capture.dataset import Views, batches
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import Captures, open_captures
@@ -60,12 +62,14 @@ from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import FitSample, fit_dataset
 from primdiffusion.training.fit_losses import loss_terms
+from primdiffusion.training.fit_voxels import fit_subject
 from record import command_line, report, run
 from torch import Tensor
 
 FIRST_SEED = 30_000_000
 """Seed of the first person made here; training sets count from 0."""
 PEOPLE, POSES, CAMERAS = 6, 4, 12
+FITTED_PEOPLE = 6
 REFINE_FIGURES = ("refine_psnr_heldout_views", "refine_seconds_cpu")
 Figures = dict[str, float | int | str | None]
 VIEWS = 8
@@ -132,6 +136,8 @@ def main() -> None:
         some = captures["heldout"] or captures["train"]
         assert some is not None
         figures = quality_figures(qualities)
+        if captures["heldout"] is not None and "full" in models and not arguments.quick:
+            figures |= fitted_figures(models["full"], captures["heldout"], min(arguments.people, FITTED_PEOPLE))
         if "full" in models:
             figures |= reconstruct_seconds(models["full"], some, 2 if arguments.quick else 7)
         figures |= step_seconds(some, 2 if arguments.quick else 8)
@@ -200,6 +206,35 @@ def measured(
         given_views=VIEWS,
     )
     return summary(evaluate(model, captures, settings, lpips))
+
+
+def fitted_figures(model: EncoderModel, captures: Captures, count: int) -> Figures:
+    """Means over all images of voxels that were fitted to these images: the limit of the boxes."""
+    names = [captures.subjects[i * len(captures.subjects) // count] for i in range(count)]
+    voxels = {name: fit_subject(captures, name, model.config) for name in names}
+    rows = []
+    for name, fitted in voxels.items():
+        payload = Payload(fitted.rgb, fitted.density * model.config.full_density, fitted.extent)
+        rows += evaluate(Fitted(model, payload), captures, EvaluationSettings((name,), given_views=VIEWS))
+    means = summary(rows)["all"]
+    return {"psnr_fitted": means.psnr, "ssim_fitted": means.ssim, "mask_iou_fitted": means.mask_iou, "people_fitted": count}
+
+
+class Fitted(NamedTuple):
+    """An encoder whose answer is known."""
+
+    model: EncoderModel
+    payload: Payload
+
+    @property
+    def body(self) -> BodyModel:
+        return self.model.body
+
+    def encode(self, views: Views, betas: Tensor) -> Payload:
+        return self.payload
+
+    def place(self, payload: Payload, betas: Tensor, pose: BodyPose) -> Primitives:
+        return self.model.place(payload, betas, pose)
 
 
 def quality_figures(qualities: dict[str, Quality]) -> Figures:

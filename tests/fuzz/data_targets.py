@@ -206,6 +206,24 @@ def read_joints_network(path: Path) -> None:
     finite(*load_pose_depth_network(path).state_dict().values())
 
 
+def make_fitted(folder: Path) -> Path:
+    import torch
+    from primdiffusion.primitives.primitives import K, S
+    from primdiffusion.training.fit_voxels import FittedVoxels, write_fitted
+
+    voxels = torch.full((K, S, S, S), 0.5)
+    channels = voxels[:, None].repeat(1, 3, 1, 1, 1)
+    write_fitted(folder, "person", FittedVoxels(channels, voxels, channels[:, :2].clone(), torch.ones(K, 3)))
+    return folder / "person.npz"
+
+
+def read_fitted_voxels(path: Path) -> None:
+    from primdiffusion.training.fit_voxels import read_fitted
+
+    fitted = read_fitted(path.parent, path.stem)
+    finite(fitted.rgb, fitted.density, fitted.weight, fitted.extent)
+
+
 def make_state_dict(folder: Path) -> Path:
     torch.save({"layer.weight": torch.ones(3, 4), "layer.bias": torch.zeros(3)}, folder / "network.pth")
     return folder / "network.pth"
@@ -300,6 +318,7 @@ TARGETS = (
     Target("human's card", make_card, mutations.JSON, read_cards),
     Target("manifest", make_manifest, mutations.JSON, read_manifest),
     Target("packed index", make_packed, mutations.JSON, read_packed),
+    Target("fitted voxels", make_fitted, mutations.NPZ, read_fitted_voxels),
     Target("packed shard", make_shard, mutations.SAFETENSORS, read_shard),
     Target("payload of a gallery", make_gallery, mutations.NPZ, read_gallery),
     Target("training state", make_state, mutations.SAFETENSORS, read_state),

@@ -242,6 +242,7 @@ BACKEND = {
     "torch_file.py": FORMATS,
     "training/captured_people.py": ("human's card", "payload"),
     "training/cells.py": ("run: latents",),
+    "training/fit_voxels.py": ("fitted voxels",),
     "training/run_folder.py": ("run: settings", "run: starts", "run: metrics"),
     "training/shards.py": ("packed index", "packed shard"),
     "training/state.py": ("training state",),

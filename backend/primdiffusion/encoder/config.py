@@ -156,7 +156,7 @@ RELEASED = dataclasses.replace(
 """The authors' stage 1 (SPEC 2)."""
 PRESETS: Mapping[str, EncoderConfig] = {
     "default": DEFAULT,
-    "shared_scale": dataclasses.replace(DEFAULT, delta_scale="shared"),
+    "shared_scale": dataclasses.replace(DEFAULT, delta_scale="shared", thickness="constant", extent=(0.85, 0.85, 0.6)),
     "template_rt": dataclasses.replace(DEFAULT, frames="template"),
     "no_attention": dataclasses.replace(DEFAULT, attention="none"),
     "paper": PAPER,

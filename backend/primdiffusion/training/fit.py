@@ -18,7 +18,7 @@ from primdiffusion.capture.dataset import CaptureDataset, Position, ProcessRank,
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.encoder.blocks import UntiedConv
 from primdiffusion.encoder.config import PRESETS
-from primdiffusion.encoder.model import EncoderModel, save_encoder
+from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.formats.json_files import parse_json
@@ -85,8 +85,9 @@ class EncoderTask(Task):
     smaller = "fewer --targets, or a smaller --size"
 
     def __init__(self, config: FitConfig, captures: Captures, accelerator: Accelerator) -> None:
-        """Open the data: raises as `fit` for captures, held-out ones and weights of the perceptual loss."""
+        """Open the data: raises as `fit` for captures, held-out ones, the start and weights of the perceptual loss."""
         self.config, self.captures, self.accelerator = config, captures, accelerator
+        self.start = None if config.start is None else _start(config.start, config.encoder)
         self.perceptual = _features(config, accelerator.device)
         self.held = None if config.held is None else open_captures(config.held)
         if self.held is not None:
@@ -105,7 +106,9 @@ class EncoderTask(Task):
         return {"": self.config}
 
     def network(self, phase: str) -> Encoder:
-        """Return the encoder as initialised."""
+        """Return the encoder that training starts from."""
+        if self.start is not None:
+            return self.start.encoder.float().requires_grad_(True).train()
         torch.manual_seed(self.config.seed)
         return Encoder(PRESETS[self.config.encoder])
 
@@ -193,12 +196,20 @@ class EncoderTask(Task):
             "seed": config.seed,
             "loss": parse_json(json.dumps(dataclasses.asdict(config.loss), default=str)),
             "full_density": PRESETS[config.encoder].full_density,
+            "start": None if self.start is None else self.start.card,
             **versions(),
         }
         return EncoderModel(_encoder(state.average), card)
 
     def _in_use(self) -> EncoderModel:
         return EncoderModel(_encoder(self.encoder), {})
+
+
+def _start(path: Path, preset: str) -> EncoderModel:
+    start = load_encoder(path)
+    if start.config != PRESETS[preset]:
+        raise ValueError(f"{path} is an encoder of other settings than {preset}: choose its own preset with --encoder")
+    return start
 
 
 def _encoder(network: nn.Module) -> Encoder:

@@ -65,30 +65,33 @@ class FitConfig(RunSettings):
     held: Path | None = None
     """Captures of held-out subjects for evaluation."""
     fitted: Path | None = None
-    """Folder of voxels fitted to all images of each subject, for loss.voxels; those that it lacks are made first, half a
-    minute each."""
+    """Folder of voxels fitted to all images of each subject, for loss.voxels; those that it lacks are made first, half
+    a minute each."""
     encoder: Preset = "default"
     """default, its ablations shared_scale, template_rt and no_attention, the same four in the paper's form (paper,
     paper_shared_scale, ...), or the architecture released."""
+    start: Path | None = None
+    """Encoder of the same preset whose weights training starts from, for instance the default one; without it, random
+    weights, which draw the hull of the masks."""
     steps: Count = 20_000
     """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: Count = 4
     """Subjects per step and process."""
-    views: Count = 6
+    views: Count = 8
     """Input images; if a subject has fewer, some are used twice."""
-    targets: Count = 2
+    targets: Count = 1
     """Target images of each subject."""
-    size: Count = 256
-    """Width and height of the targets, pixels."""
+    size: Count = 512
+    """Width and height of the targets, pixels: what is learned from smaller ones is blurred in larger ones."""
     framing: Literal["whole", "crop"] = "crop"
     """crop: squares around the subject, of `size` pixels or more; whole: whole images, as in the paper."""
     conditioning_frame: Literal["first", "same", "any"] = "any"
     """Frame of the input images: the first, near T (released), that of the targets, or any."""
     step: Positive = 0.004
     """Metres between samples of a ray."""
-    learning_rate: Positive = 2e-5
+    learning_rate: Positive = 1e-4
     """Learning rate of AdamW after a warm-up of 100 steps."""
-    place_rate: Positive = 80.0
+    place_rate: Positive = 16.0
     """Factor on the learning rate of untied biases."""
     weight_decay: NotNegative = 0.0
     """Weight decay of AdamW."""
@@ -96,8 +99,9 @@ class FitConfig(RunSettings):
     """Largest norm of the gradient."""
     ema: Decay = 0.998
     """Decay of the averaged weights, which are evaluated and saved."""
-    hold_scale: Annotated[int, Range(0)] = 200
-    """Steps with fixed delta scales (released: 2000)."""
+    hold_scale: Annotated[int, Range(0)] = 1_000_000
+    """Steps with fixed delta scales (released: 2000). Boxes that start from the masks' hull should keep their size:
+    free ones shrink until gaps appear."""
     mixed_precision: Literal["no", "bf16"] = "no"
     """Precision of the network; the marcher runs in float32."""
     loss: LossConfig = dataclasses.field(default_factory=LossConfig)

@@ -23,9 +23,9 @@ from primdiffusion.capture.reader import Captures
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import EncoderModel, frames_of
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.formats.arrays import read_arrays, write_deflated
 from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.whole_files import replacing
+from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import K, Payload, S
 from primdiffusion.reconstruction import targets_of
@@ -105,7 +105,7 @@ def fit_missing(captures: Captures, encoder: EncoderConfig, folder: Path) -> Non
     missing = [name for name in captures.subjects if not _path(folder, name).exists()]
     for number, name in enumerate(missing):
         began = time.perf_counter()
-        _write(_path(folder, name), fit_subject(captures, name, encoder))
+        write_fitted(folder, name, fit_subject(captures, name, encoder))
         seconds = time.perf_counter() - began
         logging.info("fitted the voxels of %s, %d of %d, %.0f s", name, number + 1, len(missing), seconds)
 
@@ -151,10 +151,11 @@ def read_fitted(folder: Path, name: str) -> FittedVoxels:
     )
 
 
-def _write(path: Path, fitted: FittedVoxels) -> None:
-    arrays = {name: (getattr(fitted, name).numpy() * STEPS).round().astype(np.uint16) for name in ("rgb", "density")}
-    with replacing(path) as temporary, temporary.open("wb") as file:
-        np.savez(file, **arrays, weight=fitted.weight.numpy(), extent=fitted.extent.numpy())
+def write_fitted(folder: Path, name: str, fitted: FittedVoxels) -> None:
+    """Write a subject's voxels, atomically. Raises OSError."""
+    arrays = {key: (getattr(fitted, key).numpy() * STEPS).round().astype(np.uint16) for key in ("rgb", "density")}
+    with written_whole(_path(folder, name)) as unfinished:
+        write_deflated(unfinished, {**arrays, "weight": fitted.weight.numpy(), "extent": fitted.extent.numpy()})
 
 
 def _path(folder: Path, name: str) -> Path:

@@ -117,10 +117,9 @@ def test_texels_outside_every_chart_are_not_visible():
 def test_half_covered_pixels_count_by_their_mask_and_less_covered_ones_not_at_all(mask, seen):
     body = plates(0.0)
     found = unproject_texels(views_of([plain((90, 80, 70, mask))], [filling(0, 16)]), body.template, 0, body)
-    middle = found.map(lambda tensor: tensor[..., 128, 128])
-    assert middle.seen.item() == seen
-    assert middle.covered.item() == mask
-    assert middle.rgb[0].tolist() == ([90, 80, 70] if seen else [0, 0, 0])
+    assert found.seen[0, 128, 128].item() == seen
+    assert found.covered[0, 128, 128].item() == mask
+    assert found.rgb[0, :, 128, 128].tolist() == ([90, 80, 70] if seen else [0, 0, 0])
 
 
 @pytest.mark.parametrize("facing", [0, 1, 2])

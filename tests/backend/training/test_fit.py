@@ -82,6 +82,18 @@ def test_weights_change_and_the_average_is_what_is_kept(captures, tmp_path):
     assert any(not torch.equal(state[f"average.{key}"], state[f"network.{key}"]) for key in kept)
 
 
+def test_training_goes_on_from_another_run(captures, tmp_path):
+    first = fit(settings(captures, tmp_path / "first", steps=2))
+    path = tmp_path / "first" / MODEL
+    second = fit(settings(captures, tmp_path / "second", minutes=0.0, start=path))
+    kept = load_encoder(path).encoder
+    assert all(torch.equal(a, b) for a, b in zip(second.encoder.parameters(), kept.parameters(), strict=True))
+    assert second.card["start"]["steps"] == 2
+    assert first.card["start"] is None
+    with refused(ValueError, str(path), "no_attention"):
+        fit(settings(captures, tmp_path / "third", start=path, encoder="no_attention"))
+
+
 def test_without_minutes_left_the_encoder_is_that_of_the_last_step(captures, tmp_path, monkeypatch):
     assert fit(settings(captures, tmp_path / "run", minutes=0.0)).card["steps"] == 0
     assert load_encoder(tmp_path / "run" / MODEL).card["steps"] == 0

@@ -1,4 +1,4 @@
-"""Voxels as direct targets: fitted once to all images of a subject, brought into the boxes of a sample, learned from."""
+"""Voxels as direct targets: fitted once to all images of a subject, brought into a sample's boxes, learned from."""
 
 import dataclasses
 from pathlib import Path
@@ -141,15 +141,16 @@ def test_a_run_learns_from_voxels_without_marching_and_keeps_the_boxes(captures,
     monkeypatch.setattr("primdiffusion.training.fit.measure", lambda *_: 0.0)
     monkeypatch.setattr("primdiffusion.training.fit.write_pictures", lambda *_: None)
     run = tmp_path / "run"
-    config = settings(captures, run, steps=24, learning_rate=3e-3, ema=0.5, loss=VOXELS_ALONE, fitted=fitted)
+    rates = {"learning_rate": 2e-2, "place_rate": 1.0, "ema": 0.5}
+    config = settings(captures, run, steps=60, conditioning_frame="first", loss=VOXELS_ALONE, fitted=fitted, **rates)
     model = fit(config)
     loss = [row["voxels"] for row in rows(run) if "voxels" in row]
-    assert np.mean(loss[-6:]) < 0.9 * np.mean(loss[:4])
+    assert np.mean(loss[-10:]) < 0.9 * np.mean(loss[:10])
     assert not {"rgb", "silhouette"} & rows(run)[0].keys()
     assert model.card["loss"]["voxels"] == 1.0
     opened = open_captures(captures)
     payload = load_encoder(run / MODEL).encode(conditioning_views(opened, NAMES[0]), torch.zeros(10))
-    assert torch.allclose(payload.delta_scale, torch.tensor(PRESETS["default"].extent), rtol=5e-3)
+    assert torch.allclose(payload.delta_scale, torch.tensor(PRESETS["default"].extent), rtol=1e-2)
 
 
 def test_both_losses_together(captures, fitted, tmp_path):
