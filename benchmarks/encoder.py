@@ -5,9 +5,9 @@ evaluates those of the checkpoints full, shared_scale, template_rt, no_attention
 that the folder contains; without --models, the package's encoder. Each person is encoded from eight views of one pose
 and compared in all views (or --cameras of them) and poses at 512 x 512; figures with `_novel` are of views and poses
 that the encoder was not given; those with `_fitted` are of voxels fitted to the very images of held-out people that
-are compared, in the boxes the encoder starts from: no encoder with these boxes can do much better. As in the paper, psnr_shared_scale and similar figures are of training people. Without
-capture folders, held-out people are made from MakeHuman's assets (--assets), with seeds that training does not use.
---quick evaluates one person. Times are the best or median of several; names with `processor` are processor time, the
+are compared, in the boxes the encoder starts from: no encoder with these boxes can do much better. As in the paper,
+psnr_shared_scale and similar figures are of training people. Without capture folders, held-out people are made from
+MakeHuman's assets (--assets), with seeds that training does not use. --quick evaluates one person. Times are the best or median of several; names with `processor` are processor time, the
 others wall time.
 
 `encoder.py curve --metrics docs/results/encoder_metrics.jsonl --plot docs/pictures/encoder_curve.png` plots PSNR on
@@ -49,7 +49,15 @@ from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import EncoderModel, load_encoder, look_up
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
-from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, picture, summary, table
+from primdiffusion.evaluation.reconstruction import (
+    EvaluationSettings,
+    Means,
+    PictureScore,
+    evaluate,
+    picture,
+    summary,
+    table,
+)
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
@@ -210,14 +218,15 @@ def measured(
 
 def fitted_figures(model: EncoderModel, captures: Captures, count: int) -> Figures:
     """Means over all images of voxels that were fitted to these images: the limit of the boxes."""
-    names = [captures.subjects[i * len(captures.subjects) // count] for i in range(count)]
-    voxels = {name: fit_subject(captures, name, model.config) for name in names}
-    rows = []
-    for name, fitted in voxels.items():
-        payload = Payload(fitted.rgb, fitted.density * model.config.full_density, fitted.extent)
-        rows += evaluate(Fitted(model, payload), captures, EvaluationSettings((name,), given_views=VIEWS))
-    means = summary(rows)["all"]
-    return {"psnr_fitted": means.psnr, "ssim_fitted": means.ssim, "mask_iou_fitted": means.mask_iou, "people_fitted": count}
+    scores: list[PictureScore] = []
+    for number in range(count):
+        name = captures.subjects[number * len(captures.subjects) // count]
+        voxels = fit_subject(captures, name, model.config)
+        payload = Payload(voxels.rgb, voxels.density * model.config.full_density, voxels.extent)
+        scores += evaluate(Fitted(model, payload), captures, EvaluationSettings((name,), given_views=VIEWS))
+    means = summary(scores)["all"]
+    figures = {f"{name}_fitted": getattr(means, name) for name in ("psnr", "ssim", "mask_iou")}
+    return {**figures, "people_fitted": count}
 
 
 class Fitted(NamedTuple):
