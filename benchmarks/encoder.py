@@ -4,11 +4,11 @@
 evaluates those of the checkpoints full, shared_scale, template_rt, no_attention and full_at_equal_steps (.safetensors)
 that the folder contains; without --models, the package's encoder. Each person is encoded from eight views of one pose
 and compared in all views (or --cameras of them) and poses at 512 x 512; figures with `_novel` are of views and poses
-that the encoder was not given; those with `_fitted` are of voxels fitted to the very images of held-out people that
-are compared, in the boxes the encoder starts from: no encoder with these boxes can do much better. As in the paper,
+that the encoder was not given; those with `_fitted` are of voxels fitted to the very images of held-out people that are
+compared, in the boxes the encoder starts from: no encoder with these boxes can do much better. As in the paper,
 psnr_shared_scale and similar figures are of training people. Without capture folders, held-out people are made from
-MakeHuman's assets (--assets), with seeds that training does not use. --quick evaluates one person. Times are the best or median of several; names with `processor` are processor time, the
-others wall time.
+MakeHuman's assets (--assets), with seeds that training does not use. --quick evaluates one person. Times are the best
+or median of several; names with `processor` are processor time, the others wall time.
 
 `encoder.py curve --metrics docs/results/encoder_metrics.jsonl --plot docs/pictures/encoder_curve.png` plots PSNR on
 training and held-out people by step from a run's metrics.jsonl, and prints the gain of the last doubling of the steps,
