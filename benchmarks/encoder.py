@@ -2,13 +2,13 @@
 
 `python benchmarks/encoder.py --train CAPTURES --heldout CAPTURES --models DIR --json encoder.json --table encoder.md`
 evaluates those of the checkpoints full, shared_scale, template_rt, no_attention and full_at_equal_steps (.safetensors)
-that the folder contains; without --models, the package's encoder. Each person is encoded from eight views of one pose
-and compared in all views (or --cameras of them) and poses at 512 x 512; figures with `_novel` are of views and poses
-that the encoder was not given; those with `_fitted` are of voxels fitted to the very images of held-out people that are
-compared, in the boxes the encoder starts from: no encoder with these boxes can do much better. As in the paper,
-psnr_shared_scale and similar figures are of training people. Without capture folders, held-out people are made from
-MakeHuman's assets (--assets), with seeds that training does not use. --quick evaluates one person. Times are the best
-or median of several; names with `processor` are processor time, the others wall time.
+that the folder contains; without --models, the package's encoder, and beside it one that is untrained. Each person is
+encoded from eight views of one pose and compared in all views (or --cameras of them) and poses at 512 x 512; figures
+with `_novel` are of views and poses that the encoder was not given; those with `_fitted` are of voxels fitted to the
+very images of held-out people that are compared, in the boxes the encoder starts from: no encoder with these boxes can
+do much better. As in the paper, psnr_shared_scale and similar figures are of training people. Without capture folders,
+held-out people are made from MakeHuman's assets (--assets), with seeds that training does not use. --quick evaluates
+one person. Times are the best or median of several; names with `processor` are processor time, the others wall time.
 
 `encoder.py curve --metrics docs/results/encoder_metrics.jsonl --plot docs/pictures/encoder_curve.png` plots PSNR on
 training and held-out people by step from a run's metrics.jsonl, and prints the gain of the last doubling of the steps,
@@ -108,6 +108,7 @@ class Variant(NamedTuple):
 
 VARIANTS = (
     Variant("full", "full model", (32.15, 0.984, 0.048)),
+    Variant("untrained", "untrained: the hull of the masks", None),
     Variant("full_at_equal_steps", "full model, as many steps as those below", None),
     Variant("shared_scale", "one delta scale for all boxes", (18.35, 0.803, 0.182)),
     Variant("template_rt", "frames of the template body", (31.70, 0.982, 0.058)),
@@ -133,6 +134,9 @@ def main() -> None:
         captures = {name: None if root is None else open_captures(root) for name, root in sets.items()}
         lpips = load_lpips(arguments.lpips) if arguments.lpips else None
         models = read_models(arguments.models)
+        if "full" in models:
+            torch.manual_seed(0)
+            models["untrained"] = EncoderModel(Encoder(models["full"].config).eval().requires_grad_(False), {})
         qualities = {
             name: Quality(
                 *(measured(model, captures[one], arguments, lpips) for one in ("train", "heldout")),
@@ -247,10 +251,12 @@ class Fitted(NamedTuple):
 
 
 def quality_figures(qualities: dict[str, Quality]) -> Figures:
-    """Figures by name: the full model's in detail, the others' PSNR and SSIM; None where not measured."""
+    """Figures by name: the full model's in detail, others' PSNR and SSIM; None where not measured."""
     figures: Figures = {}
     for variant in VARIANTS:
-        quality = qualities.get(variant.name, Quality(None, None, None, None))
+        if variant.name not in qualities:
+            continue
+        quality = qualities[variant.name]
         suffix = "" if variant.name == "full" else f"_{variant.name}"
         for people, means in (("train", quality.train), ("heldout", quality.heldout)):
             for metric in ("psnr", "ssim"):

@@ -33,6 +33,11 @@ SOURCES = {
         "benchmarks/encoder.py --train DIR --heldout DIR --models DIR --json docs/results/encoder.json "
         "--table docs/results/encoder_table.md",
     ),
+    "encoder_ablations": (
+        "The encoder's ablations, 240 steps each, with boxes of one thickness",
+        "benchmarks/encoder.py --train DIR --heldout DIR --models DIR --json docs/results/encoder_ablations.json "
+        "--table docs/results/encoder_ablations_table.md",
+    ),
     "diffusion": (
         "Generated people",
         "benchmarks/diffusion.py --people DIR --reference DIR --voxel FILE --json docs/results/diffusion.json "
