@@ -16,7 +16,7 @@ from primdiffusion.capture.poses import BUILT_IN, built_in_poses
 from primdiffusion.diffusion.codec import CellCodec, cells_from_voxels
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample, seeded
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import Human, people_of

@@ -19,7 +19,7 @@ from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.evaluation.gallery import PORTRAITS, camera_of
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, generate, place

@@ -28,7 +28,7 @@ from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import DISJOINT, region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, Sampling
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, generate, place

@@ -44,7 +44,7 @@ from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.formats.camera_rig import Rig, View
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import generate
 from primdiffusion.human_file import save_human
 from record import command_line, report

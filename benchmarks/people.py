@@ -25,7 +25,7 @@ import numpy as np
 import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh

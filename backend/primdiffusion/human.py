@@ -28,7 +28,7 @@ from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.formats import requests
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import polar

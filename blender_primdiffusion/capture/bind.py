@@ -11,7 +11,7 @@ from mathutils.bvhtree import BVHTree
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
-from ..formats.poses.skeleton import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import FileError
 from ..scene.armature import build_armature
 from ..scene.convention import points_to_backend, points_to_blender

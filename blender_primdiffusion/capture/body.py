@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from ..formats.arrays import MOST_BODY_VALUES, all_finite, read_arrays
 from ..formats.body_layout import body_data
-from ..formats.poses.skeleton import JOINT_NAMES, PARENTS, chain, joint_positions
+from ..formats.joints import JOINT_NAMES, PARENTS
+from ..formats.poses.skeleton import chain, joint_positions
 from ..formats.regular_files import FileError
 
 BETAS = 10

@@ -9,9 +9,9 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rigs import MATCH_BONES, UNMATCHED, BoneMap, facing, map_bones, rig_from_smpl
 from ..formats.poses.rotation import matrix_to_quaternion, to_axis_angle
-from ..formats.poses.skeleton import JOINT_NAMES
 from ..formats.regular_files import as_file_error
 from ..scene.convention import points_to_blender
 from .bind import bind_static

@@ -9,7 +9,7 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.poses.skeleton import JOINT_NAMES, PARENTS
+from ..formats.joints import JOINT_NAMES, PARENTS
 from ..scene.human_file import HumanPayload, file_version, read_sizes
 from ..scene.rest_human import body_of_file
 from ..scene.shape import SAME_BETAS, ShapeModel, box_growth, stretch_of, tangent_frames

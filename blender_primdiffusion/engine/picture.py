@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.poses.skeleton import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from ..scene.armature import model_origin
 from ..scene.blend_values import stored_numbers
 from ..scene.convention import transforms_to_backend

@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.answers import RenderAnswer
+from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.poses.rotation import from_axis_angle, to_axis_angle
-from ..formats.poses.skeleton import JOINT_NAMES, PARENTS, REST_JOINTS, joint_positions
+from ..formats.poses.skeleton import REST_JOINTS, joint_positions
 from ..formats.regular_files import check_regular
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import builtin_poses, current_pose

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..engine.picture import pose_of
 from ..formats.answers import MergeAnswer, MergeFramesAnswer
-from ..formats.poses.skeleton import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import remove_file
 from ..scene.attachment import set_attachment
 from ..scene.human import armature_of

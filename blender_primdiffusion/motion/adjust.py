@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..formats.poses.motion import Motion
 from ..formats.poses.rotation import from_quaternion, matrix_to_quaternion, slerp
-from ..formats.poses.skeleton import JOINT_NAMES, REST_JOINTS, joint_positions
+from ..formats.poses.skeleton import REST_JOINTS, joint_positions
 from ..scene.convention import continuous_quaternions
 
 _FEET = [JOINT_NAMES.index(f"{side}_{part}") for side in ("left", "right") for part in ("ankle", "foot")]

@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import about_axis
-from ..formats.poses.skeleton import JOINT_NAMES, REST_JOINTS
+from ..formats.poses.skeleton import REST_JOINTS
 
 FLOOR = -1.168
 """Height of the soles at rest, metres."""

@@ -18,9 +18,9 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite
+from ..formats.joints import JOINT_NAMES
 from ..formats.json_files import read_json
 from ..formats.poses.rotation import from_axis_angle, matrix_to_quaternion, slerp, to_axis_angle
-from ..formats.poses.skeleton import JOINT_NAMES
 from ..formats.regular_files import FileError, as_file_error, remove_file
 from ..formats.whole_files import write_atomically
 from ..scene.armature import bone_bases, model_origin, rest_rotations

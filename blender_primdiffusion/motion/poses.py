@@ -8,9 +8,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..formats.poses.motion import Motion
 from ..formats.poses.rotation import about_axis
-from ..formats.poses.skeleton import JOINT_NAMES, REST_JOINTS, joint_positions
+from ..formats.poses.skeleton import REST_JOINTS, joint_positions
 from .legs import FLOOR
 
 X, Y, Z = 0, 1, 2

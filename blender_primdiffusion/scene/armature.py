@@ -15,8 +15,8 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.poses.rotation import matrix_to_quaternion
-from ..formats.poses.skeleton import JOINT_NAMES, PARENTS
 from .actions import action_curves, last_key, new_action
 from .blend_values import stored_numbers
 from .convention import continuous_quaternions, points_to_blender, rotations_to_blender

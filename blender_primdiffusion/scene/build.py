@@ -12,8 +12,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
-from ..formats.poses.skeleton import JOINT_NAMES
 from .armature import build_armature
 from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT
 from .convention import frames_to_blender, points_to_blender

@@ -13,7 +13,7 @@ from typing import Any
 
 import bpy
 
-from ..formats.poses.skeleton import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from .human import BODY_MARK, MARK, armature_of, volume_path, volumes_of
 from .proxy import PROXY_MARK
 from .stand_in import STAND_IN

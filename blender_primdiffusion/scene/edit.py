@@ -10,8 +10,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
-from ..formats.poses.skeleton import JOINT_NAMES
 from .armature import move_rest_joints
 from .build import floor_below
 from .convention import frames_to_blender, points_to_blender

@@ -16,7 +16,7 @@ from pathlib import Path
 import addon_utils
 import bpy
 
-from ..formats.poses.skeleton import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import remove_folder
 from ..formats.whole_files import replacing
 

@@ -21,7 +21,7 @@ from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite, check_shapes, read_arrays
-from ..formats.poses.skeleton import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import FileError, as_file_error, portable_name
 from .armature import model_origin
 from .blend_values import as_numbers, stored_record

@@ -11,9 +11,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..formats.poses.motion import Motion
 from ..formats.poses.rotation import nearest
-from ..formats.poses.skeleton import JOINT_NAMES, unchain
+from ..formats.poses.skeleton import unchain
 from ..motion.adjust import cut, from_origin, in_place, on_floor, resample, scale_places, stride_ratio
 from ..motion.pose_library import check_posable, rest_joints
 from ..scene.actions import last_key, push_to_strip

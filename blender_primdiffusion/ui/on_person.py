@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import bpy
 
-from ..formats.poses.skeleton import JOINT_NAMES
+from ..formats.joints import JOINT_NAMES
 from ..jobs.copies import separate
 from ..jobs.follow import Reporting
 from ..jobs.target import named_person, selected_person

@@ -10,9 +10,10 @@ import numpy as np
 from bpy.utils import previews
 from numpy.typing import NDArray
 
+from ..formats.joints import JOINT_NAMES
 from ..formats.picture_files import write_png
 from ..formats.poses.rotation import to_axis_angle
-from ..formats.poses.skeleton import JOINT_NAMES, joint_positions
+from ..formats.poses.skeleton import joint_positions
 from ..jobs.assets import clay_figure
 from ..motion.pose_library import (
     apply_pose,

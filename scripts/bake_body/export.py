@@ -8,7 +8,7 @@ import pathlib
 
 import numpy as np
 from linear_model import LinearModel
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES, PARENTS
+from primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 
 GRAIN = 2.0**-17
 """Metres (7.6 micrometres): stored lengths are rounded to this grid, so that the files compress."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES, PARENTS
+from primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 
 PELVIS_AT_REST = np.array([0.0, -0.22, 0.02])
 """Position of the pelvis in SMPL's template, in metres."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 
 _OTHER_SIDE = {"left": "right", "right": "left"}
 MIRRORED_JOINT = np.array(

@@ -10,7 +10,7 @@ import torch
 from numpy import ndarray as Array
 from PIL import Image
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.surface import vertex_normals
 from primdiffusion.primitives.anchors import CHARTS, Anchors, attach
 from primdiffusion.primitives.primitives import GRID, Frames

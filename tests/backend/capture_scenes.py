@@ -8,7 +8,7 @@ from primdiffusion.body.model import default_body
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.render import PASSES, RenderJob, render
 from primdiffusion.formats.camera_rig import Rig
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.gltf import Skeleton, glb
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from primdiffusion.capture.coco import KEYPOINTS
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 
 
 def front() -> View:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import about_axis, to_axis_angle
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES, joint_positions
+from blender_primdiffusion.formats.poses.skeleton import joint_positions
 
 from blender_primdiffusion.motion.pose_library import current_pose, rest_joints
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from blender_primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 from blender_primdiffusion.formats.poses.rotation import from_axis_angle
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES, PARENTS
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 FRAMES = 6

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.motion import Motion
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from synthetic import axis_angle
 
 from blender_primdiffusion.capture.body import Body, read_body

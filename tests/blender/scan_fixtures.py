@@ -7,8 +7,8 @@ from pathlib import Path
 
 import bpy
 import numpy as np
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import about_axis
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from mathutils import Matrix
 
 from blender_primdiffusion.capture.body import Body, skin, skinning_transforms

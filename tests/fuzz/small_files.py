@@ -196,7 +196,7 @@ def bvh(frames: int, extra: int = 0) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
         from bvh_files import motion_of, write_bvh
-        from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+        from primdiffusion.formats.joints import JOINT_NAMES
 
         path = write_bvh(folder / "a.bvh", REST_JOINTS, *motion_of(), {name: name for name in JOINT_NAMES})
         head = path.read_text().split("MOTION")[0]

@@ -145,7 +145,7 @@ def read_own_pose(path: Path) -> None:
 def make_bvh(folder: Path) -> Path:
     from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
     from bvh_files import motion_of, write_bvh
-    from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+    from primdiffusion.formats.joints import JOINT_NAMES
 
     return write_bvh(folder / "a.bvh", REST_JOINTS, *motion_of(), {name: name for name in JOINT_NAMES})
 

@@ -7,10 +7,11 @@ import pickle
 from pathlib import Path
 
 import numpy as np
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.mhr import JOINTS, REST, Y_UP
 from primdiffusion.formats.poses.rigs import map_bones, rig_from_smpl
 from primdiffusion.formats.poses.rotation import from_axis_angle
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES, REST_JOINTS, chain
+from primdiffusion.formats.poses.skeleton import REST_JOINTS, chain
 
 LENGTHS = {
     "l_upleg": (0.08, -0.02, 0.01), "l_lowleg": (0.42, 0, 0), "l_foot": (0.42, 0, 0), "l_subtalar": (0.03, -0.01, 0),

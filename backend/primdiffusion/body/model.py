@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.formats.arrays import read_arrays
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import axis_angle_to_matrix, polar
 

@@ -30,8 +30,8 @@ from primdiffusion.capture.sheet import joints_of
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.group_places import MOST
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.whole_files import replacing
 

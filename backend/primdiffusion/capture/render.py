@@ -28,7 +28,7 @@ from primdiffusion.formats import capture_layout, picture_files
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.group_places import extent, first_frames, stand_together
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.regular_files import check_unlinked
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.whole_files import replacing, write_atomically

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.samplers import SamplerStep
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.regular_files import remove_file
 from primdiffusion.formats.requests import Compositing
 from primdiffusion.geometry.camera import Camera

@@ -18,7 +18,7 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.options import ViewCommand
 from primdiffusion.device import best_device
 from primdiffusion.failures import optional_package
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import VERTICAL_FOV, Human, framing, place

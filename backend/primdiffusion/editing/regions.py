@@ -18,7 +18,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.formats.arrays import read_numbers
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, SIDED_PARTS, WHOLE_PARTS
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import Anchors, anchor_skin_weights, attach, default_anchors, default_texels

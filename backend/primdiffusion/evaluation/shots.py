@@ -17,8 +17,8 @@ from torch.nn import functional
 
 from primdiffusion.body.model import BodyPose, PosedBody, default_body
 from primdiffusion.formats.arrays import read_npy
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.pictures import opened_picture, strips

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import VOXEL, ProxySettings
 from primdiffusion.formats.whole_files import staged, written_whole
 from primdiffusion.geometry.srgb import encode_srgb

@@ -9,7 +9,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
-from .poses.skeleton import JOINT_NAMES
+from .joints import JOINT_NAMES
 from .schema import Ending, FieldError, Length, Option, Range, Shape, Slider
 
 Sampler = Literal["ddim", "dpmpp_2m", "ddpm"]

@@ -23,8 +23,8 @@ import torch
 
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.people_files import LARGEST_GLB
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
 from primdiffusion.formats.regular_files import FileError, as_file_error, read_regular, remove_folder
 from primdiffusion.formats.requests import Count, Seed, check_seed
 from primdiffusion.formats.schema import Checked

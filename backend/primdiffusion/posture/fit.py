@@ -20,7 +20,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.diffusion.model import ShapePrior
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import axis_angle_to_matrix

@@ -15,7 +15,7 @@ from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph
 from primdiffusion.capture.reader import as_camera, windowed_view
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.human import pose_body
 from primdiffusion.posture.fit import Posture, each

@@ -6,7 +6,7 @@ import numpy as np
 import smplx
 import torch
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from smplx.lbs import lbs
 from support.errors import refused

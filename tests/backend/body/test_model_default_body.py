@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.people.base_mesh import load_base_mesh
 
 FLIP = np.array([-1.0, 1.0, 1.0], np.float32)

@@ -18,7 +18,7 @@ from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig, View
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.regular_files import FileError
 from scipy import ndimage
 from support.errors import refused

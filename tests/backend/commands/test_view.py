@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.commands.view import COARSE, Viewer, camera_of, theta_of
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import framing, generate, place
 from scipy.spatial.transform import Rotation
 from tiny_model import tiny_model

@@ -14,7 +14,7 @@ from primdiffusion.editing.regions import (
     region_from_weights,
     region_of,
 )
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.primitives.anchors import attach, build_anchors, default_anchors
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import GRID, K

@@ -9,7 +9,7 @@ from PIL import Image
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.evaluation import shots
 from primdiffusion.evaluation.shots import JOINTS, SIDE, body_camera, folder_shots, human_shots, mesh_shots
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import generate, pose_body
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.base_mesh import load_base_mesh

@@ -10,7 +10,7 @@ import torch
 import trimesh
 from PIL import Image
 from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.gltf import Skeleton, glb
 from support.errors import refused

@@ -13,7 +13,7 @@ from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.photograph import Photograph
 from primdiffusion.capture.reader import Window
 from primdiffusion.diffusion.model import STANDARD_SHAPES
-from primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.human import framing, pose_body

@@ -54,7 +54,7 @@ def test_the_file_holds_what_the_encoder_makes_of_the_pictures(root, line, tmp_p
     got = stored.payload(0)
     assert stored.voxels.shape == (1, K, S, S, S, 4)
     assert torch.allclose(got.delta_scale, wanted.delta_scale, rtol=1e-3)
-    assert (got.delta_scale != 1).all()
+    assert (got.delta_scale[:, :2] != 1).all()
     assert (got.density - wanted.density).abs().max() < 0.51 / 255 * stored.full_density
     assert torch.equal(stored.betas, person.betas)
     people = PersonFolder(tmp_path / "out")

@@ -7,9 +7,10 @@ import json
 
 import numpy as np
 import pytest
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.files import read_motion, write_amass
 from blender_primdiffusion.formats.poses.motion import Detected, Motion
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES, REST_JOINTS, joint_positions
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, joint_positions
 
 from blender_primdiffusion.motion.adjust import scale_places, stride_ratio
 from blender_primdiffusion.motion.built_in_motions import built_in_motion

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import to_axis_angle
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES, REST_JOINTS, chain, joint_positions
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joint_positions
 
 from blender_primdiffusion.motion.built_in_motions import MOTIONS, built_in_motion
 from blender_primdiffusion.motion.legs import FLOOR, FootTrack, joint, reach

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.motion import Motion
 from blender_primdiffusion.formats.poses.rotation import (
     about_axis,
@@ -14,7 +15,7 @@ from blender_primdiffusion.formats.poses.rotation import (
     nearest,
     to_axis_angle,
 )
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES, REST_JOINTS, chain, joint_positions, unchain
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joint_positions, unchain
 from support.errors import refused
 
 from blender_primdiffusion.capture.body import read_body

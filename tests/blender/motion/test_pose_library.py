@@ -10,8 +10,9 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import from_axis_angle, to_axis_angle
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES, joint_positions
+from blender_primdiffusion.formats.poses.skeleton import joint_positions
 from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 

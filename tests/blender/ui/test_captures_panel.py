@@ -15,7 +15,7 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.capture_layout import picture_path
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from capture_person import _few_faces, chequers, files_of
 from support.errors import refused
 

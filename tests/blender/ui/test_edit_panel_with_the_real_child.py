@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 
 from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans, person_file
 

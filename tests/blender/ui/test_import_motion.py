@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 import synthetic
 from amass_files import feet, write_amass
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.files import read_motion
 from blender_primdiffusion.formats.poses.rotation import about_axis
-from blender_primdiffusion.formats.poses.skeleton import JOINT_NAMES, REST_JOINTS
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from bvh_files import motion_of, write_bvh
 from jobs_driven import Layout
 from support.errors import refused

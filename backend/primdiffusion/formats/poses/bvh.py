@@ -11,11 +11,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ..joints import JOINT_NAMES
 from ..regular_files import FileError, as_file_error, read_regular
 from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion
 from .rigs import MATCH_BONES, UNMATCHED, BoneMap, chosen_bones, map_bones, retarget
 from .rotation import about_axis
-from .skeleton import JOINT_NAMES, REST_JOINTS
+from .skeleton import REST_JOINTS
 
 LARGEST_BYTES = 64 * 2**20
 LONGEST_HIERARCHY = 2**20

@@ -10,8 +10,9 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from ..joints import JOINT_NAMES, PARENTS
 from .rotation import about_axis, between
-from .skeleton import JOINT_NAMES, PARENTS, REST_JOINTS, unchain
+from .skeleton import REST_JOINTS, unchain
 
 _SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
 RIGS: dict[str, dict[str, str]] = {

@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from .skeleton import JOINT_NAMES, REST_JOINTS
+from ..joints import JOINT_NAMES
+from .skeleton import REST_JOINTS
 
 TOLERANCE = 1e-3
 """Largest difference of a scalar product of two columns from that of a rotation."""

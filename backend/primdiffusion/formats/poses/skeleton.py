@@ -1,18 +1,12 @@
-"""The joints of SMPL, and so the bones of armatures; and the average skeleton: at rest, and in a pose."""
+"""The average skeleton: its joints at rest, and where they are in a pose."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-JOINT_NAMES: tuple[str, ...] = (
-    "pelvis", "left_hip", "right_hip", "spine1", "left_knee", "right_knee", "spine2", "left_ankle", "right_ankle",
-    "spine3", "left_foot", "right_foot", "neck", "left_collar", "right_collar", "head", "left_shoulder",
-    "right_shoulder", "left_elbow", "right_elbow", "left_wrist", "right_wrist", "left_hand", "right_hand",
-)  # fmt: skip
-"""SMPL's 24 joints in the order and with the names of the smplx package."""
-PARENTS: tuple[int, ...] = (-1, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 9, 9, 12, 13, 14, 16, 17, 18, 19, 20, 21)
-"""Parent of every joint; -1 for the pelvis."""
+from ..joints import JOINT_NAMES, PARENTS
+
 _LEFT = {
     "hip": (0.114, -0.236, 0.011), "knee": (0.139, -0.643, 0.019), "ankle": (0.139, -1.089, -0.007),
     "foot": (0.151, -1.141, 0.140), "collar": (0.024, 0.259, 0.038), "shoulder": (0.181, 0.254, 0.032),
