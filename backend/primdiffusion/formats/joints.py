@@ -1,4 +1,4 @@
-"""The joints of SMPL, and so the bones of armatures."""
+"""The joints of SMPL, and so the bones of armatures; without numpy, which the command line's help does not need."""
 
 from __future__ import annotations
 
