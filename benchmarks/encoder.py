@@ -283,13 +283,13 @@ def table_of(qualities: dict[str, Quality]) -> str:
         "|---" * 12 + "|",
     ]
     for variant in VARIANTS:
-        quality = qualities.get(variant.name)
-        cells: list[object] = [None] * 8
-        if quality is not None:
-            parts = [(quality.train, "all"), (quality.heldout, "all"), (quality.heldout, "novel_views_novel_poses")]
-            pairs = [(_mean(*part, "psnr"), _mean(*part, "ssim")) for part in parts]
-            cells = [cell for p, s in pairs for cell in (p and f"{p:.2f}", s and f"{s:.4f}")]
-            cells += [quality.steps, quality.people]
+        if variant.name not in qualities:
+            continue
+        quality = qualities[variant.name]
+        parts = [(quality.train, "all"), (quality.heldout, "all"), (quality.heldout, "novel_views_novel_poses")]
+        pairs = [(_mean(*part, "psnr"), _mean(*part, "ssim")) for part in parts]
+        cells: list[object] = [cell for p, s in pairs for cell in (p and f"{p:.2f}", s and f"{s:.4f}")]
+        cells += [quality.steps, quality.people]
         paper: Sequence[object] = (None,) * 3
         if variant.paper is not None:
             paper = [f"{value:.{digits}f}" for value, digits in zip(variant.paper, (2, 3, 3), strict=True)]
