@@ -38,7 +38,7 @@ def main() -> None:
     losses = []
     for step in range(1, arguments.steps + 1):
         images, targets = zip(*(sample(files, one) for one in random.sample(annotations, arguments.batch)), strict=True)
-        loss = sum(model(list(images), list(targets)).values())
+        loss = torch.stack(list(model(list(images), list(targets)).values())).sum()
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
