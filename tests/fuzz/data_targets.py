@@ -213,7 +213,7 @@ def make_fitted(folder: Path) -> Path:
 
     voxels = torch.full((K, S, S, S), 0.5)
     channels = voxels[:, None].repeat(1, 3, 1, 1, 1)
-    write_fitted(folder, "person", FittedVoxels(channels, voxels, channels[:, :2].clone(), torch.ones(K, 3)))
+    write_fitted(folder, "person", FittedVoxels(channels, voxels, channels[:, :2].clone(), torch.ones(K, 3)), "images")
     return folder / "person.npz"
 
 

@@ -92,12 +92,12 @@ class EncoderTask(Task):
         self.held = None if config.held is None else open_captures(config.held)
         if self.held is not None:
             betas_of(self.held)
-        if config.fitted is not None and config.loss.voxels:
-            with accelerator.main_process_first():
-                fit_missing(captures, PRESETS[config.encoder], config.fitted)
         self.dataset = fit_dataset(captures, config)
         if not len(self.dataset):
             raise ValueError(f"the captures in {config.data} have no frames: render some")
+        if config.fitted is not None and config.loss.voxels:
+            with accelerator.main_process_first():
+                fit_missing(captures, PRESETS[config.encoder], config.fitted)
         self._batches: Iterator[Batch] | None = None
 
     @property

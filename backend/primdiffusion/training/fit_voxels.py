@@ -19,7 +19,8 @@ from jaxtyping import Float32
 from torch import Tensor
 
 from primdiffusion.capture.conditioning import conditioning_views, default_betas, spread_cameras
-from primdiffusion.capture.reader import Captures
+from primdiffusion.capture.dataset import source_stamp
+from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import EncoderModel, frames_of
 from primdiffusion.encoder.network import Encoder
@@ -42,6 +43,8 @@ START_VIEWS = 16
 """Images of the first frame from which the fit starts, at most."""
 UNSEEN = 1e-9
 """Weight of voxels that no image shows: the fit left them where the encoder starts."""
+PLACING = ("appearance", "masks", "facing", "frames", "extent", "thickness", "full_density")
+"""Settings of the encoder on which its boxes, and the values from which the fit starts, depend."""
 STEPS = 65535
 """Colours and relative densities are stored as multiples of 1 / STEPS."""
 
@@ -95,17 +98,18 @@ def resampled(fitted: FittedVoxels, extent: Float32[Tensor, "k 3"]) -> FittedVox
 
 
 def fit_missing(captures: Captures, encoder: EncoderConfig, folder: Path) -> None:
-    """Fit the voxels of all subjects that have no file in `folder`. Interrupted, it goes on where it was.
+    """Fit the voxels of all subjects that have no file in `folder`, or one of other images or boxes. A stop loses one.
 
     Raises:
         FileNotFoundError, FileError: an image is missing or damaged.
         OSError: a file cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    missing = [name for name in captures.subjects if not _path(folder, name).exists()]
+    sources = {name: _source(captures.subject(name), encoder) for name in captures.subjects}
+    missing = [name for name, source in sources.items() if _stored_source(_path(folder, name)) != source]
     for number, name in enumerate(missing):
         began = time.perf_counter()
-        write_fitted(folder, name, fit_subject(captures, name, encoder))
+        write_fitted(folder, name, fit_subject(captures, name, encoder), sources[name])
         seconds = time.perf_counter() - began
         logging.info("fitted the voxels of %s, %d of %d, %.0f s", name, number + 1, len(missing), seconds)
 
@@ -114,8 +118,9 @@ def fit_subject(captures: Captures, name: str, encoder: EncoderConfig) -> Fitted
     """Fit one subject's voxels to at most MOST_IMAGES of its images, evenly spread over frames and cameras."""
     subject = captures.subject(name)
     betas = default_betas(subject)
-    torch.manual_seed(0)  # weights that encode nothing yet: the start is the hull in the colours of the images
-    untrained = EncoderModel(Encoder(encoder).eval().requires_grad_(False), {})
+    with torch.random.fork_rng():
+        torch.manual_seed(0)  # weights that encode nothing yet: the start is the hull in the colours of the images
+        untrained = EncoderModel(Encoder(encoder).eval().requires_grad_(False), {})
     first = conditioning_views(captures, name, 0, spread_cameras(subject, 0, START_VIEWS))
     start = untrained.encode(first, betas)
     shown = _spread(subject.frames * len(subject.views), MOST_IMAGES)
@@ -151,11 +156,22 @@ def read_fitted(folder: Path, name: str) -> FittedVoxels:
     )
 
 
-def write_fitted(folder: Path, name: str, fitted: FittedVoxels) -> None:
-    """Write a subject's voxels, atomically. Raises OSError."""
+def write_fitted(folder: Path, name: str, fitted: FittedVoxels, source: str) -> None:
+    """Write a subject's voxels, atomically, with what they were made from. Raises OSError."""
     arrays = {key: (getattr(fitted, key).numpy() * STEPS).round().astype(np.uint16) for key in ("rgb", "density")}
     with written_whole(_path(folder, name)) as unfinished:
-        write_deflated(unfinished, {**arrays, "weight": fitted.weight.numpy(), "extent": fitted.extent.numpy()})
+        others = {"weight": fitted.weight.numpy(), "extent": fitted.extent.numpy(), "source": np.array(source)}
+        write_deflated(unfinished, {**arrays, **others})
+
+
+def _source(subject: Subject, encoder: EncoderConfig) -> str:
+    """What voxels are made from: the images, and the settings that place boxes and look images up."""
+    return f"{source_stamp(subject)} {[getattr(encoder, name) for name in PLACING]}"
+
+
+def _stored_source(path: Path) -> str | None:
+    """The source of a file; None if there is no file. Raises FileError for a damaged one."""
+    return str(read_arrays(path, ("source",))["source"]) if path.exists() else None
 
 
 def _path(folder: Path, name: str) -> Path:

@@ -96,6 +96,9 @@ def test_only_what_is_missing_is_fitted(captures, fitted, tmp_path, monkeypatch)
     for _ in range(2):
         fit_missing(open_captures(captures), PRESETS["default"], tmp_path)
     assert made == [NAMES[1]]
+    other = dataclasses.replace(PRESETS["default"], extent=(1.0, 1.0, 1.0))
+    fit_missing(open_captures(captures), other, tmp_path)  # other boxes, though of the same names
+    assert made == [NAMES[1], *NAMES]
     kept = read_fitted(tmp_path, NAMES[1])
     for name in ("rgb", "density", "weight", "extent"):
         assert torch.allclose(getattr(kept, name), getattr(drawn_voxels(), name), atol=1e-5), name
