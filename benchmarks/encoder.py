@@ -33,7 +33,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from march import best_ms, from_script
+from march import best_ms
 from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.body.model import BodyModel, BodyPose
@@ -78,7 +78,6 @@ FIRST_SEED = 30_000_000
 """Seed of the first person made here; training sets count from 0."""
 PEOPLE, POSES, CAMERAS = 6, 4, 12
 FITTED_PEOPLE = 6
-REFINE_FIGURES = ("refine_psnr_heldout_views", "refine_seconds_cpu")
 Figures = dict[str, float | int | str | None]
 VIEWS = 8
 PARTS = ("data", "forward", "march", "march_backward", "backward", "update")
@@ -153,11 +152,6 @@ def main() -> None:
         if "full" in models:
             figures |= reconstruct_seconds(models["full"], some, 2 if arguments.quick else 7)
         figures |= step_seconds(some, 2 if arguments.quick else 8)
-    if arguments.quick or arguments.without_refine:
-        figures |= dict.fromkeys(REFINE_FIGURES)
-    else:
-        assets = () if arguments.assets is None else ("--assets", str(arguments.assets))
-        figures |= from_script("refine.py", REFINE_FIGURES, *assets)
     report(figures, arguments.json)
     text = table_of(qualities)
     print(text)
@@ -174,7 +168,6 @@ def parsed() -> argparse.Namespace:
     parser.add_argument("--cameras", type=int, help="number of cameras to compare in, evenly spaced; without it, all")
     parser.add_argument("--lpips", type=Path, nargs="*", default=(), help="files with the weights of LPIPS")
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
-    parser.add_argument("--without-refine", action="store_true", help="skip benchmarks/refine.py")
     parser.add_argument("--quick", action="store_true", help="one person, two poses")
     parser.add_argument("--table", type=Path, help="markdown file for the tables")
     return parser.parse_args()

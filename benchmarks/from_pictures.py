@@ -18,6 +18,14 @@ The sheet has a row for each human: the given view, then two others beside the t
 
 `python benchmarks/from_pictures.py seconds --assets DIR --json F` adds one_view_seconds_cpu to the figures in F, the
 mean wall time of a reconstruction from one view. Run nothing else in the two minutes that it takes.
+
+`python benchmarks/from_pictures.py distance --assets DIR --json F` adds how real the sides look that the view does not
+show: their kernel distance to held-out meshes, over that of as many generated humans' sides. Back and left portraits
+in T pose are compared, in the feature space of `primdiffusion.evaluation`, by a network fitted to these two. Portraits
+of meshes stay in the folder --reference, which benchmarks/diffusion.py uses as well.
+
+    one_view_unseen_distance_ratio          of reconstructions, whose unseen sides are the most probable ones
+    one_view_drawn_unseen_distance_ratio    of those with a seed, whose unseen sides are drawn
 """
 
 from __future__ import annotations
@@ -27,14 +35,15 @@ import dataclasses
 import json
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
+from diffusion_sets import generated
 from figure_metrics import figure_psnr
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from PIL import Image
 from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views, default_betas
 from primdiffusion.capture.dataset import Views
@@ -45,6 +54,10 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
+from primdiffusion.evaluation.attribute_network import features_of, fit_attribute_network
+from primdiffusion.evaluation.distances import kernel_distance
+from primdiffusion.evaluation.gallery import COLOURINGS, PORTRAITS, made_gallery, mesh_sources, open_gallery
+from primdiffusion.evaluation.generation import PORTRAITS_FOLDER
 from primdiffusion.evaluation.image_metrics import ssim
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
@@ -60,6 +73,8 @@ from torch import Tensor
 
 SEED = 31_000_000
 """Seed of the first human; training sets count from 0."""
+HELD_SEED = 10_000_000
+"""Seed of the first mesh that generated and reconstructed humans are compared with."""
 CAMERAS, SIZE, POSES = 32, 512, 2
 FRAMES, EIGHT = (1, 4, 16), 8
 GREY = decode_srgb(torch.tensor(0.5))
@@ -132,11 +147,53 @@ def seconds() -> None:
             began = time.perf_counter()
             reconstruct_by_prior(model, case.given)
             taken.append(time.perf_counter() - began)
-    figures = {"one_view_seconds_cpu": round(float(np.mean(taken)), 4)}
-    if arguments.json is not None and arguments.json.exists():
-        known = json.loads(arguments.json.read_text(encoding="utf-8"))
+    add({"one_view_seconds_cpu": round(float(np.mean(taken)), 4)}, arguments.json)
+
+
+def distance() -> None:
+    parser = options(people=32)
+    parser.add_argument("--reference", type=Path, default=Path("runs/reference"), help="folder for portraits of meshes")
+    parser.add_argument("--meshes", type=int, default=300, help="geometries of the reference; half as many held out")
+    arguments = parser.parse_args()
+    model = load_checkpoint(arguments.checkpoint)
+    assets = open_assets(arguments.assets, required_meshes())
+    train, held = (
+        open_gallery(
+            mesh_sources(assets, range(first, first + count), COLOURINGS), arguments.reference / PORTRAITS_FOLDER
+        )
+        for first, count in ((0, arguments.meshes), (HELD_SEED, arguments.meshes // 2))
+    )
+    network = fit_attribute_network(unseen_sides(train.pictures), train.attributes)
+
+    def distance_of(humans: Iterable[Human]) -> float:
+        made = unseen_sides(made_gallery(place(human) for human in humans))
+        return kernel_distance(features_of(network, made), features_of(network, unseen_sides(held.pictures)))
+
+    with tempfile.TemporaryDirectory() as scratch:
+        captures = captured(Path(scratch), arguments.assets, arguments.people)
+        cases = [case_of(captures, name, number % POSES).given for number, name in enumerate(captures.subjects)]
+        made = distance_of(generated(model, range(len(cases))))
+        probable = distance_of(reconstruct_by_prior(model, case) for case in cases)
+        drawn = distance_of(reconstruct_by_prior(model, case, seed=seed) for seed, case in enumerate(cases))
+    figures = {
+        "one_view_unseen_distance_ratio": round(probable / made, 4),
+        "one_view_drawn_unseen_distance_ratio": round(drawn / made, 4),
+    }
+    add(figures, arguments.json)
+
+
+def unseen_sides(portraits: UInt8[Tensor, "n v h w 4"]) -> UInt8[Tensor, "n v h w 4"]:
+    """The back and the left in place of all portraits, as many as the network takes."""
+    back, left = (next(i for i, one in enumerate(PORTRAITS) if one.name == name) for name in ("back", "left"))
+    return portraits[:, [back, left] * (len(PORTRAITS) // 2)]
+
+
+def add(figures: dict[str, float], path: Path | None) -> None:
+    """Print the figures, and add them to the record if a path is given."""
+    if path is not None and path.exists():
+        known = json.loads(path.read_text(encoding="utf-8"))
         figures = {name: value for name, value in known.items() if name not in surroundings()} | figures
-    report(figures, arguments.json)
+    report(figures, path)
 
 
 def options(people: int) -> argparse.ArgumentParser:
@@ -220,4 +277,4 @@ def small(pictures: Float[Tensor, "v H W 3"]) -> Float[Tensor, "d"]:
 
 
 if __name__ == "__main__":
-    run(main, seconds=seconds)
+    run(main, seconds=seconds, distance=distance)

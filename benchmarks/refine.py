@@ -1,15 +1,18 @@
 """Measures what refining gains on a captured person: PSNR on held-out cameras and in a held-out pose, and time.
 
 `python benchmarks/refine.py --assets DIR --json F` makes one dressed person from a seed that no training set uses,
-draws them in nine poses from 24 sides at 256 x 256 with the rasteriser, and refines on eight poses and 21 cameras, once
-starting from `from_mesh` of their mesh and once from the bare grey body. PSNR is of whole sRGB-encoded pictures,
-averaged: `heldout_views` are three cameras in the eight poses, `unseen_pose` all cameras in the ninth. Seconds are wall
-time and processor time of the steps. `--quick` takes 60 steps from the mesh only. `--pictures DIR` saves
-held-out views side by side: before, after, target; from the mesh in the first row, from the body in the second.
+draws them in nine poses from 24 sides at 256 x 256 with the rasteriser, and refines on eight poses and 21 cameras,
+starting from the encoder's human, from `from_mesh` of their mesh, and from the bare grey body. PSNR is of whole
+sRGB-encoded pictures, averaged: `heldout_views` are three cameras in the eight poses, `unseen_pose` all cameras in the
+ninth. Seconds are wall time and processor time of the steps. `linear_` figures are of the linear solve instead
+(`render.inverse`), on 84 of the pictures. `--quick` takes 60 steps from the encoder only. `--pictures DIR` saves
+held-out views side by side, a row for each start: before, after, target.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -17,20 +20,24 @@ from pathlib import Path
 
 import torch
 from PIL import Image
-from primdiffusion.capture.conditioning import conditioning_views, default_betas
+from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views, default_betas
 from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
-from primdiffusion.commands.reconstruct import split_cameras
+from primdiffusion.commands.reconstruct import ENCODER_VIEWS, split_cameras
 from primdiffusion.device import best_device
+from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
-from primdiffusion.human import Human, place
+from primdiffusion.human import Human, default_frames, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
+from primdiffusion.primitives.from_mesh import FULL_DENSITY
+from primdiffusion.reconstruction import reconstruct, targets_of
+from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
 from primdiffusion.training.refine import RefineSettings, bare_body, meshed_person, refine, view_psnr
 from record import command_line, report
@@ -39,6 +46,7 @@ SEED = 30_000_000
 """Seed of the person; training sets count from 0."""
 POSES, CAMERAS, HELD, SIZE = 9, 24, 3, 256
 QUICK_STEPS = 60
+LINEAR_PICTURES = 84
 
 
 def main() -> None:
@@ -66,12 +74,17 @@ def main() -> None:
             [conditioning_views(captures, name, frame, cameras) for frame in frames]
             for frames, cameras in ((range(POSES - 1), given), (range(POSES - 1), held), ((POSES - 1,), None))
         ]
-        starts = {"": meshed_person(path)} | ({} if arguments.quick else {"_from_body": bare_body(betas)})
+        cameras = tuple(given[:: math.ceil(len(given) / ENCODER_VIEWS)])
+        seen = CapturedPerson(name, 0, cameras, conditioning_views(captures, name, 0, cameras), betas, ())
+        starts = {"encoder": reconstruct(load_encoder(), seen)}
+        if not arguments.quick:
+            starts |= {"mesh": meshed_person(path), "body": bare_body(betas)}
     figures, rows = {"refine_steps": steps}, []
-    for suffix, start in starts.items():
+    for source, start in starts.items():
         measured, refined = measure(start.to(best_device()), *sets, steps)
-        figures |= {f"{figure}{suffix}": value for figure, value in measured.items()}
+        figures |= {f"{figure}_from_{source}": value for figure, value in measured.items()}
         rows.append(compared((start, refined), [sets[1][0], sets[1][4], sets[2][0]]))
+    figures |= linear(starts["encoder"], sets[0], sets[1], sets[2])
     if arguments.pictures:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
         pixels = (torch.cat(rows).cpu() * 255).round().to(torch.uint8).numpy()
@@ -100,6 +113,23 @@ def measure(
         "refine_processor_seconds": moments[-1][1] - moments[0][1],
     }
     return figures, refined
+
+
+def linear(start: Human, given: list[Views], held: list[Views], unseen: list[Views]) -> dict[str, float]:
+    """Figures of the linear solve, with LINEAR_PICTURES of the given ones; boxes keep their sizes."""
+    targets = []
+    for views in given:
+        frames = [default_frames(start.betas, views.pose)] * len(views.rgba)
+        targets += targets_of(views, frames, SIZE)
+    targets = targets[:: math.ceil(len(targets) / LINEAR_PICTURES)]
+    fit_payload(start.payload, targets[:1], FULL_DENSITY)  # compiles the marcher
+    began = time.perf_counter()
+    solved = dataclasses.replace(start, payload=fit_payload(start.payload, targets, FULL_DENSITY))
+    return {
+        "linear_seconds_cpu": time.perf_counter() - began,
+        "linear_psnr_heldout_views": mean_psnr(solved, held),
+        "linear_psnr_unseen_pose": mean_psnr(solved, unseen),
+    }
 
 
 def mean_psnr(human: Human, views: Sequence[Views]) -> float:

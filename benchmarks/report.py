@@ -33,6 +33,7 @@ SOURCES = {
         "benchmarks/encoder.py --train DIR --heldout DIR --models DIR --json docs/results/encoder.json "
         "--table docs/results/encoder_table.md",
     ),
+    "refine": ("Refining on captures", "benchmarks/refine.py --assets DIR --json docs/results/refine.json"),
     "encoder_ablations": (
         "The encoder's ablations, 240 steps each, with boxes of one thickness",
         "benchmarks/encoder.py --train DIR --heldout DIR --models DIR --json docs/results/encoder_ablations.json "

@@ -20,10 +20,10 @@ from torchvision.models.detection import keypointrcnn_resnet50_fpn
 
 
 def main() -> None:
-    """Prints the mean loss of every ten steps, and saves the weights."""
+    """Prints the mean loss of every ten steps and the error of keypoints at the end, and saves the weights."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--captures", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=2000)
+    parser.add_argument("--steps", type=int, default=600)
     parser.add_argument("--batch", type=int, default=4)
     parser.add_argument("--out", type=Path, default=Path("keypoints.pth"))
     arguments = parser.parse_args()
@@ -33,7 +33,8 @@ def main() -> None:
     annotations = [one for one in coco["annotations"] if one["num_keypoints"]]
     side = max(image["width"] for image in coco["images"])
     sizes = {"min_size": side, "max_size": side}
-    model = keypointrcnn_resnet50_fpn(weights=None, weights_backbone=None, num_keypoints=17, **sizes)
+    fewer = {"box_batch_size_per_image": 16, "rpn_pre_nms_top_n_train": 200, "rpn_post_nms_top_n_train": 50}
+    model = keypointrcnn_resnet50_fpn(weights=None, weights_backbone=None, num_keypoints=17, **sizes, **fewer)
     optimiser = torch.optim.AdamW(model.parameters(), lr=2e-4)
     losses = []
     for step in range(1, arguments.steps + 1):
@@ -46,6 +47,10 @@ def main() -> None:
         if step % 10 == 0:
             print(f"step {step}  loss {np.mean(losses[-10:]):.2f}", flush=True)
     torch.save(model.state_dict(), arguments.out)
+    model.eval()
+    with torch.no_grad():
+        errors = torch.cat([error(model, *sample(files, one)) for one in annotations])
+    print(f"keypoints are off by {errors.median():.2f} pixels in the median, 90 % by {errors.quantile(0.9):.2f}")
 
 
 def sample(files: dict[int, Path], one: dict) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
@@ -59,6 +64,14 @@ def sample(files: dict[int, Path], one: dict) -> tuple[torch.Tensor, dict[str, t
         "keypoints": torch.cat([keypoints[..., :2], keypoints[..., 2:].clamp(max=1)], -1),
     }
     return torch.from_numpy(image).movedim(-1, 0) / 255, target
+
+
+def error(model: torch.nn.Module, image: torch.Tensor, target: dict[str, torch.Tensor]) -> torch.Tensor:
+    """Distances of labelled keypoints from those of the most probable human found, pixels; infinite if none is."""
+    found, (true,) = model([image])[0]["keypoints"], target["keypoints"]
+    labelled = true[:, 2] > 0
+    nearest = found[0, labelled, :2] if len(found) else torch.full((int(labelled.sum()), 2), torch.inf)
+    return (nearest - true[labelled, :2]).norm(dim=-1)
 
 
 if __name__ == "__main__":

@@ -192,7 +192,7 @@ class RefineCommand:
     .human.safetensors, or a .glb of primdiffusion people."""
     checkpoint: Path | None = None
     """Trained encoder (.safetensors) for --start encoder; the default is the one in the package."""
-    steps: int = 300
+    steps: int = 150
     """Optimiser steps, of two images each."""
     size: Pixels = 256
     """Largest side of the images used, and width and height of the previews, pixels."""

@@ -58,7 +58,7 @@ GREY = (128, 128, 128, 255)
 class RefineSettings(Checked):
     """Settings of refinement. The rates were tuned on humans in detailed clothes."""
 
-    steps: Count = 300
+    steps: Count = 150
     """Optimiser steps."""
     views: Count = 2
     """Images per step."""
