@@ -29,7 +29,6 @@ IN_ORDER = dataclasses.replace(ROUGH, compositing="index_order")
 BOXES = 2 if INTERPRETED else 1
 """The interpreter's time grows with the boxes: it draws one of so many."""
 FIELDS = ("rgb", "density", "position", "rotation", "half_extent")
-PLACE = ("position", "rotation", "half_extent")
 VIEW = ("intrinsics", "world_to_camera")
 
 
@@ -89,10 +88,15 @@ def mixed_sizes(count: int, seed: int, density: float) -> Primitives:
 
 
 def coincident(count: int, seed: int, density: float) -> Primitives:
-    """Each of `count` boxes four times in one place, but with other contents: their order shows."""
+    """Each of `count` boxes four times in one place, with other contents, and each larger than the one before it.
+
+    Their order shows, and is not that in which rays enter them.
+    """
     boxes = mixed_sizes(4 * count, seed, density)
-    places = {name: getattr(boxes, name)[:count].repeat(4, *[1] * (getattr(boxes, name).ndim - 1)) for name in PLACE}
-    return dataclasses.replace(boxes, **places)
+    position, rotation = boxes.position[:count].repeat(4, 1), boxes.rotation[:count].repeat(4, 1, 1)
+    larger = 1 + 0.1 * torch.arange(4, dtype=torch.float64).repeat_interleave(count)[:, None]
+    half_extent = boxes.half_extent[:count].repeat(4, 1) * larger
+    return dataclasses.replace(boxes, position=position, rotation=rotation, half_extent=half_extent)
 
 
 @pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
