@@ -221,8 +221,9 @@ def kernels(_: argparse.Namespace, folder: Path) -> Figures:
 
 def launches() -> Iterator[hopper.Launch]:
     """Every kernel of the marcher, as tests compile them."""
-    yield from (hopper.forward(*chosen) for chosen in SAMPLE_SETS)
-    yield hopper.backward()
+    for index_order in (False, True):
+        yield from (hopper.forward(*chosen, index_order=index_order) for chosen in SAMPLE_SETS)
+        yield hopper.backward(index_order=index_order)
     yield from hopper.small()
 
 

@@ -12,7 +12,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render import cuda
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cuda import Shapes, march_cuda
-from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, Span
+from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings, Span
 from primdiffusion.render.reference import march_reference
 from support.errors import refused
 from torch import Tensor
@@ -25,6 +25,7 @@ FACE_STEP = 3.4e-4
 """The window's value at a face, by which a sample that rounding moves in or out of a box changes."""
 ROUGH = MarchSettings(step=0.024, samples_per_voxel=1.0)
 """Few samples, to save the interpreter's time."""
+IN_ORDER = dataclasses.replace(ROUGH, compositing="index_order")
 BOXES = 2 if INTERPRETED else 1
 """The interpreter's time grows with the boxes: it draws one of so many."""
 FIELDS = ("rgb", "density", "position", "rotation", "half_extent")
@@ -86,10 +87,35 @@ def mixed_sizes(count: int, seed: int, density: float) -> Primitives:
     return random_boxes(count, seed, smallest=0.03, largest=0.12, density=density)
 
 
+def coincident(count: int, seed: int, density: float) -> Primitives:
+    """Each of `count` boxes four times in one place, with other contents, and each larger than the one before it.
+
+    Their order shows, and is not that in which rays enter them.
+    """
+    boxes = mixed_sizes(4 * count, seed, density)
+    position, rotation = boxes.position[:count].repeat(4, 1), boxes.rotation[:count].repeat(4, 1, 1)
+    larger = 1 + 0.1 * torch.arange(4, dtype=torch.float64).repeat_interleave(count)[:, None]
+    half_extent = boxes.half_extent[:count].repeat(4, 1) * larger
+    return dataclasses.replace(boxes, position=position, rotation=rotation, half_extent=half_extent)
+
+
+@pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
 @pytest.mark.parametrize("seed", range(2))
-def test_agrees_on_overlapping_boxes_from_thin_to_saturating(seed):
+def test_agrees_on_overlapping_boxes_from_thin_to_saturating(seed, settings):
     boxes = mixed_sizes(14 // BOXES, seed, 10.0 * 15**seed)
-    assert_agree(boxes, camera_at((0.2, 0.1, 0.6), fov=0.5, width=18, height=14))
+    assert_agree(boxes, camera_at((0.2, 0.1, 0.6), fov=0.5, width=18, height=14), settings)
+
+
+@pytest.mark.parametrize("density", [20.0, 90.0, 800.0])
+def test_agrees_where_rays_end_between_boxes_in_one_place(density):
+    boxes, camera = coincident(2, 19, density), camera_at((0.2, 0.1, 0.6), fov=0.3, width=16, height=12)
+    assert_agree(boxes, camera, IN_ORDER)
+    picture = draw(boxes, camera, IN_ORDER)
+    backwards = boxes.map(lambda tensor: tensor.flip(0))
+    assert_agree(backwards, camera, IN_ORDER)
+    for other in (draw(backwards, camera, IN_ORDER), draw(boxes, camera)):
+        assert (picture.rgb - other.rgb).abs().max() > 0.03
+        assert (picture.alpha - other.alpha).abs().max() < 1e-5
 
 
 def test_agrees_with_the_shapes_that_devices_use():
@@ -104,6 +130,8 @@ def test_agrees_with_the_shapes_that_devices_use():
         MarchSettings(0.006, (3, 1)),
         MarchSettings(0.05, (8, 4, 2)),
         MarchSettings(0.004, (2, 1)),
+        RELEASED,
+        MarchSettings(0.05, (8, 4, 2), compositing="index_order"),
     ],
 )
 def test_agrees_at_other_settings(settings):
@@ -149,13 +177,14 @@ def test_agrees_where_axes_reflect_and_pixels_are_oblong_and_sheared():
     assert_agree(boxes, camera)
 
 
-def test_agrees_within_a_span_with_and_without_ends():
-    boxes, camera = mixed_sizes(8, 17, 40.0), camera_at((0.0, 0.0, 0.6), fov=0.4, width=16, height=12)
+@pytest.mark.parametrize(("settings", "density"), [(ROUGH, 40.0), (IN_ORDER, 100.0)])
+def test_agrees_within_a_span_with_and_without_ends(settings, density):
+    boxes, camera = mixed_sizes(8, 17, density), camera_at((0.0, 0.0, 0.6), fov=0.4, width=16, height=12)
     near = torch.linspace(0.0, 0.7, 16, dtype=torch.float64).expand(12, 16).clone()
     far = torch.full((12, 16), 0.62, dtype=torch.float64)
     far[::2] = torch.inf
     near[3], far[3] = 0.7, 0.5
-    assert_agree(boxes, camera, span=Span(near, far))
+    assert_agree(boxes, camera, settings, Span(near, far))
 
 
 def test_nothing_gives_an_empty_picture_and_no_gradient():
@@ -183,27 +212,30 @@ def test_boxes_without_extent_draw_nothing_and_disturb_nothing():
     assert torch.equal(draw(boxes, camera).rgb, draw(kept, camera).rgb)
 
 
-def test_lists_of_bins_serve_where_lists_of_tiles_would_be_too_long(monkeypatch):
-    boxes, camera = random_boxes(6 // BOXES, 18), camera_at((0.0, 0.1, 0.5), width=20, height=16)
+@pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
+def test_lists_of_bins_serve_where_lists_of_tiles_would_be_too_long(settings, monkeypatch):
+    boxes, camera = coincident(2, 18, 60.0), camera_at((0.0, 0.1, 0.5), width=20, height=16)
     small = dataclasses.replace(WIDE, tile=(8, 8), bin=2)
-    whole = draw(boxes, camera, shapes=small)
+    whole = draw(boxes, camera, settings, shapes=small)
+    assert whole.alpha.max() == 1
     monkeypatch.setattr(cuda, "LIST_LIMIT", 0)
-    assert (draw(boxes, camera, shapes=small).rgb - whole.rgb).abs().max() < 1e-6
+    assert (draw(boxes, camera, settings, shapes=small).rgb - whole.rgb).abs().max() < 1e-6
 
 
-def test_a_batch_draws_each_person_from_each_view():
-    people = [random_boxes(4 // BOXES, seed, density=60.0) for seed in (20, 21)]
+@pytest.mark.parametrize(("settings", "density"), [(ROUGH, 60.0), (IN_ORDER, 200.0)])
+def test_a_batch_draws_each_person_from_each_view(settings, density):
+    people = [random_boxes(4 // BOXES, seed, density=density) for seed in (20, 21)]
     views = [camera_at((0.2, 0.1, 0.6), width=13, height=9), camera_at((-0.4, 0.1, 0.4), width=13, height=9)]
     scenes = [(person, view) for person in people for view in views]
     got = march_cuda(
         single(batch(*(person for person, _ in scenes))),
         single(batch(*(view for _, view in scenes))),
-        ROUGH,
+        settings,
         shapes=WIDE,
     )
     for i, (person, view) in enumerate(scenes):
-        expected = march_reference(double(person), double(view), ROUGH)
-        assert_equals(got.map(lambda tensor, i=i: tensor[i]), expected, 60.0, ROUGH.step)
+        expected = march_reference(double(person), double(view), settings)
+        assert_equals(got.map(lambda tensor, i=i: tensor[i]), expected, density, settings.step)
         assert expected.alpha.max() > 0.1
 
 
@@ -244,12 +276,30 @@ def assert_gradients_agree(boxes, camera, settings=ROUGH, span=None, shapes=WIDE
     assert_same_gradients(got, expected, **tolerance)
 
 
-@pytest.mark.parametrize("density", [2.0, 150.0])
-def test_gradients_agree_on_rays_that_stay_open_and_rays_that_saturate(density):
+@pytest.mark.parametrize(("density", "settings"), [(2.0, ROUGH), (150.0, ROUGH), (2.0, IN_ORDER), (150.0, IN_ORDER)])
+def test_gradients_agree_on_rays_that_stay_open_and_rays_that_saturate(density, settings):
     boxes, camera = mixed_sizes(8 // BOXES, 30, density), camera_at((0.2, 0.1, 0.6), fov=0.3, width=14, height=12)
     share = (march_reference(boxes, camera, ROUGH).alpha >= 1).double().mean()
     assert share > 0.2 if density > 100 else share < 0.01
-    assert_gradients_agree(boxes, camera)
+    assert_gradients_agree(boxes, camera, settings)
+
+
+@pytest.mark.parametrize("density", [30.0, 800.0])
+def test_gradients_agree_where_rays_end_between_boxes_in_one_place(density):
+    boxes, camera = coincident(1, 37, density), camera_at((0.2, 0.1, 0.6), fov=0.15, width=10, height=8)
+    assert_gradients_agree(boxes, camera, IN_ORDER)
+
+
+def test_a_box_behind_an_opaque_one_in_its_place_receives_no_gradient():
+    """From inside, where the window is 1 and the first sample is enough."""
+    box, camera = one_box(0.1, 2e3), single(batch(camera_at((0.0, 0.0, 0.01), fov=0.5, width=8, height=8)))
+    leaf = single(batch(box.map(lambda tensor: tensor.repeat(2, *[1] * (tensor.ndim - 1)))))
+    leaf = leaf.map(lambda tensor: tensor.clone().requires_grad_())
+    picture = march_cuda(leaf, camera, IN_ORDER, shapes=WIDE)
+    (picture.rgb.sum() + picture.depth.sum()).backward()
+    on_first, on_second = ([getattr(leaf, name).grad[0, i].abs().sum() for name in FIELDS] for i in range(2))
+    assert max(on_first) > 1
+    assert max(on_second) == 0
 
 
 def test_gradients_agree_with_the_shapes_that_devices_use():
@@ -262,11 +312,14 @@ def test_gradients_agree_with_the_camera_inside_boxes_and_beside_them():
     assert_gradients_agree(boxes, camera_at((0.01, 0.0, 0.05), fov=1.6, width=14, height=14))
 
 
-def test_gradients_agree_at_other_strides_and_within_a_span():
-    boxes, camera = random_boxes(4 // BOXES, 33, density=40.0), camera_at((0.2, 0.1, 0.6), fov=0.4, width=14, height=10)
+@pytest.mark.parametrize(("compositing", "density"), [("mixed", 40.0), ("index_order", 200.0)])
+def test_gradients_agree_at_other_strides_and_within_a_span(compositing, density):
+    boxes = random_boxes(4 // BOXES, 33, density=density)
+    camera = camera_at((0.2, 0.1, 0.6), fov=0.4, width=14, height=10)
     camera.intrinsics[0, 1] = 2.0
     near, far = torch.full((10, 14), 0.55, dtype=torch.float64), torch.full((10, 14), 0.68, dtype=torch.float64)
-    assert_gradients_agree(boxes, camera, MarchSettings(0.015, (3, 1)), Span(near, far))
+    settings = MarchSettings(0.015, (3, 1), compositing=compositing)
+    assert_gradients_agree(boxes, camera, settings, Span(near, far))
 
 
 def test_gradients_agree_from_two_kilometres_away():
@@ -274,17 +327,18 @@ def test_gradients_agree_from_two_kilometres_away():
     assert_gradients_agree(mixed_sizes(6 // BOXES, 34, 50.0), camera, largest=5e-3)
 
 
-def test_gradients_of_boxes_that_views_share_are_sums_over_the_views():
-    boxes = random_boxes(4 // BOXES, 35, density=60.0)
+@pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
+def test_gradients_of_boxes_that_views_share_are_sums_over_the_views(settings):
+    boxes = coincident(1, 35, 60.0)
     views = [camera_at((0.2, 0.1, 0.6), width=9, height=7), camera_at((-0.4, 0.1, 0.4), width=9, height=7)]
 
     def slow(boxes: Primitives, cameras: Camera) -> Rendering:
         each = [dataclasses.replace(cameras, **{n: getattr(cameras, n)[i] for n in VIEW}) for i in range(2)]
-        pictures = [march_reference(boxes, view, ROUGH) for view in each]
+        pictures = [march_reference(boxes, view, settings) for view in each]
         names = ("rgb", "alpha", "depth", "first_hit")
         return Rendering(*(torch.stack([getattr(picture, name) for picture in pictures]) for name in names))
 
-    got = gradients(lambda b, c: march_cuda(b, c, ROUGH, shapes=WIDE), single(batch(boxes)), single(batch(*views)))
+    got = gradients(lambda b, c: march_cuda(b, c, settings, shapes=WIDE), single(batch(boxes)), single(batch(*views)))
     expected = gradients(slow, double(boxes), double(batch(*views)))
     assert_same_gradients(got, expected)
 
@@ -341,8 +395,6 @@ def test_bad_scenes_are_rejected_as_check_scene_does():
     limit = torch.full((20, 24), torch.nan, dtype=torch.float64)
     with refused(ValueError, "span.near", "NaN"):
         draw(boxes, camera, span=Span(limit, torch.ones_like(limit)))
-    with refused(ValueError, "index_order"):
-        draw(boxes, camera, MarchSettings(compositing="index_order"))
     with refused(ValueError, "float32"):
         march_cuda(batch(boxes), batch(camera))
     with refused(ValueError, "march"):

@@ -24,30 +24,31 @@ class Launch(NamedTuple):
     options: Mapping[str, int]
 
 
-def forward(sets: int, gap: int) -> Launch:
+def forward(sets: int, gap: int, *, index_order: bool = False) -> Launch:
     """The marcher's forward kernel, for this many sets of boxes and this gap."""
     from primdiffusion.render import triton_march
 
     shapes = cuda.Shapes()
-    more = {"TILES_OF_LIST": 1, "HAS_SPAN": False, "KEEP": True, "WHOLE": True}
+    more = {"TILES_OF_LIST": 1, "HAS_SPAN": False, "KEEP": True, "WHOLE": True, "INDEX_ORDER": index_order}
     constants = cuda.march_constants(shapes, sets, gap) | more
     options = {"num_warps": shapes.march_warps, "maxnreg": shapes.march_registers}
     return Launch(triton_march.march_tiles, "fifiliifffffi", ("i32",) * 7 + ("fp32",), constants, options)
 
 
-def backward() -> Launch:
+def backward(*, index_order: bool = False) -> Launch:
     """The marcher's backward kernel."""
     from primdiffusion.render import triton_adjoint
 
     shapes = cuda.Shapes()
-    constants = {"HAS_SPAN": False, "BLOCK_WIDTH": shapes.block[0], "BLOCK_HEIGHT": shapes.block[1]}
+    constants = {"HAS_SPAN": False, "INDEX_ORDER": index_order}
+    constants |= {"BLOCK_WIDTH": shapes.block[0], "BLOCK_HEIGHT": shapes.block[1]}
     options = {"num_warps": shapes.adjoint_warps}
     return Launch(triton_adjoint.adjoint_boxes, "fififillffffff", ("i32",) * 5 + ("fp32",), constants, options)
 
 
 def small() -> Iterator[Launch]:
     """The others, also where an argument is 1 or absent: Triton compiles such kernels anew."""
-    from primdiffusion.render import triton_adjoint, triton_boxes, triton_lists
+    from primdiffusion.render import triton_adjoint, triton_boxes, triton_lists, triton_march
 
     place = {"STRIDES": (4, 2, 1), "TILE_WIDTH": 8, "TILE_HEIGHT": 4, "BIN": 8}
     place |= {"BLOCK_WIDTH": 8, "BLOCK_HEIGHT": 4, "LANES": cuda.LANES}
@@ -62,9 +63,15 @@ def small() -> Iterator[Launch]:
         (triton_adjoint.finish_boxes, "lffffffffff", 0, one | {"views": 1}, 4),
     ):
         yield Launch(kernel, pointers, ("i32",) * scalars, constants, {"num_warps": warps})
-    tiles = lists | {"TILE_WIDTH": 8, "TILE_HEIGHT": 4}
+    tiles = {"TILE_WIDTH": 8, "TILE_HEIGHT": 4}
+    end, end_of = triton_march.end_in_order, tiles | {"TILES_OF_LIST": 1}
+    yield Launch(end, "fifiliffi", ("i32",) * 7 + ("fp32",), end_of, {"num_warps": 1})
+    yield Launch(end, "fifiliffi", ("i32",) * 5 + ("fp32",), end_of | one, {"num_warps": 1})
+    tiles |= lists
     yield Launch(triton_lists.list_tiles, "ilifiilil", ("i32",) * 4 + ("fp32",), tiles, {"num_warps": 1})
-    yield Launch(triton_adjoint.seed_rays, "ffffif", ("i32", "fp32"), {"LANES": 256}, {"num_warps": 4})
+    for index_order in (False, True):
+        constants = {"INDEX_ORDER": index_order, "LANES": cuda.LANES_OF_SEEDS}
+        yield Launch(triton_adjoint.seed_rays, "ffffif", ("i32", "fp32"), constants, {"num_warps": 4})
 
 
 def compiled(launch: Launch) -> Any:

@@ -1,7 +1,8 @@
 """The fast marcher for CUDA devices: Triton kernels, float32, batched, with a hand-written adjoint (SPEC 4).
 
 The same rule as `reference.py`. Triton compiles the kernels on first use and caches them on disk; it is imported only
-then, so that this module loads without it. An image takes the launches of `_prepare` and one of `march_tiles`.
+then, so that this module loads without it. An image takes the launches of `_prepare` and one of `march_tiles`; in
+index order one more, of `end_in_order`.
 """
 
 from __future__ import annotations
@@ -65,11 +66,11 @@ def available(device: torch.device | str = "cuda") -> bool:
     return torch.device(device).type == "cuda" and importlib.util.find_spec("triton") is not None
 
 
-def suits(primitives: Primitives, camera: Camera, settings: MarchSettings) -> bool:
-    """Whether `march_cuda` supports the scene: float32, voxels of 8^3, "mixed" compositing."""
+def suits(primitives: Primitives, camera: Camera) -> bool:
+    """Whether `march_cuda` supports the scene: float32, voxels of 8^3."""
     tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
     single = all(tensor.dtype == torch.float32 for tensor in tensors)
-    return single and primitives.density.shape[-3:] == (S, S, S) and settings.compositing == "mixed"
+    return single and primitives.density.shape[-3:] == (S, S, S)
 
 
 def march_cuda(
@@ -79,19 +80,20 @@ def march_cuda(
     span: Span | None = None,
     shapes: Shapes = Shapes(),
 ) -> Rendering:
-    """As `march_reference` with "mixed" compositing, in float32 on a CUDA device; images [B, H, W].
+    """As `march_reference`, in float32 on a CUDA device; images [B, H, W].
 
     `primitives` have one leading dimension, 1 or B (1: all views see the same boxes), `camera` and `span` B.
     Differentiable once in every tensor of primitives and camera. Images and gradients are deterministic. Voxel
     gradients are summed in tf32 (eleven significant bits per term). Synchronises with the device once per call, for
     checks and the lengths of lists. Memory beyond inputs and outputs: 9 KB per box, and 16 bytes for each tile that a
     box touches, at most `LIST_LIMIT` of them; with gradients 40 bytes per pixel, and during the backward pass another
-    32 per pixel and 8 KB for every 512 pixels of a box (for more pixels in larger images).
+    32 per pixel and 8 KB for every 512 pixels of a box (for more pixels in larger images). In index order 40 bytes per
+    pixel even without gradients, and lists twice.
 
-    Raises ValueError as `check_scene` does, for other compositing, voxels other than 8^3 and dtypes other than float32;
-    ImportError without Triton.
+    Raises ValueError as `check_scene` does, for voxels other than 8^3 and dtypes other than float32; ImportError
+    without Triton.
     """
-    _check(primitives, camera, settings, span)
+    _check(primitives, camera, span)
     if importlib.util.find_spec("triton") is None:
         raise ImportError(
             "march_cuda needs Triton, which is not installed: install the version of triton that your torch requires "
@@ -120,6 +122,11 @@ class _Scene(NamedTuple):
     """Whether there will be a backward pass."""
 
     @property
+    def index_order(self) -> bool:
+        """Whether boxes are composited in the order of their index."""
+        return self.settings.compositing == "index_order"
+
+    @property
     def unit(self) -> int:
         """Common divisor of all strides, in lattice points: the unit of the kernels."""
         return math.gcd(*self.settings.strides)
@@ -135,17 +142,26 @@ class _Scene(NamedTuple):
         return tuple(stride // self.unit for stride in self.settings.strides)
 
 
+class _Lists(NamedTuple):
+    """The boxes of each tile, or of each bin."""
+
+    entries: Int[Tensor, "n 4"]
+    begin: Int[Tensor, "b lists"]
+    count: Int[Tensor, "b lists"]
+    tiles_of_list: int
+
+
 class _Prepared(NamedTuple):
-    """Packed boxes (see `triton_boxes`), and the lists of boxes of each tile."""
+    """Packed boxes (see `triton_boxes`), and their lists."""
 
     voxels: Float[Tensor, "p k 512 4"]
     record: Float[Tensor, "b k 32"]
     indices: Int[Tensor, "b k 16"]
     reach: Int[Tensor, "b h w 2"] | None
-    entries: Int[Tensor, "n 4"]
-    begin: Int[Tensor, "b lists"]
-    count: Int[Tensor, "b lists"]
-    tiles_of_list: int
+    lists: _Lists
+    """Nearest box first."""
+    in_order: _Lists | None
+    """Lowest index first; only in index order."""
     gap: int
     """The largest of 1, 2, 4 that divides the strides of all visible boxes."""
     units: int
@@ -157,14 +173,12 @@ def _launch(kernel: Any, grid: tuple[int, ...], *arguments: Any, **options: Any)
     kernel[grid](*arguments, **options, num_stages=1)
 
 
-def _check(primitives: Primitives, camera: Camera, settings: MarchSettings, span: Span | None) -> None:
+def _check(primitives: Primitives, camera: Camera, span: Span | None) -> None:
     """Check everything that needs no synchronisation with the device."""
     tensors = [*vars(primitives).values(), camera.intrinsics, camera.world_to_camera]
     if any(tensor.dtype != torch.float32 for tensor in tensors):
         dtypes = sorted({str(tensor.dtype) for tensor in tensors})
         raise ValueError(f"march_cuda takes float32, not {dtypes}: convert with .to(), or call march_reference")
-    if settings.compositing != "mixed":
-        raise ValueError(f"march_cuda does not composite by {settings.compositing!r}: call march_reference")
     b, k = camera.intrinsics.shape[0] if camera.intrinsics.ndim == 3 else -1, primitives.position.shape[-2]
     p = primitives.position.shape[0] if primitives.position.ndim == 3 else -1
     shapes = [(p, k, 3), (p, k, 3, 3), (p, k, 3), (p, k, 3, S, S, S), (p, k, S, S, S), (b, 3, 3), (b, 3, 4)]
@@ -191,7 +205,7 @@ def _lattice(spacing: float, thresholds: tuple[float, ...], device: torch.device
 def _prepare(scene: _Scene, boxes: list[Tensor], intrinsics: Tensor, world_to_camera: Tensor) -> _Prepared:
     """Pack, place and check the boxes, and list them by tile."""
     # triton is optional
-    from primdiffusion.render import triton_boxes, triton_lists
+    from primdiffusion.render import triton_boxes
 
     position, rotation, half_extent, rgb, density = boxes
     shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height
@@ -225,6 +239,23 @@ def _prepare(scene: _Scene, boxes: list[Tensor], intrinsics: Tensor, world_to_ca
     if wrong or no_number:
         check_scene(scene.primitives, scene.camera, scene.span)
     gap = 1 if finest & 1 else 2 if finest & 2 else 4
+    lists = _list(scene, order, record, indices, totals, in_bins, in_tiles)
+    in_order = None
+    if scene.index_order:
+        by_index = torch.arange(k, device=device).repeat(b, 1)
+        in_order = _list(scene, by_index, record, indices, torch.zeros_like(totals), in_bins, in_tiles)
+    return _Prepared(voxels, record, indices, reach, lists, in_order, gap, units)
+
+
+def _list(
+    scene: _Scene, order: Tensor, record: Tensor, indices: Tensor, totals: Tensor, in_bins: int, in_tiles: int
+) -> _Lists:
+    """List the boxes of each tile in `order` [b, k]; `totals` counts the entries written."""
+    # triton is optional
+    from primdiffusion.render import triton_lists
+
+    (b, k), device = order.shape, order.device
+    shapes, width, height = scene.shapes, scene.camera.width, scene.camera.height
     across, down = -(-width // shapes.tile[0]), -(-height // shapes.tile[1])
     bins_across, bins_down = -(-across // shapes.bin), -(-down // shapes.bin)
     bins, tiles = bins_across * bins_down, across * down
@@ -249,13 +280,13 @@ def _prepare(scene: _Scene, boxes: list[Tensor], intrinsics: Tensor, world_to_ca
         num_warps=4,
     )
     if in_tiles > LIST_LIMIT:
-        return _Prepared(voxels, record, indices, reach, *bin_lists, shapes.bin, gap, units)
+        return _Lists(*bin_lists, shapes.bin)
     tile_lists = a_list(in_tiles, tiles)
     _launch(triton_lists.list_tiles, (tiles, b), 
         *bin_lists, record, indices, *tile_lists, totals, k, across, bins_across, bins, scene.spacing,
         BIN=shapes.bin, TILE_WIDTH=shapes.tile[0], TILE_HEIGHT=shapes.tile[1], LANES=LANES_OF_TILE, num_warps=1,
     )  # fmt: skip
-    return _Prepared(voxels, record, indices, reach, *tile_lists, 1, gap, units)
+    return _Lists(*tile_lists, 1)
 
 
 def march_constants(shapes: Shapes, sets: int, gap: int) -> dict[str, int]:
@@ -287,24 +318,31 @@ class _March(torch.autograd.Function):
         new = functools.partial(torch.empty, device=intrinsics.device)
         flat = (b, height, width)
         picture = (new((*flat, 3)), new(flat), new(flat), new(flat))
-        kept = new((*flat, 8) if scene.keep else 0)
-        ends = new((*flat, 2) if scene.keep else 0, dtype=torch.int32)
+        keep = scene.keep or scene.index_order
+        kept = new((*flat, 8) if keep else 0)
+        ends = new((*flat, 2) if keep else 0, dtype=torch.int32)
         fine = math.gcd(max(scene.strides), 4)
         gap = min(ready.gap, fine)
         across, down = -(-width // shapes.tile[0]), -(-height // shapes.tile[1])
-        list_across = -(-across // ready.tiles_of_list)
+        packed, (*lists, tiles_of_list) = (ready.record, ready.indices, ready.voxels), ready.lists
+        list_across = -(-across // tiles_of_list)
+        sizes = (k, k if p == b else 0, height, width, across, list_across, lists[1].shape[1], scene.spacing)
         _launch(triton_march.march_tiles, (across * down, b), 
-            ready.record, ready.indices, ready.voxels, ready.entries, ready.begin, ready.count, ready.reach, *picture,
-            kept, ends, k, k if p == b else 0, height, width, across, list_across, ready.begin.shape[1], scene.spacing,
-            TILES_OF_LIST=ready.tiles_of_list, HAS_SPAN=ready.reach is not None, KEEP=scene.keep,
-            WHOLE=all(fine % stride == 0 for stride in scene.strides),
+            *packed, *lists, ready.reach, *picture, kept, ends, *sizes,
+            TILES_OF_LIST=tiles_of_list, HAS_SPAN=ready.reach is not None, KEEP=keep,
+            WHOLE=all(fine % stride == 0 for stride in scene.strides), INDEX_ORDER=scene.index_order,
             **march_constants(shapes, fine // gap, gap), num_warps=shapes.march_warps, maxnreg=shapes.march_registers,
         )  # fmt: skip
+        if ready.in_order is not None:
+            _launch(triton_march.end_in_order, (across * down, b), 
+                *packed, *ready.in_order[:3], picture[0], kept, ends, *sizes,
+                TILES_OF_LIST=tiles_of_list, TILE_WIDTH=shapes.tile[0], TILE_HEIGHT=shapes.tile[1], num_warps=1,
+            )  # fmt: skip
         ctx.mark_non_differentiable(picture[3])
-        ctx.shapes, ctx.spacing, ctx.units = shapes, scene.spacing, ready.units
+        ctx.shapes, ctx.spacing, ctx.units, ctx.index_order = shapes, scene.spacing, ready.units, scene.index_order
         geometry = (*boxes[:3], intrinsics, world_to_camera)
         if scene.keep:
-            ctx.save_for_backward(*geometry, ready.voxels, ready.record, ready.indices, ready.reach, kept, ends)
+            ctx.save_for_backward(*geometry, *packed, ready.reach, kept, ends)
         return picture
 
     @staticmethod
@@ -312,17 +350,25 @@ class _March(torch.autograd.Function):
     def backward(ctx: Any, *on_picture: Tensor) -> tuple[Tensor | None, ...]:  # type: ignore[override]
         if ctx.units is None:
             return None, *(on_picture[0].new_zeros(shape) for shape in ctx.nothing)
-        return None, *_adjoint(ctx.shapes, ctx.spacing, ctx.units, *on_picture[:3], *ctx.saved_tensors)
+        settings = (ctx.shapes, ctx.spacing, ctx.units, ctx.index_order)
+        return None, *_adjoint(*settings, *on_picture[:3], *ctx.saved_tensors)
 
 
 def _adjoint(
-    shapes: Shapes, spacing: float, units: int, on_rgb: Tensor, on_alpha: Tensor, on_depth: Tensor, *saved: Tensor
+    shapes: Shapes,
+    spacing: float,
+    units: int,
+    index_order: bool,
+    on_rgb: Tensor,
+    on_alpha: Tensor,
+    on_depth: Tensor,
+    *saved: Tensor,
 ) -> tuple[Tensor, ...]:
     """Gradients in the order of `_March.forward`'s tensors."""
     # triton is optional
     from primdiffusion.render import triton_adjoint
 
-    position, rotation, half_extent, intrinsics, world_to_camera, voxels, record, indices, reach, kept, ends = saved
+    position, rotation, half_extent, intrinsics, world_to_camera, record, indices, voxels, reach, kept, ends = saved
     height, width = on_alpha.shape[1:]
     (p, k), b, device = position.shape[:2], len(intrinsics), position.device
     own_boxes = k if p == b else 0
@@ -332,7 +378,7 @@ def _adjoint(
     rays = b * height * width
     _launch(triton_adjoint.seed_rays, (-(-rays // LANES_OF_SEEDS),), 
         on_rgb.contiguous(), on_alpha.contiguous(), on_depth.contiguous(), kept, ends, seeds, rays, spacing,
-        LANES=LANES_OF_SEEDS, num_warps=4,
+        INDEX_ORDER=index_order, LANES=LANES_OF_SEEDS, num_warps=4,
     )  # fmt: skip
     blocks = indices[..., 12].flatten().long()
     blocks_of_unit = shapes.blocks_for(b * height * width)
@@ -345,8 +391,8 @@ def _adjoint(
         _launch(triton_adjoint.adjoint_boxes, (units,), 
             record, indices, voxels, reach, seeds, ends, unit_box, unit_part, rotation, half_extent, intrinsics,
             world_to_camera, unit_voxels, unit_sums, k, own_boxes, height, width, blocks_of_unit,
-            spacing, HAS_SPAN=reach is not None, BLOCK_WIDTH=shapes.block[0], BLOCK_HEIGHT=shapes.block[1],
-            num_warps=shapes.adjoint_warps,
+            spacing, HAS_SPAN=reach is not None, INDEX_ORDER=index_order, BLOCK_WIDTH=shapes.block[0],
+            BLOCK_HEIGHT=shapes.block[1], num_warps=shapes.adjoint_warps,
         )  # fmt: skip
     on_boxes = [new(shape) for shape in ((p, k, 3), (p, k, 3, 3), (p, k, 3), (p, k, 3, S, S, S), (p, k, S, S, S))]
     on_camera = new((b, k, 12))

@@ -24,8 +24,10 @@ SUMS = 24
 
 
 @triton.jit
-def seed_rays(g_rgb, g_alpha, g_depth, kept, ends, seeds, rays, spacing, LANES: tl.constexpr):
-    """Per-ray inputs of the samples' gradients: g_rgb 0-2, g_distance 3, h 4, kappa 5."""
+def seed_rays(
+    g_rgb, g_alpha, g_depth, kept, ends, seeds, rays, spacing, INDEX_ORDER: tl.constexpr, LANES: tl.constexpr
+):  # fmt: skip
+    """Per-ray inputs of the samples' gradients: g_rgb 0-2, g_distance 3, h 4, kappa 5, with INDEX_ORDER its box 6."""
     ray = tl.program_id(0).to(tl.int64) * LANES + tl.arange(0, LANES)
     here = ray < rays
     red = tl.load(g_rgb + ray * 3, here, 0.0)
@@ -48,6 +50,8 @@ def seed_rays(g_rgb, g_alpha, g_depth, kept, ends, seeds, rays, spacing, LANES: 
     tl.store(seeds + ray * 8 + 3, distance, here)
     tl.store(seeds + ray * 8 + 4, tl.where(opaque, -at_end, open_), here)
     tl.store(seeds + ray * 8 + 5, tl.where(opaque, tl.load(kept + ray * 8, here, 0.0), 1.0), here)
+    if INDEX_ORDER:
+        tl.store(seeds + ray * 8 + 6, tl.load(kept + ray * 8 + 6, here, 0.0), here)
 
 
 @triton.jit
@@ -114,9 +118,13 @@ def adjoint_boxes(
     record, indices, voxels, reach, seeds, ends, unit_box, unit_part,
     rotation, half_extent, intrinsics, world_to_camera, out_voxels, out_sums,
     boxes, own_boxes, height, width, blocks_of_unit, spacing,
-    HAS_SPAN: tl.constexpr, BLOCK_WIDTH: tl.constexpr, BLOCK_HEIGHT: tl.constexpr,
+    HAS_SPAN: tl.constexpr, INDEX_ORDER: tl.constexpr, BLOCK_WIDTH: tl.constexpr, BLOCK_HEIGHT: tl.constexpr,
 ):  # fmt: skip
-    """One unit: up to `blocks_of_unit` blocks of the pixels that a box covers in a view."""
+    """One unit: up to `blocks_of_unit` blocks of the pixels that a box covers in a view.
+
+    With INDEX_ORDER, at the point that saturates a ray only the box in its seed has the share kappa: boxes of lower
+    index have 1, those of higher index 0.
+    """
     unit = tl.program_id(0).to(tl.int64)
     k = tl.load(unit_box + unit).to(tl.int64)
     view = k // boxes
@@ -162,6 +170,10 @@ def adjoint_boxes(
         first = n0 + tl.ceil(tl.minimum(tl.maximum(low, -1e9), 1e9) - 0.01).to(tl.int32)
         last = n0 + tl.floor(tl.minimum(tl.maximum(high, -1e9), 1e9) + 0.01).to(tl.int32)
         first, last = tl.maximum(first, 1), tl.minimum(last, end)
+        if INDEX_ORDER:
+            own, saturating = (k % boxes).to(tl.float32), tl.load(seeds + ray * 8 + 6, here, 0.0)
+            last = tl.where(own > saturating, tl.minimum(last, end - 1), last)
+            end = tl.where(own == saturating, end, NEVER)
         if HAS_SPAN:
             first = tl.maximum(first, tl.load(reach + ray * 2, here, NEVER))
             last = tl.minimum(last, tl.load(reach + ray * 2 + 1, here, 0))

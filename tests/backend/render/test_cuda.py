@@ -14,7 +14,6 @@ import pytest
 import torch
 from march_scenes import camera_at, random_boxes
 from primdiffusion.render import cuda
-from primdiffusion.render.lattice import RELEASED, MarchSettings
 from support import hopper
 
 CASES = Path(__file__).parents[1] / "march_cuda_cases.py"
@@ -75,19 +74,21 @@ def used(launch: hopper.Launch, folder: Path):
 
 
 @with_triton
+@pytest.mark.parametrize("index_order", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("sets", "gap"), [(2, 2), *(pytest.param(*others, marks=pytest.mark.slow) for others in ((1, 4), (1, 1), (4, 1)))]
 )
-def test_the_forward_kernel_fits_into_registers(sets, gap, tmp_path):
-    kernel, found = used(hopper.forward(sets, gap), tmp_path)
+def test_the_forward_kernel_fits_into_registers(sets, gap, index_order, tmp_path):
+    kernel, found = used(hopper.forward(sets, gap, index_order=index_order), tmp_path)
     assert found["STACK"] == 0
     assert found["REG"] <= cuda.Shapes().march_registers
     assert "ld.global.v4" in kernel.asm["ptx"]
 
 
 @with_triton
-def test_the_backward_kernel_fits_into_registers_and_uses_tensor_cores(tmp_path):
-    kernel, found = used(hopper.backward(), tmp_path)
+@pytest.mark.parametrize("index_order", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_the_backward_kernel_fits_into_registers_and_uses_tensor_cores(index_order, tmp_path):
+    kernel, found = used(hopper.backward(index_order=index_order), tmp_path)
     assert found["STACK"] == 0
     assert "mma.sync" in kernel.asm["ptx"]
     assert "ld.global.v4" in kernel.asm["ptx"]
@@ -102,7 +103,6 @@ def test_the_small_kernels_compile_without_spilling(tmp_path):
 
 def test_suits_what_it_can_draw():
     boxes, camera = random_boxes(1).to(dtype=torch.float32), camera_at((0.0, 0.0, 0.5)).to(dtype=torch.float32)
-    assert cuda.suits(boxes, camera, MarchSettings())
-    assert not cuda.suits(boxes, camera, RELEASED)
-    assert not cuda.suits(boxes, camera.to(dtype=torch.float64), MarchSettings())
-    assert not cuda.suits(random_boxes(1, size=4).to(dtype=torch.float32), camera, MarchSettings())
+    assert cuda.suits(boxes, camera)
+    assert not cuda.suits(boxes, camera.to(dtype=torch.float64))
+    assert not cuda.suits(random_boxes(1, size=4).to(dtype=torch.float32), camera)

@@ -138,7 +138,8 @@ def test_gradients_reach_the_boxes_through_the_released_settings_and_backgrounds
     assert all(tensor.grad.abs().sum() > 0 for tensor in vars(leaves).values())
 
 
-def test_on_cuda_devices_a_batch_is_one_call_and_one_person_is_not_copied(monkeypatch):
+@pytest.mark.parametrize("settings", [MarchSettings(), RELEASED])
+def test_on_cuda_devices_a_batch_is_one_call_and_one_person_is_not_copied(settings, monkeypatch):
     """The call is recorded and answered by the CPU's back end: which tensors go in, and where pictures come out."""
     calls = []
 
@@ -155,16 +156,15 @@ def test_on_cuda_devices_a_batch_is_one_call_and_one_person_is_not_copied(monkey
         (boxes, one(cameras, 1), (2, 2)),
         (one(boxes, 0), one(cameras, 0), (1, 1)),
     ]
-    expected = [march(person, view) for person, view, _ in scenes]
+    expected = [march(person, view, settings) for person, view, _ in scenes]
     monkeypatch.setattr(cuda, "available", lambda device: True)
     monkeypatch.setattr(cuda, "march_cuda", march_cuda)
     for (person, view, sizes), pictures in zip(scenes, expected, strict=True):
-        got = march(person, view)
+        got = march(person, view, settings)
         assert calls[-1] == (*sizes, None)
         for name in FIELDS:
             assert torch.equal(getattr(got, name), getattr(pictures, name)), name
-    march(boxes.to(dtype=torch.float64), one(cameras, 0).to(dtype=torch.float64))
-    march(boxes, one(cameras, 0), RELEASED)
+    march(boxes.to(dtype=torch.float64), one(cameras, 0).to(dtype=torch.float64), settings)
     assert len(calls) == len(scenes)
 
 
