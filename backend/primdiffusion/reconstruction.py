@@ -41,6 +41,9 @@ OBSERVATIONS = 150.0
 pixels; more would fit them to noise, fewer would ignore the view."""
 PIXEL_STD = 0.08
 """Standard deviation of such a pixel from what the best coefficients draw, in encoded colour."""
+PULL, SMOOTHNESS = 2.0, 1.0
+"""Penalties of the voxels' fit to one view (`InverseSettings`), which each further view outweighs more. As small as for
+many views, they would let one view change what only other sides show."""
 COARSE_SIDE, FINE_SIDE = 176, 512
 """Largest sides of the pictures for coefficients and for voxels, pixels."""
 
@@ -135,7 +138,9 @@ class PersonComponents:
             drawn_by = generator if step == STEPS - 1 else None
             coefficients = self.closer(coefficients, targets, drawn_by)
             on_step()
-        payload = fit_payload(self.payload(coefficients), targets_of(views, frames, FINE_SIDE), self.full_density)
+        targets = targets_of(views, frames, FINE_SIDE)
+        settings = InverseSettings(pull=PULL / len(targets), smoothness=SMOOTHNESS / len(targets))
+        payload = fit_payload(self.payload(coefficients), targets, self.full_density, settings)
         on_step()
         return payload
 
