@@ -153,7 +153,7 @@ def seconds() -> None:
 def distance() -> None:
     parser = options(people=32)
     parser.add_argument("--reference", type=Path, default=Path("runs/reference"), help="folder for portraits of meshes")
-    parser.add_argument("--meshes", type=int, default=300, help="geometries of the reference; half as many held out")
+    parser.add_argument("--meshes", type=int, default=160, help="geometries of the reference; half as many held out")
     arguments = parser.parse_args()
     model = load_checkpoint(arguments.checkpoint)
     assets = open_assets(arguments.assets, required_meshes())
