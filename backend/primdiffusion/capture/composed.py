@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
-from jaxtyping import Bool, Float32, UInt8, UInt16
+from jaxtyping import Float32, UInt8, UInt16
 from PIL import Image
 
 from primdiffusion.capture.reader import Subject
@@ -91,18 +91,15 @@ class StoredView:
 
 def drawn_box(views: Sequence[StoredView]) -> Box:
     """The smallest box around all pixels of the images and masks that are not 0: there are no humans outside of it."""
-    rows, columns = np.zeros(views[0].mask.shape[0], np.bool_), np.zeros(views[0].mask.shape[1], np.bool_)
-    for view in views:
-        for picture in (view.img, view.mask):
-            if picture.size:
-                rows |= picture.reshape(len(rows), -1).max(1) > 0
-                columns |= picture.max(0).reshape(len(columns), -1).max(1) > 0
-    return _extent(rows), _extent(columns)
+    pictures = [picture for view in views for picture in (view.img, view.mask) if picture.size]
+    rows = _extent([picture.reshape(len(picture), -1).max(1) for picture in pictures])
+    highest = [picture[rows].max(0, initial=0) for picture in pictures]
+    return rows, _extent([of_column.reshape(len(of_column), -1).max(1) for of_column in highest])
 
 
-def _extent(found: Bool[np.ndarray, "n"]) -> slice:
-    """From the first to the last that is found."""
-    (places,) = np.nonzero(found)
+def _extent(values: Sequence[UInt8[np.ndarray, "n"]]) -> slice:
+    """From the first to the last place at which one of the values is not 0."""
+    (places,) = np.nonzero(np.max(values, axis=0))
     return slice(places[0], places[-1] + 1) if len(places) else slice(0)
 
 

@@ -65,7 +65,9 @@ def read_grey_png(file: BinaryIO, width: int, height: int, kind: type[np.unsigne
     if len(filtered) != height * stride or not inflating.eof or inflating.unused_data:
         return None
     rows = np.frombuffer(filtered, np.uint8).reshape(height, stride)
-    return None if rows[:, 0].any() else rows[:, 1:].copy().view(np.dtype(kind).newbyteorder(">")).astype(kind)
+    if rows[:, 0].any():  # filtered
+        return None
+    return rows[:, 1:].copy().view(np.dtype(kind).newbyteorder(">")).astype(kind, copy=False)
 
 
 def _png_head(width: int, height: int, bits: int, colour: int) -> bytes:

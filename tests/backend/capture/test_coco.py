@@ -1,6 +1,7 @@
 """COCO annotations of captures: as pycocotools reads them, and against masks, joints and rays cast at the mesh."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
@@ -172,6 +173,30 @@ def test_random_masks_come_back():
     for height, width in ((1, 1), (1, 7), (6, 1), (9, 5)):
         for mask in rng.random((20, height, width)) < 0.5:
             assert np.array_equal(decoded(run_lengths(mask), height, width), mask)
+
+
+def test_run_lengths_are_those_of_pycocotools():
+    tools = pytest.importorskip("pycocotools.mask")
+    rng = np.random.default_rng(4)
+    masks = [rng.random((17, 23)) < share for share in (0, 0.02, 0.5, 0.98, 1)]
+    masks += [np.pad(np.ones((5, 4), bool), ((top, 9 - top), (left, 8 - left))) for top in (0, 9) for left in (0, 8)]
+    for mask in masks:
+        height, width = mask.shape
+        own = tools.frPyObjects({"size": [height, width], "counts": run_lengths(mask)}, height, width)
+        assert own == tools.encode(np.asfortranarray(mask, np.uint8))
+
+
+def test_the_face_is_that_of_the_whole_body(bodies):
+    subject = open_captures(bodies).subject(NAME)
+    for betas in (subject.smpl.betas, np.linspace(-2, 2, 4, dtype=np.float32)):
+        shaped = default_body().to(dtype=torch.float64).shape(torch.from_numpy(betas).double())
+        poses = [shaped.pose(subject.smpl.pose(frame).to(dtype=torch.float64)) for frame in range(subject.frames)]
+        face = np.stack([posed.vertices.numpy()[list(FACE.values())].mean(1) for posed in poses])
+        moved = dataclasses.replace(subject, smpl=dataclasses.replace(subject.smpl, betas=betas))
+        joints = np.stack([posed.joints[:, :3, 3].numpy() for posed in poses])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("primdiffusion.capture.coco.joints_of", lambda _, joints=joints: joints)
+            np.testing.assert_allclose(keypoints_of(moved)[:, : len(FACE)], face, rtol=0, atol=1e-12)
 
 
 def test_the_command_writes_the_same_bytes_again_and_rendering_goes_on(root, whole, capsys):
