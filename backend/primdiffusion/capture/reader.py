@@ -278,11 +278,10 @@ def _read(file: BinaryIO, path: Path, kind: str, width: int, height: int) -> np.
     """
     bytes_each = _BYTES_OF_A_PIXEL.get(kind, 4)
     with _named(path):
-        small = width * height * bytes_each <= decoded_bytes(file.seek(0, os.SEEK_END))
-        if small and kind in ("mask", "depth", "part"):
-            found = read_grey_png(file, width, height, np.uint16 if kind == "depth" else np.uint8)
-            if found is not None:
-                return found
+        backed = width * height * bytes_each <= decoded_bytes(file.seek(0, os.SEEK_END))  # else Pillow's way says so
+        found = read_grey_png(file, width, height, _GREY[kind]) if backed and kind in _GREY else None
+    if found is not None:
+        return found
     with _named(path), opened_picture(file, bytes_each=bytes_each) as picture:
         size = picture.size
         if size == (width, height) and kind == "depth":
@@ -381,4 +380,5 @@ def _as_stored(values: np.ndarray) -> np.ndarray:
 
 _BYTES_OF_A_PIXEL = {"img": 4, "mask": 1, "depth": 4, "normal": 12, "part": 1}
 """Of a view in memory."""
+_GREY = {"mask": np.uint8, "depth": np.uint16, "part": np.uint8}
 _KINDS = {"img": _as_stored, "mask": _as_stored, "depth": _depth, "normal": _normal, "part": _as_stored}
