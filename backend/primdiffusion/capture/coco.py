@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import csv
 import dataclasses
+import functools
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -21,10 +22,18 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8, UInt16
+from jaxtyping import Bool, Float
+from torch import Tensor
 
-from primdiffusion.body.model import default_body
-from primdiffusion.capture.composed import Backgrounds, StoredView, composed_path, uncovered, write_composed
+from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
+from primdiffusion.capture.composed import (
+    Backgrounds,
+    StoredView,
+    composed_path,
+    drawn_box,
+    uncovered,
+    write_composed,
+)
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import joints_of
 from primdiffusion.formats import capture_layout
@@ -108,10 +117,15 @@ def write_coco(
 
 def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
     """COCO's uncompressed run lengths: of pixels column by column, outside and inside in turn, outside first."""
-    pixels = mask.T.ravel()
-    changes = np.flatnonzero(pixels[1:] != pixels[:-1]) + 1
-    runs = np.diff(changes, prepend=0, append=pixels.size).tolist()
-    return [0, *runs] if pixels[0] else runs
+    columns = np.flatnonzero(mask.any(0))
+    if not len(columns):
+        return [mask.size]
+    height = len(mask)
+    pixels = np.zeros(height * (columns[-1] + 1 - columns[0]) + 2, np.bool_)  # one outside at each end
+    pixels[1:-1] = mask.T[columns[0] : columns[-1] + 1].ravel()
+    changes = np.flatnonzero(pixels[1:] != pixels[:-1]) + height * columns[0]
+    runs = np.diff(changes, prepend=0, append=mask.size).tolist()
+    return runs if runs[-1] else runs[:-1]
 
 
 def keypoints_of(subject: Subject) -> Float[np.ndarray, "F 17 3"]:
@@ -125,25 +139,41 @@ def keypoints_of(subject: Subject) -> Float[np.ndarray, "F 17 3"]:
     points[:, len(FACE) :] = joints[:, _JOINTS]
     if len(subject.smpl.betas) > body.shape_basis.shape[-1]:
         return points
-    shaped = body.to(dtype=torch.float64).shape(torch.from_numpy(subject.smpl.betas).double())
-    for frame in range(subject.frames):
-        posed = shaped.pose(subject.smpl.pose(frame).to(dtype=torch.float64))
-        apart = np.linalg.norm(posed.joints[:, :3, 3].numpy() - joints[frame], axis=-1)
-        if apart.max() <= SAME_BODY:
-            points[frame, : len(FACE)] = posed.vertices.numpy()[list(FACE.values())].mean(1)
+    smpl = subject.smpl
+    poses = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
+    posed = _face().shape(torch.from_numpy(smpl.betas).double()).pose(poses.to(dtype=torch.float64))
+    apart = np.linalg.norm(posed.joints[..., :3, 3].numpy() - joints, axis=-1).max(-1)
+    face = posed.vertices[:, : 2 * len(FACE)].unflatten(1, (-1, 2)).mean(2).numpy()
+    points[:, : len(FACE)] = np.where((apart <= SAME_BODY)[:, None, None], face, np.nan)
     return points
 
 
-def visibility(
-    view: View,
-    points: Float[np.ndarray, "17 3"],
-    mask: UInt8[np.ndarray, "H W"],
-    depth: UInt16[np.ndarray, "H W"],
-) -> tuple[Float[np.ndarray, "17 2"], list[int]]:
-    """Pixels of keypoints in the world, pixel centres at +0.5, and COCO's visibility of each.
+@functools.cache
+def _face() -> BodyModel:
+    """The default body, float64, of the face's vertices and one for each joint, where the body's shape puts it."""
+    body = default_body().to(dtype=torch.float64)
+    chosen = [vertex for pair in FACE.values() for vertex in pair]
 
-    A keypoint is visible if the surface at its pixel is at most THICKNESS in front of it, or if there is none. `mask`
-    and `depth` are as stored; depth does not reach beyond 16 m, where keypoints in the mask count as hidden.
+    def few(values: Tensor) -> Tensor:
+        return torch.cat([values[chosen], torch.tensordot(body.joint_regressor, values, 1)])
+
+    return dataclasses.replace(
+        body,
+        template=few(body.template),
+        shape_basis=few(body.shape_basis),
+        pose_basis=few(body.pose_basis),
+        joint_regressor=torch.eye(len(chosen) + J, dtype=torch.float64)[len(chosen) :],
+        skin_weights=few(body.skin_weights),
+    )
+
+
+def visibility(
+    view: View, points: Float[np.ndarray, "17 3"], humans: Sequence[StoredView]
+) -> tuple[Float[np.ndarray, "17 2"], list[int]]:
+    """Pixels of keypoints in the world, pixel centres at +0.5, and COCO's visibility of each among all humans in view.
+
+    A keypoint is visible if the surface at its pixel is at most THICKNESS in front of it, or if there is none. Stored
+    depth does not reach beyond 16 m, where keypoints in a mask count as hidden.
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         pixels, far = view.project(points)
@@ -153,8 +183,8 @@ def visibility(
             seen.append(0)
             continue
         at = int(y), int(x)
-        surface = depth[at] * DEPTH_UNIT if depth[at] else np.inf
-        beyond = z > _FARTHEST and mask[at] >= THRESHOLD
+        surface = min((human.depth[at] for human in humans if human.depth[at]), default=np.inf) * DEPTH_UNIT
+        beyond = z > _FARTHEST and any(human.mask[at] >= THRESHOLD for human in humans)
         seen.append(1 if beyond or z - surface > thickness else 2)
     return pixels, seen
 
@@ -204,14 +234,16 @@ class _Image:
     def annotations(self, points: Sequence[Float[np.ndarray, "F 17 3"]]) -> Iterator[dict[str, Any]]:
         """All subjects of which the image shows a pixel, without ids; writes the image if it is composed."""
         views = [self._stored(subject, own[self.frame]) for subject, own in zip(self.subjects, points, strict=True)]
+        box = drawn_box(views)
+        parts = [view.cut(box) for view in views]
+        shares = uncovered(parts)
         if self.is_composed:
-            write_composed(views, self.subjects[0], self.frame, self.camera, self.background)
-        mask = np.maximum.reduce([view.mask for view in views])
-        depth = np.minimum.reduce([view.depth - np.uint16(1) for view in views]) + np.uint16(1)  # 0 wraps: the farthest
-        for subject, view, share, own in zip(self.subjects, views, uncovered(views)[:-1], points, strict=True):
-            seen = share * view.mask >= THRESHOLD
+            write_composed(parts, shares, box, self.subjects[0], self.frame, self.camera, self.background)
+        for subject, view, part, share, own in zip(self.subjects, views, parts, shares[:-1], points, strict=True):
+            seen = np.zeros(view.mask.shape, np.bool_)
+            seen[box] = share * part.mask >= THRESHOLD
             if seen.any():
-                pixels, visible = visibility(self.view, own[self.frame], mask, depth)
+                pixels, visible = visibility(self.view, own[self.frame], views)
                 yield {
                     **_outline(seen),
                     **({"amodal": _mask(view.mask >= THRESHOLD)} if len(views) > 1 else {}),
@@ -241,13 +273,13 @@ def _outline(inside: Bool[np.ndarray, "H W"]) -> dict[str, Any]:
     return {
         "iscrowd": 0,
         "bbox": [left, top, int(columns[-1]) + 1 - left, int(rows[-1]) + 1 - top],
-        "area": int(inside.sum()),
+        "area": int(np.count_nonzero(inside)),
         "segmentation": _mask(inside),
     }
 
 
 def _keypoints(pixels: Float[np.ndarray, "17 2"], visible: Sequence[int]) -> dict[str, Any]:
-    indices = [_rounded(pixel - 0.5, 2) if v else [0, 0] for pixel, v in zip(pixels, visible, strict=True)]
+    indices = [place if v else [0, 0] for place, v in zip(_rounded(pixels - 0.5, 2), visible, strict=True)]
     return {
         "num_keypoints": sum(v > 0 for v in visible),
         "keypoints": [value for (x, y), v in zip(indices, visible, strict=True) for value in (x, y, v)],
@@ -311,7 +343,7 @@ def _rows(
             yield [image.id, image.file_name, subject.name, image.frame, image.camera, *values]
 
 
-def _rounded(values: np.ndarray, digits: int) -> list[float]:
+def _rounded(values: np.ndarray, digits: int) -> list[Any]:
     return (np.round(values.astype(np.float64), digits) + 0.0).tolist()  # + 0.0: no negative zeros
 
 

@@ -7,18 +7,19 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+import numba
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
 from PIL import Image
 
 from primdiffusion.capture.reader import Subject
-from primdiffusion.capture.render import JPEG_QUALITY, srgb_bytes
+from primdiffusion.capture.render import JPEG_QUALITY
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.formats.regular_files import as_file_error, check_inside
 from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.pictures import opened_picture
-from primdiffusion.raster.textures import LINEAR_OF_BYTE
+from primdiffusion.raster.textures import BYTE_OF_LINEAR, BYTE_STEPS, LINEAR_OF_BYTE
 
 FOLDER = "composed"
 """Folder of composed images, in that of the captures."""
@@ -43,9 +44,17 @@ def composed_path(subject: Subject, frame: int, camera: int) -> Path:
 
 
 def write_composed(
-    views: Sequence[StoredView], subject: Subject, frame: int, camera: int, background: Path | None
+    views: Sequence[StoredView],
+    shares: Float32[np.ndarray, "n+1 h w"],
+    box: Box,
+    subject: Subject,
+    frame: int,
+    camera: int,
+    background: Path | None,
 ) -> None:
     """Write an image of all humans in a view, of whom `subject` is the first, over a background or black, atomically.
+
+    `views` and their `uncovered` shares are of the box alone.
 
     Raises:
         FileNotFoundError, FileError: an image or the background is missing or damaged.
@@ -53,11 +62,16 @@ def write_composed(
     """
     path, view = composed_path(subject, frame, camera), subject.views[camera]
     check_inside(path, subject.folder.parent)
-    behind = np.zeros((view.height, view.width, 3), np.uint8)
+    image = np.zeros((view.height, view.width, 3), np.uint8)
     if background is not None:
-        behind = read_background(background, view.width, view.height)
+        image = read_background(background, view.width, view.height)
+    image[box] = compose(views, shares, image[box])
     with replacing(path) as partial:
-        Image.fromarray(compose(views, behind)).save(partial, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+        Image.fromarray(image).save(partial, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+
+
+Box = tuple[slice, slice]
+"""Rows and columns of a picture."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -70,25 +84,89 @@ class StoredView:
     distance: float
     """Depth of the hips, metres, for pixels of the mask without a depth: edges."""
 
+    def cut(self, box: Box) -> StoredView:
+        """The view in a box."""
+        return StoredView(self.img[box], self.mask[box], self.depth[box], self.distance)
+
+
+def drawn_box(views: Sequence[StoredView]) -> Box:
+    """The smallest box around all pixels of the images and masks that are not 0: there are no humans outside of it."""
+    pictures = [picture for view in views for picture in (view.img, view.mask) if picture.size]
+    rows = _extent([picture.reshape(len(picture), -1).max(1) for picture in pictures])
+    highest = [picture[rows].max(0, initial=0) for picture in pictures]
+    return rows, _extent([of_column.reshape(len(of_column), -1).max(1) for of_column in highest])
+
+
+def _extent(values: Sequence[UInt8[np.ndarray, "n"]]) -> slice:
+    """From the first to the last place at which one of the values is not 0."""
+    (places,) = np.nonzero(np.max(values, axis=0))
+    return slice(places[0], places[-1] + 1) if len(places) else slice(0)
+
 
 def uncovered(views: Sequence[StoredView]) -> Float32[np.ndarray, "n+1 H W"]:
     """The share of each pixel that nearer humans leave to each human, and, last, to the background."""
-    depth = np.stack([np.where(view.depth > 0, view.depth * DEPTH_UNIT, view.distance) for view in views])
-    shares = np.stack([1 - view.mask / np.float32(255) for view in views])
-    order = depth.argsort(axis=0, kind="stable")
-    left = np.cumprod(np.take_along_axis(shares, order, axis=0), axis=0)
-    found = np.ones((len(views) + 1, *depth.shape[1:]), np.float32)
-    np.put_along_axis(found[:-1], order[1:], left[:-1], axis=0)
-    found[-1] = left[-1]
-    return found
+    masks, depths = np.stack([view.mask for view in views]), np.stack([view.depth for view in views])
+    shares = np.ones((len(views) + 1, *masks.shape[1:]), np.float32)
+    _uncovered(masks, depths, np.array([view.distance for view in views]), _LEFT_BY_BYTE, shares)
+    return shares
 
 
-def compose(views: Sequence[StoredView], background: UInt8[np.ndarray, "H W 3"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Draw all humans and the background in linear light, nearer over farther; colours are premultiplied over black."""
-    layers = [*(view.img for view in views), background]
-    shares = uncovered(views)
-    linear = sum(share[..., None] * LINEAR_OF_BYTE[layer] for share, layer in zip(shares, layers, strict=True))
-    return srgb_bytes(np.minimum(linear, 1))
+def compose(
+    views: Sequence[StoredView], shares: Float32[np.ndarray, "n+1 H W"], background: UInt8[np.ndarray, "H W 3"]
+) -> UInt8[np.ndarray, "H W 3"]:
+    """Draw all humans and the background in linear light, nearer over farther; colours are premultiplied over black.
+
+    `shares` are those of `uncovered`.
+    """
+    image = np.empty_like(background, order="C")
+    layers = np.stack([*(view.img for view in views), background])
+    _compose(layers, shares, LINEAR_OF_BYTE, BYTE_OF_LINEAR, image)
+    return image
+
+
+_LEFT_BY_BYTE = 1 - np.arange(256, dtype=np.uint8) / np.float32(255)
+"""The share of a pixel that a human leaves, by the byte of the mask."""
+
+
+@numba.njit(cache=True, nogil=True)
+def _uncovered(masks, depths, distances, left_by_byte, shares):
+    """Write shares where they are not 1."""
+    humans, height, width = masks.shape
+    place, order = np.empty(humans), np.empty(humans, np.int64)
+    for row in range(height):
+        for column in range(width):
+            covered = False
+            for human in range(humans):
+                covered |= masks[human, row, column] > 0
+            if not covered:
+                continue
+            for human in range(humans):
+                steps = depths[human, row, column]
+                place[human] = steps * DEPTH_UNIT if steps > 0 else distances[human]
+                at = human
+                while at > 0 and place[order[at - 1]] > place[human]:
+                    order[at] = order[at - 1]
+                    at -= 1
+                order[at] = human
+            left = np.float32(1)
+            for human in order:
+                shares[human, row, column] = left
+                left *= left_by_byte[masks[human, row, column]]
+            shares[humans, row, column] = left
+
+
+@numba.njit(cache=True, nogil=True)
+def _compose(layers, shares, linear_of_byte, byte_of_linear, image):
+    count, height, width, _ = layers.shape
+    for row in range(height):
+        for column in range(width):
+            for channel in range(3):
+                total = np.float32(0)
+                for layer in range(count):
+                    total += shares[layer, row, column] * linear_of_byte[layers[layer, row, column, channel]]
+                image[row, column, channel] = byte_of_linear[
+                    int(min(total, np.float32(1)) * np.float32(BYTE_STEPS - 1) + np.float32(0.5))
+                ]
 
 
 def read_background(path: Path, width: int, height: int) -> UInt8[np.ndarray, "height width 3"]:
@@ -105,4 +183,4 @@ def read_background(path: Path, width: int, height: int) -> UInt8[np.ndarray, "h
         scale = min(picture.width / width, picture.height / height)
         left, top = (picture.width - scale * width) / 2, (picture.height - scale * height) / 2
         box = (left, top, left + scale * width, top + scale * height)
-        return np.asarray(picture.convert("RGB").resize((width, height), Image.Resampling.BICUBIC, box))
+        return np.array(picture.convert("RGB").resize((width, height), Image.Resampling.BICUBIC, box))

@@ -96,13 +96,17 @@ def decoded(picture: Image.Image, mode: str) -> UInt8[np.ndarray, "H W *channels
     bands = len(Image.new(mode, (1, 1)).getbands())
     pixels = np.empty((picture.height, picture.width, bands), np.uint8)
     for top, strip in strips(picture):
-        pixels[top : top + strip.height] = np.asarray(strip.convert(mode)).reshape(strip.height, strip.width, bands)
+        converted = strip if strip.mode == mode else strip.convert(mode)
+        pixels[top : top + strip.height] = np.asarray(converted).reshape(strip.height, strip.width, bands)
     return pixels if bands > 1 else pixels[..., 0]
 
 
 def strips(picture: Image.Image, pixels: int | None = None) -> Iterator[tuple[int, Image.Image]]:
     """Yield the picture in strips of whole rows of about `pixels`, each with the number of its first row."""
     rows = max(1, (pixels or STRIP_PIXELS) // max(picture.width, 1))
+    if rows >= picture.height:  # without a copy
+        yield 0, picture
+        return
     for top in range(0, picture.height, rows):
         yield top, picture.crop((0, top, picture.width, min(top + rows, picture.height)))
 

@@ -1,6 +1,7 @@
 """COCO annotations of captures: as pycocotools reads them, and against masks, joints and rays cast at the mesh."""
 
 import csv
+import dataclasses
 import json
 
 import numpy as np
@@ -12,7 +13,7 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.coco import FACE, KEYPOINTS, keypoints_of, run_lengths, visibility, write_coco
-from primdiffusion.capture.composed import Backgrounds, StoredView, compose, read_background
+from primdiffusion.capture.composed import Backgrounds, StoredView, compose, read_background, uncovered
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
@@ -152,10 +153,12 @@ def test_points_before_behind_and_outside():
     points[8] = (0, 0, 20)
     points[9] = (np.nan, 0, 1)
     mask, depth = np.full((10, 10), 255, np.uint8), np.full((10, 10), round(0.87 / 0.00025), np.uint16)
-    pixels, seen = visibility(view, points, mask, depth)
+    image = np.zeros((10, 10, 3), np.uint8)
+    shown, nothing = StoredView(image, mask, depth, 1.0), StoredView(image, mask, np.zeros_like(depth), 1.0)
+    pixels, seen = visibility(view, points, [nothing, shown])
     assert seen == [1, 1, 1, 1, 1, 2, 0, 0, 1, 0, 1, 2, 2, 2, 2, 2, 2]  # 0.13 m behind: wrists hidden, hips not
     assert pixels[5].tolist() == [5, 5]
-    assert visibility(view, points, mask, np.zeros_like(depth))[1] == [2] * 6 + [0, 0, 1, 0] + [2] * 7
+    assert visibility(view, points, [nothing])[1] == [2] * 6 + [0, 0, 1, 0] + [2] * 7
 
 
 @pytest.mark.parametrize("rows", ["10", "01", "11", "00"])
@@ -170,6 +173,30 @@ def test_random_masks_come_back():
     for height, width in ((1, 1), (1, 7), (6, 1), (9, 5)):
         for mask in rng.random((20, height, width)) < 0.5:
             assert np.array_equal(decoded(run_lengths(mask), height, width), mask)
+
+
+def test_run_lengths_are_those_of_pycocotools():
+    tools = pytest.importorskip("pycocotools.mask")
+    rng = np.random.default_rng(4)
+    masks = [rng.random((17, 23)) < share for share in (0, 0.02, 0.5, 0.98, 1)]
+    masks += [np.pad(np.ones((5, 4), bool), ((top, 9 - top), (left, 8 - left))) for top in (0, 9) for left in (0, 8)]
+    for mask in masks:
+        height, width = mask.shape
+        own = tools.frPyObjects({"size": [height, width], "counts": run_lengths(mask)}, height, width)
+        assert own == tools.encode(np.asfortranarray(mask, np.uint8))
+
+
+def test_the_face_is_that_of_the_whole_body(bodies):
+    subject = open_captures(bodies).subject(NAME)
+    for betas in (subject.smpl.betas, np.linspace(-2, 2, 4, dtype=np.float32)):
+        shaped = default_body().to(dtype=torch.float64).shape(torch.from_numpy(betas).double())
+        poses = [shaped.pose(subject.smpl.pose(frame).to(dtype=torch.float64)) for frame in range(subject.frames)]
+        face = np.stack([posed.vertices.numpy()[list(FACE.values())].mean(1) for posed in poses])
+        moved = dataclasses.replace(subject, smpl=dataclasses.replace(subject.smpl, betas=betas))
+        joints = np.stack([posed.joints[:, :3, 3].numpy() for posed in poses])
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("primdiffusion.capture.coco.joints_of", lambda _, joints=joints: joints)
+            np.testing.assert_allclose(keypoints_of(moved)[:, : len(FACE)], face, rtol=0, atol=1e-12)
 
 
 def test_the_command_writes_the_same_bytes_again_and_rendering_goes_on(root, whole, capsys):
@@ -275,7 +302,7 @@ def test_backgrounds_fill_what_the_human_leaves_and_the_seed_draws_them(root, ba
 def test_half_covered_pixels_mix_in_linear_light():
     image, mask = np.array([[[0, 0, 0], [188, 0, 0], [255, 255, 255]]], np.uint8), np.array([[0, 128, 255]], np.uint8)
     view = StoredView(image, mask, np.full((1, 3), 4000, np.uint16), 1.0)
-    mixed = compose([view], np.full((1, 3, 3), 255, np.uint8))
+    mixed = compose([view], uncovered([view]), np.full((1, 3, 3), 255, np.uint8))
     assert mixed.tolist() == [[[255, 255, 255], [255, 187, 187], [255, 255, 255]]]
 
 
