@@ -22,7 +22,7 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import all_finite
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.picture_files import DEPTH_UNIT, read_grey_png
+from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.formats.regular_files import FileError, open_regular
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.pictures import LARGEST_FILE, decoded, decoded_bytes, opened_picture, strips
@@ -187,7 +187,7 @@ class Captures:
     @property
     def passes(self) -> tuple[str, ...]:
         """Passes that every view has."""
-        return tuple(self.about.get("passes", PASSES_OF_RELEASED))
+        return tuple(dict.fromkeys(self.about.get("passes", PASSES_OF_RELEASED)))
 
     def subject(self, name: str) -> Subject:
         """Read a subject.
@@ -276,18 +276,12 @@ def _read(file: BinaryIO, path: Path, kind: str, width: int, height: int) -> np.
 
     Raises FileError for a damaged file, or one of another size.
     """
-    bytes_each = _BYTES_OF_A_PIXEL.get(kind, 4)
-    with _named(path):
-        backed = width * height * bytes_each <= decoded_bytes(file.seek(0, os.SEEK_END))  # else Pillow's way says so
-        found = read_grey_png(file, width, height, _GREY[kind]) if backed and kind in _GREY else None
-    if found is not None:
-        return found
-    with _named(path), opened_picture(file, bytes_each=bytes_each) as picture:
+    with _named(path), opened_picture(file, bytes_each=_BYTES_OF_A_PIXEL.get(kind, 4)) as picture:
         size = picture.size
         if size == (width, height) and kind == "depth":
             if len(picture.getbands()) != 1:
                 raise ValueError(f"it has {len(picture.getbands())} channels instead of one")
-            return np.concatenate([np.asarray(strip).astype(np.uint16, copy=False) for _, strip in strips(picture)])
+            return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
         if size == (width, height):
             return decoded(picture, "RGB" if kind in ("img", "normal") else "L")
     raise FileError(path, f"has {size[0]} x {size[1]} pixels, its camera {width} x {height}", "render it again")
@@ -380,5 +374,4 @@ def _as_stored(values: np.ndarray) -> np.ndarray:
 
 _BYTES_OF_A_PIXEL = {"img": 4, "mask": 1, "depth": 4, "normal": 12, "part": 1}
 """Of a view in memory."""
-_GREY = {"mask": np.uint8, "depth": np.uint16, "part": np.uint8}
 _KINDS = {"img": _as_stored, "mask": _as_stored, "depth": _depth, "normal": _normal, "part": _as_stored}

@@ -63,7 +63,7 @@ def _read_pickled(path: Path) -> dict[str, np.ndarray]:
 
 def _checked(path: Path, arrays: dict[str, np.ndarray]) -> SmplParameters:
     check_motion_size(path, max(values.size for values in arrays.values()))
-    frames = len(arrays["global_orient"])
+    frames = next(iter(arrays["global_orient"].shape), 0)
     shapes = {"global_orient": (frames, 3), "body_pose": (frames, 3 * (J - 1)), "transl": (frames, 3)}
     for name, shape in shapes.items():
         if arrays[name].shape != shape:
