@@ -50,6 +50,20 @@ def test_what_no_view_shows_has_the_most_probable_colours_given_what_they_show(y
     assert (found.provenance["reconstructed_from"], found.provenance["views"]) == ("anna", list(range(len(yaws))))
 
 
+def test_the_more_views_the_nearer_the_human_is_to_what_they_show():
+    human = human_of(COLOURS)
+    noise = torch.rand(human.payload.rgb.shape, generator=torch.Generator().manual_seed(0))
+    noisy = dataclasses.replace(human, payload=dataclasses.replace(human.payload, rgb=noise))
+    errors = []
+    for count in (1, 4):  # the same view again: it tells nothing new
+        person = captured(noisy, BodyPose.rest(), [0.0] * count)
+        found = reconstruct_by_prior(MODEL, person)
+        target = targets_of(person.views, [frames_of(found)] * count, 128)[0]
+        drawn = march(place(found), target.camera).rgb
+        errors.append(float((encode_srgb(drawn) - encode_srgb(torch.from_numpy(target.rgba[..., :3]))).abs().mean()))
+    assert errors[1] < 0.85 * errors[0]
+
+
 def test_smaller_pictures_are_what_their_cameras_see():
     human = human_of(COLOURS)
     person = captured(human, BodyPose.rest(), [0.3])

@@ -203,8 +203,8 @@ def test_outside_of_the_box_there_is_only_the_background():
         assert np.array_equal(compose(parts, shares, behind[box]), whole[box])
         behind[box] = whole[box]
         assert np.array_equal(behind, whole)
-    nobody = StoredView(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint16), 1.0)
-    assert nobody.mask[drawn_box([nobody])].size == 0
+    empty = StoredView(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint16), 1.0)
+    assert empty.mask[drawn_box([empty])].size == 0
 
 
 def test_all_bytes_come_back_from_linear_light():
