@@ -109,8 +109,8 @@ def main() -> None:
                 fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
             start = given(case, photograph, model, Fault(), number)
             began = time.perf_counter()
-            posture, coefficients = fit_posture_in(model, [photograph], start, lambda: None)
-            human = human_in(model, [photograph], posture, coefficients)
+            posture = fit_posture_in(model, [photograph], start, lambda: None)
+            human = human_in(model, [photograph], posture)
             seconds = time.perf_counter() - began
             views = aligned(case, human)
             row = {
@@ -121,7 +121,7 @@ def main() -> None:
                 "picture_seconds_cpu": seconds,
             }
             if not number % POSES:
-                standing, _ = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
+                standing = fit_posture_in(model, [photograph], start_of([photograph], model), lambda: None)
                 row["camera_error_px_standing"] = camera_error(case, photograph, standing)
             for fault_name, fault in FAULTS.items() if number < arguments.robust else ():
                 error, quality = with_fault(model, case, Path(scratch) / f"{name}_{fault_name}", fault, number)
@@ -171,8 +171,8 @@ def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, se
     """Camera error and PSNR."""
     photograph = photographed(case, folder, fault)
     start = given(case, photograph, model, fault, seed)
-    posture, coefficients = fit_posture_in(model, [photograph], start, lambda: None)
-    human = human_in(model, [photograph], posture, coefficients)
+    posture = fit_posture_in(model, [photograph], start, lambda: None)
+    human = human_in(model, [photograph], posture)
     return camera_error(case, photograph, posture), psnr(human, case, aligned(case, human))
 
 

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.photograph import Photograph, rgba_of
@@ -31,7 +29,7 @@ from primdiffusion.posture.start import (
     standing,
     turned_to_camera,
 )
-from primdiffusion.reconstruction import STEPS, PersonComponents, targets_of
+from primdiffusion.reconstruction import FIT_STEPS, PersonComponents, targets_of
 from primdiffusion.render.inverse import TargetImage
 
 
@@ -45,7 +43,6 @@ class Round(NamedTuple):
 
 ROUNDS = (Round(96, Stage(60, 0.04), 2), Round(96, Stage(80, 0.02), 2), Round(192, Stage(60, 0.01), 0))
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
-HUMAN_STEPS = STEPS + 1
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
 POSE_FILE_TIGHTNESS = 2.0
@@ -105,8 +102,8 @@ def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: S
 
 def fit_posture_in(
     model: DiffusionModel, photographs: Sequence[Photograph], start: Start, on_step: Callable[[], None]
-) -> tuple[Posture, Float[Tensor, "r"]]:
-    """The posture in the pictures, and the person coefficients that explain them in it; deterministic.
+) -> Posture:
+    """The posture in the pictures; deterministic.
 
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
     """
@@ -116,28 +113,32 @@ def fit_posture_in(
         fit.refine(components.payload(coefficients), _targets(photographs, fit.posture(), side), stage, on_step)
         targets = _targets(photographs, fit.posture(), side)
         for _ in range(coefficient_steps):
-            coefficients = components.closer(coefficients, targets)
+            coefficients = components.closer(coefficients, targets).coefficients
             on_step()
-    return fit.posture(), coefficients
+    return fit.posture()
+
+
+def human_steps(model: DiffusionModel) -> int:
+    """How often `human_in` reports."""
+    return PersonComponents.of(model).start_steps + FIT_STEPS
 
 
 def human_in(
     model: DiffusionModel,
     photographs: Sequence[Photograph],
     posture: Posture,
-    coefficients: Float[Tensor, "r"] | None = None,
     seed: int | None = None,
     on_step: Callable[[], None] = lambda: None,
 ) -> Human:
-    """The human in pictures whose posture is known, on the CPU; `on_step` is called HUMAN_STEPS times.
+    """The human in pictures whose posture is known, on the CPU; `on_step` is called `human_steps` times.
 
-    `coefficients` is where the fit starts. With a seed, what no picture shows is drawn instead of the most probable.
-    Raises ValueError as `PersonComponents.of`.
+    With a seed, what no picture shows is drawn instead of the most probable. Raises ValueError as
+    `PersonComponents.of`.
     """
-    components = PersonComponents.of(model)
+    components, views, frames = PersonComponents.of(model), _views(photographs, posture), posture.frames()
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    coefficients = components.mean if coefficients is None else coefficients
-    payload = components.fit(_views(photographs, posture), posture.frames(), coefficients, on_step, generator)
+    coefficients = components.start(views, frames, on_step)
+    payload = components.fit(views, frames, coefficients, on_step, generator)
     names = [photograph.path.name for photograph in photographs]
     origin: dict[str, Any] = {"reconstructed_from": names} | ({} if seed is None else {"seed": seed})
     return Human(payload, posture.betas, {**origin, **made_by(model)}).validate()

@@ -2,22 +2,25 @@
 
 `reconstruct_by_prior` finds the person coefficients c of the diffusion model that explain the pictures. Near an
 estimate a picture is linear in c (`cpu_linear`), and the prior is a mixture of Gaussians, so the posterior mean of c
-has a closed form; a few Gauss-Newton steps repeat it. What no picture shows thus has the most probable colours and
-shape given what they show: the back of a jacket belongs to its front. Then the voxels themselves are fitted to the
-pictures (`render.inverse`), which keeps the others close to that human.
+has a closed form; a few Gauss-Newton steps repeat it. They end in the outfit that they start near, so they start from
+each, and go on from those that explain the pictures best. What no picture shows thus has the most probable colours and
+shape given what they show: the back of a jacket belongs to its front. The network draws what c cannot. Then the voxels
+themselves are fitted to the pictures (`render.inverse`), which keeps the others close to that human.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float32
+from numpy import ndarray
 from torch import Tensor
 
 from primdiffusion.capture.conditioning import CapturedPerson
@@ -34,8 +37,15 @@ from primdiffusion.render.cpu_linear import apply_to_codes
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
 from primdiffusion.version import __version__
 
-STEPS = 4
-"""Gauss-Newton steps for person coefficients."""
+TRIALS = ((64, 1000, 1), (64, 6, 2), (176, 2, 3))
+"""Rounds that choose where to start, among the mean human and the mean of each outfit: largest side of the pictures,
+the most candidates left, and the Gauss-Newton steps of each."""
+TRIAL_VIEWS = 2
+"""Views, evenly spaced, that they look at."""
+STEPS = 2
+"""Gauss-Newton steps from there, in all views."""
+FIT_STEPS = STEPS + 1
+"""How often `PersonComponents.fit` reports."""
 OBSERVATIONS = 150.0
 """Number of independent pixels that a view counts as. What person components cannot draw differs over patches, not over
 pixels; more would fit them to noise, fewer would ignore the view."""
@@ -83,18 +93,29 @@ def reconstruct_by_prior(
 
     def report() -> None:
         if on_step is not None:
-            on_step(next(done), STEPS + 1)
+            on_step(next(done), components.start_steps + FIT_STEPS)
 
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    payload = components.fit(person.views, frames, components.mean, report, generator)
+    coefficients = components.start(person.views, frames, report)
+    payload = components.fit(person.views, frames, coefficients, report, generator)
     drawn = {} if seed is None else {"seed": seed}
     return Human(payload, person.betas, {**_origin(person), **drawn, **made_by(model)}).validate()
+
+
+class Explanation(NamedTuple):
+    """Person coefficients after a step of Gauss-Newton."""
+
+    coefficients: Float[Tensor, "r"]
+    """Their posterior mean, or a draw, for pictures linearised at the coefficients before the step."""
+    evidence: float
+    """Logarithm of the probability of these pictures."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PersonComponents:
     """The person components of a diffusion model, and their prior."""
 
+    denoiser: PersonDenoiser
     prior: PersonPrior
     codec: LinearCodec
     full_density: float
@@ -108,27 +129,58 @@ class PersonComponents:
             raise ValueError(
                 f"the model belongs to the body {model.body_setup.files.smpl.path}: give one of the default body"
             )
-        return cls(model.denoiser.prior.to("cpu"), model.codec.codec.to("cpu"), model.full_density)
+        codec = model.codec.codec.to("cpu")
+        return cls(model.denoiser, model.denoiser.prior.to("cpu"), codec, model.full_density)
 
     @property
     def mean(self) -> Float[Tensor, "r"]:
         """Coefficients of the mean human."""
         return torch.zeros(len(self.prior.basis))
 
-    def payload(self, coefficients: Float[Tensor, "r"]) -> Payload:
+    @property
+    def start_steps(self) -> int:
+        """How often `start` reports."""
+        return sum(min(count, 1 + len(self.prior.centre)) * steps for _, count, steps in TRIALS)
+
+    @functools.cached_property
+    def _voxel_basis(self) -> Float32[ndarray, "b 512 4 c"]:
+        return self.codec.voxel_basis(self.prior.basis.shape[1] // K).contiguous().numpy()
+
+    @functools.cached_property
+    def _codes(self) -> Float32[ndarray, "k c r"]:
+        """Channels of each box by component."""
+        return self.prior.basis.unflatten(1, (-1, K)).permute(2, 1, 0).contiguous().numpy()
+
+    def payload(self, coefficients: Float[Tensor, "r"], rest: Float[Tensor, "c h w"] | float = 0.0) -> Payload:
         """Decode."""
-        latents = self.prior.mean + self.prior.picture(coefficients[None])
+        latents = self.prior.mean + self.prior.picture(coefficients[None]) + rest
         return payload_from_cells(self.codec.decode(latents)[0], self.full_density, self.codec.zone)
+
+    def start(
+        self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None
+    ) -> Float[Tensor, "r"]:
+        """Coefficients near those of the human in views with these frames; reports `start_steps` times."""
+        every = math.ceil(len(frames) / TRIAL_VIEWS)
+        candidates = [Explanation(start, 0.0) for start in (self.mean, *self.prior.group_means())]
+        for side, count, steps in TRIALS:
+            targets = targets_of(views, frames, side)[::every]
+            candidates = sorted(candidates, key=lambda one: one.evidence, reverse=True)[:count]
+            for number, explanation in enumerate(candidates):
+                for _ in range(steps):
+                    explanation = self.closer(explanation.coefficients, targets)
+                    on_step()
+                candidates[number] = explanation
+        return max(candidates, key=lambda one: one.evidence).coefficients
 
     def fit(
         self,
         views: Views,
         frames: Sequence[Frames],
         coefficients: Float[Tensor, "r"],
-        on_step: Callable[[], None],
+        on_step: Callable[[], None] = lambda: None,
         generator: torch.Generator | None = None,
     ) -> Payload:
-        """The human in views with these frames: STEPS steps from `coefficients`, then voxels; `on_step` after each.
+        """The human in views with these frames: STEPS steps from `coefficients`, then voxels. Reports FIT_STEPS times.
 
         With a generator, coefficients are drawn from their distribution given the views, instead of its mean: what no
         view shows varies with it.
@@ -136,23 +188,31 @@ class PersonComponents:
         targets = targets_of(views, frames, COARSE_SIDE)
         for step in range(STEPS):
             drawn_by = generator if step == STEPS - 1 else None
-            coefficients = self.closer(coefficients, targets, drawn_by)
+            coefficients = self.closer(coefficients, targets, drawn_by).coefficients
             on_step()
         targets = targets_of(views, frames, FINE_SIDE)
         settings = InverseSettings(pull=PULL / len(targets), smoothness=SMOOTHNESS / len(targets))
-        payload = fit_payload(self.payload(coefficients), targets, self.full_density, settings)
+        start = self.payload(coefficients, self.expected_rest(coefficients))
+        payload = fit_payload(start, targets, self.full_density, settings)
         on_step()
         return payload
+
+    @torch.inference_mode()
+    def expected_rest(self, coefficients: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
+        """The mean rest of humans with these coefficients: what the network makes of noise alone."""
+        last, device = self.denoiser.schedule.length - 1, self.denoiser.component_std.device
+        noise = torch.randn(1, *self.prior.mean.shape, generator=torch.Generator().manual_seed(0))
+        level, person = torch.tensor([last], device=device), coefficients[None].to(device)
+        rest = self.denoiser.rest(noise.to(device), person, level).cpu()
+        return (self.prior.join(torch.zeros_like(coefficients[None]), rest) - self.prior.mean)[0].clone()
 
     def closer(
         self,
         coefficients: Float[Tensor, "r"],
         targets: Sequence[TargetImage],
         generator: torch.Generator | None = None,
-    ) -> Float[Tensor, "r"]:
-        """The posterior mean of coefficients, or a draw, for pictures linearised at `coefficients`: a step of
-        Gauss-Newton.
-        """
+    ) -> Explanation:
+        """A step of Gauss-Newton from `coefficients`, to their posterior mean or, with a generator, to a draw."""
         prior, codec = self.prior, self.codec
         cells = codec.decode(prior.mean + prior.picture(coefficients[None]))[0].requires_grad_()
         payload = payload_from_cells(cells, self.full_density, codec.zone)
@@ -161,21 +221,26 @@ class PersonComponents:
         (by_cell,) = torch.autograd.grad(payload.rgb.sum() + payload.density.sum(), cells)
         slope = by_cell[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1).numpy()
         payload, region = payload.map(Tensor.detach), codec.region.numpy()
-        basis = codec.voxel_basis(prior.basis.shape[1] // K).contiguous().numpy()
-        codes = prior.basis.unflatten(1, (-1, K)).permute(2, 1, 0).contiguous().numpy()
         precision, vector = torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis))
+        misfit = 0.0
+        """Of the pictures at coefficients of 0, by the linearisation."""
         for target in targets:
             view = LinearisedView.of(target, payload, InverseSettings())
             seen = np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0
-            matrix = apply_to_codes(view.jacobian, slope, basis, region, codes, view.alpha_free)[seen]
+            matrix = apply_to_codes(view.jacobian, slope, self._voxel_basis, region, self._codes, view.alpha_free)[seen]
             matrix = torch.from_numpy(matrix).flatten(0, 1)
-            weight = torch.from_numpy(view.weight[seen]).flatten() * (OBSERVATIONS / PIXEL_STD**2)
-            weighted = matrix.mT * weight
+            weight = torch.from_numpy(view.weight) * (OBSERVATIONS / PIXEL_STD**2)
+            residual, weight_seen = torch.from_numpy(view.residual), weight[seen].flatten()
+            wanted = residual[seen].flatten() + matrix @ coefficients
+            weighted = matrix.mT * weight_seen
             precision += weighted @ matrix
-            vector += weighted @ (torch.from_numpy(view.residual[seen]).flatten() + matrix @ coefficients)
-        if generator is None:
-            return prior.posterior_mean(precision, vector)
-        return prior.posterior_sample(precision, vector, generator)
+            vector += weighted @ wanted
+            misfit += float(weight_seen.double() @ wanted.double().square()) / 2
+            misfit += float((weight[~seen].double() * residual[~seen].double().square()).sum()) / 2
+        mean, evidence = prior.posterior(precision, vector)
+        if generator is not None:
+            mean = prior.posterior_sample(precision, vector, generator)
+        return Explanation(mean, evidence - misfit)
 
 
 def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[TargetImage]:

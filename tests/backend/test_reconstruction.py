@@ -10,10 +10,10 @@ from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views, stack
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, frames_of, framing, place
-from primdiffusion.reconstruction import reconstruct_by_prior, targets_of
+from primdiffusion.reconstruction import FIT_STEPS, PersonComponents, reconstruct_by_prior, targets_of
 from primdiffusion.render.march import march
 from support.errors import refused
-from tiny_model import tiny_model
+from tiny_model import SLOW, tiny_model
 
 MODEL = tiny_model()
 PRIOR = MODEL.denoiser.prior
@@ -85,7 +85,48 @@ def test_steps_are_reported_and_an_exception_cancels():
 
     with pytest.raises(KeyboardInterrupt):
         reconstruct_by_prior(MODEL, person, cancel)
-    assert steps == [(1, 5), (2, 5)]
+    total = PersonComponents.of(MODEL).start_steps + FIT_STEPS
+    assert steps == [(1, total), (2, total)]
+
+
+def test_every_step_is_reported():
+    steps = []
+    reconstruct_by_prior(MODEL, captured(human_of(COLOURS), BodyPose.rest(), [0.0]), lambda *step: steps.append(step))
+    assert [done for done, _ in steps] == list(range(1, steps[-1][1] + 1))
+
+
+def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
+    # the mean human is so bright that its colours are clipped: no picture tells which way they should go
+    white = torch.zeros_like(PRIOR.mean)
+    white[:3] = 150 / 32
+    prior = dataclasses.replace(
+        PRIOR,
+        mean=white,
+        log_weight=torch.tensor([[0.8], [0.2]]).log(),
+        centre=torch.tensor([30.0, -150.0])[:, None, None].repeat(1, 1, 3),
+        axes=PRIOR.axes.repeat(2, 1, 1),
+        variance=torch.full((2, 3), 12.0**2),
+        kind=PRIOR.kind.transpose(0, 1),
+    )
+    components = dataclasses.replace(PersonComponents.of(MODEL), prior=prior)
+    wanted = torch.tensor([-140.0, -155.0, -150.0])
+    human = Human(components.payload(wanted), BETAS, {})
+    person = captured(human, BodyPose.rest(), [0.0])
+    frames = [frames_of(human)]
+    from_mean = components.mean
+    for _ in range(4):
+        from_mean = components.closer(from_mean, targets_of(person.views, frames, 64)).coefficients
+    assert (from_mean - wanted).norm() > 100
+    assert (components.start(person.views, frames) - wanted).norm() < 10
+
+
+def test_what_components_cannot_draw_comes_from_the_network():
+    model = tiny_model(SLOW)
+    with torch.no_grad():
+        model.denoiser.local.outer.bias.copy_(torch.tensor([0.0, 0.0, 0.0, 2.0]))
+    rest = PersonComponents.of(model).expected_rest(COLOURS)
+    assert torch.allclose(rest[3], torch.tensor(2 * 0.01**0.5), atol=0.01)  # in standard deviations of the rest
+    assert rest[:3].abs().max() < 0.01
 
 
 def test_a_model_without_person_components_is_refused():

@@ -36,11 +36,11 @@ from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer
 from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
 from primdiffusion.formats.whole_files import staged
 from primdiffusion.from_pictures import (
-    HUMAN_STEPS,
     POSTURE_STEPS,
     Start,
     fit_posture_in,
     human_in,
+    human_steps,
     outline_overlap,
     start_of,
 )
@@ -192,13 +192,13 @@ def reconstruct_pictures(request: ReconstructRequest, session: Session, report: 
     began = time.perf_counter()
     with staged(request.out_dir) as folder:
         model, photographs, start, warnings = _read(request, session, report)
-        posture, coefficients = start.posture, None
-        on_step = _steps(report, HUMAN_STEPS + (POSTURE_STEPS if request.refine else 0))
+        posture = start.posture
+        on_step = _steps(report, human_steps(model) + (POSTURE_STEPS if request.refine else 0))
         if request.refine:
-            posture, coefficients = fit_posture_in(model, photographs, start, on_step)
+            posture = fit_posture_in(model, photographs, start, on_step)
         elif not start.complete:
             raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
-        human = human_in(model, photographs, posture, coefficients, request.seed, on_step)
+        human = human_in(model, photographs, posture, request.seed, on_step)
         warnings += _doubts(model, photographs, posture)
         report("write", 0, 1, None)
         write_human(folder, human, request.size)
@@ -219,7 +219,7 @@ def fit_posture(request: FitPostureRequest, session: Session, report: ReportProg
     began = time.perf_counter()
     with staged(request.out_dir) as folder:
         model, photographs, start, warnings = _read(request, session, report)
-        posture, _ = fit_posture_in(model, photographs, start, _steps(report, POSTURE_STEPS))
+        posture = fit_posture_in(model, photographs, start, _steps(report, POSTURE_STEPS))
         warnings += _doubts(model, photographs, posture)
         _write_posture(folder / POSTURE_FILE, photographs, posture)
     seconds = round(time.perf_counter() - began, 3)

@@ -112,23 +112,30 @@ class PersonPrior(TensorRecord):
         coefficients = self.denoise_coefficients(y, signal[..., 0, 0], noise[..., 0, 0], condition)
         return self.join(coefficients, self.denoise_rest(rest, signal, noise))
 
-    def posterior_mean(self, precision: Float[Tensor, "r r"], vector: Float[Tensor, "r"]) -> Float[Tensor, "r"]:
-        """E[c] given an observation of likelihood exp(vector^T c - c^T precision c / 2)."""
-        share, mean, _ = self._posterior(precision, vector)
-        return torch.einsum("gm,gmr->r", share, mean).to(vector)
+    def posterior(
+        self, precision: Float[Tensor, "r r"], vector: Float[Tensor, "r"]
+    ) -> tuple[Float[Tensor, "r"], float]:
+        """E[c] given an observation of likelihood exp(vector^T c - c^T precision c / 2), and the logarithm of that
+        likelihood's mean over the prior.
+        """
+        logits, mean, _ = self._posterior(precision, vector)
+        share = logits.flatten().softmax(0).view_as(logits)
+        return torch.einsum("gm,gmr->r", share, mean).to(vector), float(logits.flatten().logsumexp(0))
 
     def posterior_sample(
         self, precision: Float[Tensor, "r r"], vector: Float[Tensor, "r"], generator: torch.Generator
     ) -> Float[Tensor, "r"]:
         """A draw of c given such an observation: a part of the mixture, then its Gaussian."""
-        share, mean, factor = self._posterior(precision, vector)
-        part = int(torch.multinomial(share.flatten(), 1, generator=generator))
+        logits, mean, factor = self._posterior(precision, vector)
+        part = int(torch.multinomial(logits.flatten().softmax(0), 1, generator=generator))
         noise = torch.randn(len(vector), 1, generator=generator, dtype=mean.dtype)
-        spread = torch.linalg.solve_triangular(factor[part // share.shape[1]].mT, noise, upper=True)
+        spread = torch.linalg.solve_triangular(factor[part // logits.shape[1]].mT, noise, upper=True)
         return (mean.flatten(0, 1)[part] + spread[:, 0]).to(vector)
 
     def _posterior(self, precision: Tensor, vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Probabilities [g, m] and means [g, m, r] of the parts, and lower factors of their precisions [g, r, r]."""
+        """Logarithms of the parts' weights times their mean likelihoods [g, m], their means given the observation
+        [g, m, r], and lower factors of their precisions [g, r, r].
+        """
         axes, variance, centre = (_double(part) for part in (self.axes, self.variance, self.centre))
         own = (axes.mT / variance[:, None, :]) @ axes
         from_centre = centre @ own
@@ -137,8 +144,12 @@ class PersonPrior(TensorRecord):
         mean = torch.cholesky_solve(total.mT, factor).mT
         spread = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * variance.log().sum(-1)
         evidence = (mean * total).sum(-1) / 2 - (from_centre * centre).sum(-1) / 2 - spread[:, None]
-        share = (_double(self.log_weight) + evidence).flatten().softmax(0).view_as(evidence)
-        return share, mean, factor
+        return _double(self.log_weight) + evidence, mean, factor
+
+    def group_means(self) -> Float[Tensor, "g r"]:
+        """Mean coefficients of each group's parts."""
+        weight = self.log_weight.softmax(1)
+        return torch.einsum("gm,gmr->gr", weight, self.centre)
 
     def marginal_variance(self) -> Float[Tensor, "r"]:
         """Variance of each person coefficient over the whole mixture."""

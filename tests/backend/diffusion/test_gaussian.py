@@ -63,8 +63,29 @@ def test_posterior_mean_of_white_noise_is_what_the_denoiser_gives(prior):
     wanted = prior.denoise_coefficients(y, signal, noise)
     ratio = (signal / noise.square())[0, 0]
     precision = 0.7 * ratio * torch.eye(4, dtype=F64)
-    got = torch.stack([prior.posterior_mean(precision, ratio * one) for one in y])
+    got = torch.stack([prior.posterior(precision, ratio * one)[0] for one in y])
     assert torch.allclose(got, wanted, atol=1e-9)
+
+
+def test_evidence_is_the_mean_likelihood_over_the_prior(prior):
+    generator = torch.Generator().manual_seed(5)
+    matrix, y = (torch.randn(*shape, generator=generator, dtype=F64) for shape in ((6, 4), (6,)))
+    variance = 0.3
+    _, evidence = prior.posterior(matrix.T @ matrix / variance, matrix.T @ y / variance)
+    wanted = 0.0
+    for group, part in itertools.product(range(2), range(3)):
+        own = prior.axes[group].T @ torch.diag(prior.variance[group]) @ prior.axes[group]
+        covariance = matrix @ own @ matrix.T + variance * torch.eye(6, dtype=F64)
+        density = multivariate_normal((matrix @ prior.centre[group, part]).numpy(), covariance.numpy()).pdf(y.numpy())
+        wanted += prior.log_weight[group, part].exp().item() * density
+    white = multivariate_normal(np.zeros(6), variance * np.eye(6)).pdf(y.numpy())
+    assert evidence == pytest.approx(np.log(wanted / white), abs=1e-9)
+
+
+def test_group_means_are_those_of_samples_of_a_group(prior):
+    weight = prior.log_weight.exp()
+    wanted = torch.stack([(w[:, None] * c).sum(0) / w.sum() for w, c in zip(weight, prior.centre, strict=True)])
+    assert torch.allclose(prior.group_means(), wanted, atol=1e-12)
 
 
 def test_posterior_samples_have_the_posterior_s_mean_and_follow_what_is_observed(prior):
@@ -72,7 +93,7 @@ def test_posterior_samples_have_the_posterior_s_mean_and_follow_what_is_observed
     vector = torch.tensor([1.0, -0.3, 0.0, 0.7e6], dtype=F64)
     generator = torch.Generator().manual_seed(5)
     drawn = torch.stack([prior.posterior_sample(precision, vector, generator) for _ in range(4000)])
-    mean = prior.posterior_mean(precision, vector)
+    mean, _ = prior.posterior(precision, vector)
     assert ((drawn.mean(0) - mean).abs() < 4 * drawn.std(0) / 4000**0.5 + 1e-6).all()
     assert torch.allclose(drawn[:, 3], torch.tensor(0.7, dtype=F64), atol=0.01)
     everything = prior.posterior_sample(torch.zeros(4, 4, dtype=F64), torch.zeros(4, dtype=F64), generator)
