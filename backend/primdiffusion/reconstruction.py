@@ -29,7 +29,9 @@ from primdiffusion.diffusion.codec import VOXEL_VALUES, CellCodec, LinearCodec, 
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.encoder.model import EncoderModel, betas_of_frames
+from primdiffusion.diffusion.samplers import ddim, gaussian_noise
+from primdiffusion.encoder.model import EncoderModel, betas_of_frames, frames_of
+from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.human import Human, default_frames, made_by
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
@@ -54,6 +56,8 @@ PIXEL_STD = 0.08
 PULL, SMOOTHNESS = 2.0, 1.0
 """Penalties of the voxels' fit to one view (`InverseSettings`), which each further view outweighs more. As small as for
 many views, they would let one view change what only other sides show."""
+ENCODED_PULL, ENCODED_SMOOTHNESS = 8.0, 4.0
+"""The same after the encoder, whose human is nearer to the subject."""
 COARSE_SIDE, FINE_SIDE = 176, 512
 """Largest sides of the pictures for coefficients and for voxels, pixels."""
 
@@ -63,7 +67,7 @@ def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
 
     Raises ValueError if the model's output is not finite.
     """
-    payload = model.encode(person.views, person.betas)
+    payload = encode_and_fit(model, person.views, person.betas)
     provenance = {
         **_origin(person),
         "checkpoint": model.card.get("name", "unnamed"),
@@ -72,6 +76,26 @@ def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
     }
     betas = betas_of_frames(model.config, person.betas)
     return Human(payload, betas, provenance, model.body_setup).to("cpu").validate()
+
+
+def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"]) -> Payload:
+    """The encoder's payload, then one step of the linear solve, which adds the detail that the network smooths.
+
+    Boxes of the released code (`compat`) stay as their network draws them. Images without the subject are ignored.
+    """
+    payload = model.encode(views, betas)
+    frames = frames_of(model.config, betas, views.pose, model.body_setup)[1]
+    targets = [one for one in targets_of(views, [frames] * len(views.rgba), FINE_SIDE) if _shows(one)]
+    if model.config.compat == "released" or not targets or not bool(torch.isfinite(payload.density).all()):
+        return payload
+    settings = InverseSettings(steps=1, pull=ENCODED_PULL / len(targets), smoothness=ENCODED_SMOOTHNESS / len(targets))
+    return fit_payload(payload.to("cpu"), targets, model.config.full_density, settings)
+
+
+def _shows(target: TargetImage) -> bool:
+    """Whether an image shows the subject, and its camera faces it."""
+    depth = target.camera.project(target.frames.position)[1]
+    return bool(target.rgba[..., 3].any()) and bool((depth > 0).any())
 
 
 def reconstruct_by_prior(
@@ -116,6 +140,8 @@ class PersonComponents:
     """The person components of a diffusion model, and their prior."""
 
     denoiser: PersonDenoiser
+    chain: list[int]
+    """Descending t at which the denoiser draws."""
     prior: PersonPrior
     codec: LinearCodec
     full_density: float
@@ -129,8 +155,9 @@ class PersonComponents:
             raise ValueError(
                 f"the model belongs to the body {model.body_setup.files.smpl.path}: give one of the default body"
             )
+        chain = model.chain(model.schedule.length, requests.Sampling.steps)
         codec = model.codec.codec.to("cpu")
-        return cls(model.denoiser, model.denoiser.prior.to("cpu"), codec, model.full_density)
+        return cls(model.denoiser, chain, model.denoiser.prior.to("cpu"), codec, model.full_density)
 
     @property
     def mean(self) -> Float[Tensor, "r"]:
@@ -182,8 +209,8 @@ class PersonComponents:
     ) -> Payload:
         """The human in views with these frames: STEPS steps from `coefficients`, then voxels. Reports FIT_STEPS times.
 
-        With a generator, coefficients are drawn from their distribution given the views, instead of its mean: what no
-        view shows varies with it.
+        With a generator, coefficients are drawn from their distribution given the views, and the rest from that given
+        the coefficients, instead of their means: what no view shows varies with it.
         """
         targets = targets_of(views, frames, COARSE_SIDE)
         for step in range(STEPS):
@@ -192,19 +219,35 @@ class PersonComponents:
             on_step()
         targets = targets_of(views, frames, FINE_SIDE)
         settings = InverseSettings(pull=PULL / len(targets), smoothness=SMOOTHNESS / len(targets))
-        start = self.payload(coefficients, self.expected_rest(coefficients))
+        rest = self.expected_rest(coefficients) if generator is None else self.drawn_rest(coefficients, generator)
+        start = self.payload(coefficients, rest)
         payload = fit_payload(start, targets, self.full_density, settings)
         on_step()
         return payload
 
-    @torch.inference_mode()
     def expected_rest(self, coefficients: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
         """The mean rest of humans with these coefficients: what the network makes of noise alone."""
-        last, device = self.denoiser.schedule.length - 1, self.denoiser.component_std.device
-        noise = torch.randn(1, *self.prior.mean.shape, generator=torch.Generator().manual_seed(0))
-        level, person = torch.tensor([last], device=device), coefficients[None].to(device)
-        rest = self.denoiser.rest(noise.to(device), person, level).cpu()
-        return (self.prior.join(torch.zeros_like(coefficients[None]), rest) - self.prior.mean)[0].clone()
+        noise = gaussian_noise(self.prior.mean[None], torch.Generator().manual_seed(0))
+        return self._denoised_rest(noise, self.denoiser.schedule.length - 1, coefficients)[0]
+
+    def drawn_rest(self, coefficients: Float[Tensor, "r"], generator: torch.Generator) -> Float[Tensor, "c h w"]:
+        """The rest of a human with these coefficients, drawn by DDIM."""
+        schedule, noise = self.denoiser.schedule, gaussian_noise(self.prior.mean[None], generator)
+
+        def denoise(x: Tensor, t: int) -> Tensor:
+            return self._denoised_rest(x, t, coefficients)
+
+        *_, last = ddim(denoise, schedule, schedule.noise(self.chain[0]) * noise, self.chain, generator)
+        return last.x0[0]
+
+    def _denoised_rest(self, x: Float[Tensor, "1 c h w"], t: int, coefficients: Float[Tensor, "r"]) -> Tensor:
+        """The clean guess of a rest that holds noise of step t."""
+        device = self.denoiser.component_std.device
+        level, person = torch.tensor([t], device=device), coefficients[None].to(device)
+        outside = self.prior.join(torch.zeros_like(coefficients[None]), x) - self.prior.mean
+        with torch.inference_mode():
+            rest = self.denoiser.rest(outside.to(device), person, level)
+        return self.prior.join(torch.zeros_like(coefficients[None]), rest.cpu().clone()) - self.prior.mean
 
     def closer(
         self,

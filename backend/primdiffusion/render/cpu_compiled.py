@@ -5,10 +5,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -34,6 +34,7 @@ _LARGEST_SOURCE = 1_000_000
 _SOURCES = ("cpu_*.py", "merge.py", "lattice.py", "compositing.py")
 
 Function = Callable[..., Any]
+Result = TypeVar("Result")
 
 
 def kernel(function: Function) -> Any:
@@ -75,6 +76,12 @@ def on_all_threads(function: Any, *arguments: Any) -> None:
     for other in others:
         if not other.cancel():  # cancelled if it has not started: no work is left
             other.result()
+
+
+def at_once(calls: Sequence[Callable[[], Result]]) -> list[Result]:
+    """Results of calls of kernels, which run at the same time, on as many threads as there are; in order."""
+    others = [_pool(os.getpid()).submit(call) for call in calls[1:]]
+    return [calls[0](), *(other.result() for other in others)]
 
 
 @functools.cache

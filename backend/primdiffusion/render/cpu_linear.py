@@ -7,6 +7,9 @@ a ray in a box, so that products with the matrix and its transpose cost a fracti
 
 from __future__ import annotations
 
+import functools
+import itertools
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -18,7 +21,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import draw_with_ends
 from primdiffusion.render.cpu_adjoint import counted_steps
-from primdiffusion.render.cpu_compiled import TILE, index, kernel, part
+from primdiffusion.render.cpu_compiled import TILE, at_once, index, kernel, on_all_threads, part, take
 from primdiffusion.render.cpu_forward import NEVER
 from primdiffusion.render.cpu_sampling import (
     HIT_ROWS,
@@ -40,8 +43,10 @@ COLOUR, DENSITY, OPACITY = 0, 1, 4
 WEIGHTS = 5
 SHORTEST = 4e-5
 """Entries with less than this length of ray (metres) are dropped: 0.8 % of opacity at a density of 200 per metre."""
-FIRST_ROOM = 2_000_000
-"""Initial capacity in entries; an image of a human with 176 x 176 pixels has about 1.5 million."""
+FIRST_ROOM, ROOM_PER_PIXEL = 2_000_000, 16
+"""Initial capacity in entries; images of humans have some 1.5 million with 176 x 176 pixels, 3 million with 512 x 512."""
+PARTS = 4
+"""Ranges of boxes that are computed at once. Constant, so that sums over rays do not depend on the machine."""
 
 
 class PictureJacobian(NamedTuple):
@@ -84,28 +89,54 @@ def linearise(primitives: Primitives, camera: Camera, background: float) -> tupl
     behind = np.where(saturates[:, None], ends.rgb, np.float32(background)).astype(np.float32)
     density = primitives.density.detach().float().contiguous().numpy().reshape(boxes, VOXELS)
     rgb = primitives.rgb.detach().float().contiguous().numpy().reshape(boxes, 3, VOXELS)
-    room = FIRST_ROOM
-    while True:
-        box_start = np.zeros(boxes + 1, np.int64)
-        ray, start = np.empty(room // 8, np.int32), np.empty(room // 8 + 1, np.int64)
-        voxel, weight = np.empty(room, np.int16), np.empty((room, WEIGHTS), np.float32)
-        segments, entries = _linearise(
-            box_start, ray, start, voxel, weight, density, rgb, ends.index, share, ends.box, behind, scene.boxes,
-            scene.size, scene.rectangle, view.limits, scene.pixel_to_world, view.width, view.height, view.spacing,
-        )  # fmt: skip
-        if segments >= 0:
-            break
-        room *= 2
-    start[segments] = entries
+    room = max(FIRST_ROOM, ROOM_PER_PIXEL * len(behind)) // PARTS
+
+    def entries_of(first: int, last: int) -> tuple[ndarray, ...]:
+        """The arrays of PictureJacobian for a range of boxes."""
+        capacity = room
+        while True:
+            box_start = np.zeros(last - first + 1, np.int64)
+            ray, start = np.empty(capacity // 8, np.int32), np.empty(capacity // 8 + 1, np.int64)
+            voxel, weight = np.empty(capacity, np.int16), np.empty((capacity, WEIGHTS), np.float32)
+            segments, entries = _linearise(
+                first, last, box_start, ray, start, voxel, weight, density, rgb, ends.index, share, ends.box, behind,
+                scene.boxes, scene.size, scene.rectangle, view.limits, scene.pixel_to_world, view.width, view.height,
+                view.spacing,
+            )  # fmt: skip
+            if segments >= 0:
+                return box_start[:-1], ray[:segments], start[:segments], voxel[:entries], weight[:entries]
+            capacity *= 2
+
+    ranges = _ranges(_tiles(scene.rectangle))
+    parts = list(zip(*at_once([functools.partial(entries_of, *one) for one in ranges]), strict=True))
     jacobian = PictureJacobian(
-        box_start,
-        ray[:segments].copy(),
-        start[: segments + 1].copy(),
-        voxel[:entries].copy(),
-        weight[:entries].copy(),
+        _joined(parts[0], parts[1]),
+        np.concatenate(parts[1]),
+        _joined(parts[2], parts[3]),
+        np.concatenate(parts[3]),
+        np.concatenate(parts[4]),
         len(behind),
     )
     return rendering, jacobian
+
+
+def _tiles(rectangle: Int32[ndarray, "k 4"]) -> Int64[ndarray, "k"]:
+    """Number of tiles that each box may be seen in: an estimate of its work."""
+    sides = (rectangle[:, 1::2] - rectangle[:, ::2] + 1).clip(0).astype(np.int64)
+    return sides[:, 0] * sides[:, 1]
+
+
+def _ranges(work: Int64[ndarray, "k"]) -> list[tuple[int, int]]:
+    """PARTS ranges (first, last + 1) of boxes with about the same work."""
+    total = np.concatenate([[0], np.cumsum(work + 1)])
+    bounds = np.searchsorted(total, np.linspace(0, total[-1], PARTS + 1))
+    return list(itertools.pairwise(bounds.tolist()))
+
+
+def _joined(starts: Sequence[Int64[ndarray, "n"]], items: Sequence[ndarray]) -> Int64[ndarray, "m+1"]:
+    """Starts of the parts' groups of items, in the parts joined; the last is the number of items."""
+    offsets = np.cumsum([0, *map(len, items)])
+    return np.concatenate([*(start + offset for start, offset in zip(starts, offsets, strict=False)), offsets[-1:]])
 
 
 def apply(
@@ -115,8 +146,14 @@ def apply(
 
     `alpha_free` is 1 where alpha follows density and 0 where the ray is opaque.
     """
-    out = np.zeros((jacobian.rays, 4), np.float32)
-    _apply(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight, change, out)
+
+    def part(first: int, last: int) -> ndarray:
+        out = np.zeros((jacobian.rays, 4), np.float32)
+        arrays = jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight
+        _apply(first, last, jacobian.box_start, *arrays, change, out)
+        return out
+
+    out = sum(at_once([functools.partial(part, *one) for one in _ranges(np.diff(jacobian.box_start))]))
     out[:, 3] *= alpha_free
     return out
 
@@ -130,7 +167,8 @@ def add_transposed(
     """out += J^T y."""
     freed = pixels.copy()
     freed[:, 3] *= alpha_free
-    _add_transposed(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight, freed, out)
+    arrays = jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight
+    on_all_threads(_add_transposed, *arrays, freed, out)
 
 
 def add_diagonal(
@@ -142,7 +180,8 @@ def add_diagonal(
     """out += diag(J^T W J), merged entries squared, for a diagonal W of the pixels' weights."""
     freed = weight.copy()
     freed[:, 3] *= alpha_free
-    _add_diagonal(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight, freed, out)
+    arrays = jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight
+    on_all_threads(_add_diagonal, *arrays, freed, out)
 
 
 def apply_to_codes(
@@ -204,8 +243,8 @@ class ColourMatrix(NamedTuple):
 
 @kernel
 def _linearise(
-    box_start, ray_of, start, voxel, weight, density, rgb, ends, shares, last_box, behind, boxes, size, rectangle,
-    limits, pixel_to_world, width, height, spacing,
+    begin_box, end_box, box_start, ray_of, start, voxel, weight, density, rgb, ends, shares, last_box, behind, boxes,
+    size, rectangle, limits, pixel_to_world, width, height, spacing,
 ):  # fmt: skip
     """Fill the matrix; return the numbers of segments and entries, or -1 if they exceed its capacity."""
     rays = np.empty(3 * PIXELS, np.float32)
@@ -216,8 +255,8 @@ def _linearise(
     touched = np.empty(VOXELS, np.int64)
     seen = np.zeros(VOXELS, np.bool_)
     segments, entries = 0, 0
-    for k in range(len(rectangle)):
-        box_start[k] = segments
+    for k in range(begin_box, end_box):
+        box_start[k - begin_box] = segments
         if rectangle[k, 0] > rectangle[k, 1]:
             continue
         stride = boxes.stride[k]
@@ -264,7 +303,7 @@ def _linearise(
                         if entries > first:
                             ray_of[segments], start[segments] = ray, first
                             segments += 1
-    box_start[len(rectangle)] = segments
+    box_start[end_box - begin_box] = segments
     return segments, entries
 
 
@@ -310,8 +349,8 @@ def _merge_segment(sums, touched, seen, density, rgb, behind, block, hits, lane,
 
 
 @kernel
-def _apply(box_start, ray, start, voxel, weight, x, out):
-    for k in range(len(box_start) - 1):
+def _apply(begin_box, end_box, box_start, ray, start, voxel, weight, x, out):
+    for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
             r, g, b, a = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
@@ -330,8 +369,11 @@ def _apply(box_start, ray, start, voxel, weight, x, out):
 
 
 @kernel
-def _add_transposed(box_start, ray, start, voxel, weight, y, out):
-    for k in range(len(box_start) - 1):
+def _add_transposed(taken, box_start, ray, start, voxel, weight, y, out):
+    while True:
+        k = take(taken)
+        if k >= len(box_start) - 1:
+            break
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
             i = ray[segment]
@@ -346,8 +388,11 @@ def _add_transposed(box_start, ray, start, voxel, weight, y, out):
 
 
 @kernel
-def _add_diagonal(box_start, ray, start, voxel, weight, y, out):
-    for k in range(len(box_start) - 1):
+def _add_diagonal(taken, box_start, ray, start, voxel, weight, y, out):
+    while True:
+        k = take(taken)
+        if k >= len(box_start) - 1:
+            break
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
             i = ray[segment]
