@@ -244,10 +244,9 @@ class PersonComponents:
         """The clean guess of a rest that holds noise of step t."""
         device = self.denoiser.component_std.device
         level, person = torch.tensor([t], device=device), coefficients[None].to(device)
-        outside = self.prior.join(torch.zeros_like(coefficients[None]), x) - self.prior.mean
         with torch.inference_mode():
-            rest = self.denoiser.rest(outside.to(device), person, level)
-        return self.prior.join(torch.zeros_like(coefficients[None]), rest.cpu().clone()) - self.prior.mean
+            rest = self.denoiser.rest(self.prior.outside(x).to(device), person, level)
+        return self.prior.outside(rest.cpu().clone())
 
     def closer(
         self,
@@ -265,21 +264,20 @@ class PersonComponents:
         slope = by_cell[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1).numpy()
         payload, region = payload.map(Tensor.detach), codec.region.numpy()
         precision, vector = torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis))
-        misfit = 0.0
-        """Of the pictures at coefficients of 0, by the linearisation."""
+        misfit = 0.0  # of coefficients of 0, by the linearisation
         for target in targets:
             view = LinearisedView.of(target, payload, InverseSettings())
             seen = np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0
-            matrix = apply_to_codes(view.jacobian, slope, self._voxel_basis, region, self._codes, view.alpha_free)[seen]
-            matrix = torch.from_numpy(matrix).flatten(0, 1)
-            weight = torch.from_numpy(view.weight) * (OBSERVATIONS / PIXEL_STD**2)
-            residual, weight_seen = torch.from_numpy(view.residual), weight[seen].flatten()
-            wanted = residual[seen].flatten() + matrix @ coefficients
-            weighted = matrix.mT * weight_seen
+            by_code = apply_to_codes(view.jacobian, slope, self._voxel_basis, region, self._codes, view.alpha_free)
+            matrix = torch.from_numpy(by_code[seen]).flatten(0, 1)
+            weights = view.weight * np.float32(OBSERVATIONS / PIXEL_STD**2)
+            weight = torch.from_numpy(weights[seen]).flatten()
+            wanted = torch.from_numpy(view.residual[seen]).flatten() + matrix @ coefficients
+            weighted = matrix.mT * weight
             precision += weighted @ matrix
             vector += weighted @ wanted
-            misfit += float(weight_seen.double() @ wanted.double().square()) / 2
-            misfit += float((weight[~seen].double() * residual[~seen].double().square()).sum()) / 2
+            misfit += float(weight.double() @ wanted.double().square()) / 2
+            misfit += float((weights[~seen] * view.residual[~seen] ** 2).sum(dtype=np.float64)) / 2
         mean, evidence = prior.posterior(precision, vector)
         if generator is not None:
             mean = prior.posterior_sample(precision, vector, generator)

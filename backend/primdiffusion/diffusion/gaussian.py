@@ -56,6 +56,10 @@ class PersonPrior(TensorRecord):
         """Latents of person coefficients and rest; the rest's share along the components is removed."""
         return self.mean + rest + self.picture(coefficients - self._along(rest))
 
+    def outside(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
+        """The part orthogonal to the person components of latents without the mean."""
+        return z - self.picture(self._along(z))
+
     def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
         """Return the contribution of person coefficients to latents, without the mean."""
         flat = coefficients @ self.basis

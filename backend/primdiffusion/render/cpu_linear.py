@@ -44,9 +44,9 @@ WEIGHTS = 5
 SHORTEST = 4e-5
 """Entries with less than this length of ray (metres) are dropped: 0.8 % of opacity at a density of 200 per metre."""
 FIRST_ROOM, ROOM_PER_PIXEL = 2_000_000, 16
-"""Initial capacity in entries; images of humans have some 1.5 million with 176 x 176 pixels, 3 million with 512 x 512."""
+"""Initial capacity in entries; an image of a human has 1.5 million with 176 x 176 pixels, 3 million with 512 x 512."""
 PARTS = 4
-"""Ranges of boxes that are computed at once. Constant, so that sums over rays do not depend on the machine."""
+"""Ranges of boxes computed at once. Constant, so that sums over rays are the same on every machine."""
 
 
 class PictureJacobian(NamedTuple):
@@ -153,7 +153,8 @@ def apply(
         _apply(first, last, jacobian.box_start, *arrays, change, out)
         return out
 
-    out = sum(at_once([functools.partial(part, *one) for one in _ranges(np.diff(jacobian.box_start))]))
+    parts = at_once([functools.partial(part, *one) for one in _ranges(np.diff(jacobian.box_start))])
+    out = functools.reduce(np.add, parts)
     out[:, 3] *= alpha_free
     return out
 

@@ -106,9 +106,21 @@ def test_colour_matrix_multiplies_every_column_alike(scene):
     assert float((colours * back).sum()) == pytest.approx(float((together**2).sum()), rel=1e-3)
 
 
+def test_parts_make_the_same_matrix_as_the_whole(scene, monkeypatch):
+    boxes, camera, jacobian, free = scene
+    change = normal(4, jacobian.voxels, 4)
+    drawn = apply(jacobian, change, free)
+    monkeypatch.setattr(cpu_linear, "PARTS", 1)
+    _, whole = linearise(boxes, camera, GREY)
+    for name, part, wanted in zip(PictureJacobian._fields, jacobian, whole, strict=True):
+        assert np.array_equal(part, wanted), name
+    assert np.allclose(drawn, apply(whole, change, free), atol=1e-4)
+
+
 def test_room_grows_with_the_matrix(scene, monkeypatch):
     boxes, camera, jacobian, _ = scene
     monkeypatch.setattr(cpu_linear, "FIRST_ROOM", 512)
+    monkeypatch.setattr(cpu_linear, "ROOM_PER_PIXEL", 0)
     _, again = linearise(boxes, camera, GREY)
     for field in PictureJacobian._fields:
         assert np.array_equal(getattr(again, field), getattr(jacobian, field)), field
