@@ -4,9 +4,10 @@
 draws them in nine poses from 24 sides at 256 x 256 with the rasteriser, and refines on eight poses and 21 cameras,
 starting from the encoder's human, from `from_mesh` of their mesh, and from the bare grey body. PSNR is of whole
 sRGB-encoded pictures, averaged: `heldout_views` are three cameras in the eight poses, `unseen_pose` all cameras in the
-ninth. Seconds are wall time and processor time of the steps. `linear_` figures are of the linear solve instead
-(`render.inverse`), on 84 of the pictures. `--quick` takes 60 steps from the encoder only. `--pictures DIR` saves
-held-out views side by side, a row for each start: before, after, target.
+ninth. Seconds are wall time and processor time of the steps. `fixed_boxes` figures are of refining with boxes that keep
+their sizes, `linear_` figures of the linear solve instead (`render.inverse`), on 84 of the pictures. `--quick` takes 60
+steps from the encoder only. `--pictures DIR` saves held-out views side by side, a row for each start: before, after,
+target.
 """
 
 from __future__ import annotations
@@ -84,6 +85,11 @@ def main() -> None:
         measured, refined = measure(start.to(best_device()), *sets, steps)
         figures |= {f"{figure}_from_{source}": value for figure, value in measured.items()}
         rows.append(compared((start, refined), [sets[1][0], sets[1][4], sets[2][0]]))
+    fixed = refine(starts["encoder"], sets[0], RefineSettings(steps=steps, scale_rate=0)).human
+    figures |= {
+        "refine_psnr_heldout_views_fixed_boxes": mean_psnr(fixed, sets[1]),
+        "refine_psnr_unseen_pose_fixed_boxes": mean_psnr(fixed, sets[2]),
+    }
     figures |= linear(starts["encoder"], sets[0], sets[1], sets[2])
     if arguments.pictures:
         arguments.pictures.mkdir(parents=True, exist_ok=True)
