@@ -8,11 +8,21 @@ import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.encoder.model import EncoderModel
+from primdiffusion.encoder.network import Encoder
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, frames_of, framing, place
-from primdiffusion.reconstruction import FIT_STEPS, PersonComponents, reconstruct_by_prior, targets_of
+from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.reconstruction import (
+    FIT_STEPS,
+    PersonComponents,
+    encode_and_fit,
+    reconstruct_by_prior,
+    targets_of,
+)
 from primdiffusion.render.march import march
 from support.errors import refused
+from tiny_encoder import TINY, tiny_encoder
 from tiny_model import SLOW, tiny_model
 
 MODEL = tiny_model()
@@ -133,3 +143,34 @@ def test_a_model_without_person_components_is_refused():
     person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
     with refused(ValueError, "person components"):
         reconstruct_by_prior(dataclasses.replace(MODEL, denoiser=torch.nn.Identity()), person)
+
+
+def test_the_fit_after_the_encoder_draws_the_views_closer():
+    model, person = tiny_encoder(), captured(human_of(COLOURS), BodyPose.rest(), [0.0, 1.6, 3.1])
+    frames = [frames_of(human_of(COLOURS))] * 3
+
+    def error(payload: Payload) -> float:
+        drawn = [
+            march(Primitives.place(frames[0], payload), one.camera) for one in targets_of(person.views, frames, 128)
+        ]
+        pairs = zip(drawn, targets_of(person.views, frames, 128), strict=True)
+        return float(sum((one.rgb - torch.from_numpy(target.rgba[..., :3])).square().mean() for one, target in pairs))
+
+    encoded = model.encode(person.views, person.betas)
+    assert error(encode_and_fit(model, person.views, person.betas)) < 0.8 * error(encoded)
+
+
+def test_images_without_the_subject_are_not_fitted():
+    person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
+    empty = dataclasses.replace(person.views, rgba=torch.zeros_like(person.views.rgba))
+    encoded = tiny_encoder().encode(empty, BETAS)
+    assert torch.equal(encode_and_fit(tiny_encoder(), empty, BETAS).density, encoded.density)
+
+
+def test_boxes_of_the_released_code_stay_as_their_network_draws_them():
+    small = dataclasses.replace(TINY, compat="released", detail="bottleneck", grid_entry="halving")
+    torch.manual_seed(0)
+    model = EncoderModel(Encoder(small).eval().requires_grad_(False), {})
+    person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
+    encoded = model.encode(person.views, BETAS)
+    assert torch.equal(encode_and_fit(model, person.views, BETAS).rgb, encoded.rgb)
