@@ -14,6 +14,7 @@ import dataclasses
 import functools
 import itertools
 import math
+import sys
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -39,11 +40,21 @@ from primdiffusion.render.cpu_linear import apply_to_codes
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
 from primdiffusion.version import __version__
 
-TRIALS = ((64, 1000, 1), (64, 6, 2), (176, 2, 3))
-"""Rounds that choose where to start, among the mean human and the mean of each outfit: largest side of the pictures,
-the most candidates left, and the Gauss-Newton steps of each."""
+
+class Trial(NamedTuple):
+    """A round that thins out candidates for where to start: the mean human, and the mean of each outfit."""
+
+    side: int
+    """Largest side of the pictures, pixels."""
+    most: int
+    """Candidates left, those that explain the pictures best."""
+    steps: int
+    """Gauss-Newton steps of each."""
+
+
+TRIALS = (Trial(64, sys.maxsize, 1), Trial(64, 6, 2), Trial(176, 2, 3))
 TRIAL_VIEWS = 2
-"""Views, evenly spaced, that they look at."""
+"""Views, evenly spaced, that trials look at."""
 STEPS = 2
 """Gauss-Newton steps from there, in all views."""
 FIT_STEPS = STEPS + 1
@@ -83,10 +94,11 @@ def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"])
 
     Boxes of the released code (`compat`) stay as their network draws them. Images without the subject are ignored.
     """
+    views, betas = views.to("cpu"), betas.cpu()
     payload = model.encode(views, betas)
     frames = frames_of(model.config, betas, views.pose, model.body_setup)[1]
     targets = [one for one in targets_of(views, [frames] * len(views.rgba), FINE_SIDE) if _shows(one)]
-    if model.config.compat == "released" or not targets or not bool(torch.isfinite(payload.density).all()):
+    if model.config.compat == "released" or not targets:
         return payload
     settings = InverseSettings(steps=1, pull=ENCODED_PULL / len(targets), smoothness=ENCODED_SMOOTHNESS / len(targets))
     return fit_payload(payload.to("cpu"), targets, model.config.full_density, settings)
@@ -167,7 +179,7 @@ class PersonComponents:
     @property
     def start_steps(self) -> int:
         """How often `start` reports."""
-        return sum(min(count, 1 + len(self.prior.centre)) * steps for _, count, steps in TRIALS)
+        return sum(min(trial.most, 1 + len(self.prior.centre)) * trial.steps for trial in TRIALS)
 
     @functools.cached_property
     def _voxel_basis(self) -> Float32[ndarray, "b 512 4 c"]:
@@ -189,11 +201,11 @@ class PersonComponents:
         """Coefficients near those of the human in views with these frames; reports `start_steps` times."""
         every = math.ceil(len(frames) / TRIAL_VIEWS)
         candidates = [Explanation(start, 0.0) for start in (self.mean, *self.prior.group_means())]
-        for side, count, steps in TRIALS:
-            targets = targets_of(views, frames, side)[::every]
-            candidates = sorted(candidates, key=lambda one: one.evidence, reverse=True)[:count]
+        for trial in TRIALS:
+            targets = targets_of(views, frames, trial.side)[::every]
+            candidates = sorted(candidates, key=lambda one: one.evidence, reverse=True)[: trial.most]
             for number, explanation in enumerate(candidates):
-                for _ in range(steps):
+                for _ in range(trial.steps):
                     explanation = self.closer(explanation.coefficients, targets)
                     on_step()
                 candidates[number] = explanation
