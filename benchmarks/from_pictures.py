@@ -28,6 +28,7 @@ stay in the folder --reference, which benchmarks/diffusion.py uses as well.
 
     one_view_unseen_distance_ratio          of reconstructions, whose unseen sides are the most probable ones
     one_view_drawn_unseen_distance_ratio    of those with a seed, whose unseen sides are drawn
+    ..._unseen_distance                     the distances themselves
 """
 
 from __future__ import annotations
