@@ -58,7 +58,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation.attribute_network import features_of, fit_attribute_network
-from primdiffusion.evaluation.distances import kernel_distance
+from primdiffusion.evaluation.distances import cubic_kernel, kernel_distance
 from primdiffusion.evaluation.gallery import COLOURINGS, PORTRAITS, made_gallery, mesh_sources, open_gallery
 from primdiffusion.evaluation.generation import PORTRAITS_FOLDER
 from primdiffusion.evaluation.image_metrics import ssim
@@ -197,11 +197,8 @@ def distance_in_pairs(first: Float[Tensor, "n f"], second: Float[Tensor, "n f"])
     Gretton et al. 2012, eq. 4. What both have in common, such as who the people are, cancels.
     """
     first, second = first.double(), second.double()
-
-    def kernel(a: Float[Tensor, "n f"], b: Float[Tensor, "n f"]) -> Float[Tensor, "n n"]:
-        return (a @ b.T / a.shape[1] + 1) ** 3
-
-    table = kernel(first, first) + kernel(second, second) - kernel(first, second) - kernel(second, first)
+    between = cubic_kernel(first, second)
+    table = cubic_kernel(first, first) + cubic_kernel(second, second) - between - between.T
     return float((table.sum() - table.trace()) / (len(table) * (len(table) - 1)))
 
 

@@ -5,9 +5,11 @@ import math
 
 import pytest
 import torch
+from primdiffusion import reconstruction
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.diffusion.model import sample
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.geometry.srgb import encode_srgb
@@ -15,11 +17,14 @@ from primdiffusion.human import Human, frames_of, framing, place
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.reconstruction import (
     FIT_STEPS,
+    OBSERVATIONS,
+    PIXEL_STD,
     PersonComponents,
     encode_and_fit,
     reconstruct_by_prior,
     targets_of,
 )
+from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
 from support.errors import refused
 from tiny_encoder import TINY, tiny_encoder
@@ -130,6 +135,28 @@ def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
     assert (components.start(person.views, frames) - wanted).norm() < 10
 
 
+def test_evidence_is_the_pictures_probability_where_the_prior_leaves_no_choice():
+    prior = dataclasses.replace(PRIOR, centre=torch.zeros(1, 2, 3), variance=torch.full((1, 3), 1e-8))
+    components = dataclasses.replace(PersonComponents.of(MODEL), prior=prior)
+    human = human_of(COLOURS)
+    targets = targets_of(captured(human, BodyPose.rest(), [0.0]).views, [frames_of(human)], 64)
+    view = LinearisedView.of(targets[0], components.payload(components.mean), InverseSettings())
+    wanted = -OBSERVATIONS / PIXEL_STD**2 * float((view.weight * view.residual**2).sum()) / 2
+    assert components.closer(components.mean, targets).evidence == pytest.approx(wanted, rel=1e-3)
+
+
+def test_a_seed_draws_the_rest_too():
+    person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
+    behind = frames_of(human_of(COLOURS)).rotation[:, 2, 2] < -0.7
+    one, other = (reconstruct_by_prior(MODEL, person, seed=seed).payload.density[behind] for seed in (1, 2))
+    assert (one - other).abs().mean() > 0.1  # coefficients are of colours alone
+    components = PersonComponents.of(MODEL)
+    rest = components.drawn_rest(COLOURS, torch.Generator().manual_seed(0))
+    assert torch.allclose(PRIOR.outside(rest[None])[0], rest, atol=1e-5)
+    *_, last = sample(MODEL, [0])
+    assert float(rest.std()) == pytest.approx(float(PRIOR.split(last.x0)[1].std()), rel=0.1)
+
+
 def test_what_components_cannot_draw_comes_from_the_network():
     model = tiny_model(SLOW)
     with torch.no_grad():
@@ -165,6 +192,16 @@ def test_images_without_the_subject_are_not_fitted():
     empty = dataclasses.replace(person.views, rgba=torch.zeros_like(person.views.rgba))
     encoded = tiny_encoder().encode(empty, BETAS)
     assert torch.equal(encode_and_fit(tiny_encoder(), empty, BETAS).density, encoded.density)
+
+
+def test_of_many_images_some_evenly_spaced_are_fitted(monkeypatch):
+    person, model = captured(human_of(COLOURS), BodyPose.rest(), [0.0, 1.6, 3.1, 4.7]), tiny_encoder()
+    fitted = []
+    monkeypatch.setattr(reconstruction, "MOST_FITTED", 2)
+    monkeypatch.setattr(reconstruction, "fit_payload", lambda start, targets, *_: fitted.extend(targets) or start)
+    encode_and_fit(model, person.views, BETAS)
+    for target, number in zip(fitted, (0, 2), strict=True):
+        assert torch.equal(target.camera.world_to_camera, person.views.camera.world_to_camera[number])
 
 
 def test_boxes_of_the_released_code_stay_as_their_network_draws_them():

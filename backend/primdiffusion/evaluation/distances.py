@@ -47,23 +47,24 @@ def too_few_samples(first: int, second: int, features: int) -> str | None:
     )
 
 
+def cubic_kernel(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> Float[Tensor, "n m"]:
+    """(x.y / d + 1)^3 of every two samples."""
+    return (first @ second.T / first.shape[1] + 1) ** 3
+
+
 def kernel_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> float:
-    """Squared maximum mean discrepancy with the kernel (x.y / d + 1)^3 (KID, Binkowski et al. 2018).
+    """Squared maximum mean discrepancy with `cubic_kernel` (KID, Binkowski et al. 2018).
 
     The unbiased estimate over all samples: 0 on average for two sets of one distribution, so it can be negative. Raises
     ValueError as `frechet_distance`.
     """
     _check(first, second)
     first, second = first.double(), second.double()
-
-    def kernel(a: Tensor, b: Tensor) -> Tensor:
-        return (a @ b.T / a.shape[1] + 1) ** 3
-
     within = 0.0
     for features in (first, second):
-        table = kernel(features, features)
+        table = cubic_kernel(features, features)
         within += float((table.sum() - table.trace()) / (len(features) * (len(features) - 1)))
-    return within - 2 * float(kernel(first, second).mean())
+    return within - 2 * float(cubic_kernel(first, second).mean())
 
 
 class KernelDistances(NamedTuple):
