@@ -38,9 +38,10 @@ from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.reconstruction import reconstruct, targets_of
+from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
-from primdiffusion.training.refine import RefineSettings, bare_body, meshed_person, refine, view_psnr
+from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
 from record import command_line, report
 
 SEED = 30_000_000
@@ -53,7 +54,7 @@ LINEAR_PICTURES = 84
 def main() -> None:
     parser = command_line(__doc__)
     parser.add_argument("--assets", type=Path, help="MakeHuman asset folder (or PRIMDIFFUSION_ASSETS)")
-    parser.add_argument("--steps", type=int, default=RefineSettings().steps, help="steps of each refinement")
+    parser.add_argument("--steps", type=int, default=DescentSettings().steps, help="steps of each refinement")
     parser.add_argument("--seed", type=int, default=SEED, help="seed of the person")
     parser.add_argument("--quick", action="store_true", help="few steps, from the mesh only")
     parser.add_argument("--pictures", type=Path, help="folder for a PNG")
@@ -85,7 +86,7 @@ def main() -> None:
         measured, refined = measure(start.to(best_device()), *sets, steps)
         figures |= {f"{figure}_from_{source}": value for figure, value in measured.items()}
         rows.append(compared((start, refined), [sets[1][0], sets[1][4], sets[2][0]]))
-    fixed = refine(starts["encoder"], sets[0], RefineSettings(steps=steps, scale_rate=0)).human
+    fixed = refine(starts["encoder"], sets[0], DescentSettings(steps=steps, scale_rate=0)).human
     figures |= {
         "refine_psnr_heldout_views_fixed_boxes": mean_psnr(fixed, sets[1]),
         "refine_psnr_unseen_pose_fixed_boxes": mean_psnr(fixed, sets[2]),
@@ -102,14 +103,14 @@ def measure(
     start: Human, given: list[Views], held: list[Views], unseen: list[Views], steps: int
 ) -> tuple[dict[str, float], Human]:
     """Figures of one refinement, and its person. A step beforehand compiles the marcher."""
-    refine(start, given[:1], RefineSettings(steps=1))
+    refine(start, given[:1], DescentSettings(steps=1))
     moments = []
 
     def note(_: object) -> None:
         moments.append((time.perf_counter(), time.process_time()))
 
     note(None)
-    refined = refine(start, given, RefineSettings(steps=steps), note).human
+    refined = refine(start, given, DescentSettings(steps=steps), note).human
     figures = {
         "refine_psnr_start": mean_psnr(start, held),
         "refine_psnr_heldout_views": mean_psnr(refined, held),

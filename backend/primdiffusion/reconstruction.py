@@ -37,6 +37,7 @@ from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.human import Human, default_frames, made_by
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.render.cpu_linear import apply_to_codes
+from primdiffusion.render.descent import DescentSettings, PosedView, descend
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
 from primdiffusion.version import __version__
 
@@ -67,10 +68,10 @@ PIXEL_STD = 0.08
 PULL, SMOOTHNESS = 2.0, 1.0
 """Penalties of the voxels' fit to one view (`InverseSettings`), which each further view outweighs more. As small as for
 many views, they would let one view change what only other sides show."""
-ENCODED_PULL, ENCODED_SMOOTHNESS = 8.0, 4.0
-"""The same after the encoder, whose human is nearer to the subject."""
-MOST_FITTED = 16
-"""Images that the encoder's human is fitted to, evenly spaced: each takes 65 MB of memory and a quarter of a second."""
+ENCODED = DescentSettings(steps=40)
+"""Descent from the encoder's human."""
+ENCODED_SIDE = 256
+"""Largest side of the grid of rays that a step of it draws: every second pixel of images of 512 pixels."""
 COARSE_SIDE, FINE_SIDE = 176, 512
 """Largest sides of the pictures for coefficients and for voxels, pixels."""
 
@@ -92,25 +93,27 @@ def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
 
 
 def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"]) -> Payload:
-    """The encoder's payload, then one step of the linear solve, which adds the detail that the network smooths.
+    """The encoder's payload, then a short descent on its images: it adds the detail that the network smooths.
 
     Boxes of the released code (`compat`) stay as their network draws them. Images without the subject are ignored.
     """
-    views, betas = views.to("cpu"), betas.cpu()
     payload = model.encode(views, betas)
-    frames = frames_of(model.config, betas, views.pose, model.body_setup)[1]
-    targets = [one for one in targets_of(views, [frames] * len(views.rgba), FINE_SIDE) if _shows(one)]
-    targets = targets[:: math.ceil(len(targets) / MOST_FITTED) or 1]
-    if model.config.compat == "released" or not targets:
+    frames = frames_of(model.config, betas.cpu(), views.pose.to("cpu"), model.body_setup)[1]
+    views, frames = views.to(payload.density.device), frames.to(payload.density.device)
+    cameras = [views.camera.map(lambda values, i=i: values[i]) for i in range(len(views.rgba))]
+    images = [PosedView(frames, camera, rgba) for camera, rgba in zip(cameras, views.rgba, strict=True)]
+    seen = [image for image in images if _shows(image)]
+    if model.config.compat == "released" or not seen:
         return payload
-    settings = InverseSettings(steps=1, pull=ENCODED_PULL / len(targets), smoothness=ENCODED_SMOOTHNESS / len(targets))
-    return fit_payload(payload.to("cpu"), targets, model.config.full_density, settings)
+    stride = math.ceil(max(views.camera.width, views.camera.height) / ENCODED_SIDE)
+    settings = dataclasses.replace(ENCODED, stride=stride, largest_density=model.config.full_density)
+    return descend(payload, seen, settings).payload
 
 
-def _shows(target: TargetImage) -> bool:
+def _shows(image: PosedView) -> bool:
     """Whether an image shows the subject, and its camera faces it."""
-    depth = target.camera.project(target.frames.position)[1]
-    return bool(target.rgba[..., 3].any()) and bool((depth > 0).any())
+    depth = image.camera.project(image.frames.position)[1]
+    return bool(image.target[..., 3].any()) and bool((depth > 0).any())
 
 
 def reconstruct_by_prior(

@@ -5,7 +5,6 @@ import math
 
 import pytest
 import torch
-from primdiffusion import reconstruction
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views, stack
@@ -192,16 +191,6 @@ def test_images_without_the_subject_are_not_fitted():
     empty = dataclasses.replace(person.views, rgba=torch.zeros_like(person.views.rgba))
     encoded = tiny_encoder().encode(empty, BETAS)
     assert torch.equal(encode_and_fit(tiny_encoder(), empty, BETAS).density, encoded.density)
-
-
-def test_of_many_images_some_evenly_spaced_are_fitted(monkeypatch):
-    person, model = captured(human_of(COLOURS), BodyPose.rest(), [0.0, 1.6, 3.1, 4.7]), tiny_encoder()
-    fitted = []
-    monkeypatch.setattr(reconstruction, "MOST_FITTED", 2)
-    monkeypatch.setattr(reconstruction, "fit_payload", lambda start, targets, *_: fitted.extend(targets) or start)
-    encode_and_fit(model, person.views, BETAS)
-    for target, number in zip(fitted, (0, 2), strict=True):
-        assert torch.equal(target.camera.world_to_camera, person.views.camera.world_to_camera[number])
 
 
 def test_boxes_of_the_released_code_stay_as_their_network_draws_them():

@@ -52,7 +52,8 @@ from primdiffusion.posture.fit import Posture
 from primdiffusion.posture.start import views_of
 from primdiffusion.reconstruction import reconstruct as reconstruct_human
 from primdiffusion.reconstruction import reconstruct_by_prior
-from primdiffusion.training.refine import RefineSettings, RefineStep, bare_body, meshed_person, refine, view_psnr
+from primdiffusion.render.descent import DescentSettings, DescentStep
+from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
 
 STAGES = 4
 """Load, read, encode, write."""
@@ -120,7 +121,7 @@ def run_refine(command: RefineCommand) -> None:
     Raises:
         ValueError, FileNotFoundError: captures, start or settings are missing, damaged or do not match; OSError.
     """
-    settings = RefineSettings(command.steps, seconds=60 * command.minutes, seed=command.seed)
+    settings = DescentSettings(command.steps, seconds=60 * command.minutes, seed=command.seed)
     with staged(command.out) as folder:
         captures, name = choose_subject(command.capture, command.subject)
         person = captures.subject(name)
@@ -132,7 +133,7 @@ def run_refine(command: RefineCommand) -> None:
         human = _start(command, captures, name, betas, given).to(best_device())
         with tqdm(total=command.steps, desc=name, unit="step", disable=None) as bar:
 
-            def on_step(step: RefineStep) -> None:
+            def on_step(step: DescentStep) -> None:
                 bar.update()
 
             refined = refine(human, views, settings, on_step)

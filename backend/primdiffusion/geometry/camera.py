@@ -52,6 +52,13 @@ class Camera(TensorRecord):
         """The camera of a crop that starts at pixel (left, top); pixels keep their rays."""
         return dataclasses.replace(self.moved_in_picture(float(-left), float(-top)), width=width, height=height)
 
+    def every(self, stride: int, left: int, top: int) -> Camera:
+        """The camera of every stride-th pixel of every stride-th row, from (left, top) on; pixels keep their rays."""
+        moved = self.moved_in_picture((stride - 1) / 2 - left, (stride - 1) / 2 - top).intrinsics
+        intrinsics = torch.cat([moved[..., :2, :] / stride, moved[..., 2:, :]], dim=-2)
+        width, height = -(-(self.width - left) // stride), -(-(self.height - top) // stride)
+        return dataclasses.replace(self, intrinsics=intrinsics, width=width, height=height)
+
     def project(self, points: Float[Tensor, "*b 3"]) -> tuple[Float[Tensor, "*b 2"], Float[Tensor, "*b"]]:
         """Pixel coordinates and depth along the optical axis; points behind the camera have depth <= 0.
 

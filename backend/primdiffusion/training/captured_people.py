@@ -29,7 +29,8 @@ from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD
 from primdiffusion.people.payloads import store_person, voxels_from_payload
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.training.refine import RefineSettings, refine
+from primdiffusion.render.descent import DescentSettings
+from primdiffusion.training.refine import refine
 from primdiffusion.training.stored_people import read_person
 
 
@@ -108,7 +109,7 @@ def looks_of(
         payload = model.encode(conditioning_views(captures, name, frame, cameras), given).validate()
         if pictures:
             human = Human(payload, betas, {}, model.body_setup).to(payload.density.device)
-            payload = refine(human, pictures, RefineSettings(settings.refine_steps, seed=settings.seed)).human.payload
+            payload = refine(human, pictures, DescentSettings(settings.refine_steps, seed=settings.seed)).human.payload
         payloads.append(payload.to("cpu"))
     return payloads, betas
 

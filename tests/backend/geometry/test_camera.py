@@ -35,6 +35,15 @@ def test_rays_pass_through_the_points_that_project_to_their_pixel_centres():
     torch.testing.assert_close(direction.norm(dim=-1), torch.ones(48, 64).double())
 
 
+@pytest.mark.parametrize(("stride", "left", "top"), [(1, 0, 0), (3, 1, 0), (3, 2, 2)])
+def test_every_third_pixel_keeps_its_ray(stride, left, top):
+    eye, target = torch.tensor([0.4, 1.2, 2.0]), torch.tensor([0.0, 0.9, 0.0])
+    camera = look_at(eye, target, vertical_fov=0.7, width=31, height=20)
+    some = camera.every(stride, left, top)
+    assert torch.equal(some.position, camera.position)
+    torch.testing.assert_close(some.rays()[1], camera.rays()[1][top::stride, left::stride])
+
+
 def test_the_vertical_field_of_view_spans_the_height():
     camera = front_camera()
     top = torch.tensor([0.0, 1.0 + 3.0 * torch.tan(torch.tensor(0.4)).item(), 0.0]).double()

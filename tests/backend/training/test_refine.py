@@ -21,11 +21,12 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human, save_human
 from primdiffusion.primitives.primitives import K, Payload, S
+from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.march import march
-from primdiffusion.training.refine import RefineSettings, bare_body, refine, view_psnr
+from primdiffusion.training.refine import bare_body, refine, view_psnr
 from support.errors import refused
 
-QUICK = RefineSettings(steps=15, views=1, density_rate=0.01)
+QUICK = DescentSettings(steps=15, views=1, density_rate=0.01)
 """So few steps on so few pixels of random boxes: density, which is right at the start, must not run ahead of colour."""
 FRONT, SIDE, BACK = 0.0, math.pi / 2, math.pi
 
@@ -164,11 +165,11 @@ def test_what_cannot_be_refined_is_rejected_in_a_sentence(views, broken, sentenc
 @pytest.mark.parametrize("wrong", [{"steps": 0}, {"views": 0}, {"seconds": math.nan}, {"colour_rate": -1}])
 def test_impossible_settings_are_rejected(wrong):
     with refused(ValueError, next(iter(wrong))):
-        RefineSettings(**wrong)
+        DescentSettings(**wrong)
 
 
 def test_rates_that_lead_nowhere_end_in_a_sentence(views, monkeypatch):
-    monkeypatch.setattr("primdiffusion.training.refine._loss", lambda *_: torch.tensor(torch.nan))
+    monkeypatch.setattr("primdiffusion.render.descent._loss", lambda *_: torch.tensor(torch.nan))
     with refused(ValueError, "step 1"):
         refine(person(2), views, QUICK)
 
@@ -177,7 +178,7 @@ def test_pictures_too_large_for_memory_are_named(views, monkeypatch):
     def full(*_):
         raise RuntimeError("[enforce fail at alloc_cpu.cpp] not enough memory: you tried to allocate 9 bytes")
 
-    monkeypatch.setattr("primdiffusion.training.refine.march", full)
+    monkeypatch.setattr("primdiffusion.render.descent.march", full)
     with refused(MemoryError, "40 x 40 pixels"):
         refine(person(2), views, QUICK)
 
@@ -267,7 +268,7 @@ def test_a_bare_body_takes_on_the_captured_one_s_colours(tmp_path):
     held, given = split_cameras(12, 3)
     shown = [conditioning_views(captures, "striped", frame, given) for frame in range(4)]
     start = bare_body(torch.zeros(10))
-    refined = refine(start, shown, RefineSettings(steps=150)).human
+    refined = refine(start, shown, DescentSettings(steps=150)).human
     for frames, cameras, least in ((range(4), held, 33.0), ((4,), range(12), 31.0)):
         judged = [conditioning_views(captures, "striped", frame, cameras) for frame in frames]
         reached = float(view_psnr(refined, judged).mean())

@@ -1,0 +1,206 @@
+"""Fit a payload to images by gradient descent through the marcher.
+
+The objective is that of stage 1 (paper sec. 3.2: L_rgb, L_sil), on random views. Adam optimises sRGB-encoded colours,
+densities and the logarithm of box sizes, which the linear solve (`inverse`) keeps. Values that no view shows have no
+gradient and stay bit-identical. There is no other regulariser.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Annotated, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from primdiffusion.failures import PictureOutOfMemory, out_of_memory
+from primdiffusion.formats.requests import Count, NotNegative, RayStep
+from primdiffusion.formats.schema import Checked, Range
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.primitives.from_mesh import FULL_DENSITY
+from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.render.march import MarchSettings, Rendering, march
+
+BETAS = (0.7, 0.9)
+"""Adam's decay rates; short averages, because a run is some tens or hundreds of steps."""
+WARM_UP = 3
+"""Warm-up of the rates, in steps: Adam's first steps have the same length for any gradient."""
+LARGEST_CHANGE = 3.0
+"""Largest factor by which the side of a box grows or shrinks."""
+
+
+@dataclasses.dataclass(frozen=True)
+class DescentSettings(Checked):
+    """Settings of the descent. The rates were tuned on humans in detailed clothes."""
+
+    steps: Count = 150
+    """Optimiser steps."""
+    views: Count = 2
+    """Images per step."""
+    stride: Count = 1
+    """A step draws every stride-th pixel of every stride-th row, at a random offset: one of its square as many rays."""
+    colour_rate: NotNegative = 0.03
+    """Learning rate of sRGB-encoded colours in 0 ... 1."""
+    density_rate: NotNegative = 0.03
+    """Learning rate of densities in units of FULL_DENSITY."""
+    scale_rate: NotNegative = 0.09
+    """Learning rate of the logarithm of box sizes; 0 keeps them."""
+    last_rate: NotNegative = 0.1
+    """Fraction of the rates at the end of their cosine decay."""
+    largest_density: Annotated[float, Range(1)] = FULL_DENSITY
+    """1/m; more gains a tenth of a dB, and exceeds the range of the training set of the diffusion model."""
+    silhouette: NotNegative = 0.05
+    """Weight of the mean square error of the silhouette, relative to that of the colours."""
+    step: RayStep = 0.01
+    """Metres between samples of a ray."""
+    seconds: Annotated[float, Range(0)] = math.inf
+    """Time limit, checked after each step; the decay of the rates does not adapt to it."""
+    seed: int = 0
+    """Seed of the order of views and of the offsets."""
+
+
+class DescentStep(NamedTuple):
+    """Progress after a step."""
+
+    number: int
+    """From 1."""
+    loss: float
+
+
+class Descent(NamedTuple):
+    """Result of a descent."""
+
+    payload: Payload
+    """Without gradients, on the device of the start."""
+    steps: int
+    """Completed steps; fewer than requested if time ran out."""
+    seconds: float
+
+
+class PosedView(NamedTuple):
+    """An image with its camera and the frames of the primitives."""
+
+    frames: Frames
+    camera: Camera
+    target: Tensor
+    """uint8 [H, W, 4]."""
+
+
+def descend(
+    start: Payload,
+    views: Sequence[PosedView],
+    settings: DescentSettings = DescentSettings(),
+    on_step: Callable[[DescentStep], None] | None = None,
+) -> Descent:
+    """Fit a payload to the views, from `start` and on its device.
+
+    Deterministic for the same input, settings and device. `on_step` is called after each step; an exception that it
+    raises cancels.
+
+    Raises:
+        ValueError: the optimisation diverges.
+        PictureOutOfMemory: images of this size do not fit into memory.
+    """
+    start = start.map(lambda values: values.detach().float())
+    leaves = _Leaves.of(start)
+    groups = zip(leaves, (settings.colour_rate, settings.density_rate, settings.scale_rate), strict=True)
+    adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in groups], betas=BETAS, fused=True)
+    fall = torch.optim.lr_scheduler.LambdaLR(adam, lambda done: _share_of_rate(done, settings))
+    chosen = _chosen(views, settings)
+    covered = sum(float(view.target[..., 3].sum()) for view in views) / 255 / len(views) / settings.stride**2
+    began, number = time.perf_counter(), 0
+    with torch.enable_grad():
+        for number in range(1, settings.steps + 1):
+            adam.zero_grad()
+            payload = leaves.payload(start)
+            losses = [_loss(view, payload, settings) for view in itertools.islice(chosen, settings.views)]
+            loss = torch.stack(losses).mean() / covered
+            value = float(loss.detach())
+            if not math.isfinite(value):
+                raise ValueError(f"refinement diverged at step {number} (loss {value}): use smaller rates")
+            loss.backward()
+            adam.step()
+            fall.step()
+            leaves.clamp_(settings.largest_density)
+            if on_step is not None:
+                on_step(DescentStep(number, value))
+            if time.perf_counter() - began > settings.seconds:
+                break
+    return Descent(leaves.result(start), number, time.perf_counter() - began)
+
+
+class _Leaves(NamedTuple):
+    """The optimised tensors."""
+
+    colour: Tensor
+    """sRGB-encoded."""
+    density: Tensor
+    """In units of FULL_DENSITY."""
+    log_scale: Tensor
+    """Logarithm of box sizes relative to the start."""
+
+    @classmethod
+    def of(cls, start: Payload) -> _Leaves:
+        colour = encode_srgb(start.rgb.clamp(0, 1))
+        density = start.density.clamp_min(0) / FULL_DENSITY
+        return cls(*(leaf.requires_grad_() for leaf in (colour, density, torch.zeros_like(start.delta_scale))))
+
+    def payload(self, start: Payload) -> Payload:
+        scale = start.delta_scale * self.log_scale.exp()
+        return Payload(decode_srgb(self.colour), self.density * FULL_DENSITY, scale)
+
+    @torch.no_grad()
+    def clamp_(self, largest_density: float) -> None:
+        """Clamp to valid values, after the step: clamping in the forward pass would stop the gradient at the bounds."""
+        self.colour.clamp_(0, 1)
+        self.density.clamp_(0, largest_density / FULL_DENSITY)
+        self.log_scale.clamp_(-math.log(LARGEST_CHANGE), math.log(LARGEST_CHANGE))
+
+    @torch.no_grad()
+    def result(self, start: Payload) -> Payload:
+        """The payload, bit-identical to the start where nothing changed."""
+        now, then = self.payload(start), _Leaves.of(start)
+        return Payload(
+            torch.where(self.colour == then.colour, start.rgb, now.rgb),
+            torch.where(self.density == then.density, start.density, now.density),
+            torch.where(self.log_scale == 0, start.delta_scale, now.delta_scale),
+        )
+
+
+def _chosen(views: Sequence[PosedView], settings: DescentSettings) -> Iterator[PosedView]:
+    """Shuffled views without end, epoch by epoch, each at a random offset of the stride."""
+    draws, stride = np.random.default_rng(settings.seed), settings.stride
+    while True:
+        for number in draws.permutation(len(views)):
+            view = views[number]
+            left, top = draws.integers(stride, size=2).tolist()
+            yield PosedView(view.frames, view.camera.every(stride, left, top), view.target[top::stride, left::stride])
+
+
+def _share_of_rate(done: int, settings: DescentSettings) -> float:
+    fall = 0.5 + 0.5 * math.cos(math.pi * min(done / settings.steps, 1))
+    return min(1, (done + 1) / WARM_UP) * (settings.last_rate + (1 - settings.last_rate) * fall)
+
+
+def _loss(view: PosedView, payload: Payload, settings: DescentSettings) -> Tensor:
+    """L_rgb + silhouette * L_sil, summed over pixels; L_rgb is the mean over channels."""
+    rendering = render_view(view, payload, settings.step)
+    target = view.target.float() / 255
+    colour = (encode_srgb(rendering.rgb) - target[..., :3]).square().mean(-1)
+    return (colour + settings.silhouette * (rendering.alpha - target[..., 3]).square()).sum()
+
+
+def render_view(view: PosedView, payload: Payload, step: float) -> Rendering:
+    """Render the payload for the view's camera. Raises PictureOutOfMemory."""
+    try:
+        return march(Primitives.place(view.frames, payload), view.camera, MarchSettings(step=step))
+    except (MemoryError, RuntimeError) as e:
+        if out_of_memory(e):
+            raise PictureOutOfMemory(view.camera.width, view.camera.height) from e
+        raise
