@@ -4,9 +4,9 @@
 evaluates those of the checkpoints full, shared_scale, template_rt, no_attention and full_at_equal_steps (.safetensors)
 that the folder contains; without --models, the package's encoder, and beside it one that is untrained. Each person is
 encoded from eight views of one pose and compared in all views (or --cameras of them) and poses at 512 x 512; figures
-with `_novel` are of views and poses that the encoder was not given; those with `_solved` are of the encoder followed by
-a step of the linear solve, as in `reconstruct`; those with `_fitted` are of voxels fitted to the very images of
-held-out people that are compared, at 256 x 256, in the boxes the encoder starts from. As in the paper,
+with `_novel` are of views and poses that the encoder was not given; those with `_descended` are of the encoder followed
+by the descent on the eight views, as in `reconstruct`; those with `_refined` are of `refine` on the very images of
+held-out people that are compared, the limit of the boxes. As in the paper,
 psnr_shared_scale and similar figures are of training people. Without capture folders, held-out people are made from
 MakeHuman's assets (--assets), with seeds that training does not use. --quick evaluates one person. Times are the best
 or median of several; names with `processor` are processor time, the others wall time.
@@ -16,7 +16,7 @@ training and held-out people by step from a run's metrics.jsonl, and prints the 
 an upper bound for the gain of another doubling.
 
 `encoder.py pictures --train CAPTURES --heldout CAPTURES --out docs/pictures/encoder.png` draws a row for each person,
-not hand-picked: one of the eight views that the encoder was given and its reconstruction; a view and a pose that it was
+not hand-picked: one of the eight views that `reconstruct` was given and its result; a view and a pose that it was
 not given, each beside the captured picture; the novel pose's depth and primitives.
 """
 
@@ -67,19 +67,19 @@ from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.reconstruction import encode_and_fit
+from primdiffusion.reconstruction import encode_and_fit, reconstruct
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import FitSample, fit_dataset
 from primdiffusion.training.fit_losses import loss_terms
-from primdiffusion.training.fit_voxels import fit_subject
+from primdiffusion.training.refine import refine
 from record import command_line, report, run
 from torch import Tensor
 
 FIRST_SEED = 30_000_000
 """Seed of the first person made here; training sets count from 0."""
 PEOPLE, POSES, CAMERAS = 6, 4, 12
-FITTED_PEOPLE = 6
+REFINED_PEOPLE = 6
 Figures = dict[str, float | int | str | None]
 VIEWS = 8
 PARTS = ("data", "forward", "march", "march_backward", "backward", "update")
@@ -109,7 +109,7 @@ class Variant(NamedTuple):
 
 VARIANTS = (
     Variant("full", "full model", (32.15, 0.984, 0.048)),
-    Variant("solved", "full model, then a step of the linear solve, as in `reconstruct`", None),
+    Variant("descended", "full model, then the descent, as in `reconstruct`", None),
     Variant("untrained", "untrained: the hull of the masks", None),
     Variant("full_at_equal_steps", "full model, as many steps as those below", None),
     Variant("shared_scale", "one delta scale for all boxes", (18.35, 0.803, 0.182)),
@@ -135,9 +135,9 @@ def main() -> None:
             sets["heldout"] = made_people(Path(scratch), arguments.assets, 1 if arguments.quick else PEOPLE)
         captures = {name: None if root is None else open_captures(root) for name, root in sets.items()}
         lpips = load_lpips(arguments.lpips) if arguments.lpips else None
-        models: dict[str, EncoderModel | Solved] = {**read_models(arguments.models)}
+        models: dict[str, EncoderModel | Descended] = {**read_models(arguments.models)}
         if "full" in models:
-            models["solved"] = Solved(models["full"])
+            models["descended"] = Descended(models["full"])
             torch.manual_seed(0)
             models["untrained"] = EncoderModel(Encoder(models["full"].config).eval().requires_grad_(False), {})
         qualities = {
@@ -152,7 +152,7 @@ def main() -> None:
         assert some is not None
         figures = quality_figures(qualities)
         if captures["heldout"] is not None and "full" in models and not arguments.quick:
-            figures |= fitted_figures(models["full"], captures["heldout"], min(arguments.people, FITTED_PEOPLE))
+            figures |= refined_figures(models["full"], captures["heldout"], min(arguments.people, REFINED_PEOPLE))
         if "full" in models:
             figures |= reconstruct_seconds(models["full"], some, 2 if arguments.quick else 7)
         figures |= step_seconds(some, 2 if arguments.quick else 8)
@@ -199,7 +199,7 @@ def read_models(folder: Path | None) -> dict[str, EncoderModel]:
 
 
 def measured(
-    model: EncoderModel | Solved, captures: Captures | None, arguments: argparse.Namespace, lpips: Lpips | None
+    model: EncoderModel | Descended, captures: Captures | None, arguments: argparse.Namespace, lpips: Lpips | None
 ) -> dict[str, Means] | None:
     """Means over each part of a set's pictures."""
     if captures is None:
@@ -217,21 +217,23 @@ def measured(
     return summary(evaluate(model, captures, settings, lpips))
 
 
-def fitted_figures(model: EncoderModel, captures: Captures, count: int) -> Figures:
-    """Means over all images of voxels that were fitted to these images: the limit of the boxes."""
+def refined_figures(model: EncoderModel, captures: Captures, count: int) -> Figures:
+    """Means over all images of humans that were refined on these images."""
     scores: list[PictureScore] = []
     for number in range(count):
         name = captures.subjects[number * len(captures.subjects) // count]
-        voxels = fit_subject(captures, name, model.config)
-        payload = Payload(voxels.rgb, voxels.density * model.config.full_density, voxels.extent)
-        scores += evaluate(Fitted(model, payload), captures, EvaluationSettings((name,), given_views=VIEWS))
+        subject = captures.subject(name)
+        person = captured_person(captures.root, name, 0, VIEWS)
+        views = [conditioning_views(captures, name, frame, None, SIZE) for frame in range(subject.frames)]
+        payload = refine(reconstruct(model, person), views).human.payload
+        scores += evaluate(Known(model, payload), captures, EvaluationSettings((name,), given_views=VIEWS, size=SIZE))
     means = summary(scores)["all"]
-    figures = {f"{name}_fitted": getattr(means, name) for name in ("psnr", "ssim", "mask_iou")}
-    return {**figures, "people_fitted": count}
+    figures = {f"{name}_refined": getattr(means, name) for name in ("psnr", "ssim", "mask_iou")}
+    return {**figures, "people_refined": count}
 
 
-class Solved(NamedTuple):
-    """An encoder followed by a step of the linear solve."""
+class Descended(NamedTuple):
+    """An encoder followed by the descent."""
 
     model: EncoderModel
 
@@ -250,7 +252,7 @@ class Solved(NamedTuple):
         return self.model.place(payload, betas, pose)
 
 
-class Fitted(NamedTuple):
+class Known(NamedTuple):
     """An encoder whose answer is known."""
 
     model: EncoderModel
@@ -339,7 +341,7 @@ def reconstruct_seconds(model: EncoderModel, captures: Captures, repeats: int) -
             f"reconstruct_{name}seconds_cpu": total,
             f"reconstruct_unproject_{name}seconds_cpu": looked_up,
             f"reconstruct_forward_{name}seconds_cpu": max(encoded - looked_up, 0.0),
-            f"reconstruct_solve_{name}seconds_cpu": max(total - encoded, 0.0),
+            f"reconstruct_descent_{name}seconds_cpu": max(total - encoded, 0.0),
         }
     return figures
 
@@ -439,7 +441,7 @@ def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) ->
     novel = [camera for camera in range(len(subject.views)) if camera not in given] or list(given)
     shown = (given[0], novel[0], novel[len(novel) // 2])
     views = conditioning_views(captures, name, 0, given, SIZE)
-    payload = model.encode(views, betas)
+    payload = encode_and_fit(model, views, betas)
     for number, (frame, camera) in enumerate(zip((0, 0, novel_frame), shown, strict=True)):
         seen = conditioning_views(captures, name, frame, [camera], SIZE)
         primitives = model.place(payload, betas, seen.pose)

@@ -5,6 +5,7 @@ import math
 
 import pytest
 import torch
+from primdiffusion import reconstruction
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views, stack
@@ -23,6 +24,7 @@ from primdiffusion.reconstruction import (
     reconstruct_by_prior,
     targets_of,
 )
+from primdiffusion.render.descent import Descent, DescentSettings
 from primdiffusion.render.inverse import InverseSettings, LinearisedView
 from primdiffusion.render.march import march
 from support.errors import refused
@@ -183,7 +185,24 @@ def test_the_fit_after_the_encoder_draws_the_views_closer():
         return float(sum((one.rgb - torch.from_numpy(target.rgba[..., :3])).square().mean() for one, target in pairs))
 
     encoded = model.encode(person.views, person.betas)
-    assert error(encode_and_fit(model, person.views, person.betas)) < 0.8 * error(encoded)
+    fitted = encode_and_fit(model, person.views, person.betas)
+    assert error(fitted) < 0.3 * error(encoded)
+    assert float(fitted.density.max()) <= model.config.full_density
+    assert not torch.equal(fitted.delta_scale, encoded.delta_scale)
+
+
+def test_a_step_of_it_draws_no_more_rays_than_an_image_of_256_pixels_has(monkeypatch):
+    human, settings = human_of(COLOURS), []
+    large = framing(place(human), 0.0, 600, 400)
+    views = Views(torch.full((1, 400, 600, 4), 255, dtype=torch.uint8), stack([large]), BodyPose.rest())
+
+    def noted(start: Payload, views: list, its: DescentSettings) -> Descent:
+        settings.append(its)
+        return Descent(start, 0, 0.0)
+
+    monkeypatch.setattr(reconstruction, "descend", noted)
+    encode_and_fit(tiny_encoder(), views, BETAS)
+    assert settings[0].stride == 3
 
 
 def test_images_without_the_subject_are_not_fitted():
