@@ -68,7 +68,7 @@ PIXEL_STD = 0.08
 PULL, SMOOTHNESS = 2.0, 1.0
 """Penalties of the voxels' fit to one view (`InverseSettings`), which each further view outweighs more. As small as for
 many views, they would let one view change what only other sides show."""
-ENCODED = DescentSettings(steps=28, views=3)
+ENCODED = DescentSettings(steps=28, views=3, step=0.015)
 """Descent from the encoder's human."""
 ENCODED_SIDE = 256
 """Largest side of the grid of rays that a step of it draws: every second pixel of images of 512 pixels."""

@@ -71,8 +71,7 @@ def pack(
     on_all_threads(
         _pack_boxes, voxels, low, high, rectangle, nearest, suspect,
         rgb.contiguous().numpy().reshape(-1), density.contiguous().numpy().reshape(-1), size, local,
-        away, rotation.contiguous().numpy(), solid.numpy(),
-        np.linalg.inv(to_world), across, down, empty_cells,
+        away, rotation.contiguous().numpy(), solid.numpy(), to_world, across, down, empty_cells,
     )  # fmt: skip
     boxes = PackedBoxes(local, away, stride.numpy(), nearest, low, high, voxels)
     seen = np.flatnonzero(rectangle[:, 0] <= rectangle[:, 1])
@@ -91,9 +90,10 @@ def heaviest_first(work: Int64[ndarray, "n"]) -> Int64[ndarray, "n"]:
 @kernel
 def _pack_boxes(
     taken, voxels, low, high, rectangle, nearest, suspect,
-    rgb, density, size, to_local, offset, rotation, solid, world_to_pixel, across, down, empty_cells,
+    rgb, density, size, to_local, offset, rotation, solid, pixel_to_world, across, down, empty_cells,
 ):  # fmt: skip
-    corners, to_world = np.empty((8, 3)), np.empty((3, 3))
+    corners, to_world, world_to_pixel = np.empty((8, 3)), np.empty((3, 3)), np.empty((3, 3))
+    _invert(world_to_pixel, pixel_to_world)
     k = take(taken)
     while k < len(solid):
         _pack_box(
