@@ -68,6 +68,18 @@ def test_steps_on_a_quarter_of_the_pixels_fit_all_of_them():
             assert after[row::2, column::2].mean() < 0.1 * before[row::2, column::2].mean()
 
 
+def test_no_pixel_is_left_out():
+    grey = smooth_payload(1)
+    grey = Payload(torch.full_like(grey.rgb, 0.5), grey.density, grey.delta_scale)
+    views = views_of(grey)
+    for view in views:
+        view.target[::2, ::2, :3] = 0
+    fitted = descend(grey, views, DescentSettings(steps=STEPS, stride=2, step=0.004, density_rate=0, scale_rate=0))
+    middle = slice(12, 21)
+    brightness = drawn(views[1], fitted.payload)[middle, middle, :3].float().mean() / views[1].target[..., :3].max()
+    assert 0.6 < brightness < 0.9  # three quarters of the pixels are grey
+
+
 def test_boxes_of_wrong_sizes_find_theirs():
     wanted = smooth_payload(1)
     views = views_of(wanted)
