@@ -5,7 +5,7 @@ evaluates those of the checkpoints full, shared_scale, template_rt, no_attention
 that the folder contains; without --models, the package's encoder, and beside it one that is untrained. Each person is
 encoded from eight views of one pose and compared in all views (or --cameras of them) and poses at 512 x 512; figures
 with `_novel` are of views and poses that the encoder was not given; those with `_descended` are of the encoder followed
-by the descent on the eight views, as in `reconstruct`; those with `_refined` are of `refine` on the very images of
+by gradient descent on the eight views, as in `reconstruct`; those with `_refined` are of `refine` on the very images of
 held-out people that are compared, the limit of the boxes. As in the paper,
 psnr_shared_scale and similar figures are of training people. Without capture folders, held-out people are made from
 MakeHuman's assets (--assets), with seeds that training does not use. --quick evaluates one person. Times are the best
@@ -109,7 +109,7 @@ class Variant(NamedTuple):
 
 VARIANTS = (
     Variant("full", "full model", (32.15, 0.984, 0.048)),
-    Variant("descended", "full model, then the descent, as in `reconstruct`", None),
+    Variant("descended", "full model, then gradient descent, as in `reconstruct`", None),
     Variant("untrained", "untrained: the hull of the masks", None),
     Variant("full_at_equal_steps", "full model, as many steps as those below", None),
     Variant("shared_scale", "one delta scale for all boxes", (18.35, 0.803, 0.182)),
@@ -233,7 +233,7 @@ def refined_figures(model: EncoderModel, captures: Captures, count: int) -> Figu
 
 
 class Descended(NamedTuple):
-    """An encoder followed by the descent."""
+    """An encoder followed by gradient descent on the images."""
 
     model: EncoderModel
 

@@ -68,10 +68,10 @@ PIXEL_STD = 0.08
 PULL, SMOOTHNESS = 2.0, 1.0
 """Penalties of the voxels' fit to one view (`InverseSettings`), which each further view outweighs more. As small as for
 many views, they would let one view change what only other sides show."""
-ENCODED = DescentSettings(steps=28, views=3, step=0.015)
-"""Descent from the encoder's human."""
-ENCODED_SIDE = 256
-"""Largest side of the grid of rays that a step of it draws: every second pixel of images of 512 pixels."""
+DESCENT = DescentSettings(steps=28, views=3, step=0.015)
+"""Gradient descent from the encoder's human."""
+DESCENT_SIDE = 256
+"""Largest side of the images that its steps draw, pixels: every second pixel of images of 512 pixels."""
 COARSE_SIDE, FINE_SIDE = 176, 512
 """Largest sides of the pictures for coefficients and for voxels, pixels."""
 
@@ -93,7 +93,7 @@ def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
 
 
 def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"]) -> Payload:
-    """The encoder's payload, then a short descent on its images: it adds the detail that the network smooths.
+    """The encoder's payload, optimised on its images by a short gradient descent that adds detail.
 
     Boxes of the released code (`compat`) stay as their network draws them. Images without the subject are ignored.
     """
@@ -105,8 +105,8 @@ def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"])
     seen = [image for image in images if _shows(image)]
     if model.config.compat == "released" or not seen:
         return payload
-    stride = math.ceil(max(views.camera.width, views.camera.height) / ENCODED_SIDE)
-    settings = dataclasses.replace(ENCODED, stride=stride, largest_density=model.config.full_density)
+    stride = math.ceil(max(views.camera.width, views.camera.height) / DESCENT_SIDE)
+    settings = dataclasses.replace(DESCENT, stride=stride, largest_density=model.config.full_density)
     return descend(payload, seen, settings).payload
 
 

@@ -190,13 +190,13 @@ def test_the_fit_after_the_encoder_draws_the_views_closer():
     assert not torch.equal(fitted.delta_scale, encoded.delta_scale)
 
 
-def test_a_step_of_it_draws_no_more_rays_than_an_image_of_256_pixels_has(monkeypatch):
+def test_the_fit_draws_no_more_rays_than_an_image_of_256_pixels_has(monkeypatch):
     human, settings = human_of(COLOURS), []
     large = framing(place(human), 0.0, 600, 400)
     views = Views(torch.full((1, 400, 600, 4), 255, dtype=torch.uint8), stack([large]), BodyPose.rest())
 
-    def noted(start: Payload, views: list, its: DescentSettings) -> Descent:
-        settings.append(its)
+    def noted(start: Payload, views: list, used: DescentSettings) -> Descent:
+        settings.append(used)
         return Descent(start, 0, 0.0)
 
     monkeypatch.setattr(reconstruction, "descend", noted)

@@ -5,22 +5,16 @@ import math
 import numpy as np
 import pytest
 import torch
+from march_scenes import sheet_frames
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people.payloads import orbit_camera
-from primdiffusion.primitives.primitives import Frames, Payload
+from primdiffusion.primitives.primitives import Payload
 from primdiffusion.render.descent import LARGEST_CHANGE, DescentSettings, PosedView, descend, render_view
 
 SIDE = 3
 """Boxes along a side of the sheet that is fitted."""
+FRAMES = sheet_frames(SIDE)
 STEPS = 60
-
-
-def sheet() -> Frames:
-    """Boxes side by side that overlap, all facing +z."""
-    line = (torch.arange(SIDE) - (SIDE - 1) / 2) * 0.05
-    y, x = torch.meshgrid(line, line, indexing="ij")
-    position = torch.stack([x.flatten(), y.flatten(), torch.zeros(SIDE**2)], dim=-1)
-    return Frames(position, torch.eye(3).expand(SIDE**2, 3, 3).clone(), torch.full((SIDE**2, 3), 0.045))
 
 
 def smooth_payload(seed: int) -> Payload:
@@ -38,7 +32,7 @@ def views_of(payload: Payload, count: int = 4, size: int = 33) -> list[PosedView
     views = []
     for number in range(count):
         camera = orbit_camera(np.zeros(3), 0.3, 40 * number - 60, 20 * math.sin(3 * number), math.radians(30), size)
-        blank = PosedView(sheet(), camera, torch.zeros(size, size, 4, dtype=torch.uint8))
+        blank = PosedView(FRAMES, camera, torch.zeros(size, size, 4, dtype=torch.uint8))
         views.append(blank._replace(target=drawn(blank, payload)))
     return views
 

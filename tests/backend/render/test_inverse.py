@@ -6,10 +6,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from march_scenes import sheet_frames
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.payloads import fitted_payloads, orbit_camera
-from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.cpu import march_cpu
 from primdiffusion.render.inverse import (
     BACKGROUND,
@@ -25,14 +26,7 @@ from support.errors import refused
 FULL = 200.0
 SIDE = 3
 """Boxes along a side of the sheet that is fitted."""
-
-
-def sheet_frames() -> Frames:
-    """Boxes side by side that overlap, all facing +z."""
-    line = (torch.arange(SIDE) - (SIDE - 1) / 2) * 0.05
-    y, x = torch.meshgrid(line, line, indexing="ij")
-    position = torch.stack([x.flatten(), y.flatten(), torch.zeros(SIDE**2)], dim=-1)
-    return Frames(position, torch.eye(3).expand(SIDE**2, 3, 3).clone(), torch.full((SIDE**2, 3), 0.045))
+FRAMES = sheet_frames(SIDE)
 
 
 def random_payload(seed: int, smooth: bool = False) -> Payload:
@@ -54,8 +48,8 @@ def cameras(count: int, turn: float = 0.0, size: int = 32) -> list[Camera]:
 def pictures(payload: Payload, views: list[Camera]) -> list[TargetImage]:
     targets = []
     for camera in views:
-        drawn = march_cpu(Primitives.place(sheet_frames(), payload), camera)
-        targets.append(TargetImage(sheet_frames(), camera, torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy()))
+        drawn = march_cpu(Primitives.place(FRAMES, payload), camera)
+        targets.append(TargetImage(FRAMES, camera, torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy()))
     return targets
 
 
@@ -86,7 +80,7 @@ def test_fitted_values_are_bounded():
 
 def test_boxes_that_no_picture_shows_stay_as_they_were():
     start = random_payload(4)
-    away = dataclasses.replace(sheet_frames(), position=sheet_frames().position + torch.tensor([0.0, 0.0, 50.0]))
+    away = dataclasses.replace(FRAMES, position=FRAMES.position + torch.tensor([0.0, 0.0, 50.0]))
     hidden = [dataclasses.replace(target, frames=away) for target in pictures(random_payload(5), cameras(3))]
     fitted = fit_payload(start, hidden, FULL)
     torch.testing.assert_close(fitted.rgb, start.rgb)
@@ -149,9 +143,9 @@ def test_a_mesh_without_textures_is_named():
         np.zeros((0, 0, 4), np.uint8), np.zeros((3, 1), np.int32), np.ones((3, 1)),
     )  # fmt: skip
     with refused(ValueError, "body"):
-        fitted_payloads([TexturedMesh((bare,))], sheet_frames(), np.zeros(10))
+        fitted_payloads([TexturedMesh((bare,))], FRAMES, np.zeros(10))
     with refused(ValueError, "colouring"):
-        fitted_payloads([], sheet_frames(), np.zeros(10))
+        fitted_payloads([], FRAMES, np.zeros(10))
 
 
 def test_influence_is_the_square_change_of_the_images_by_a_voxel():
@@ -179,6 +173,6 @@ def test_influence_is_the_square_change_of_the_images_by_a_voxel():
 
 def over_grey(payload: Payload, camera: Camera) -> np.ndarray:
     """Pixels of an image: colour over the background of fits, and alpha."""
-    drawn = march_cpu(Primitives.place(sheet_frames(), payload), camera)
+    drawn = march_cpu(Primitives.place(FRAMES, payload), camera)
     rgb = drawn.rgb + (1 - drawn.alpha[..., None]) * BACKGROUND
     return torch.cat([rgb, drawn.alpha[..., None]], -1).flatten(0, 1).double().numpy()
