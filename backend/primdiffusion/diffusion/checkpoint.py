@@ -248,32 +248,29 @@ def _store_half(tensors: dict[str, Tensor], codec: LinearCodec) -> None:
 
 def _restore_prior(weights: dict[str, Tensor], codec: LinearCodec) -> None:
     """Undo `_store_half`, in what `_model` reads, and complete priors of older files, whose components are of the whole
-    body."""
-    if "prior_part" not in weights:
-        count, groups = len(weights["prior_parity"]), weights["prior_log_weight"]
-        weights |= {
-            "prior_part": torch.zeros(K), "prior_left": torch.zeros(len(groups)), "prior_head": torch.zeros_like(groups),
-            "prior_head_axes": torch.zeros(1, 0, 0), "prior_head_variance": torch.zeros(1, 0),
-            "prior_head_left": torch.zeros(1), "prior_shared": torch.zeros(len(groups), 0, count),
-        }  # fmt: skip
-        if "prior_basis" in weights:
-            whole = weights["prior_basis"].unflatten(1, (-1, K))
-            weights["prior_basis"] = whole.permute(2, 1, 0)
-    for name in ("prior_part", "prior_head"):
-        weights[name] = weights[name].long()
+    body.
+    """
+    older = "prior_part" not in weights
+    part = torch.zeros(K, dtype=torch.int64) if older else weights["prior_part"].long()
     half = weights.pop("prior_basis_half", None)
     if half is not None:
         if half.ndim != 4 or half.shape[2:] != (GRID, GRID // 2) or half.shape[1] > codec.channels:
             raise ValueError(f"halves of person components have shape {tuple(half.shape)}")
-        part = weights["prior_part"]
         whole = _whole_components(half, part, weights["prior_parity"], codec)
-        weights["prior_basis"] = whole.permute(2, 1, 0)[part.argsort(stable=True)].contiguous()
+        weights["prior_basis"] = whole.flatten(1) if older else whole.permute(2, 1, 0)[part.argsort(stable=True)]
+    if older:
+        prior = PersonPrior.of_whole_body(**under(weights, "prior_"))
+        weights |= {f"prior_{field.name}": getattr(prior, field.name) for field in dataclasses.fields(prior)}
+    for name in ("prior_part", "prior_head"):
+        weights[name] = weights[name].long()
 
 
 def _whole_components(
     half: Float[Tensor, "n d 32 16"], part: Int[Tensor, "k"], parity: Float[Tensor, "r"], codec: LinearCodec
 ) -> Float[Tensor, "n d k"]:
     left = torch.nn.functional.pad(half, (0, GRID // 2))
+    if len(parity) % len(half) or not bool(((part >= 0) & (part < len(parity) // len(half))).all()):
+        raise ValueError(f"{len(parity)} parities are not those of {len(half)} components of each part")
     signs = parity.unflatten(0, (-1, len(half)))[part].T.unflatten(1, (1, GRID, GRID))
     return (left + signs * codec.mirror(left)).flatten(2)
 

@@ -25,6 +25,7 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
+from torch.nn import functional
 
 from primdiffusion.geometry.records import TensorRecord
 
@@ -69,6 +70,30 @@ class PersonPrior(TensorRecord):
     first group count."""
     kind: Float[Tensor, "g m x"]
     """The condition (`AttributeVocabulary.encode`) of each kind; x may be 0."""
+
+    @classmethod
+    def of_whole_body(
+        cls,
+        mean: Float[Tensor, "c h w"],
+        basis: Float[Tensor, "r d"],
+        parity: Float[Tensor, "r"],
+        rest_variance: Float[Tensor, "c h w"],
+        log_weight: Float[Tensor, "g m"],
+        centre: Float[Tensor, "g m r"],
+        axes: Float[Tensor, "g r r"],
+        variance: Float[Tensor, "g r"],
+        kind: Float[Tensor, "g m x"],
+    ) -> PersonPrior:
+        """One part, whose components are rows over whole channels, with one Gaussian for each group."""
+        cells, groups = mean[0].numel(), len(log_weight)
+        return cls(
+            mean=mean, basis=basis.unflatten(1, (-1, cells)).permute(2, 1, 0).contiguous(),
+            part=torch.zeros(cells, dtype=torch.int64), parity=parity, rest_variance=rest_variance,
+            log_weight=log_weight, centre=centre, axes=axes, variance=variance, left=variance.new_zeros(groups),
+            head=torch.zeros(log_weight.shape, dtype=torch.int64), head_axes=axes.new_zeros(1, 0, 0),
+            head_variance=axes.new_zeros(1, 0), head_left=axes.new_zeros(1),
+            shared=axes.new_zeros(groups, 0, len(parity)), kind=kind,
+        )  # fmt: skip
 
     def split(self, z: Float[Tensor, "b c h w"], signal: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Person coefficients [b, R] and rest [b, C, H, W] of latents whose mean is scaled by `signal` [b, 1, 1, 1]."""
@@ -208,6 +233,36 @@ class PersonPrior(TensorRecord):
         drawn = torch.multinomial(weight.to(generator.device), count, replacement=True, generator=generator)
         return drawn.to(self.mean.device)
 
+    def heads_of(self, group: int) -> list[int]:
+        """The heads that kinds of a group have."""
+        return self.head[group][self.log_weight[group] > IMPOSSIBLE / 2].unique().tolist()
+
+    def gaussian_of(self, group: int, head: int | None, directions: int) -> GaussianOfKinds:
+        """The mean and the leading directions of the covariance of all kinds of a group, or of those with one head."""
+        chosen = self.log_weight[group] > IMPOSSIBLE / 2
+        if head is not None:
+            chosen &= self.head[group] == head
+        weight, centre = self.log_weight[group][chosen].softmax(0), self.centre[group][chosen]
+        heads = torch.zeros_like(self.head_left).index_add(0, self.head[group][chosen], weight)
+        mean, inner = weight @ centre, self.axes.shape[2]
+        own = self.variance[group].sqrt()[:, None] * self.axes[group]
+        of_heads = ((heads[:, None] * self.head_variance).sqrt()[..., None] * self.head_axes)[heads > 0].flatten(0, 1)
+        rows = [
+            functional.pad(own, (0, len(mean) - inner)),
+            functional.pad(of_heads, (inner, 0)),
+            self.shared[group],
+            weight.sqrt()[:, None] * (centre - mean),
+        ]
+        factor = torch.cat(rows)
+        _, vectors = torch.linalg.eigh((factor @ factor.T).double())
+        return GaussianOfKinds(mean, vectors.flip(1)[:, :directions].T.to(factor) @ factor)
+
+    def gaussian_of_all(self, directions: int) -> GaussianOfKinds:
+        """The mean and the leading directions of the covariance of all people."""
+        whole = self.gaussian()
+        factor = whole.variance[0].sqrt()[:, None] * whole.axes[0]
+        return GaussianOfKinds(whole.centre[0, 0], factor[-directions:].flip(0))
+
     def gaussian(self) -> PersonPrior:
         """Return the single Gaussian with this mixture's mean and covariance, as a baseline."""
         weight = self.log_weight.exp()
@@ -234,6 +289,13 @@ class PersonPrior(TensorRecord):
             shared=self.shared[:1, :0],
             kind=self.kind[:1, :1] * 0,
         )
+
+
+class GaussianOfKinds(NamedTuple):
+    """Coefficients c = mean + weights @ factor, with weights ~ N(0, 1)."""
+
+    mean: Float[Tensor, "r"]
+    factor: Float[Tensor, "w r"]
 
 
 class _Block(NamedTuple):

@@ -60,10 +60,11 @@ def fit_mixture(
 
     The leading `clothes` coefficients are those of the clothes, the others the head's.
     """
-    keys = [
+    groups, heads, *features = [
         [name for name in key if name in vocabulary.categories]
         for key in (config.groups, config.heads, *config.features)
     ]
+    keys = [groups, heads, *filter(None, features)]
     values = _values(condition, vocabulary)
     rows = [[tuple(values[name][i] for name in key) for i in range(len(c))] for key in keys]
     choices = [sorted(set(row)) for row in rows]
@@ -72,13 +73,11 @@ def fit_mixture(
     shared, remainder = _shared(remainder, clothes, rows[0], choices[0], config)
     axes = _covariances(remainder[:, :clothes], rows[0], choices[0], config)
     head_axes = _covariances(remainder[:, clothes:], rows[1], choices[1], config)
-    groups = [_kinds(group, keys, rows, choices) for group in choices[0]]
-    most = max(map(len, groups))
-    log_weight = torch.full((len(groups), most), IMPOSSIBLE)
-    centre = torch.zeros(len(groups), most, c.shape[1])
-    head = torch.zeros(len(groups), most, dtype=torch.long)
-    kind = torch.zeros(len(groups), most, condition.shape[1])
-    for g, kinds in enumerate(groups):
+    all_kinds = [_kinds(group, keys, rows, choices) for group in choices[0]]
+    size = len(all_kinds), max(map(len, all_kinds))
+    log_weight, head = torch.full(size, IMPOSSIBLE), torch.zeros(size, dtype=torch.int64)
+    centre, kind = torch.zeros(*size, c.shape[1]), torch.zeros(*size, condition.shape[1])
+    for g, kinds in enumerate(all_kinds):
         for m, (log_share, chosen) in enumerate(kinds):
             log_weight[g, m] = log_share
             centre[g, m] = sum(effects[k][choices[k].index(v)] for k, v in enumerate(chosen))
@@ -195,16 +194,20 @@ def _condition(
 
 
 def fit_prior(
-    people: LatentSet, codec: LinearCodec, vocabulary: AttributeVocabulary, config: PriorConfig
+    people: LatentSet,
+    codec: LinearCodec,
+    vocabulary: AttributeVocabulary,
+    config: PriorConfig,
+    part: Int[Tensor, "k"] | None = None,
 ) -> PersonPrior:
-    """Principal components of each part of people and their mirror images, and a mixture of Gaussians over them.
+    """Principal components of each part (None: `body_parts`) of people and their mirror images, and a mixture of Gaussians over them.
 
     Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under
     the mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest
     too small: both are corrected by leaving `config.folds` parts of the geometries out in turn. Mean and rest are those
     of detailed people.
     """
-    part = body_parts()
+    part = body_parts() if part is None else part
     detailed = int(people.detailed)
     mean = torch.stack([chunk.float().sum(0) for chunk in people.latents[:detailed].split(CHUNK)]).sum(0) / detailed
     mean = (mean + codec.mirror(mean)) / 2
@@ -213,7 +216,8 @@ def fit_prior(
     basis = torch.cat([one.basis[..., :count] for one in fitted])
     signs = torch.cat([one.signs[:count] for one in fitted])
     kept = torch.cat([one.kept[:count] for one in fitted])
-    inside = PersonPrior(mean, basis, part, signs, *[mean] * 12)  # splits latents; the distribution follows
+    nothing = torch.zeros(0)
+    inside = PersonPrior(mean, basis, part, signs, *[nothing] * 12)  # splits latents; its distribution follows
     coefficients, rest_energy = [], torch.zeros_like(mean)
     for first in range(0, len(people), CHUNK):
         c, rest = inside.split(people.latents[first : first + CHUNK].float())
@@ -223,7 +227,7 @@ def fit_prior(
     rest = rest_energy / detailed
     rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
     c = torch.cat(coefficients) * kept.sqrt()
-    clothes = len(signs) - 2 * count
+    clothes = max(count, len(signs) - 2 * count)  # the others are hands and head; a single part is all
     mixture = fit_mixture(c, clothes, people.condition, vocabulary, config)
     return dataclasses.replace(inside, rest_variance=rest.clamp_min(1e-6), **mixture._asdict())
 
