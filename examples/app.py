@@ -65,4 +65,5 @@ def page(model: DiffusionModel, size: int = 384) -> gradio.Blocks:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", type=Path)
-    page(pd.load_checkpoint(parser.parse_args().checkpoint)).launch()
+    model = pd.load_checkpoint(parser.parse_args().checkpoint)
+    page(model).launch(server_name="127.0.0.1", share=False)  # whatever GRADIO_SERVER_NAME and GRADIO_SHARE say
