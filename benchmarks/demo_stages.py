@@ -115,10 +115,10 @@ def cycles(arguments: argparse.Namespace) -> dict[str, float]:
     from blender_primdiffusion.scene.cycles import setup_cycles_preview
 
     setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples, yaw=arguments.yaw, world=0.48)
-    scene.render.filepath = str(arguments.out)
     start = time.perf_counter()
     bpy.app.handlers.render_stats.append(lambda stats, _: print(stats, flush=True))  # the demo shows the last line
-    bpy.ops.render.render(write_still=True)
+    bpy.ops.render.render()
+    bpy.data.images["Render Result"].save_render(str(arguments.out))
     return {"seconds_cycles": time.perf_counter() - start, "volumes": float(len(bpy.data.volumes))}
 
 

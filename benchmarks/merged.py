@@ -100,9 +100,9 @@ def surface_error(human, armature, rotations: np.ndarray) -> tuple[float, float]
 
 def rendered(path: Path) -> tuple[np.ndarray, float]:
     """The scene's picture [H, W, 3] in 0 ... 1 as read from its PNG, and the seconds of the render."""
-    bpy.context.scene.render.filepath = str(path)
     began = time.perf_counter()
-    bpy.ops.render.render(write_still=True)
+    bpy.ops.render.render()
+    bpy.data.images["Render Result"].save_render(str(path))
     seconds = time.perf_counter() - began
     image = bpy.data.images.load(str(path))
     pixels = np.array(image.pixels[:], np.float32).reshape(SIZE, SIZE, 4)[..., :3]
