@@ -3,7 +3,7 @@
     model = load_checkpoint()                          # diffusion: noise -> payload and betas
     human = generate(model, seed=7)
     primitives = place(human, BodyPose.from_axis_angle(theta))   # body: betas, theta -> mesh -> frames; payload in them
-    rendering = march(primitives, framing(primitives, yaw=0.5))
+    rendering = march(primitives, framing(primitives, yaw_degrees=30))
 
 Frames are computed on the posed mesh for every pose, as in the paper (sec. 3.1): the mesh drives the primitives.
 """
@@ -261,10 +261,10 @@ def body_of(human: Human, body: BodyModel | None = None, anchors: Anchors | None
     return body, anchors
 
 
-def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: int = 512) -> Camera:
+def framing(primitives: Primitives, yaw_degrees: float = 0.0, width: int = 512, height: int = 512) -> Camera:
     """A level camera that frames all of `primitives`, at the height of their centre.
 
-    `yaw` in radians: 0 shows the front of the human, pi/2 the left side. The vertical field of view is 30 degrees.
+    `yaw_degrees`: 0 shows the front of the human, 90 the left side. The vertical field of view is 30 degrees.
     Raises ValueError for an image side outside 1 ... LARGEST_PICTURE pixels.
     """
     if not 1 <= min(width, height) <= max(width, height) <= LARGEST_PICTURE:
@@ -274,6 +274,7 @@ def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: 
     corners = primitives.position[:, None] + (primitives.rotation[:, None] @ local[..., None])[..., 0]
     corners = corners.detach().flatten(0, 1)
     middle = (corners.amin(0) + corners.amax(0)) / 2
+    yaw = math.radians(yaw_degrees)
     towards_camera = middle.new_tensor([math.sin(yaw), 0.0, math.cos(yaw)])
     right = middle.new_tensor([math.cos(yaw), 0.0, -math.sin(yaw)])
     offset = corners - middle
