@@ -25,6 +25,7 @@ from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_bod
 from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import DiffusionModel, sample
+from primdiffusion.diffusion.reading import unfollowed
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.formats import requests
@@ -58,7 +59,8 @@ class Human(TensorRecord):
     """Shape coefficients of the body."""
     provenance: Mapping[str, Any]
     """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
-    sample, attributes and guidance if requested, checkpoint, checkpoint_sha256, full_density, version."""
+    sample, attributes and guidance if requested, `unfollowed` (the values that it shows instead of requested ones,
+    `diffusion.reading`), checkpoint, checkpoint_sha256, full_density, version."""
     body_setup: BodySetup | None = None
     """Body and anchors; None is the default body."""
 
@@ -125,9 +127,10 @@ def generate_batch(
     ending = {} if end == CLEAN else {"end": end}
     shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **made_by(model)}
     people = people_of(model, final, seeds, attributes)
+    missed = ({"unfollowed": names} if names else {} for names in unfollowed(model, final, attributes))
     return [
-        dataclasses.replace(human, provenance={"seed": seed, **shared}).validate()
-        for human, seed in zip(people, seeds, strict=True)
+        dataclasses.replace(human, provenance={"seed": seed, **shared, **names}).validate()
+        for human, seed, names in zip(people, seeds, missed, strict=True)
     ]
 
 
