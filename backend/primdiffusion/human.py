@@ -3,7 +3,7 @@
     model = load_checkpoint()                          # diffusion: noise -> payload and betas
     human = generate(model, seed=7)
     primitives = place(human, BodyPose.from_axis_angle(theta))   # body: betas, theta -> mesh -> frames; payload in them
-    rendering = march(primitives, framing(primitives, yaw=0.5))
+    rendering = march(primitives, framing(primitives, yaw_degrees=30))
 
 Frames are computed on the posed mesh for every pose, as in the paper (sec. 3.1): the mesh drives the primitives.
 """
@@ -25,6 +25,7 @@ from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_bod
 from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import DiffusionModel, sample
+from primdiffusion.diffusion.reading import unfollowed
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.formats import requests
@@ -58,7 +59,8 @@ class Human(TensorRecord):
     """Shape coefficients of the body."""
     provenance: Mapping[str, Any]
     """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
-    sample, attributes and guidance if requested, checkpoint, checkpoint_sha256, full_density, version."""
+    sample, attributes and guidance if requested, `unfollowed` (the values that it shows instead of requested ones,
+    `diffusion.reading`), checkpoint, checkpoint_sha256, full_density, version."""
     body_setup: BodySetup | None = None
     """Body and anchors; None is the default body."""
 
@@ -125,9 +127,10 @@ def generate_batch(
     ending = {} if end == CLEAN else {"end": end}
     shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **made_by(model)}
     people = people_of(model, final, seeds, attributes)
+    missed = ({"unfollowed": names} if names else {} for names in unfollowed(model, final, attributes))
     return [
-        dataclasses.replace(human, provenance={"seed": seed, **shared}).validate()
-        for human, seed in zip(people, seeds, strict=True)
+        dataclasses.replace(human, provenance={"seed": seed, **shared, **names}).validate()
+        for human, seed, names in zip(people, seeds, missed, strict=True)
     ]
 
 
@@ -261,10 +264,10 @@ def body_of(human: Human, body: BodyModel | None = None, anchors: Anchors | None
     return body, anchors
 
 
-def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: int = 512) -> Camera:
+def framing(primitives: Primitives, yaw_degrees: float = 0.0, width: int = 512, height: int = 512) -> Camera:
     """A level camera that frames all of `primitives`, at the height of their centre.
 
-    `yaw` in radians: 0 shows the front of the human, pi/2 the left side. The vertical field of view is 30 degrees.
+    `yaw_degrees`: 0 shows the front of the human, 90 the left side. The vertical field of view is 30 degrees.
     Raises ValueError for an image side outside 1 ... LARGEST_PICTURE pixels.
     """
     if not 1 <= min(width, height) <= max(width, height) <= LARGEST_PICTURE:
@@ -274,6 +277,7 @@ def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: 
     corners = primitives.position[:, None] + (primitives.rotation[:, None] @ local[..., None])[..., 0]
     corners = corners.detach().flatten(0, 1)
     middle = (corners.amin(0) + corners.amax(0)) / 2
+    yaw = math.radians(yaw_degrees)
     towards_camera = middle.new_tensor([math.sin(yaw), 0.0, math.cos(yaw)])
     right = middle.new_tensor([math.cos(yaw), 0.0, -math.sin(yaw)])
     offset = corners - middle

@@ -165,7 +165,7 @@ def test_render_draws_a_saved_person_in_a_pose(child, checkpoint, tmp_path):
 
     raised = [[0.0, 0.0, 0.0]] * 24
     raised[16] = [0.0, 0.0, 1.2]
-    rest, posed, turned = picture(91, "r.png"), picture(92, "p.png", pose=raised), picture(93, "t.png", yaw=1.57)
+    rest, posed, turned = picture(91, "r.png"), picture(92, "p.png", pose=raised), picture(93, "t.png", yaw_degrees=90)
     assert np.abs(rest - posed).mean() > 1
     width = [(image.sum((0, 2)) > 0).sum() for image in (rest, turned)]
     assert width[1] < 0.5 * width[0], "from the side a T pose is narrow"

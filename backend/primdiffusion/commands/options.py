@@ -161,18 +161,6 @@ class ExportOnnxCommand:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ViewCommand:
-    """Show a human in a browser, with sliders for the pose."""
-
-    human: Person
-    """A .human.safetensors file."""
-    port: Annotated[int, Range(0, 65_535)] = 8080
-    """Port on this machine; the next free one if it is in use."""
-    size: Pixels = 512
-    """Height of the pictures, pixels; a third of it while the camera moves."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RefineCommand:
     """Optimise a human to match captures: person.human.safetensors and previews.
 
@@ -309,7 +297,6 @@ OPTIONS: dict[str, type] = {
     "reconstruct": ReconstructRequest,
     "refine": RefineCommand,
     "render": RenderCommand,
-    "view": ViewCommand,
     "export": ExportCommand,
     "export-onnx": ExportOnnxCommand,
     "merge": MergeCommand,

@@ -309,8 +309,8 @@ class RenderRequest:
     """Output PNG."""
     width: Pixels = 512
     height: Pixels = 512
-    yaw: float = 0.0
-    """Camera position around the human, radians: 0 in front, pi/2 at the human's left."""
+    yaw_degrees: float = 0.0
+    """Camera position around the human: 0 in front, 90 at the human's left."""
     pose: Path | list | None = None
     """72 axis-angle values (24 x 3, radians), or a pose file; None for the T pose."""
     depth: Annotated[Path, Ending((".png",))] | None = None

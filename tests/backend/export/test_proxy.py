@@ -63,7 +63,7 @@ def test_each_leg_follows_itself_though_boxes_of_the_other_reach_it():
 
 def test_rays_inwards_see_what_the_marcher_draws():
     primitives = place(person())
-    camera = framing(primitives, 0.4, 48, 48)
+    camera = framing(primitives, 23, 48, 48)
     drawn = march(primitives, camera, MarchSettings(step=0.001))
     full = drawn.alpha.reshape(-1) > 0.99
     origin, directions = camera.rays()
@@ -82,7 +82,7 @@ def test_posed_it_looks_like_the_marched_person(raised):
     pose = BodyPose.from_axis_angle(theta.flatten())
     primitives = place(person(), pose)
     skinning = pose_body(person().betas, pose).skinning.double().numpy()
-    camera = framing(primitives, 0.3, 160, 160)
+    camera = framing(primitives, 17, 160, 160)
     marched, drawn = march(primitives, camera), rasterise(proxy().mesh().posed(skinning), camera, 2)
     there, covered = marched.alpha.numpy() > 0.5, drawn.alpha > 0.5
     assert (there & covered).sum() / (there | covered).sum() > 0.93
