@@ -284,3 +284,18 @@ def test_colour_and_mask_are_those_of_the_files(root):
     rgba = subject.rgba(1, 2)
     assert np.array_equal(rgba[..., :3], subject.picture("img", 1, 2))
     assert np.array_equal(rgba[..., 3], subject.picture("mask", 1, 2))
+
+
+@pytest.mark.parametrize("labels", [(1, 1), (3, 15)])
+@pytest.mark.parametrize("mode", ["L", "P"])
+def test_in_masks_of_labels_the_person_is_what_is_not_0(root, labels, mode):
+    path = root / NAME / "mask/camera0002/0001.png"
+    covered = np.asarray(Image.open(path)) > 127
+    values = np.where(covered, labels[0], 0).astype(np.uint8)
+    values[:, 16:] = np.where(covered[:, 16:], labels[1], 0)
+    image = Image.fromarray(values, mode)
+    if mode == "P":
+        image.putpalette([channel for number in range(16) for channel in (8 * number, 0, 90 * (number > 0))])
+    image.save(path)
+    found = open_captures(root).view(NAME, 1, 2).mask.numpy()
+    assert np.array_equal(found, np.where(covered, 255, 0))
