@@ -339,22 +339,23 @@ def views_in(named: Any, path: Path, size: Callable[[int], tuple[int, int]]) -> 
 
     Raises FileError, which names `path`, and what `size` raises.
     """
-    views = []
+    views, name = [], ""
     try:
         for camera in range(len(named)):
-            about = named[f"camera{camera:04d}"]
+            name = f"camera{camera:04d}"
+            about = named[name]
             k, r, t = (np.asarray(about[key], np.float64) for key in ("K", "R", "T"))
             width, height = size(camera)
             t = t.reshape(3)
             if k.shape != (3, 3) or r.shape != (3, 3) or not all(map(all_finite, (k, r, t))):
-                raise ValueError(f"camera {camera} is not finite, or its shapes are not K 3x3, R 3x3, T 3")
+                raise ValueError("it is not finite, or its shapes are not K 3x3, R 3x3, T 3")
             views.append(View(k, r, t, width, height))
     except FileNotFoundError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
         if isinstance(e, FileError):
             raise
-        raise FileError(path, f"is not a list of cameras ({e!s:.160})", "render the subject again") from e
+        raise FileError(path, f"is not a list of cameras ({name}: {e!s:.160})", "render the subject again") from e
     return views
 
 
