@@ -72,7 +72,8 @@ class Human(TensorRecord):
                 f"expected one human, got a batch of shape {tuple(self.payload.density.shape[:-4])}: select one sample"
             )
         if self.betas.ndim != 1 or not torch.isfinite(self.betas).all():
-            raise ValueError(f"betas must be one row of finite numbers, got {self.betas!r}: generate the human again")
+            given = f"{self.betas.tolist()!s:.80}"
+            raise ValueError(f"betas must be one row of finite numbers, not {given}: generate the human again")
         return self
 
 
@@ -185,6 +186,17 @@ def place(
     Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
     """
     return Primitives.place(frames_of(human, pose, body, anchors), human.payload)
+
+
+def sole_height(human: Human) -> float:
+    """Height of the soles of the human's body at rest, metres: y = 0 in files for other programs, as in Blender."""
+    return float(body_of(human)[0].shape(human.betas).vertices[:, 1].min())
+
+
+def place_on_floor(human: Human, pose: BodyPose | None = None) -> Primitives:
+    """As `place`, in a world whose y is 0 at `sole_height`."""
+    placed = place(human, pose)
+    return dataclasses.replace(placed, position=placed.position - torch.tensor([0.0, sole_height(human), 0.0]))
 
 
 def frames_of(

@@ -53,7 +53,7 @@ class GenerateCommand(GenerateRequest):
     def check(self) -> None:
         """Raise FieldError for seeds beyond the largest."""
         if self.seed + self.count - 1 > LARGEST_SEED:
-            raise FieldError(("count",), f"is {self.count}: the last seed would be above {LARGEST_SEED}")
+            raise FieldError(("count",), f"is {self.count}: the last seed would be above 2^63 - 1")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -226,7 +226,7 @@ def _read(
     request: ReconstructRequest | FitPostureRequest, session: Session, report: ReportProgress
 ) -> tuple[DiffusionModel, list[Photograph], Start, list[str]]:
     report("read", 0, 1, None)
-    photographs = read_photographs(request.pictures, request.masks)
+    photographs = read_photographs(request.pictures, request.masks, mask_label=request.mask_label)
     report("load", 0, 1, None)
     model = session.model(request.checkpoint)
     start = start_of(photographs, model, request.pose, request.cameras)

@@ -239,6 +239,8 @@ class Pictures:
     """PNG or JPEG files of one person, who is marked by alpha or by `masks`."""
     masks: tuple[Path, ...] = ()
     """A mask for each picture, of its size: opaque or white where the person is; pictures with alpha need none."""
+    mask_label: Annotated[int, Range(0, 65535)] | None = None
+    """The person's label in masks of more than two: the index in their palette, or else the grey value."""
     pose: Path | None = None
     """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl, .bvh), or a posture.json; without
     it, the person is taken to stand upright, facing the camera."""

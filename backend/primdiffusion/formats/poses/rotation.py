@@ -13,6 +13,7 @@ from .skeleton import REST_JOINTS
 
 TOLERANCE = 1e-3
 """Largest difference of a scalar product of two columns from that of a rotation."""
+ROTATION = f"a rotation (orthonormal within {TOLERANCE:g}, determinant 1)"
 _COMMON_JOINTS = 22
 """Joints that have the same names in SMPL, SMPL-H and SMPL-X."""
 _CLEARLY_UP = 0.6
@@ -187,7 +188,4 @@ def first_improper(matrices: NDArray) -> tuple[int, int] | None:
 def improper_text(frame: int | str, joint: int | str) -> str:
     """Describe a matrix that is not a rotation, as a part of a sentence."""
     name = JOINT_NAMES[joint] if isinstance(joint, int) and joint < _COMMON_JOINTS else joint
-    return (
-        f"a matrix for joint {name} in frame {frame} that is not a rotation (orthonormal within {TOLERANCE:g}, "
-        "determinant 1)"
-    )
+    return f"a matrix for joint {name} in frame {frame} that is not {ROTATION}"
