@@ -34,7 +34,6 @@ from .rotation import (
     about_axis,
     axis_direction,
     axis_name,
-    find_up,
     first_improper,
     from_axis_angle,
     improper_text,
@@ -43,6 +42,7 @@ from .rotation import (
     turn_y_up,
 )
 from .skeleton import REST_JOINTS
+from .standing import find_up, pelvis_up
 
 LARGEST_PICKLE = 64 * 2**20
 """Bytes of a .pkl."""
@@ -57,6 +57,8 @@ ENDINGS = (".npz", ".npy", ".json", ".pkl", ".bvh")
 UP_AXES = ("", "x", "-x", "y", "-y", "z", "-z")
 """Axes that may point up in a file; the empty one stands for detection."""
 _BODIES = {24: "SMPL", 22: "SMPL without hands", 52: "SMPL-H", 55: "SMPL-X"}
+_MOST_TRIED = 2000
+"""Frames by which the up axis is found."""
 _BODY_JOINTS = 22
 """Joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
 
@@ -97,8 +99,8 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
     except OSError as e:
         raise FileError(path, f"cannot be read ({e.strerror or e})", "check that it may be opened") from e
     if up:
-        return _turned(motion, axis_name(axes @ axis_direction(up)), up)
-    return _upright(motion, axes) if detect_up else motion
+        return _turned(motion, axes @ axis_direction(up), up)
+    return _upright(motion, axes, "y" if suffix == ".bvh" else "z") if detect_up else motion
 
 
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
@@ -213,17 +215,19 @@ def _arrays(content: Any, name: str) -> dict[str, NDArray]:
         raise FileError(name, f"holds no lists of numbers of equal length ({e!s:.80})", "export it again") from e
 
 
-def _upright(motion: Motion, axes: NDArray) -> Motion:
+def _upright(motion: Motion, axes: NDArray, expected: str) -> Motion:
     """The motion with its detected up axis turned to y; `axes` is the rotation from the file's axes so far."""
-    up = find_up(motion.rotations[:, 0])
-    if not up:
-        unknown = dataclasses.replace(motion.detected, up="")
-        note = "does not state which axis is up: y is assumed"
-        return dataclasses.replace(motion, notes=(*motion.notes, note), detected=unknown)
-    return _turned(motion, up, axis_name(axes.T @ axis_direction(up)))
+    few = motion.frames(np.unique(np.linspace(0, len(motion) - 1, min(len(motion), _MOST_TRIED)).astype(int)))
+    up = find_up(few.joints(), expected)
+    if up:
+        return _turned(motion, axis_direction(up), axis_name(axes.T @ axis_direction(up)))
+    up = axis_direction(pelvis_up(few.rotations[:, 0]))
+    lying = _turned(motion, up, axis_name(axes.T @ up))
+    note = "stands in no frame, whichever axis is up: set the up axis by hand if it is another one"
+    return dataclasses.replace(lying, notes=(*lying.notes, note))
 
 
-def _turned(motion: Motion, up: str, in_file: str) -> Motion:
+def _turned(motion: Motion, up: NDArray, in_file: str) -> Motion:
     rotations, translations = turn_y_up(motion.rotations, motion.translations, up)
     return dataclasses.replace(
         motion,
