@@ -20,8 +20,10 @@ def motion_of(spread: float = 0.35, seed: int = 0) -> tuple[np.ndarray, np.ndarr
 
 
 def along_x(rest: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A rest [24, 3] and rotations [F, 24, 3, 3] from it as Rokoko writes them: with all angles zero each bone lies along
-    its parent's local x. They put joints where joint rotations of SMPL from `rest` do."""
+    """A rest [24, 3] and rotations [F, 24, 3, 3] as Rokoko writes them: with all angles zero each bone lies along x.
+
+    They put joints where joint rotations of SMPL from `rest` do.
+    """
     own, flat = np.tile(np.eye(3), (24, 1, 1)), np.array(rest)
     for joint in range(24):
         children = [child for child, parent in enumerate(PARENTS) if parent == joint]

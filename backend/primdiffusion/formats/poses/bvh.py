@@ -98,9 +98,11 @@ def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motio
     """The motion of a BVH file on SMPL's skeleton, y up judging by the rest pose, and the rotation [3, 3] from the
     file's axes.
 
-    See `rigs.retarget`. Where the rest is no pose of a person (as Rokoko writes it, all bones along x), a frame in which
-    the person stands with straight limbs takes its place. The root's path is scaled by the length of the legs, so feet slide little. Positions of joints
-    other than the root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises FileError.
+    See `rigs.retarget`. Where the rest is no pose of a person (as Rokoko writes it, all bones along x), a frame in
+    which the person stands with straight limbs takes its place.
+
+    The root's path is scaled by the length of the legs, so feet slide little. Positions of joints other than the
+    root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises FileError.
     """
     hierarchy = parse_bvh(path)
     names = bone_names(hierarchy)

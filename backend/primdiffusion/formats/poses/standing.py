@@ -40,7 +40,7 @@ def pelvis_up(pelvis: NDArray) -> str:
 
 
 def is_standing(heads: Mapping[str, NDArray]) -> NDArray[np.bool_]:
-    """Whether joints by SMPL's names, places [..., 3], are those of a person whose trunk continues the line of the legs."""
+    """Whether joints by SMPL's names, places [..., 3], are of a person whose trunk continues the line of the legs."""
     hips, shoulders, ankles = (
         (heads[f"left_{part}"] + heads[f"right_{part}"]) / 2 for part in ("hip", "shoulder", "ankle")
     )
