@@ -35,6 +35,8 @@ class Detected:
     """Frame rate in the file; 0 where it states none."""
     bones: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """SMPL's joint -> the file's bone, for files with bones."""
+    people: tuple[str, ...] = ()
+    """Names of the people in a tracker's output."""
     average_legs: bool = False
     """Whether lengths were scaled to average legs, so that they must be scaled to each body."""
 

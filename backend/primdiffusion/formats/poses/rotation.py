@@ -150,9 +150,10 @@ def turn_y_up(
     """Joint rotations [F, 24, 3, 3] and translations [F, 3] of a world in which the direction `up` [3] is up, turned to
     y up.
 
+    A camera's axes, y down and z away, are turned about x: who faces the camera faces +z then.
     Translations as in SMPL's files: relative to a body whose pelvis is at its rest position, not at the origin.
     """
-    turn = between(up, np.array([0.0, 1.0, 0.0]))
+    turn = about_axis(0, np.pi) if up[1] < -0.999 else between(up, np.array([0.0, 1.0, 0.0]))
     rotations = np.array(rotations, np.float64)
     rotations[:, 0] = turn @ rotations[:, 0]
     pelvis = REST_JOINTS[0]
