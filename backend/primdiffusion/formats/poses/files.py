@@ -253,8 +253,10 @@ def _upright(motion: Motion, axes: NDArray, expected: str) -> Motion:
         return _turned(motion, axis_direction(up), axis_name(axes.T @ axis_direction(up)))
     up = axis_direction(pelvis_up(few.rotations[:, 0]))
     lying = _turned(motion, up, axis_name(axes.T @ up))
-    note = "stands in no frame, whichever axis is up: set the up axis by hand if it is another one"
-    return dataclasses.replace(lying, notes=(*lying.notes, note))
+    doubt = "The person stands in no frame, whichever axis is up: set the up axis by hand if it is another one"
+    return dataclasses.replace(
+        lying, notes=(*lying.notes, doubt), detected=dataclasses.replace(lying.detected, doubt=doubt)
+    )
 
 
 def _turned(motion: Motion, up: NDArray, in_file: str) -> Motion:

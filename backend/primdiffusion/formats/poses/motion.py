@@ -28,7 +28,9 @@ class Detected:
     rig: str = ""
     """SMPL, SMPL-H, SMPL-X, or the naming of the bones; empty where unknown."""
     up: str = ""
-    """The file's axis that points up, such as "z" or "-y"; empty where it was not detected."""
+    """The file's axis that points up, such as "z" or "-y"."""
+    doubt: str = ""
+    """A sentence about what makes the up axis doubtful."""
     unit: str = "metres"
     """Unit of lengths in the file."""
     fps: float = 0.0

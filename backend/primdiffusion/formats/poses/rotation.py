@@ -153,7 +153,7 @@ def turn_y_up(
     A camera's axes, y down and z away, are turned about x: who faces the camera faces +z then.
     Translations as in SMPL's files: relative to a body whose pelvis is at its rest position, not at the origin.
     """
-    turn = about_axis(0, np.pi) if up[1] < -0.999 else between(up, np.array([0.0, 1.0, 0.0]))
+    turn = about_axis(0, np.pi) if up[1] < 1e-9 - 1 else between(up, np.array([0.0, 1.0, 0.0]))
     rotations = np.array(rotations, np.float64)
     rotations[:, 0] = turn @ rotations[:, 0]
     pelvis = REST_JOINTS[0]
