@@ -88,12 +88,14 @@ class _JoblibArray(Inert):
     def __setstate__(self, state: object) -> None:
         """Store the state, and the bytes behind it."""
         match state:
-            case {"shape": tuple() as shape, "dtype": _NumberType(arguments=(str() as kind, *_))}:
+            case {"shape": tuple() as shape, "dtype": _NumberType(arguments=(str() as kind, *_)), **rest}:
                 found = _TYPE_SIZE.fullmatch(kind)
+            case _:
+                raise ValueError("an array has no shape or type")
         if found is None or not all(isinstance(n, int) and n >= 0 for n in shape):
             raise ValueError("an array holds objects, not numbers")
         size = int(found[1]) * (4 if kind[0] == "U" else 1) * math.prod(shape)
-        if state.get("numpy_array_alignment_bytes") is not None:
+        if rest.get("numpy_array_alignment_bytes") is not None:
             self.stream.seek(ord(self.stream.read(1)), io.SEEK_CUR)
         self.state, self.raw = state, self.stream.read(min(size, len(self.stream.getbuffer())))
 
@@ -186,7 +188,7 @@ class _Unpickler(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIss
     def __init__(self, data: bytes, path: str | Path) -> None:
         stream = io.BytesIO(data)
         super().__init__(stream, encoding="latin1")
-        self.dispatch = _Operations(len(data))
+        self.dispatch = _Operations(len(data))  # pyright: ignore[reportAttributeAccessIssue]
         self._path = path
         self._joblib_array = type("_JoblibArray", (_JoblibArray,), {"stream": stream})
 

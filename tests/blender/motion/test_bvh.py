@@ -51,6 +51,7 @@ def test_a_rig_at_smpls_rest_gives_smpls_rotations(tmp_path, rig, unit):
     np.testing.assert_allclose(motion.translations, moves, atol=1e-5)
     assert motion.fps == pytest.approx(120, abs=0.01)
     assert any(("metres" if unit == 1 else "centimetres") in note for note in motion.notes)
+    assert motion.detected.doubt == ""
 
 
 def standing_first(spread: float = 0.5) -> np.ndarray:

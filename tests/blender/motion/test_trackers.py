@@ -131,6 +131,9 @@ def test_an_array_of_joblib_by_columns_is_read(tmp_path):
         dumped({"poses": np.zeros((4, 72))})[:-900],
         dumped({"poses": np.zeros((4, 72))}, compressed=True)[:-20],
         dumped({"poses": np.zeros((3, 72))}).replace(b"K\x03KH\x86", b"K\xffKH\x86"),
+        dumped({"poses": np.zeros((3, 72))}).replace(b"K\x03KH\x86", b"JHHHHK\x03"),
+        dumped({"poses": np.zeros((3, 72))}).replace(b"shape", b"shupe"),
+        dumped({"poses": np.zeros((3, 72))}).replace(b"\x8c\x02f8", b"\x8c\x02O8"),
     ],
 )
 def test_damaged_files_of_joblib_are_one_sentence(tmp_path, content):

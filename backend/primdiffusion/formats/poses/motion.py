@@ -29,8 +29,6 @@ class Detected:
     """SMPL, SMPL-H, SMPL-X, or the naming of the bones; empty where unknown."""
     up: str = ""
     """The file's axis that points up, such as "z" or "-y"."""
-    doubt: str = ""
-    """A sentence about what makes the up axis doubtful."""
     unit: str = "metres"
     """Unit of lengths in the file."""
     fps: float = 0.0
@@ -41,6 +39,8 @@ class Detected:
     """Names of the people in a tracker's output."""
     average_legs: bool = False
     """Whether lengths were scaled to average legs, so that they must be scaled to each body."""
+    doubt: str = ""
+    """A sentence about what makes the up axis doubtful."""
 
 
 LARGEST_NUMBER = 1e6

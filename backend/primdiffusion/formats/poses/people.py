@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,7 +50,7 @@ def people_in(content: Any, keys: Collection[str]) -> dict[str, Mapping[str, Any
     return found
 
 
-def choose(people: Mapping[str, Mapping[str, np.ndarray]], lengths: Mapping[str, int], name: str, path: object) -> str:
+def choose(people: Mapping[str, Mapping[str, np.ndarray]], lengths: Mapping[str, int], name: str, path: Path) -> str:
     """The person called `name`, or who has the most frames where it is empty. Raises FileError."""
     if not name:
         return max(people, key=lambda person: lengths[person])
