@@ -87,7 +87,7 @@ def run(command: ExportCommand) -> None:
         raise FileNotFoundError(f"there is no folder {command.out.parent}: create it, or choose another")
     human = load_human(command.human)
     if command.out.suffix.lower() == ".ply":
-        pose = None if command.pose is None else read_pose(command.pose, command.frame)
+        pose = None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
         write_gaussians(command.out, gaussians_of(place_on_floor(human, pose), command.gaussians))
     elif command.out.suffix.lower() == ".glb":
         write_proxy_glb(command.out, mesh_proxy(human, command), human.provenance)

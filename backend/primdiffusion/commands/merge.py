@@ -76,7 +76,7 @@ def run(command: MergeCommand) -> None:
     as_vdb = command.out.suffix.lower() == ".vdb"
     if as_vdb:
         load_openvdb()
-    pose = None if command.pose is None else read_pose(command.pose, command.frame)
+    pose = None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
     people = []
     for number, path in enumerate(command.humans):
         placed = place_on_floor(load_human(path), pose)

@@ -64,11 +64,14 @@ class PoseOptions:
     """Pose file (.npz, .npy, .json, .pkl, .bvh), such as 72 axis-angle numbers (24 x 3, radians); default: T pose."""
     frame: int = 0
     """Frame of a pose file with several."""
+    tracked_person: str = ""
+    """Name or number of a person in a tracker's pose file of several people; default: who is in the most frames."""
 
     def check(self) -> None:
-        """Raise FieldError for a frame without a pose file."""
-        if self.frame and self.pose is None:
-            raise FieldError(("frame",), f"is {self.frame} without a pose file: give one with --pose")
+        """Raise FieldError for a frame or person without a pose file."""
+        for name, value in (("frame", self.frame), ("tracked_person", self.tracked_person)):
+            if value and self.pose is None:
+                raise FieldError((name,), f"is {value} without a pose file: give one with --pose")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -56,7 +56,9 @@ def run(command: RenderCommand) -> None:
     """Render, and print the path."""
     look = ViewSettings(command.view, settings=MarchSettings(step=command.step))
     human = load_human(command.human)
-    primitives = place(human, None if command.pose is None else read_pose(command.pose, command.frame))
+    primitives = place(
+        human, None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
+    )
     width, height = (command.size if side is None else side for side in (command.width, command.height))
     camera = framing(primitives, command.yaw, width, height)
     background = BACKGROUNDS[command.background]
