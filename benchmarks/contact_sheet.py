@@ -24,7 +24,7 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.image import depth_colours, over
+from primdiffusion.render.image import depth_colours
 from primdiffusion.render.march import march
 
 BACKGROUND = (0.72, 0.72, 0.72)
@@ -100,7 +100,7 @@ def relaxed_depth(human: Human, width: int, height: int) -> np.ndarray:
 def whole(human: Human, size: int) -> np.ndarray:
     """In T pose, a little from the side."""
     primitives = place(human)
-    return seen(primitives, framing(primitives, 0.3, size, size))
+    return seen(primitives, framing(primitives, 17, size, size))
 
 
 def head(human: Human, size: int) -> np.ndarray:
@@ -110,7 +110,7 @@ def head(human: Human, size: int) -> np.ndarray:
 
 def seen(primitives: Primitives, camera: Camera) -> np.ndarray:
     """sRGB bytes over the background."""
-    picture = encode_srgb(over(march(primitives, camera), BACKGROUND))
+    picture = encode_srgb(march(primitives, camera).over(BACKGROUND))
     return (picture.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 

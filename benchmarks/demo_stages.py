@@ -27,7 +27,7 @@ from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import anchor_skin_weights, attach, default_anchors
-from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
+from primdiffusion.render.image import depth_to_png, rgba_to_png
 from primdiffusion.render.march import march
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))
@@ -38,7 +38,6 @@ ROOT = Path(__file__).resolve().parents[1]
 MODULE = "bl_ext.user_default.primdiffusion"
 SEED = 7
 BACKGROUND = (0.72, 0.72, 0.72)
-SIDE_VIEW = math.radians(70)
 
 
 def person(arguments: argparse.Namespace) -> dict[str, float]:
@@ -114,11 +113,12 @@ def cycles(arguments: argparse.Namespace) -> dict[str, float]:
     sys.path.insert(0, str(ROOT))
     from blender_primdiffusion.scene.cycles import setup_cycles_preview
 
-    setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples, yaw=arguments.yaw, world=0.48)
-    scene.render.filepath = str(arguments.out)
+    yaw = math.radians(arguments.yaw)
+    setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples, yaw=yaw, world=0.48)
     start = time.perf_counter()
     bpy.app.handlers.render_stats.append(lambda stats, _: print(stats, flush=True))  # the demo shows the last line
-    bpy.ops.render.render(write_still=True)
+    bpy.ops.render.render()
+    bpy.data.images["Render Result"].save_render(str(arguments.out))
     return {"seconds_cycles": time.perf_counter() - start, "volumes": float(len(bpy.data.volumes))}
 
 
@@ -139,7 +139,7 @@ def main() -> None:
         drawing.add_argument(f"--{name}", type=Path, required=True)
     drawing.add_argument("--size", type=int, default=384)
     drawing.add_argument("--samples", type=int, default=1)
-    drawing.add_argument("--yaw", type=float, default=0.5, help="radians around the person, 0 is the front")
+    drawing.add_argument("--yaw", type=float, default=29, help="degrees around the person, 0 is the front")
     marching = stages.add_parser("march")
     marching.set_defaults(stage=march_pictures)
     for name in ("human", "out", "json"):
@@ -171,10 +171,10 @@ def march_pictures(arguments: argparse.Namespace) -> dict[str, float]:
     rendering = march(rest, front)
     seconds = time.perf_counter() - start
 
-    to_png(arguments.out / "march_rest.png", rendering, BACKGROUND)
-    depth_to_png(arguments.out / "march_depth.png", rendering)
-    to_png(arguments.out / "march_posed.png", march(walking, framing(walking)), BACKGROUND)
-    to_png(arguments.out / "march_side.png", march(walking, framing(walking, yaw=SIDE_VIEW)), BACKGROUND)
+    rendering.save(arguments.out / "march_rest.png", BACKGROUND)
+    depth_to_png(arguments.out / "march_depth.png", rendering.depth, rendering.alpha)
+    march(walking, framing(walking)).save(arguments.out / "march_posed.png", BACKGROUND)
+    march(walking, framing(walking, 70)).save(arguments.out / "march_side.png", BACKGROUND)
     boxes = draw(Scene(rest, chart=default_anchors().chart), front, ViewSettings("boxes"))
     rgba_to_png(arguments.out / "march_boxes.png", torch.from_numpy(boxes.combined), BACKGROUND)
     return {"seconds_march_512": seconds, "grid_share_on_body": share_on_body(rest.position)}

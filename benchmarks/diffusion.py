@@ -66,7 +66,6 @@ from primdiffusion.human import place
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.render.image import over
 from primdiffusion.render.march import march
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
@@ -399,7 +398,7 @@ def portraits(primitives: Primitives) -> np.ndarray:
 def seen(primitives: Primitives, portrait: Portrait, halvings: int) -> np.ndarray:
     """sRGB bytes of a portrait."""
     view = march(primitives, camera_of(portrait, CELL >> halvings))
-    return (encode_srgb(over(view, BACKGROUND)).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return (encode_srgb(view.over(BACKGROUND)).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 if __name__ == "__main__":

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import colorsys
 import dataclasses
-import math
 import statistics
 import time
 from collections import defaultdict
@@ -32,7 +31,6 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, Sampling
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, generate, place
-from primdiffusion.render.image import over
 from primdiffusion.render.march import march
 from record import command_line, report
 
@@ -46,7 +44,7 @@ HEADING, LABEL = 24, 18
 GARMENTS = ("top", "bottom", "shoes", "hair", "skin")
 
 Captioned = tuple[str, Human] | tuple[str, Human, float]
-"""A picture's caption, the person on it, and the yaw of the camera in radians."""
+"""A picture's caption, the person on it, and the yaw of the camera in degrees."""
 
 
 class Studio:
@@ -68,10 +66,10 @@ class Studio:
         person = self.people[0]
         yield "person", person
         painted = in_colours(person, DISJOINT)
-        for name, yaw in (("parts, front", 0.0), ("left side", math.pi / 2), ("back", math.pi)):
+        for name, yaw in (("parts, front", 0.0), ("left side", 90.0), ("back", 180.0)):
             yield name, painted, yaw
         unions = in_colours(person, GARMENTS)
-        for name, yaw in ((", ".join(GARMENTS[:3]), 0.0), (", ".join(GARMENTS[3:]), math.pi)):
+        for name, yaw in ((", ".join(GARMENTS[:3]), 0.0), (", ".join(GARMENTS[3:]), 180.0)):
             yield name, unions, yaw
 
     def varied(self) -> Iterator[Captioned]:
@@ -161,7 +159,7 @@ def picture(human: Human, height: int, yaw: float = 0.0) -> np.ndarray:
         theta[JOINT_NAMES.index(f"{side}_shoulder"), 2] = sign * ARMS_LOWERED
     primitives = place(human, BodyPose.from_axis_angle(theta.flatten()))
     rendering = march(primitives, framing(primitives, yaw, 2 * height // 3, height))
-    return (encode_srgb(over(rendering, BACKGROUND)).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+    return (encode_srgb(rendering.over(BACKGROUND)).clamp(0, 1) * 255).round().to(torch.uint8).numpy()
 
 
 def sheet(rows: list[tuple[str, list[tuple[str, np.ndarray]]]], height: int) -> Image.Image:

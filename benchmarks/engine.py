@@ -70,7 +70,6 @@ def stage(human: Human, folder: Path) -> bpy.types.Object:
     scene.render.film_transparent = True
     scene.render.dither_intensity = 0
     scene.render.image_settings.file_format, scene.render.image_settings.color_mode = "PNG", "RGBA"
-    scene.render.filepath = str(folder / "picture.png")
     scene.view_settings.view_transform = "Standard"
     scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.camera.data.lens, scene.camera.data.sensor_width = LENS_MM, SENSOR_MM
@@ -146,11 +145,17 @@ def overhead(change: Callable[[int], None]) -> dict[str, float]:
     return {f"{name}_ms": 1e3 * value for name, value in best.items()}
 
 
-def pixel_error(human: Human, armature: bpy.types.Object, rotations: np.ndarray) -> float:
+def rendered(path: Path) -> bpy.types.Image:
+    """Render the scene to a file, and load that."""
+    bpy.ops.render.render()
+    bpy.data.images["Render Result"].save_render(str(path))
+    return bpy.data.images.load(str(path))
+
+
+def pixel_error(human: Human, armature: bpy.types.Object, rotations: np.ndarray, folder: Path) -> float:
     """The largest difference between Blender's saved PNG and the backend's picture, pixel values in 0 ... 1."""
     pose_from_joint_rotations(armature, rotations)
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(bpy.context.scene.render.filepath)
+    image = rendered(folder / "picture.png")
     given = np.round(255 * np.array(image.pixels[:])).reshape(SIZE, SIZE, 4)[::-1]
     focal = LENS_MM / SENSOR_MM * SIZE
     eye = BACKEND_FROM_BLENDER @ (np.array(bpy.context.scene.camera.location) - np.array(armature.location))
@@ -177,7 +182,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="primdiffusion_benchmark_") as folder:
         armature = stage(human, Path(folder))
         figures: dict[str, float | int | str | None] = {"size": SIZE, "frames": FRAMES}
-        figures["engine_pixel_error_max"] = max(pixel_error(human, armature, pose(seed)) for seed in range(3))
+        figures["engine_pixel_error_max"] = max(
+            pixel_error(human, armature, pose(seed), Path(folder)) for seed in range(3)
+        )
         camera = bpy.context.scene.camera
         moved = overhead(lambda frame: setattr(camera.location, "x", 0.01 * frame))
         posed = overhead(lambda frame: pose_from_joint_rotations(armature, pose(frame)))
@@ -231,9 +238,7 @@ def picture(folder: Path) -> np.ndarray:
     """Render the scene: linear, premultiplied [h, w, 4]."""
     render = bpy.context.scene.render
     render.image_settings.file_format, render.image_settings.color_mode = "OPEN_EXR", "RGBA"
-    render.filepath = str(folder / "picture.exr")
-    bpy.ops.render.render(write_still=True)
-    image = bpy.data.images.load(render.filepath)
+    image = rendered(folder / "picture.exr")
     try:
         return np.array(image.pixels[:]).reshape(HEIGHT, WIDTH, 4)[::-1]
     finally:

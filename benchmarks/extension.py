@@ -245,9 +245,9 @@ def _frame_ms(scene: bpy.types.Scene) -> float:
 
 
 def _render_seconds(path: Path) -> float:
-    bpy.context.scene.render.filepath = str(path)
     start = time.perf_counter()
-    bpy.ops.render.render(write_still=True)
+    bpy.ops.render.render()
+    bpy.data.images["Render Result"].save_render(str(path))
     return time.perf_counter() - start
 
 

@@ -18,6 +18,8 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
 - kills: of the programs in KILLED, in as many processes as there are cores, at most two; a loss is a file that is
   half-written, gone, set back, or other than that of an undisturbed run. disks, deaths (of the extension's child) and
   environments are `tests/chaos` too
+- rigs: motions and scans of the default body as a Mixamo, Ready Player Me, Rokoko, VRoid and SOMA rig: how many are
+  read and stand, and the largest error of a scan's size as a fraction (`tests/blender/real_rigs.py`)
 - window: rounds of undo and redo among timers in a real window, and crashes, from the figures of
   `scripts/window/look.py --scenes undo_and_timers`; left out without --window
 """
@@ -221,6 +223,10 @@ PARTS: dict[str, Part] = {
     ),
     "disks": Part(("disk_full_commands", "disk_full_losses"), lambda _: chaos("disks")),
     "environments": Part(("environments", "environments_failed"), lambda _: chaos("environments")),
+    "rigs": Part(
+        ("real_rigs", "real_rigs_read", "real_rigs_upright", "capture_scale_error_max"),
+        lambda _: tool("tests/blender/real_rigs.py", is_shown=False),
+    ),
     "window": Part(("window_rounds", "window_crashes"), lambda given: window(given.window)),
 }
 

@@ -9,7 +9,6 @@ surface_error is against the backend's own frames on the posed surface. `--no-vo
 from __future__ import annotations
 
 import dataclasses
-import math
 import sys
 import time
 from pathlib import Path
@@ -100,9 +99,9 @@ def surface_error(human, armature, rotations: np.ndarray) -> tuple[float, float]
 
 def rendered(path: Path) -> tuple[np.ndarray, float]:
     """The scene's picture [H, W, 3] in 0 ... 1 as read from its PNG, and the seconds of the render."""
-    bpy.context.scene.render.filepath = str(path)
     began = time.perf_counter()
-    bpy.ops.render.render(write_still=True)
+    bpy.ops.render.render()
+    bpy.data.images["Render Result"].save_render(str(path))
     seconds = time.perf_counter() - began
     image = bpy.data.images.load(str(path))
     pixels = np.array(image.pixels[:], np.float32).reshape(SIZE, SIZE, 4)[..., :3]
@@ -121,7 +120,7 @@ def fitted_gains(primitives: Primitives) -> dict[str, float]:
     meet the human: marched with so little density that no ray saturates.
     """
     faint = dataclasses.replace(primitives, density=primitives.density * FAINT)
-    cameras = [framing(primitives, math.pi / 2 * side, GAIN_PIXELS, GAIN_PIXELS) for side in range(4)]
+    cameras = [framing(primitives, 90 * side, GAIN_PIXELS, GAIN_PIXELS) for side in range(4)]
     reached = np.concatenate([march(faint, camera).alpha.double().numpy().ravel() / FAINT for camera in cameras])
     met = reached[reached >= MET]
     errors = {gain: np.abs(-np.expm1(-gain * met) - np.minimum(met, 1)).mean() for gain in (*GAINS, DENSITY_GAIN)}

@@ -35,7 +35,6 @@ from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import save_human
-from primdiffusion.render.image import over, to_png
 from primdiffusion.render.march import march
 from record import command_line, report, run
 
@@ -100,15 +99,15 @@ def boxes() -> None:
         seen = {share: [] for share in SHARES}
         for offset in OFF_THE_SKIN:
             before, truth = (checkered_human(0, b, offset) for b in (MEAN, betas))
-            camera = framing(place(truth), 0.3, size, size)
+            camera = framing(place(truth), 17, size, size)
             expected = march(place(truth), camera)
             for share in SHARES:
                 drawn = march(place(grown(before, betas, share)), camera)
                 holes = float((drawn.alpha[expected.alpha > 0.95] < 0.7).float().mean())
-                colours = (encode_srgb(over(one, GREY).clamp(0, 1)) for one in (drawn, expected))
+                colours = (encode_srgb(one.over(GREY).clamp(0, 1)) for one in (drawn, expected))
                 seen[share].append((float(psnr(*colours)), holes))
                 if given.pictures:
-                    to_png(given.pictures / f"{name}_{offset:g}_{share:g}.png", drawn, GREY)
+                    drawn.save(given.pictures / f"{name}_{offset:g}_{share:g}.png", GREY)
         for share, pairs in seen.items():
             for kind, values in zip(("psnr", "holes"), zip(*pairs, strict=True), strict=True):
                 figures[f"{kind}_{name}_{100 * share:.0f}"] = statistics.mean(values)

@@ -5,7 +5,6 @@ python examples/app.py                  # prints an address on this machine
 """
 
 import argparse
-import math
 import tempfile
 from pathlib import Path
 
@@ -15,7 +14,6 @@ from PIL import Image
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.export.proxy import mesh_proxy, write_proxy_glb
 from primdiffusion.human_file import save_human
-from primdiffusion.render.image import to_png
 
 VIEWS = 24
 ANY = "any"
@@ -26,9 +24,9 @@ def turntable(human: pd.Human, folder: Path, size: int) -> Path:
     boxes = pd.place(human)
     pictures = []
     for view in range(VIEWS):
-        camera = pd.framing(boxes, 2 * math.pi * view / VIEWS, size, size)
+        camera = pd.framing(boxes, 360 * view / VIEWS, size, size)
         path = folder / f"{view:02d}.png"
-        to_png(path, pd.march(boxes, camera), background=(0.8, 0.8, 0.8))
+        pd.march(boxes, camera).save(path, background=(0.8, 0.8, 0.8))
         pictures.append(Image.open(path))
     pictures[0].save(folder / "turntable.webp", save_all=True, append_images=pictures[1:], duration=1000 // 12, loop=0)
     return folder / "turntable.webp"
@@ -65,4 +63,5 @@ def page(model: DiffusionModel, size: int = 384) -> gradio.Blocks:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--checkpoint", type=Path)
-    page(pd.load_checkpoint(parser.parse_args().checkpoint)).launch()
+    model = pd.load_checkpoint(parser.parse_args().checkpoint)
+    page(model).launch(server_name="127.0.0.1", share=False)  # whatever GRADIO_SERVER_NAME and GRADIO_SHARE say

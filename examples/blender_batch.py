@@ -53,8 +53,8 @@ def main(options: list[str]) -> None:
     scene.render.resolution_x, scene.render.resolution_y = arguments.size
     for frame in arguments.frames:
         scene.frame_set(frame)
-        scene.render.filepath = str(out / f"{frame:04d}.png")
-        bpy.ops.render.render(write_still=True)
+        bpy.ops.render.render()  # without write_still: in render.filepath, Blender 5 takes {braces} for templates
+        bpy.data.images["Render Result"].save_render(str(out / f"{frame:04d}.png"))
     bpy.ops.wm.save_mainfile()
 
 

@@ -19,7 +19,6 @@ from matplotlib.figure import Figure
 from primdiffusion.human import frames_of
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.render.image import to_png
 from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_payload
 from primdiffusion.training.refine import bare_body
 from torch import Tensor
@@ -39,7 +38,7 @@ def main() -> None:
 
     human = pd.generate(pd.load_checkpoint(arguments.checkpoint), seed=7)
     boxes, frames = pd.place(human), frames_of(human)
-    cameras = [pd.framing(boxes, math.tau * turn / VIEWS, arguments.size, arguments.size) for turn in range(VIEWS)]
+    cameras = [pd.framing(boxes, 360 * turn / VIEWS, arguments.size, arguments.size) for turn in range(VIEWS)]
     pictures = [TargetImage(frames, camera, rgba(boxes, camera).numpy()) for camera in cameras]
 
     start = bare_body(human.betas).payload
@@ -52,7 +51,7 @@ def main() -> None:
     for name, course in fits.items():
         axes.plot([seconds for seconds, _ in course], [psnr(payload, pictures) for _, payload in course], label=name)
         fitted = pd.march(pd.Primitives.place(frames, course[-1][1]), cameras[0])
-        to_png(arguments.out / f"{name.replace(' ', '_')}.png", fitted)
+        fitted.save(arguments.out / f"{name.replace(' ', '_')}.png")
     axes.set(xlabel="seconds", ylabel="PSNR of the given pictures, dB")
     axes.legend()
     figure.savefig(arguments.out / "fit.png")

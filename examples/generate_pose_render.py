@@ -4,7 +4,6 @@ python examples/generate_pose_render.py --out waving
 """
 
 import argparse
-import math
 from pathlib import Path
 
 import torch
@@ -12,7 +11,6 @@ from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.human import framing, generate, place
 from primdiffusion.human_file import save_human
-from primdiffusion.render.image import to_png
 from primdiffusion.render.march import march
 from walk import walk_and_wave
 
@@ -33,8 +31,8 @@ def main() -> None:
     rotation = torch.from_numpy(walk_and_wave(frames=48)[31]).float()
     waving = place(human, BodyPose(rotation, torch.zeros(3)))
     for degrees in (0, 90, 180, 270):
-        camera = framing(waving, math.radians(degrees), arguments.size, arguments.size)
-        to_png(arguments.out / f"yaw_{degrees:03d}.png", march(waving, camera))
+        camera = framing(waving, degrees, arguments.size, arguments.size)
+        march(waving, camera).save(arguments.out / f"yaw_{degrees:03d}.png")
 
 
 if __name__ == "__main__":

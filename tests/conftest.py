@@ -3,12 +3,15 @@
 import os
 
 import pytest
+from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
 from primdiffusion.machine import share_processors
 from support import kernels
 
 share_processors()
 kernels.share()
+settings.register_profile("any_speed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("any_speed")
 
 CHECKED = [
     f"primdiffusion.{module}"

@@ -1,5 +1,6 @@
 """A checkpoint small enough to make in a test: person prior without networks, a codec of four numbers a primitive."""
 
+import dataclasses
 from pathlib import Path
 
 import torch
@@ -50,6 +51,21 @@ def tiny_model(local: LocalUNetConfig | None = None) -> DiffusionModel:
     denoiser = PersonDenoiser(DenoiserConfig(person=None, local=local), prior, schedule)
     card = {"name": "tiny", "full_density": FULL_DENSITY}
     return DiffusionModel(denoiser, schedule, CellCodec(codec), STANDARD_SHAPES, FULL_DENSITY, card, VOCABULARY)
+
+
+def model_of_two_kinds() -> DiffusionModel:
+    """Women in jeans and men in suits, far from each other."""
+    tiny = tiny_model()
+    assert isinstance(tiny.denoiser, PersonDenoiser)
+    prior = dataclasses.replace(
+        tiny.denoiser.prior,
+        centre=torch.tensor([-100.0, 100.0])[None, :, None].repeat(1, 1, COMPONENTS),
+        variance=torch.ones(1, COMPONENTS),
+        kind=torch.tensor([[[1.0, 0, 1, 0], [0, 1, 0, 1]]]),
+    )
+    denoiser = PersonDenoiser(DenoiserConfig(person=None, local=None), prior, tiny.schedule)
+    vocabulary = AttributeVocabulary({"sex": ("female", "male"), "outfit": ("jeans", "suit")}, {})
+    return dataclasses.replace(tiny, denoiser=denoiser, vocabulary=vocabulary)
 
 
 def save_tiny_checkpoint(path: Path, local: LocalUNetConfig | None = None) -> Path:

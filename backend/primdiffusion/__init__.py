@@ -4,7 +4,8 @@
 
     human = pd.generate(pd.load_checkpoint(), seed=7)
     boxes = pd.place(human)
-    image = pd.march(boxes, pd.framing(boxes, yaw=0.0, width=512, height=512))
+    image = pd.march(boxes, pd.framing(boxes, yaw_degrees=30, width=512, height=512))
+    image.save("front.png")
 
 These names, and the types they take and return, are imported when they are first used: torch is not loaded before.
 """

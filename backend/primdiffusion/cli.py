@@ -35,7 +35,6 @@ COMMANDS = {
     "reconstruct": ("commands.reconstruct:run", "Reconstruct a human from one picture, or from captures"),
     "refine": ("commands.reconstruct:run_refine", "Optimise a captured human to match the images"),
     "render": ("commands.render:run", "Render a human in a pose"),
-    "view": ("commands.view:run", "Show a human in a browser, with sliders for the pose"),
     "export": ("commands.export:run", "Export a human to other programs: .glb, .obj or .ply"),
     "export-onnx": ("commands.export_onnx:run", "Export the denoiser of a model to ONNX"),
     "merge": ("commands.merge:run", "Merge humans into one voxel grid: .vdb or .npz"),

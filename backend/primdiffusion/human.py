@@ -3,7 +3,7 @@
     model = load_checkpoint()                          # diffusion: noise -> payload and betas
     human = generate(model, seed=7)
     primitives = place(human, BodyPose.from_axis_angle(theta))   # body: betas, theta -> mesh -> frames; payload in them
-    rendering = march(primitives, framing(primitives, yaw=0.5))
+    rendering = march(primitives, framing(primitives, yaw_degrees=30))
 
 Frames are computed on the posed mesh for every pose, as in the paper (sec. 3.1): the mesh drives the primitives.
 """
@@ -25,6 +25,7 @@ from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_bod
 from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import DiffusionModel, sample
+from primdiffusion.diffusion.reading import unfollowed
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.formats import requests
@@ -58,7 +59,8 @@ class Human(TensorRecord):
     """Shape coefficients of the body."""
     provenance: Mapping[str, Any]
     """Where the human comes from; JSON values. For a generated one: seed, steps, sampler, `end` if it is not the clean
-    sample, attributes and guidance if requested, checkpoint, checkpoint_sha256, full_density, version."""
+    sample, attributes and guidance if requested, `unfollowed` (the values that it shows instead of requested ones,
+    `diffusion.reading`), checkpoint, checkpoint_sha256, full_density, version."""
     body_setup: BodySetup | None = None
     """Body and anchors; None is the default body."""
 
@@ -70,7 +72,8 @@ class Human(TensorRecord):
                 f"expected one human, got a batch of shape {tuple(self.payload.density.shape[:-4])}: select one sample"
             )
         if self.betas.ndim != 1 or not torch.isfinite(self.betas).all():
-            raise ValueError(f"betas must be one row of finite numbers, got {self.betas!r}: generate the human again")
+            given = f"{self.betas.tolist()!s:.80}"
+            raise ValueError(f"betas must be one row of finite numbers, not {given}: generate the human again")
         return self
 
 
@@ -125,9 +128,10 @@ def generate_batch(
     ending = {} if end == CLEAN else {"end": end}
     shared = {"steps": steps, "sampler": sampler, **ending, **conditioning, **made_by(model)}
     people = people_of(model, final, seeds, attributes)
+    missed = ({"unfollowed": names} if names else {} for names in unfollowed(model, final, attributes))
     return [
-        dataclasses.replace(human, provenance={"seed": seed, **shared}).validate()
-        for human, seed in zip(people, seeds, strict=True)
+        dataclasses.replace(human, provenance={"seed": seed, **shared, **names}).validate()
+        for human, seed, names in zip(people, seeds, missed, strict=True)
     ]
 
 
@@ -182,6 +186,17 @@ def place(
     Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
     """
     return Primitives.place(frames_of(human, pose, body, anchors), human.payload)
+
+
+def sole_height(human: Human) -> float:
+    """Height of the soles of the human's body at rest, metres: y = 0 in files for other programs, as in Blender."""
+    return float(body_of(human)[0].shape(human.betas).vertices[:, 1].min())
+
+
+def place_on_floor(human: Human, pose: BodyPose | None = None) -> Primitives:
+    """As `place`, in a world whose y is 0 at `sole_height`."""
+    placed = place(human, pose)
+    return dataclasses.replace(placed, position=placed.position - torch.tensor([0.0, sole_height(human), 0.0]))
 
 
 def frames_of(
@@ -261,10 +276,10 @@ def body_of(human: Human, body: BodyModel | None = None, anchors: Anchors | None
     return body, anchors
 
 
-def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: int = 512) -> Camera:
+def framing(primitives: Primitives, yaw_degrees: float = 0.0, width: int = 512, height: int = 512) -> Camera:
     """A level camera that frames all of `primitives`, at the height of their centre.
 
-    `yaw` in radians: 0 shows the front of the human, pi/2 the left side. The vertical field of view is 30 degrees.
+    `yaw_degrees`: 0 shows the front of the human, 90 the left side. The vertical field of view is 30 degrees.
     Raises ValueError for an image side outside 1 ... LARGEST_PICTURE pixels.
     """
     if not 1 <= min(width, height) <= max(width, height) <= LARGEST_PICTURE:
@@ -274,6 +289,7 @@ def framing(primitives: Primitives, yaw: float = 0.0, width: int = 512, height: 
     corners = primitives.position[:, None] + (primitives.rotation[:, None] @ local[..., None])[..., 0]
     corners = corners.detach().flatten(0, 1)
     middle = (corners.amin(0) + corners.amax(0)) / 2
+    yaw = math.radians(yaw_degrees)
     towards_camera = middle.new_tensor([math.sin(yaw), 0.0, math.cos(yaw)])
     right = middle.new_tensor([math.cos(yaw), 0.0, -math.sin(yaw)])
     offset = corners - middle

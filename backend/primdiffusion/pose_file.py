@@ -13,19 +13,20 @@ from primdiffusion.formats.poses import files
 from primdiffusion.formats.poses.motion import Motion
 
 
-def read_motion(path: str | Path) -> BodyPose:
+def read_motion(path: str | Path, person: str = "") -> BodyPose:
     """Read all frames of a file (`formats.poses.files`): rotations [F, 24, 3, 3], translations [F, 3] in metres, y up.
 
+    `person` is one of several people in it; by default who is in the most frames.
     Raises FileNotFoundError or FileError.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"the pose file {path} does not exist: check the path")
-    return _as_pose(files.read_motion(path))
+    return _as_pose(files.read_motion(path, person=person))
 
 
-def read_pose(path: str | Path, frame: int = 0) -> BodyPose:
+def read_pose(path: str | Path, frame: int = 0, person: str = "") -> BodyPose:
     """Read a `frame` of a file as `read_motion`, or its only pose. Raises FileNotFoundError and ValueError."""
-    return _frame(read_motion(path), str(path), frame)
+    return _frame(read_motion(path, person), str(path), frame)
 
 
 def pose_from_numbers(content: Any, name: str) -> BodyPose:

@@ -147,6 +147,8 @@ _SURFACE_RIDGE_M = 0.002
 _LARGEST_BETA = 4.0
 _SCALES = (0.8, 1.25)
 _POOR_M = 0.03
+_BETTER = 0.75
+"""Another size counts only if its fit costs less than this fraction of the fit at the scan's own."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -167,7 +169,9 @@ def fit_joints(body: Body, joints: Mapping[str, NDArray]) -> ShapeFit:
     """The shape whose joints at rest are nearest to `joints` (SMPL's name -> place at the T rest, metres, y up).
 
     min over betas, shift: sum_j w_j |scale * x_j + shift - J_j(betas)|^2 + ridge |betas|^2, whose J is linear in betas.
-    The scale is 1, and free between `_SCALES` only where a fit at 1 is poor or its betas are too large.
+    Betas beyond `_LARGEST_BETA` are held there, and the others solved again. The scale is 1: another one between
+    `_SCALES` is tried only where the fit at 1 is poor, and taken where the distances in the scan's own metres,
+    residual / scale, are much smaller. Distances after scaling fall with the scale whatever the shape.
     """
     names = [name for name in JOINT_NAMES if name in joints]
     places = np.array([joints[name] for name in names])
@@ -175,11 +179,15 @@ def fit_joints(body: Body, joints: Mapping[str, NDArray]) -> ShapeFit:
     weight = np.sqrt([_WEIGHTS.get(name.split("_")[-1], 1.0) for name in names])
     mean = (body.joint_regressor @ body.template)[rows]
     basis = np.einsum("jv,vcb->jcb", body.joint_regressor[rows], body.shape_basis)
-    best = _solve(places, mean, basis, weight, 1.0)
-    if best.residual > _POOR_M or np.abs(best.betas).max(initial=0) > _LARGEST_BETA:
-        tried = [_solve(places, mean, basis, weight, s) for s in np.linspace(*_SCALES, 46)]
-        best = min((*tried, best), key=lambda fit: fit.residual + _RIDGE_M * float(np.abs(fit.betas).max(initial=0)))
-    return best
+
+    def cost(fit: ShapeFit) -> float:
+        return fit.residual / fit.scale + _RIDGE_M * float(np.abs(fit.betas).max(initial=0))
+
+    own = _solve(places, mean, basis, weight, 1.0)
+    if own.residual <= _POOR_M:
+        return own
+    best = min((_solve(places, mean, basis, weight, s) for s in np.linspace(*_SCALES, 46)), key=cost)
+    return best if cost(best) < _BETTER * cost(own) else own
 
 
 def _solve(places: NDArray, mean: NDArray, basis: NDArray, weight: NDArray, scale: float) -> ShapeFit:
@@ -187,9 +195,16 @@ def _solve(places: NDArray, mean: NDArray, basis: NDArray, weight: NDArray, scal
     shifts = np.broadcast_to(-np.eye(3), (count, 3, 3))
     unknowns = (np.concatenate([basis, shifts], -1) * weight[:, None, None]).reshape(3 * count, betas + 3)
     target = ((scale * places - mean) * weight[:, None]).ravel()
-    ridge = np.concatenate([np.eye(betas) * _RIDGE_M, np.zeros((betas, 3))], -1)
-    solution = np.linalg.lstsq(np.concatenate([unknowns, ridge]), np.concatenate([target, np.zeros(betas)]), rcond=None)
-    values = solution[0]
+    rows = np.concatenate([unknowns, np.eye(betas, betas + 3) * _RIDGE_M])
+    values, free = np.zeros(betas + 3), np.ones(betas + 3, np.bool_)
+    while True:
+        wanted = np.concatenate([target, np.zeros(betas)]) - rows[:, ~free] @ values[~free]
+        values[free] = np.linalg.lstsq(rows[:, free], wanted, rcond=None)[0]
+        beyond = free & (np.abs(values) > _LARGEST_BETA)
+        beyond[betas:] = False
+        if not beyond.any():
+            break
+        values[beyond], free = np.sign(values[beyond]) * _LARGEST_BETA, free & ~beyond
     off = (unknowns @ values - target).reshape(count, 3)
     residual = float(np.sqrt((off**2).sum() / (weight**2).sum()))
     return ShapeFit(values[:betas], scale, values[betas:], residual)

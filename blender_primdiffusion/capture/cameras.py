@@ -11,6 +11,7 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.camera_rig import View
+from ..formats.poses.rotation import first_improper
 from ..formats.regular_files import open_regular
 from ..scene.convention import points_to_backend, points_to_blender
 
@@ -58,7 +59,7 @@ def view_of(
 ) -> View:
     """What a camera object of the user's sees in pictures of `size` (width, height), by Blender's own projection.
 
-    Raises ValueError for cameras without perspective.
+    Raises ValueError for cameras without perspective, and for mirrored and sheared ones.
     """
     evaluated = camera.evaluated_get(depsgraph)
     if evaluated.type != "CAMERA" or evaluated.data.type != "PERSP":
@@ -73,6 +74,10 @@ def view_of(
         ]
     )
     axes, position = _frame(evaluated)
+    if first_improper(axes[None, None]) is not None:
+        raise ValueError(
+            f"the camera {camera.name!r} is mirrored or sheared by its scale or a parent's: clear these scales (Alt S)"
+        )
     rotation = _FROM_OPENCV @ axes.T
     return View(intrinsics, rotation, -rotation @ position, width, height)
 

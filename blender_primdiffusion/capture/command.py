@@ -130,9 +130,8 @@ def read_cameras(path: Path, width: int, height: int) -> tuple[View, ...]:
             k, r, t = (np.array(named[name][key], np.float64) for key in "KRT")
             if (k.shape, r.shape, t.size) != ((3, 3), (3, 3), 3) or not all(map(all_finite, (k, r, t))):
                 raise ValueError(f"{name} has no finite K [3, 3], R [3, 3] and T [3]")
-            if not np.allclose(r @ r.T, np.eye(3), atol=1e-5) or np.linalg.det(r) < 0:
-                raise ValueError(f"R of {name} is not a rotation")
-            views.append(View(k, r, t.ravel(), width, height))
+            with as_file_error(path, f"has no camera in {name}", "render the captures again"):
+                views.append(View(k, r, t.ravel(), width, height))
         if not views:
             raise ValueError("the list is empty")
     return tuple(views)

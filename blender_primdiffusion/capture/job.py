@@ -14,6 +14,7 @@ from typing import Protocol
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..console import Report
 from ..formats.camera_rig import View, bounding_sphere
@@ -30,6 +31,7 @@ from ..formats.capture_layout import (
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
 from ..formats.poses.files import read_motion
 from ..formats.poses.motion import Motion
+from ..formats.poses.skeleton import joint_positions
 from ..formats.regular_files import FileError, check_unlinked
 from ..formats.requests import FLOAT_DEPTH
 from ..formats.whole_files import remove_abandoned, temporary_folder
@@ -217,7 +219,7 @@ def _capture(
             joints = np.stack([scan.pose(*pose) for pose in zip(poses.rotations, poses.translations, strict=True)])
         theta = poses.axis_angle().reshape(len(poses), 72)
         write_smpl(folder, theta[:, :3], theta[:, 3:], scan.betas, poses.translations)
-        write_joints(folder, views, joints)
+        write_joints(folder, views, joints, _body_joints(body, scan.betas, poses))
         write_layouts(folder, views, len(poses), settings.layouts)
         for frame in range(len(poses)):
             missing = [
@@ -235,6 +237,11 @@ def _capture(
                         stage.choose_hdri(view_seed(settings.seed, placed.first or scan_file.name, frame, camera))
                         _shoot(stage, settings, folder, view, (frame, camera))
                 yield clock.step(frame, camera)
+
+
+def _body_joints(body: Body, betas: NDArray, poses: Motion) -> NDArray[np.float64]:
+    """Joints [F, 24, 3] of the fitted body."""
+    return joint_positions(poses.rotations, poses.translations, body.rest(betas)[1])
 
 
 def _views_around(scan: Scan, settings: CaptureSettings, poses: Motion) -> list[View]:

@@ -16,6 +16,9 @@ from ..formats.regular_files import FileError
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from .scan_files import ScanFile
 
+_EVEN = 0.02
+"""Largest difference of scales, and of right angles, of an armature that counts as evenly scaled."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RigSkeleton:
@@ -205,6 +208,12 @@ def skeleton_of(
 def uniform_scale(armature: bpy.types.Object) -> float:
     """World metres a unit of the armature."""
     return float(abs(np.linalg.det(np.array(armature.matrix_world)[:3, :3])) ** (1 / 3))
+
+
+def is_evenly_scaled(armature: bpy.types.Object) -> bool:
+    """Whether turns of the armature's bones are turns in the world; a mirrored armature's are."""
+    linear = np.array(armature.matrix_world)[:3, :3] / uniform_scale(armature)
+    return bool(np.abs(linear.T @ linear - np.eye(3)).max() < _EVEN)
 
 
 def add_root(

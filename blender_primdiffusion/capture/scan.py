@@ -10,9 +10,9 @@ from mathutils import Matrix
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..formats.poses.rigs import MATCH_BONES, UNMATCHED, BoneMap, facing, map_bones, rig_from_smpl
+from ..formats.poses.rigs import NAME_BONES, UNMATCHED, BoneMap, facing, map_bones, rig_from_smpl
 from ..formats.poses.rotation import matrix_to_quaternion, to_axis_angle
-from ..formats.regular_files import as_file_error
+from ..formats.regular_files import FileError, as_file_error
 from ..scene.convention import points_to_blender
 from .bind import bind_static
 from .body import Body, ShapeFit, fit_joints
@@ -24,6 +24,7 @@ from .rigged import (
     bone_heads,
     find_armature,
     free_bones,
+    is_evenly_scaled,
     set_at_rest,
     skeleton_of,
     split_meshes,
@@ -142,8 +143,10 @@ def _load_static(context, scan_file: ScanFile, body: Body, objects, added: Added
 
 def _load_rigged(context, scan_file: ScanFile, body: Body, objects, armature, added: AddedData) -> Scan:
     meshes, loose = split_meshes(objects, scan_file)
+    if not is_evenly_scaled(armature):
+        raise FileError(scan_file.path, "has a skeleton that is scaled unevenly", "apply its scale and export it again")
     set_at_rest(armature, meshes)
-    with as_file_error(scan_file.path, UNMATCHED, MATCH_BONES):
+    with as_file_error(scan_file.path, UNMATCHED, NAME_BONES):
         bones = map_bones([bone.name for bone in armature.data.bones])
     with as_file_error(scan_file.path, "has no rest pose of a human", "export it again"):
         axes = facing(bone_heads(armature, bones.joints))

@@ -84,7 +84,7 @@ class EditJob(Job):
         done = show_in_place(context, person, result)
         shape = "; the body's shape has changed too" if done.reshaped else ""
         message = f"{self.made} {person.name} in {result.seconds:.1f} s"
-        warnings = (done.warning, overlap_warning_in(context.scene, person))
+        warnings = (*result.warnings, done.warning, overlap_warning_in(context.scene, person))
         return " ".join([f"{message}{shape}.", *(sentence(text) for text in warnings if text)])
 
 

@@ -14,6 +14,7 @@ import numpy as np
 
 from ..engine.picture import pose_of
 from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
+from ..formats.poses.rotation import nearest
 from ..formats.poses.skeleton import unchain
 from ..formats.regular_files import exists_in_its_folder, remove_file
 from ..formats.whole_files import written_whole
@@ -200,8 +201,7 @@ def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: Fr
     numbers = range(frames.first, frames.last + 1)
     joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)
     pelvis = rest_joints(armature_of(person))[0]
-    left, _, right = np.linalg.svd(joints[..., :3])
-    rotations = left @ right  # the nearest rotations: bones may be scaled
+    rotations = nearest(joints[..., :3])  # bones may be scaled and mirrored
     translations = joints[:, 0, :, :3] @ pelvis + joints[:, 0, :, 3] - pelvis
     render = context.scene.render
     return HumanMotion(

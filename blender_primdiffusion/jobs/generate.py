@@ -11,7 +11,7 @@ from typing import Any
 import bpy
 
 from ..backend.requests import sentence
-from ..formats.answers import HumanAnswer, ReconstructAnswer
+from ..formats.answers import HumanAnswer
 from ..formats.requests import ReconstructRequest
 from ..scene.build import build_prepared
 from ..scene.cycles import overlap_warning_in
@@ -42,7 +42,7 @@ def build_person(
         others = [human for human in humans(context.scene) if human != collection]
         bones = [obj for human in others for obj in human.objects if obj.type == "ARMATURE"]
         bring_into_view(armature_of(collection), 0.0 if others else FIRST_HUMAN_SHARE, bones)
-    warnings = list(result.warnings) if isinstance(result, ReconstructAnswer) else []
+    warnings = list(result.warnings)
     if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)
     notice = f"{made} in {result.seconds + time.monotonic() - prepared.began:.1f} s"

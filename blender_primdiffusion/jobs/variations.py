@@ -11,6 +11,7 @@ from typing import Any
 
 import bpy
 
+from ..backend.requests import sentence
 from ..formats.answers import VariationFiles, VariationsAnswer
 from ..formats.regular_files import remove_folder
 from ..scene.human import BODY_FILE, PERSON_FILE
@@ -127,4 +128,4 @@ class VariationsJob(Job):
     def finish(self, _context: bpy.types.Context, result: VariationsAnswer, _folder: Path) -> str:
         sheet.fill(result.people, self.title, around=bool(self.person))
         icons.free()  # of the steps
-        return f"{len(self.seeds)} humans in {result.seconds:.1f} s"
+        return " ".join([f"{len(self.seeds)} humans in {result.seconds:.1f} s.", *map(sentence, result.warnings)])

@@ -14,7 +14,7 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ..formats.poses.rotation import matrix_to_quaternion
+from ..formats.poses.rotation import matrix_to_quaternion, nearest
 from .actions import action_curves, frames_in_use, loops, own_curves, repeat
 from .armature import CONTROLS, LIMBS, POLE_M, Limb, add_keys, editing_bones, place_controls, rest_rotations
 from .convention import continuous_quaternions
@@ -252,7 +252,7 @@ def _pose_controls(armature: bpy.types.Object, frames: range, matrices: Mapping[
             armature.pose.bones[limb.pole].matrix = Matrix(pole[0])
             continue
         basis = np.linalg.inv(handle_rest) @ end
-        turns = continuous_quaternions(matrix_to_quaternion(basis[:, :3, :3]))
+        turns = continuous_quaternions(matrix_to_quaternion(nearest(basis[:, :3, :3])))
         keys[limb.handle] = {"location": basis[:, :3, 3], "rotation_quaternion": turns}
         keys[limb.pole] = {"location": (np.linalg.inv(pole_rest) @ pole)[:, :3, 3]}
     if frames:

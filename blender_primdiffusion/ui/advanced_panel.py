@@ -309,6 +309,9 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
     lines = [(name.capitalize(), as_shown(value)) for name, value in shown.items()]
     if isinstance(attributes, dict):
         lines += [(as_shown(name.capitalize()), as_shown(value)) for name, value in attributes.items()]
+    if isinstance(missed := provenance.get("unfollowed"), dict):
+        shows = [f"{name} (shows {value})" for name, value in missed.items()]
+        lines.append(("Not followed", as_shown(", ".join(shows))))
     for edit in edits if isinstance(edits, list) else ():
         if isinstance(edit, dict):
             rest = [f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)]

@@ -59,7 +59,7 @@ def nearest_to(mouse: tuple[float, float], seen: dict[str, NDArray]) -> str:
 
 
 _UP_ITEMS = [
-    ("AUTO", "Found in the File", "Detected from the orientation of the pelvis"),
+    ("AUTO", "Found in the File", "The axis along which the person stands in most frames"),
     *[
         (axis.upper().replace("-", "MINUS_"), axis.upper(), f"{axis} points up")
         for axis in ("x", "y", "z", "-x", "-y", "-z")
@@ -76,28 +76,32 @@ class FileFacts:
     """Names of the bones in a .bvh."""
     found: dict[str, str]
     """SMPL's joint -> bone, as recognised by name."""
+    people: tuple[str, ...] = ()
+    """Names of the people in a tracker's output."""
     error: str = ""
+    """What is wrong with the file, or what is doubtful."""
 
 
-def look_at(filepath: str, up: str = "") -> FileFacts:
-    """What is in a file; cached until the file changes. Does not raise: `error` holds what is wrong."""
+def look_at(filepath: str, up: str = "", person: str = "") -> FileFacts:
+    """What is in a file; cached until the file changes. Does not raise."""
     path = Path(bpy.path.abspath(filepath))
     if path.suffix.lower() not in ENDINGS or not path.is_file():
         return FileFacts({}, (), {})
     stat = path.stat()
-    return _look_at(str(path), up, stat.st_mtime_ns, stat.st_size)
+    return _look_at(str(path), up, person, stat.st_mtime_ns, stat.st_size)
 
 
 @functools.lru_cache(maxsize=8)
-def _look_at(path: str, up: str, _changed: int, _size: int) -> FileFacts:
+def _look_at(path: str, up: str, person: str, _changed: int, _size: int) -> FileFacts:
     bones: tuple[str, ...] = ()
     try:
         if path.lower().endswith(".bvh"):
             bones = tuple(bone_names(parse_bvh(Path(path))))
-        motion = read_motion(path, up)
+        motion = read_motion(path, up, person=person)
     except (FileError, OSError) as error:
-        return FileFacts({}, bones, {}, str(error))
-    return FileFacts(facts(motion), bones, dict(motion.detected.bones))
+        return FileFacts({}, bones, {}, error=str(error))
+    found = motion.detected
+    return FileFacts(facts(motion), bones, dict(found.bones), found.people, found.doubt)
 
 
 def bone_property(joint: str) -> str:
@@ -107,6 +111,10 @@ def bone_property(joint: str) -> str:
 
 def _bones_of(self, _context: bpy.types.Context, text: str) -> list[str]:
     return [bone for bone in look_at(self.filepath).bones if text.lower() in bone.lower()]
+
+
+def _people_of(self, _context: bpy.types.Context, text: str) -> list[str]:
+    return [person for person in look_at(self.filepath).people if text.lower() in person.lower()]
 
 
 class _BoneMap:
@@ -123,7 +131,7 @@ class _BoneMap:
 
 
 class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper, bpy.types.Operator):
-    """Apply the motion of an AMASS .npz, a pose file or a .bvh to the human"""
+    """Apply the motion of an AMASS .npz, a pose file, a tracker's .pkl or a .bvh to the human"""
 
     bl_idname = "primdiffusion.import_motion"
     bl_label = "Import Motion"
@@ -135,6 +143,12 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     )
     filter_glob: bpy.props.StringProperty(default=";".join(f"*{s}" for s in ENDINGS), options={"HIDDEN"})
     up: bpy.props.EnumProperty(name="Up Axis", description="Which axis of the file points up", items=_UP_ITEMS)
+    tracked_person: bpy.props.StringProperty(
+        name="Person in the File",
+        description="Whose motion is taken from a file of several people; empty: who is in the most frames",
+        search=_people_of,
+        options={"SKIP_SAVE"},
+    )
     fps: bpy.props.FloatProperty(
         name="Source Rate",
         description="Frames per second of the file; 0: as stated in the file",
@@ -193,7 +207,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         chosen = None
         if self.bones == "CHOSEN":
             chosen = {joint: getattr(self, bone_property(joint)) for joint in JOINT_NAMES}
-        motion = read_motion(bpy.path.abspath(self.filepath), self.axis(), chosen)
+        motion = read_motion(bpy.path.abspath(self.filepath), self.axis(), chosen, self.tracked_person)
         if self.fps:
             motion = dataclasses.replace(motion, fps=self.fps)
         names = [field.name for field in dataclasses.fields(Placement)]
@@ -205,6 +219,8 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
             self.report(
                 {"WARNING"}, f"{armature.name!r} shows its rest position: switch to Pose Position to see it move"
             )
+        if motion.detected.doubt:
+            self.report({"WARNING"}, motion.detected.doubt)
         self.report({"INFO"}, f"{motion.name}: {len(motion)} frames of the file on frames {first:g} to {last:g}")
         return {"FINISHED"}
 
@@ -214,8 +230,10 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
 
     def draw(self, context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
-        look = look_at(self.filepath, self.axis())
+        look = look_at(self.filepath, self.axis(), self.tracked_person)
         self._draw_found(context, look)
+        if len(look.people) > 1 or self.tracked_person:
+            layout.prop(self, "tracked_person")
         layout.prop(self, "up")
         layout.prop(self, "fps")
         column = layout.column(align=True)
@@ -254,12 +272,12 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
 
 
 class PRIMDIFFUSION_FH_motion(bpy.types.FileHandler):
-    """AMASS .npz and .bvh onto the human under the cursor, else the selected one."""
+    """AMASS .npz, .pkl of trackers and .bvh onto the human under the cursor, else the selected one."""
 
     bl_idname = "PRIMDIFFUSION_FH_motion"
     bl_label = "Motion for a Human"
     bl_import_operator = "primdiffusion.import_motion"
-    bl_file_extensions = ".npz;.bvh"
+    bl_file_extensions = ".npz;.pkl;.bvh"
 
     @classmethod
     def poll_drop(cls, context: bpy.types.Context) -> bool:

@@ -96,10 +96,12 @@ def facts(motion: Motion) -> dict[str, str]:
     found = motion.detected
     rate = f"{motion.fps:.4g}" + ("" if found.fps else " (assumed)")
     bones = {"Bones": f"{len(found.bones)} of 24"} if found.bones else {}
+    people = {"People": f"{len(found.people)}: {', '.join(found.people[:6])}"} if len(found.people) > 1 else {}
     return {
         "Rig": found.rig or "unknown",
+        **people,
         **bones,
-        "Up Axis": found.up or "not found, y assumed",
+        "Up Axis": found.up + (" (uncertain)" if found.doubt else ""),
         "Frames": f"{len(motion)} ({len(motion) / motion.fps:.1f} s)",
         "Frame Rate": rate,
         "Units": found.unit,

@@ -14,13 +14,12 @@ from PIL import Image
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.human import framing, generate, place
-from primdiffusion.render.image import to_png
 from primdiffusion.render.march import march
 
 from blender_primdiffusion.motion.poses import LIBRARY
 
 OUT = Path(__file__).resolve().parents[2] / "blender_primdiffusion" / "motion" / "data" / "thumbnails"
-SEED, YAW, SIZE = 7, 0.45, 160
+SEED, YAW_DEGREES, SIZE = 7, 26, 160
 _COLOURS = 96
 """Size of a picture's palette: the file is a third as large without a visible difference."""
 
@@ -37,7 +36,7 @@ def main() -> None:
         for name, pose in LIBRARY.items():
             rotations = torch.from_numpy(pose.rotations()).float()
             primitives = place(human, BodyPose(rotations, torch.zeros(3)))
-            to_png(large, march(primitives, framing(primitives, YAW, 2 * SIZE, 2 * SIZE)), None)
+            march(primitives, framing(primitives, YAW_DEGREES, 2 * SIZE, 2 * SIZE)).save(large)
             small = Image.open(large).resize((SIZE, SIZE), Image.Resampling.LANCZOS)
             small.quantize(_COLOURS, method=Image.Quantize.FASTOCTREE).save(out / f"{name}.png", optimize=True)
     print(f"{len(LIBRARY)} pictures, {sum(path.stat().st_size for path in out.glob('*.png')) / 1e3:.0f} kB, in {out}")

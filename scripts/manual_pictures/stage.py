@@ -93,7 +93,7 @@ def render(scene: bpy.types.Scene, path: Path, size: tuple[int, int]) -> Path:
     scene.render.resolution_x, scene.render.resolution_y = size
     scene.render.resolution_percentage = 100
     scene.render.image_settings.file_format = "PNG"
-    scene.render.filepath = str(path)
-    bpy.ops.render.render(write_still=True)
+    bpy.ops.render.render()
+    bpy.data.images["Render Result"].save_render(str(path), scene=scene)
     print(f"rendered {path.name}", file=sys.stderr, flush=True)
     return path

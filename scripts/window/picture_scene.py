@@ -69,8 +69,8 @@ def drawn(module: str, python: str, seed: int, pose: str) -> Steps:
     scene.view_settings.view_transform = "Standard"
     scene.render.image_settings.color_mode = "RGBA"
     path = Path(bpy.app.tempdir) / f"{pose.lower()}.png"
-    scene.render.filepath = str(path)
-    bpy.ops.render.render(write_still=True)
+    bpy.ops.render.render()
+    bpy.data.images["Render Result"].save_render(str(path))
     yield 1.0
     return path
 

@@ -111,7 +111,7 @@ def test_a_body_without_its_anchors_is_rejected(human):
         place(human, body=default_body())
 
 
-@pytest.mark.parametrize("yaw", [0.0, 0.7, math.pi / 2, math.pi])
+@pytest.mark.parametrize("yaw", [0, 40, 90, 180])
 @pytest.mark.parametrize("size", [(64, 64), (40, 80), (96, 32)])
 def test_the_framing_just_contains_the_person(human, yaw, size):
     primitives = place(human, bent(16, 1.0))
@@ -129,7 +129,7 @@ def test_the_framing_just_contains_the_person(human, yaw, size):
 
 def test_yaw_zero_looks_at_the_face_and_a_quarter_turn_at_the_persons_left(human):
     primitives = place(human)
-    front, left = framing(primitives, 0.0).position, framing(primitives, math.pi / 2).position
+    front, left = framing(primitives, 0.0).position, framing(primitives, yaw_degrees=90).position
     assert front[2] > 2
     assert front[0].abs() < 0.1
     assert left[0] > 2

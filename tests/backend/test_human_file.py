@@ -55,7 +55,7 @@ def test_a_compact_file_renders_as_the_whole_one_to_a_level_of_255(human, tmp_pa
     pictures = []
     for one in (human, load_human(tmp_path / "a.human")):
         primitives = place(one)
-        view = march(primitives, framing(primitives, 0.3, 96, 96))
+        view = march(primitives, framing(primitives, 17, 96, 96))
         pictures.append(torch.cat([encode_srgb(view.rgb.clamp(0, 1)), view.alpha[..., None]], -1))
     drawn = pictures[0][..., 3] > 0
     assert drawn.sum() > 500

@@ -1,7 +1,6 @@
 """Reconstruction by the prior, of people of a tiny model whose garments have one colour all over."""
 
 import dataclasses
-import math
 
 import pytest
 import torch
@@ -55,7 +54,7 @@ def captured(human: Human, pose: BodyPose, yaws: list[float]) -> CapturedPerson:
     return CapturedPerson("anna", 3, tuple(range(len(yaws))), views, BETAS, ())
 
 
-@pytest.mark.parametrize("yaws", [[0.0], [0.0, math.pi / 2]], ids=["one view", "two views"])
+@pytest.mark.parametrize("yaws", [[0.0], [0.0, 90.0]], ids=["one view", "two views"])
 def test_what_no_view_shows_has_the_most_probable_colours_given_what_they_show(yaws):
     human, pose = human_of(COLOURS), BodyPose.from_axis_angle(torch.linspace(-0.2, 0.2, 72))
     found = reconstruct_by_prior(MODEL, captured(human, pose, yaws))

@@ -31,7 +31,6 @@ def test_a_process_that_dies_is_an_error():
         run_in_process(os._exit, 3, on_wait=nothing)
 
 
-@pytest.mark.timeout(60)
 def test_what_is_raised_meanwhile_ends_it_at_once():
     def cancel():
         raise InterruptedError

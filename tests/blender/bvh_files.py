@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.joints import JOINT_NAMES, PARENTS
-from blender_primdiffusion.formats.poses.rotation import from_axis_angle
+from blender_primdiffusion.formats.poses.rotation import between, from_axis_angle
 
 Rotation = pytest.importorskip("scipy.spatial.transform").Rotation
 FRAMES = 6
@@ -17,6 +17,25 @@ ORDERS = ["ZXY", "XYZ", "YZX", "ZYX", "XZY", "YXZ"]
 def motion_of(spread: float = 0.35, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
     rng = np.random.default_rng(seed)
     return from_axis_angle(rng.normal(0, spread, (FRAMES, 24, 3))), rng.normal(0, 0.5, (FRAMES, 3))
+
+
+def along_x(rest: np.ndarray, rotations: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A rest [24, 3] and rotations [F, 24, 3, 3] as Rokoko writes them: with all angles zero each bone lies along x.
+
+    They put joints where joint rotations of SMPL from `rest` do.
+    """
+    own, flat = np.tile(np.eye(3), (24, 1, 1)), np.array(rest)
+    for joint in range(24):
+        children = [child for child, parent in enumerate(PARENTS) if parent == joint]
+        if children:
+            own[joint] = between(np.array([1.0, 0, 0]), rest[children[-1]] - rest[joint])
+        else:
+            own[joint] = own[PARENTS[joint]]
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            flat[joint] = flat[parent] + own[parent].T @ (rest[joint] - rest[parent])
+    above = np.array([np.eye(3) if parent < 0 else own[parent] for parent in PARENTS])
+    return flat, np.swapaxes(above, -1, -2) @ rotations @ own
 
 
 def write_bvh(

@@ -10,7 +10,7 @@ from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.queue import queue
 
 
-def drive(seconds: float = 60.0) -> None:
+def drive(seconds: float = 300.0) -> None:
     """The timer's part, by hand, until the line is empty."""
     end = time.monotonic() + seconds
     while follow() is not None:
@@ -18,7 +18,7 @@ def drive(seconds: float = 60.0) -> None:
         time.sleep(0.01)
 
 
-def until_running(seconds: float = 60.0) -> None:
+def until_running(seconds: float = 300.0) -> None:
     """Until the child has reported progress."""
     end = time.monotonic() + seconds
     while queue.request is None or queue.request.state != "running":

@@ -43,6 +43,33 @@ RIGIFY = {
         "hip": "thigh", "knee": "shin", "ankle": "foot", "foot": "toe", "collar": "shoulder", "shoulder": "upper_arm",
         "elbow": "forearm", "wrist": "hand", "hand": "f_middle.01"}.items()},
 }  # fmt: skip
+SOMA = {
+    "pelvis": "Hips", "spine1": "Spine1", "spine2": "Spine2", "spine3": "Chest", "neck": "Neck1", "head": "Head",
+    **{f"{side}_{part}": f"{side.title()}{bone}" for side in ("left", "right") for part, bone in {
+        "hip": "Leg", "knee": "Shin", "ankle": "Foot", "foot": "ToeBase", "collar": "Shoulder", "shoulder": "Arm",
+        "elbow": "ForeArm", "wrist": "Hand", "hand": "HandMiddleEnd"}.items()},
+}  # fmt: skip
+VROID = {
+    "pelvis": "J_Bip_C_Hips", "spine1": "J_Bip_C_Spine", "spine2": "J_Bip_C_Chest", "spine3": "J_Bip_C_UpperChest",
+    "neck": "J_Bip_C_Neck", "head": "J_Bip_C_Head",
+    **{f"{side}_{part}": f"J_Bip_{side[0].upper()}_{bone}" for side in ("left", "right") for part, bone in {
+        "hip": "UpperLeg", "knee": "LowerLeg", "ankle": "Foot", "foot": "ToeBase", "collar": "Shoulder",
+        "shoulder": "UpperArm", "elbow": "LowerArm", "wrist": "Hand", "hand": "Middle1"}.items()},
+}  # fmt: skip
+MOCAPNET = {
+    "pelvis": "hip", "spine1": "abdomen", "spine2": "waist", "spine3": "chest", "neck": "neck", "head": "head",
+    **{f"{side}_{part}": f"{side[0]}{bone}" for side in ("left", "right") for part, bone in {
+        "hip": "hip", "knee": "knee", "ankle": "foot", "foot": "bigtoe", "collar": "Collar", "shoulder": "shoulder",
+        "elbow": "elbow", "wrist": "hand", "hand": "Mid1"}.items()},
+}  # fmt: skip
+ROKOKO = {
+    "pelvis": "Hips", "spine1": "Spine1", "spine2": "Spine2", "spine3": "Spine4", "neck": "Neck", "head": "Head",
+    **{f"{side}_{part}": f"{side.title()}{bone}" for side in ("left", "right") for part, bone in {
+        "hip": "Thigh", "knee": "Shin", "ankle": "Foot", "foot": "Toe", "collar": "Shoulder", "shoulder": "Arm",
+        "elbow": "ForeArm", "wrist": "Hand", "hand": "Finger3Proximal"}.items()},
+}  # fmt: skip
+RPM = {joint: bone.removeprefix("mixamorig:") for joint, bone in MIXAMO.items()}
+"""Ready Player Me."""
 OWN = {name: name for name in JOINT_NAMES}
 
 

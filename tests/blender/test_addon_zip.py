@@ -100,7 +100,7 @@ def test_the_installed_zip_generates_and_renders_a_human_and_blender_exits(archi
     program = Path(__file__).parent / "installed_generate.py"
     blend, picture = tmp_path / "shot.blend", tmp_path / "picture.png"
     command = [sys.executable, *map(str, (program, archive, checkpoint, blend, 7, 3, picture))]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500, cwd=tmp_path)
     reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
     assert reports, done.stdout[-3000:] + done.stderr[-3000:]
     report = json.loads(reports[0].removeprefix("REPORT "))

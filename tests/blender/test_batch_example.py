@@ -42,9 +42,10 @@ def words(out: Path, **more: str) -> list[str]:
 def test_it_generates_poses_moves_renders_and_saves(addon, tmp_path, example, motion):
     np.save(tmp_path / "still.npy", np.zeros((3, 72)))
     more = {"motion": str(tmp_path / motion)} if motion else {}
-    example.main(words(tmp_path / "out", **more))
-    assert pixels(tmp_path / "out" / "0002.png").shape[:2] == (16, 24)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "out" / "people.blend"))
+    out = tmp_path / "a{b}"
+    example.main(words(out, **more))
+    assert pixels(out / "0002.png").shape[:2] == (16, 24)
+    bpy.ops.wm.open_mainfile(filepath=str(out / "people.blend"))
     first, second = sorted(humans(bpy.context.scene), key=lambda person: person.name)
     assert (first.name, second.name) == ("Person 7", "Person 8")
     assert armature_of(first).pose.bones["right_shoulder"].rotation_quaternion.angle > 0.2

@@ -22,8 +22,6 @@ from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
 BLENDER = os.environ.get("BLENDER") or shutil.which("blender")
 MODULE = "bl_ext.user_default.primdiffusion"
 ROOT = Path(__file__).resolve().parents[2]
-ENABLED_S = 0.5
-"""Generous, for busy machines; Python's byte code is written on the way. `benchmarks/extension.py` measures."""
 
 pytestmark = [
     pytest.mark.slow,
@@ -206,7 +204,7 @@ def test_a_script_runs_the_operators_on_a_file_and_a_failing_one_ends_with_its_e
     assert "/nowhere" in done.stdout + done.stderr
 
 
-def test_it_is_disabled_and_enabled_again_quickly_and_without_a_trace(installed, tmp_path):
+def test_it_is_disabled_and_enabled_again_without_a_trace(installed, tmp_path):
     program = Path(__file__).parent / "application_life.py"
     done = installed("-b", "--python-exit-code", 9, "--python", program, "--", tmp_path / "life.json")
     assert done.returncode == 0, done.stdout + done.stderr
@@ -214,7 +212,6 @@ def test_it_is_disabled_and_enabled_again_quickly_and_without_a_trace(installed,
     life = json.loads((tmp_path / "life.json").read_text())
     assert life["left"] == []
     assert not life["numpy"]
-    assert max(life["seconds"]) < ENABLED_S
 
 
 def test_uninstalling_takes_the_extension_its_folder_and_its_backend_away(installed, resources, archive):

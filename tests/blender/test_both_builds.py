@@ -26,7 +26,7 @@ def test_the_second_build_is_rejected_in_a_sentence_and_registers_nothing(archiv
     environment = {name: text for name, text in os.environ.items() if not name.startswith(("PYTHON", "PRIMDIFFUSION"))}
     environment["BLENDER_USER_RESOURCES"] = str(tmp_path / "user")
     command = [sys.executable, str(PROGRAM), *map(str, archives[::order])]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=tmp_path)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500, cwd=tmp_path)
     reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
     assert reports, done.stdout[-3000:] + done.stderr[-3000:]
     report = json.loads(reports[0].removeprefix("REPORT "))

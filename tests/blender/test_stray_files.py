@@ -20,7 +20,7 @@ def test_a_run_that_passes_leaves_no_files(tmp_path):
     environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTEST_", "BLENDER_"))}
     environment["TMPDIR"] = str(tmp_path)
     done = subprocess.run(
-        [*command, *chosen], env=environment, cwd=ROOT, capture_output=True, text=True, timeout=280, check=False
+        [*command, *chosen], env=environment, cwd=ROOT, capture_output=True, text=True, timeout=500, check=False
     )
     assert " passed" in done.stdout, done.stdout + done.stderr
     assert [path for path in tmp_path.rglob("*") if path.name != "pytest-current" and not path.is_dir()] == []

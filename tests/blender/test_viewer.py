@@ -88,7 +88,7 @@ def use(archive: Path, folder: Path, *program: Path) -> dict:
     environment = {**os.environ, "BLENDER_USER_RESOURCES": str(folder / "user")}
     environment = {name: text for name, text in environment.items() if not name.startswith(("PYTHON", "PRIMDIFFUSION"))}
     command = [sys.executable, *map(str, (PROGRAM, archive, folder, *program))]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, cwd=folder)
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=500, cwd=folder)
     reports = [line for line in done.stdout.splitlines() if line.startswith("REPORT ")]
     assert reports, done.stdout[-3000:] + done.stderr[-3000:]
     return json.loads(reports[0].removeprefix("REPORT "))

@@ -44,10 +44,10 @@ class Conversation:
     def send(self, id: int | str | None, method: str, /, **params: Any) -> None:
         self.send_line(json.dumps({"jsonrpc": "2.0", "id": id, "method": method, "params": params}).encode())
 
-    def next(self, timeout_s: float = 30) -> dict[str, Any] | None:
+    def next(self, timeout_s: float = 300) -> dict[str, Any] | None:
         return self._messages.get(timeout=timeout_s)
 
-    def until(self, wanted, timeout_s: float = 60) -> dict[str, Any]:
+    def until(self, wanted, timeout_s: float = 300) -> dict[str, Any]:
         """The first message that `wanted` accepts; others are passed over."""
         end, passed = time.monotonic() + timeout_s, []
         try:
@@ -60,7 +60,7 @@ class Conversation:
             raise AssertionError(f"nothing that was wanted in {timeout_s} s, at last {passed[-3:]}") from None
         raise AssertionError(f"the child ended: {self.stderr.decode()}")
 
-    def answer(self, id: int | str | None, timeout_s: float = 60) -> dict[str, Any]:
+    def answer(self, id: int | str | None, timeout_s: float = 300) -> dict[str, Any]:
         return self.until(lambda message: "method" not in message and message["id"] == id, timeout_s)
 
     def ask(self, id: int, method: str, /, **params: Any) -> dict[str, Any]:

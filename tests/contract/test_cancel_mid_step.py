@@ -32,7 +32,7 @@ class LongSteps:
 
             def long_reporter(*args):
                 tell = reporter(*args)
-                return lambda step: (tell(step), ctypes.PyDLL(None).sleep(60))
+                return lambda step: (tell(step), ctypes.PyDLL(None).sleep(1800))
 
             module.step_reporter = long_reporter
 
@@ -43,7 +43,7 @@ sys.meta_path.insert(0, LongSteps())
 """
 
 
-def tick(request: ChildRequest, until, timeout_s: float = 90.0) -> None:
+def tick(request: ChildRequest, until, timeout_s: float = 300.0) -> None:
     """As Blender's timer does."""
     end = time.monotonic() + timeout_s
     while not until():
@@ -68,11 +68,11 @@ def test_a_cancel_in_the_middle_of_a_step_does_not_wait_for_the_step_and_leaves_
     client = backend.client
     time.sleep(0.3)
     request.cancel()
-    tick(request, lambda: request.finished, timeout_s=30.0)
+    tick(request, lambda: request.finished)
     assert request.state == "cancelled"
     assert backend.client is None, "no request uses a child that is about to end"
-    assert client.gone_within(10.0)
-    end = time.monotonic() + 10.0
+    assert client.gone_within(300.0)
+    end = time.monotonic() + 300.0
     while out.exists():
         backend.reap()  # as the timer does, where killing the child takes longer
         assert time.monotonic() < end, list(out.iterdir())

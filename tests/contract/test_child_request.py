@@ -18,7 +18,7 @@ from blender_primdiffusion.backend.requests import Backend, ChildRequest
 PYTHON = Path(sys.executable)
 
 
-def follow(request: ChildRequest, until=lambda request: request.finished, timeout_s: float = 180) -> list[str]:
+def follow(request: ChildRequest, until=lambda request: request.finished, timeout_s: float = 300) -> list[str]:
     """Ticks as Blender's timer does; returns the states passed through."""
     states = [request.state]
     end = time.monotonic() + timeout_s
@@ -163,10 +163,11 @@ def test_a_python_that_took_too_long_is_an_error_of_its_own(tmp_path):
 
 @pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="needs SIGSTOP to hang a process")
 def test_a_child_that_hangs_is_ended_and_fails_the_request(slow_checkpoint, tmp_path):
-    backend = this_pythons_backend(silence_s=5.0)
+    backend = this_pythons_backend()
     request = generate_request(backend, seed=1, steps=BUSY_STEPS, out_dir=tmp_path / "out", checkpoint=slow_checkpoint)
     follow(request, lambda request: request.step > 2)
     os.kill(request._client.pid, signal.SIGSTOP)
+    request._client._silence_s = 2.0
     assert follow(request)[-1] == "failed"
     assert request.error.kind == "hung"
     assert backend.client is None

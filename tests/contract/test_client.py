@@ -89,7 +89,7 @@ def test_a_message_cut_off_by_the_childs_death_is_reported_as_its_death(fake_chi
 
 def test_silence_is_reported_once(fake_child):
     client = fake_child("time.sleep(60)", silence_s=0.4)
-    silent = wait_for(client, lambda e: isinstance(e, Silent), 10)
+    silent = wait_for(client, lambda e: isinstance(e, Silent))
     assert silent.seconds >= 0.4
     time.sleep(0.6)
     assert client.poll() == []
@@ -99,13 +99,15 @@ def test_silence_is_reported_once(fake_child):
 def test_heartbeats_are_no_events_but_end_the_silence(fake_child):
     client = fake_child(
         """
+        print(json.dumps({"jsonrpc": "2.0", "method": "started", "params": {}}), flush=True)
         while True:
             print(json.dumps({"jsonrpc": "2.0", "method": "heartbeat", "params": {}}), flush=True)
             time.sleep(0.1)
         """,
-        silence_s=1.5,
+        silence_s=3.0,
     )
-    end = time.monotonic() + 2.5
+    wait_for(client, lambda e: isinstance(e, Notification))
+    end = time.monotonic() + 4.0
     while time.monotonic() < end:
         assert client.poll() == []
         time.sleep(0.05)
@@ -120,7 +122,7 @@ def test_time_without_polls_is_no_silence_of_the_child(fake_child):
 
 def test_a_child_that_closes_its_output_and_hangs_is_silent(fake_child):
     client = fake_child("os.close(1); time.sleep(60)", silence_s=0.4)
-    wait_for(client, lambda e: isinstance(e, Silent), 10)
+    wait_for(client, lambda e: isinstance(e, Silent))
     client.kill()
     assert not client.alive
 
@@ -140,7 +142,7 @@ def test_a_poll_ends_when_its_time_is_over_and_a_flood_loses_no_message(fake_chi
         for i in range({count}):
             sys.stdout.write(json.dumps({{"jsonrpc": "2.0", "method": "news", "params": {{"i": i}}}}) + "\\n")
     """)
-    client._process.wait(60)
+    client._process.wait(300)
     assert len(client.poll()) == 1
     monkeypatch.undo()
     seen = []
@@ -187,7 +189,7 @@ def die_often(fake_child, count: int) -> None:
         client = BackendClient(PYTHON, module_path)
         client._command = [str(PYTHON), "-S", "-m", "primdiffusion.serve"]
         client.start()
-        client._process.wait(30)
+        client._process.wait(300)
         events = client.poll()
         assert isinstance(events[0], Response)
         assert [event.exit_code for event in events[1:]] == [3]
@@ -253,7 +255,7 @@ def test_a_killed_child_that_the_system_has_not_taken_away_yet_is_not_alive(clie
     assert not client.kill(0.0)
     assert not client.alive
     monkeypatch.undo()
-    assert client.gone_within(10.0)
+    assert client.gone_within(300.0)
 
 
 def test_every_way_to_die_has_a_sentence():

@@ -93,13 +93,6 @@ def test_the_child_fills_the_frame(child, request_for, view):
     assert progress[-1]["eta_s"] == 0
 
 
-def test_the_second_picture_of_a_scene_is_placed_at_once(child, request_for):
-    params = request_for()
-    ask(child, params)
-    again, _ = ask(child, {**params, "view": "boxes"})
-    assert again["result"]["seconds_place"] < 0.05
-
-
 def test_a_large_picture_comes_in_bands_from_the_top_and_stops_within_one(child, request_for):
     params = request_for(width=900, height=1200, step=0.0005)
     id = next(ids)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 from blender_primdiffusion.formats.poses import files
+from blender_primdiffusion.formats.poses.rigs import RIGS
 from blender_primdiffusion.formats.poses.rotation import from_axis_angle
 from primdiffusion.pose_file import read_motion, read_pose
 from support.errors import refused
@@ -76,3 +77,8 @@ def test_a_single_pose_has_the_joints_of_the_motion(tmp_path, name):
     path = written(tmp_path, name)
     theirs = torch.from_numpy(files.read_motion(path).rotations[2]).float()
     assert torch.allclose(read_pose(path, frame=2).joint_rotation, theirs, atol=1e-5)
+
+
+def test_the_manual_lists_every_rig_that_is_known_by_its_bones():
+    page = (Path(__file__).parents[2] / "docs" / "manual" / "motion.md").read_text(encoding="utf-8")
+    assert [rig for rig in RIGS if rig != "SMPL, short" and rig not in page] == []

@@ -101,7 +101,7 @@ class TinyIndex(http.server.SimpleHTTPRequestHandler):
         self.end_headers()
         if self.stalls and self.path.startswith(f"/{self.stalls}-"):
             self.wfile.write(data[:100])
-            self.go_on.wait(60)
+            self.go_on.wait(300)
             data = data[100:]
         with contextlib.suppress(OSError):
             self.wfile.write(data)
@@ -124,7 +124,7 @@ def served(folder: Path, stalls: str = "") -> Iterator[tuple[str, type[TinyIndex
         server.server_close()
 
 
-def until(condition, patience_s: float = 60.0) -> None:
+def until(condition, patience_s: float = 300.0) -> None:
     """Waits until it holds."""
     began = time.monotonic()
     while not condition():

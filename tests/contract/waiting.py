@@ -11,7 +11,7 @@ BACKEND = Path(__file__).resolve().parents[2] / "backend"
 """The checkout's own: a child sees no PYTHONPATH of the tests."""
 
 
-def wait_for(client: BackendClient, wanted, timeout_s: float = 60, into: list | None = None):
+def wait_for(client: BackendClient, wanted, timeout_s: float = 300, into: list | None = None):
     """The first event that `wanted` accepts; all events seen go `into` a list."""
     seen = into if into is not None else []
     end = time.monotonic() + timeout_s

@@ -85,8 +85,8 @@ CALLS: dict[str, dict[str, Any]] = {
         "out_dir": "made", "checkpoint": "tiny.safetensors",
     },
     "render": {
-        "human": "a.human.safetensors", "out": "made/x.png", "width": 16, "height": 16, "yaw": 0.5, "pose": "pose.json",
-        "depth": "made/depth.png",
+        "human": "a.human.safetensors", "out": "made/x.png", "width": 16, "height": 16, "yaw_degrees": 30,
+        "pose": "pose.json", "depth": "made/depth.png",
     },
     "draw": {
         "frame": "a.frame", "width": 16, "height": 16, "region": [0, 0, 16, 16], "clip": [0.1, 100.0],

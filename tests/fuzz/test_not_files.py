@@ -21,7 +21,7 @@ from fuzz.run import LONGEST_SENTENCE, ROOT
 from fuzz.target import Target, said
 from fuzz.targets import TARGETS
 
-LONGEST_S = 10
+LONGEST_S = 300
 """Until what waits is interrupted."""
 
 

@@ -105,6 +105,49 @@ def test_all_tests_run_on_three_blenders_in_environments_that_are_made_once(chec
     assert [command[0] for command in checkout.commands if "install" in command] == [pythons[0]] * 3
 
 
+@pytest.mark.parametrize("red", [("5.0",), ("4.5",), ("5.0", "5.2"), ()])
+def test_a_red_version_keeps_no_other_from_running_and_the_last_lines_say_which(
+    checkout, disks, monkeypatch, capsys, red
+):
+    disks(99_999)
+    monkeypatch.setattr(setup, "python313", lambda: "python3.13")
+    versions = {"5.0": setup.VENV, "4.5": setup.VENV45, "5.2": setup.VENV52}
+    failing, list_command = [setup.program(versions[name]) for name in red], setup.run
+
+    def run(command, **variables):
+        list_command(command, **variables)
+        if command[1:3] == ["-m", "pytest"] and command[0] in failing:
+            sys.exit(3)
+
+    monkeypatch.setattr(setup, "run", run)
+    monkeypatch.setattr(setup.sys, "argv", [])
+    with pytest.raises(SystemExit) as ended:
+        setup.main(["test"])
+    assert ended.value.code == (1 if red else 0)
+    tests = [command[0] for command in checkout.commands if command[1:3] == ["-m", "pytest"]]
+    assert tests == [setup.program(folder) for folder in versions.values()]
+    said = [f"Blender {name}: " + ("FAILED (exit code 3)" if name in red else "passed") for name in versions]
+    assert capsys.readouterr().out.splitlines()[-3:] == said
+
+
+def test_a_version_that_cannot_be_set_up_is_red_with_its_reason_and_one_without_its_python_not_tested(
+    checkout, disks, monkeypatch, capsys
+):
+    disks(99_999)
+    monkeypatch.setattr(setup, "python313", lambda: None)
+
+    def no_room(*_):
+        raise setup.Stop("no room")
+
+    monkeypatch.setattr(setup, "ready45", no_room)
+    with pytest.raises(SystemExit) as ended:
+        setup.test([])
+    assert ended.value.code == 1
+    last = capsys.readouterr().out.splitlines()[-3:]
+    assert last[:2] == ["Blender 5.0: passed", "Blender 4.5: FAILED: no room"]
+    assert last[2].startswith("Blender 5.2: not tested")
+
+
 def test_without_a_python_for_it_blender_52_is_left_out_and_named(checkout, disks, monkeypatch, capsys):
     disks(99_999)
     monkeypatch.setenv("PYTHON313", "")

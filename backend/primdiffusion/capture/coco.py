@@ -35,7 +35,7 @@ from primdiffusion.capture.composed import (
     write_composed,
 )
 from primdiffusion.capture.reader import Captures, Subject
-from primdiffusion.capture.sheet import joints_of
+from primdiffusion.capture.sheet import joints_from_body, joints_of
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.group_places import MOST
@@ -68,7 +68,8 @@ SKELETON = (
 """COCO's limbs between keypoints, which are counted from 1."""
 CATEGORY = {"id": 1, "name": "person", "supercategory": "person", "keypoints": KEYPOINTS, "skeleton": SKELETON}
 SAME_BODY = 0.002
-"""Metres between joints of captures and the default body's up to which the captures are of the default body."""
+"""Metres between the joints of the captures' body and the default body's up to which it is the default body."""
+_HEAD = JOINT_NAMES.index("head")
 _JOINTS = [JOINT_NAMES.index(name) for name in KEYPOINTS[len(FACE) :]]
 _HIPS = [KEYPOINTS.index("left_hip"), KEYPOINTS.index("right_hip")]
 _THICKNESS = np.array([THICKNESS[name.rpartition("_")[2]] for name in KEYPOINTS])
@@ -129,7 +130,9 @@ def run_lengths(mask: Bool[np.ndarray, "H W"]) -> list[int]:
 
 
 def keypoints_of(subject: Subject) -> Float[np.ndarray, "F 17 3"]:
-    """World positions of COCO's keypoints; the face's are NaN where the subject's joints are not the default body's.
+    """World positions of COCO's keypoints; the face's are NaN where the subject's body is not the default body.
+
+    On a rig of its own, the face of the fitted body moves with the head: the rig's head minus the body's.
 
     Raises:
         FileError: joints.npz is damaged.
@@ -142,8 +145,9 @@ def keypoints_of(subject: Subject) -> Float[np.ndarray, "F 17 3"]:
     smpl = subject.smpl
     poses = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
     posed = _face().shape(torch.from_numpy(smpl.betas).double()).pose(poses.to(dtype=torch.float64))
-    apart = np.linalg.norm(posed.joints[..., :3, 3].numpy() - joints, axis=-1).max(-1)
+    apart = np.linalg.norm(joints_from_body(subject, body), axis=-1).max(-1)
     face = posed.vertices[:, : 2 * len(FACE)].unflatten(1, (-1, 2)).mean(2).numpy()
+    face += (joints[:, _HEAD] - posed.joints[:, _HEAD, :3, 3].numpy())[:, None]
     points[:, : len(FACE)] = np.where((apart <= SAME_BODY)[:, None, None], face, np.nan)
     return points
 

@@ -25,7 +25,7 @@ from primdiffusion.capture.reader import (
     resample,
     windowed_view,
 )
-from primdiffusion.capture.sheet import body_joints, joints_of
+from primdiffusion.capture.sheet import joints_from_body, joints_of
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 
@@ -194,10 +194,10 @@ def body_betas(subject: Subject, body: BodyModel) -> Float[Tensor, "n"]:
             f"{subject.folder} has {len(betas)} betas of up to {float(betas.abs().max()):.3g}; there may be at most "
             f"{components} of the {name}, within {LARGEST_BETA:g}: {remedy}"
         )
-    distance = float(np.linalg.norm(joints_of(subject, body) - body_joints(subject, body), axis=-1).max())
+    distance = float(np.linalg.norm(joints_from_body(subject, body), axis=-1).max())
     if not distance <= SAME_BODY_M:
         raise ValueError(
-            f"the joints of {subject.folder} are up to {100 * distance:.0f} cm from the {name}'s, so its betas "
+            f"the body's joints in {subject.folder} are up to {100 * distance:.0f} cm from the {name}'s, so its betas "
             f"belong to another body model; {remedy}"
         )
     return torch.nn.functional.pad(betas, (0, components - len(betas)))

@@ -13,6 +13,7 @@ import numba
 import numpy as np
 import torch
 from jaxtyping import Float32, UInt8
+from PIL import Image
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
@@ -25,7 +26,15 @@ from primdiffusion.formats.json_files import read_json
 from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.formats.regular_files import FileError, open_regular
 from primdiffusion.geometry.camera import Camera
-from primdiffusion.geometry.pictures import LARGEST_FILE, decoded, decoded_bytes, opened_picture, strips
+from primdiffusion.geometry.pictures import (
+    LARGEST_FILE,
+    decoded,
+    decoded_bytes,
+    is_indexed,
+    label_values,
+    opened_picture,
+    strips,
+)
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 
@@ -96,6 +105,8 @@ def _resample(rgba, left, top, across, down, linear_of_byte, byte_of_linear, out
 
 CAMERAS_FILE = "cameras.json"
 PASSES_OF_RELEASED = ("img", "mask")
+FAINTEST = 32
+"""Share of 255 below which a mask's values are labels: no view of a person is covered that little."""
 VIEW_OF_FILES = 2
 """Times of what the largest of its files may take alone (`decoded_bytes`) that all passes of a view may take."""
 
@@ -282,9 +293,19 @@ def _read(file: BinaryIO, path: Path, kind: str, width: int, height: int) -> np.
             if len(picture.getbands()) != 1:
                 raise ValueError(f"it has {len(picture.getbands())} channels instead of one")
             return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
+        if size == (width, height) and kind == "mask":
+            return _coverage(picture)
         if size == (width, height):
             return decoded(picture, "RGB" if kind in ("img", "normal") else "L")
     raise FileError(path, f"has {size[0]} x {size[1]} pixels, its camera {width} x {height}", "render it again")
+
+
+def _coverage(picture: Image.Image) -> UInt8[np.ndarray, "H W"]:
+    """A mask of shares of 255, or, as in the released layout, of labels: the person is what is not 0 (SPEC 5)."""
+    values = label_values(picture)
+    if is_indexed(picture) or int(values.max()) < FAINTEST:
+        return np.where(values > 0, np.uint8(255), np.uint8(0))
+    return values if values.dtype == np.uint8 else decoded(picture, "L")
 
 
 @contextlib.contextmanager
@@ -318,22 +339,23 @@ def views_in(named: Any, path: Path, size: Callable[[int], tuple[int, int]]) -> 
 
     Raises FileError, which names `path`, and what `size` raises.
     """
-    views = []
+    views, name = [], ""
     try:
         for camera in range(len(named)):
-            about = named[f"camera{camera:04d}"]
+            name = f"camera{camera:04d}"
+            about = named[name]
             k, r, t = (np.asarray(about[key], np.float64) for key in ("K", "R", "T"))
             width, height = size(camera)
             t = t.reshape(3)
             if k.shape != (3, 3) or r.shape != (3, 3) or not all(map(all_finite, (k, r, t))):
-                raise ValueError(f"camera {camera} is not finite, or its shapes are not K 3x3, R 3x3, T 3")
+                raise ValueError("it is not finite, or its shapes are not K 3x3, R 3x3, T 3")
             views.append(View(k, r, t, width, height))
     except FileNotFoundError:
         raise
     except (LookupError, TypeError, ValueError, AttributeError, OverflowError) as e:
         if isinstance(e, FileError):
             raise
-        raise FileError(path, f"is not a list of cameras ({e!s:.160})", "render the subject again") from e
+        raise FileError(path, f"is not a list of cameras ({name}: {e!s:.160})", "render the subject again") from e
     return views
 
 

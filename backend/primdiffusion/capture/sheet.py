@@ -57,14 +57,29 @@ def joints_of(subject: Subject, body: BodyModel | None = None) -> Float[np.ndarr
     Raises:
         FileError: joints.npz is damaged, or of other frames or joints.
     """
+    stored = _stored_joints(subject)
+    return body_joints(subject, default_body() if body is None else body) if stored is None else stored["world"]
+
+
+def joints_from_body(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]:
+    """World positions [F, J, 3] of a body's joints from joints.npz minus those stored of the body with its betas.
+
+    They are zero for the body whose betas are stored, whatever rig the subject has. Raises as `joints_of`.
+    """
+    stored, own = _stored_joints(subject), body_joints(subject, body)
+    return np.zeros_like(own) if stored is None else own - stored.get("fitted", stored["world"])
+
+
+def _stored_joints(subject: Subject) -> dict[str, np.ndarray] | None:
     path = subject.folder / "joints.npz"
     try:
-        joints = read_numbers(path, ("world",))["world"]
+        stored = read_numbers(path, ("world",), optional=("fitted",))
     except FileNotFoundError:
-        return body_joints(subject, default_body() if body is None else body)
-    if joints.shape != (subject.frames, J, 3):
-        raise FileError(path, f"has joints of shape {joints.shape} for {subject.frames} frames", "render again")
-    return joints
+        return None
+    for joints in stored.values():
+        if joints.shape != (subject.frames, J, 3):
+            raise FileError(path, f"has joints of shape {joints.shape} for {subject.frames} frames", "render again")
+    return stored
 
 
 def body_joints(subject: Subject, body: BodyModel) -> Float[np.ndarray, "F J 3"]:

@@ -11,6 +11,8 @@ import tyro
 from primdiffusion.formats.schema import Option, Range, descriptions, field_types, read, split
 
 Record = TypeVar("Record")
+_HUGE = 1e18
+"""Limits beyond this are those of the computer, not of the option."""
 
 
 def parse(record: type[Record], arguments: Sequence[str], command: str) -> Record:
@@ -44,8 +46,16 @@ def _with_option(kind: Any, about: str) -> Any:
         plain = tyro.conf.Positional[plain]
     if option.hidden:
         plain = tyro.conf.Suppress[plain]
-    limits = [f"{str(mark).capitalize()}." for mark in marks if isinstance(mark, Range)]
-    return Annotated[plain, tyro.conf.arg(name=option.name or None, help=" ".join([about, *limits]).strip())]
+    words = " ".join([about, *(_limits(mark) for mark in marks if isinstance(mark, Range))]).strip()
+    return Annotated[plain, tyro.conf.arg(name=option.name or None, help=words)]
+
+
+def _limits(mark: Range) -> str:
+    """A sentence of help on the limits of a number, without those that nobody reaches."""
+    if mark.least <= -_HUGE:
+        return ""
+    shown = Range(mark.least) if mark.most >= _HUGE else mark
+    return f"{str(shown).capitalize()}."
 
 
 def _names_and_values(words: list[str]) -> dict[str, Any]:

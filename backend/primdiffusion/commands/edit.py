@@ -12,9 +12,10 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from primdiffusion.commands.output import FILES, Decode, step_previews, write_human
-from primdiffusion.commands.progress import ReportProgress, progress_bar, step_reporter
+from primdiffusion.commands.progress import ReportProgress, print_warnings, progress_bar, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.reading import warnings_of
 from primdiffusion.editing.edit import OnStep, combined, with_payload
 from primdiffusion.editing.inpaint import harmonise, inpaint
 from primdiffusion.editing.interpolate import interpolate
@@ -52,6 +53,7 @@ def run(request: EditRequest) -> None:
     with progress_bar() as report:
         human, answer = _edit(request, Session(), report)
     print(f"{request.out_dir}  {human.provenance['edits'][-1]['edit']}, {answer.seconds:.1f} s")
+    print_warnings(answer.warnings)
 
 
 def _edit(request: EditRequest, session: Session, report: ReportProgress) -> tuple[Human, HumanAnswer]:
@@ -72,6 +74,7 @@ def _edit(request: EditRequest, session: Session, report: ReportProgress) -> tup
         report("write", steps, steps, 0.0)  # the last chance to cancel
     answer = HumanAnswer(
         **FILES.in_folder(request.out_dir),
+        warnings=warnings_of(human.provenance["edits"][-1]),
         seed=getattr(request, "seed", None),  # interpolations have none
         steps=steps,
         seconds=round(time.perf_counter() - began, 3),

@@ -209,7 +209,7 @@ def frames_per_second(human: Human, settings: MarchSettings) -> Cell:
     primitives = place(human).to(device)
     seconds = []
     for number in range(FRAMES_TIMED + 1):
-        camera = framing(primitives, 2 * math.pi * number / FRAMES_TIMED, SIDE, SIDE)
+        camera = framing(primitives, 360 * number / FRAMES_TIMED, SIDE, SIDE)
         start = time.perf_counter()
         march(primitives, camera, settings)
         if device.type == "cuda":

@@ -17,7 +17,7 @@ from primdiffusion.export.usd import write_proxy_usdz
 from primdiffusion.formats.answers import GaussiansAnswer, HumanAnswer, ProxyAnswer
 from primdiffusion.formats.requests import GaussiansRequest, OpenHumanRequest, ProxyRequest
 from primdiffusion.formats.whole_files import staged
-from primdiffusion.human import Human, place, place_skinned
+from primdiffusion.human import Human, place_on_floor, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.pose_file import read_pose
 from primdiffusion.reshaping import reshaped
@@ -51,7 +51,7 @@ def gaussians(request: GaussiansRequest, session: Session, report: ReportProgres
     report("load", 0, 2, None)
     human = _shaped(request.person, request.betas)
     if request.object is None or request.joints is None:
-        primitives = place(human)
+        primitives = place_on_floor(human)
     else:
         joints, matrix = (torch.tensor(numbers, dtype=torch.float32) for numbers in (request.joints, request.object))
         primitives = place_skinned(human, joints, matrix)
@@ -87,8 +87,8 @@ def run(command: ExportCommand) -> None:
         raise FileNotFoundError(f"there is no folder {command.out.parent}: create it, or choose another")
     human = load_human(command.human)
     if command.out.suffix.lower() == ".ply":
-        pose = None if command.pose is None else read_pose(command.pose, command.frame)
-        write_gaussians(command.out, gaussians_of(place(human, pose), command.gaussians))
+        pose = None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
+        write_gaussians(command.out, gaussians_of(place_on_floor(human, pose), command.gaussians))
     elif command.out.suffix.lower() == ".glb":
         write_proxy_glb(command.out, mesh_proxy(human, command), human.provenance)
     elif command.out.suffix.lower() == ".usdz":

@@ -20,9 +20,10 @@ from primdiffusion.commands.output import (
     write_files,
     write_human,
 )
-from primdiffusion.commands.progress import Pace, ReportProgress, progress_bar, step_reporter
+from primdiffusion.commands.progress import Pace, ReportProgress, print_warnings, progress_bar, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.reading import warnings_of
 from primdiffusion.diffusion.samplers import RELEASED_END, SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.editing.edit import with_payload
@@ -39,9 +40,10 @@ from primdiffusion.machine import peak_memory_gb
 def generate(request: GenerateRequest, session: Session, report: ReportProgress) -> HumanAnswer:
     """Write all files or none. Raises OSError first of all if the folder cannot be written to."""
     began = time.perf_counter()
-    sampled = generate_humans(request, {request.seed: request.out_dir}, session, report)
+    (human,), sampled = generate_humans(request, {request.seed: request.out_dir}, session, report)
     return HumanAnswer(
         **FILES.in_folder(request.out_dir),
+        warnings=warnings_of(human.provenance),
         seed=request.seed,
         steps=request.steps,
         seconds=round(time.perf_counter() - began, 3),
@@ -57,10 +59,11 @@ def generate_humans(
     report: ReportProgress,
     *,
     compact: bool = False,
-) -> float:
+) -> tuple[list[Human], float]:
     """Sample a human for each seed as one batch and write each to its folder, all of them or none; see `save_human`.
 
-    Returns the time (of `perf_counter`) when sampling ended. Raises as load_checkpoint and generate_batch, and OSError.
+    Returns them, and the time (of `perf_counter`) when sampling ended. Raises as load_checkpoint and generate_batch,
+    and OSError.
     """
     seeds, steps = list(folders), request.steps
     with contextlib.ExitStack() as files:
@@ -90,7 +93,7 @@ def generate_humans(
         for folder, human in zip(unfinished, humans, strict=True):
             write_human(folder, human, request.size, compact=compact, compositing=request.compositing)
         report("write", steps, steps, 0.0)  # the last chance to cancel
-    return sampled
+    return humans, sampled
 
 
 def run(command: GenerateCommand) -> None:
@@ -104,10 +107,11 @@ def run(command: GenerateCommand) -> None:
         for folder in folders.values() if command.count > 1 else ():
             check_unlinked(folder)
         with progress_bar(f"seed {', '.join(map(str, seeds))}") as report:
-            generate_humans(command, folders, session, report, compact=command.compact)
+            humans, _ = generate_humans(command, folders, session, report, compact=command.compact)
         seconds = (time.perf_counter() - began) / len(seeds)
-        for seed, folder in folders.items():
+        for (seed, folder), human in zip(folders.items(), humans, strict=True):
             print(f"{folder}  seed {seed}, {command.steps} steps, {seconds:.1f} s")
+            print_warnings(f"seed {seed}: {warning}" for warning in warnings_of(human.provenance))
 
 
 def variations(request: VariationsRequest, session: Session, report: ReportProgress) -> VariationsAnswer:
@@ -117,7 +121,7 @@ def variations(request: VariationsRequest, session: Session, report: ReportProgr
     seed. Raises OSError first of all if the folder cannot be written to; raises as load_checkpoint, generate_batch,
     load_human and vary_batch.
     """
-    began = time.perf_counter()
+    began, warnings = time.perf_counter(), []
     with staged(request.out_dir) as folder:
         report("load", 0, request.steps, None)
         model = session.model(request.checkpoint)
@@ -127,8 +131,11 @@ def variations(request: VariationsRequest, session: Session, report: ReportProgr
             write_files(files.person, human)
             draw_front_and_back(files.picture, human, request.size)
             report("write", index + 1, len(request.seeds), None, picture=files.picture, index=index)
+            made = human.provenance if request.person is None else human.provenance["edits"][-1]
+            warnings += [f"seed {request.seeds[index]}: {warning}" for warning in warnings_of(made)]
     return VariationsAnswer(
         people=[_files(request.out_dir, seed) for seed in request.seeds],
+        warnings=warnings,
         seconds=round(time.perf_counter() - began, 3),
         peak_gb=round(peak_memory_gb(), 3),
     )

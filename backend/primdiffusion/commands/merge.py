@@ -19,7 +19,7 @@ from primdiffusion.export.merged_file import load_openvdb, upright_grid, write_g
 from primdiffusion.formats.answers import MergeAnswer, MergeFramesAnswer
 from primdiffusion.formats.requests import MergeFramesRequest, MergeRequest, PosedPerson
 from primdiffusion.formats.whole_files import written_whole
-from primdiffusion.human import Human, place, place_skinned
+from primdiffusion.human import Human, place_on_floor, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.pose_file import read_pose
 from primdiffusion.primitives.primitives import Primitives
@@ -76,10 +76,10 @@ def run(command: MergeCommand) -> None:
     as_vdb = command.out.suffix.lower() == ".vdb"
     if as_vdb:
         load_openvdb()
-    pose = None if command.pose is None else read_pose(command.pose, command.frame)
+    pose = None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
     people = []
     for number, path in enumerate(command.humans):
-        placed = place(load_human(path), pose)
+        placed = place_on_floor(load_human(path), pose)
         aside = torch.tensor([(number - (len(command.humans) - 1) / 2) * command.apart, 0.0, 0.0])
         people.append(dataclasses.replace(placed, position=placed.position + aside))
     grid = upright_grid(Primitives.together(people), command.voxel)

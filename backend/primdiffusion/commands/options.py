@@ -53,7 +53,7 @@ class GenerateCommand(GenerateRequest):
     def check(self) -> None:
         """Raise FieldError for seeds beyond the largest."""
         if self.seed + self.count - 1 > LARGEST_SEED:
-            raise FieldError(("count",), f"is {self.count}: the last seed would be above {LARGEST_SEED}")
+            raise FieldError(("count",), f"is {self.count}: the last seed would be above 2^63 - 1")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -64,11 +64,14 @@ class PoseOptions:
     """Pose file (.npz, .npy, .json, .pkl, .bvh), such as 72 axis-angle numbers (24 x 3, radians); default: T pose."""
     frame: int = 0
     """Frame of a pose file with several."""
+    tracked_person: str = ""
+    """Name or number of a person in a tracker's pose file of several people; default: who is in the most frames."""
 
     def check(self) -> None:
-        """Raise FieldError for a frame without a pose file."""
-        if self.frame and self.pose is None:
-            raise FieldError(("frame",), f"is {self.frame} without a pose file: give one with --pose")
+        """Raise FieldError for a frame or person without a pose file."""
+        for name, value in (("frame", self.frame), ("tracked_person", self.tracked_person)):
+            if value and self.pose is None:
+                raise FieldError((name,), f"is {value} without a pose file: give one with --pose")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -158,18 +161,6 @@ class ExportOnnxCommand:
     """Trained model: a .safetensors file or a folder; the default is the one in the package."""
     out: Annotated[Path, Ending((".onnx",))] = Path("denoiser.onnx")
     """Output .onnx."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class ViewCommand:
-    """Show a human in a browser, with sliders for the pose."""
-
-    human: Person
-    """A .human.safetensors file."""
-    port: Annotated[int, Range(0, 65_535)] = 8080
-    """Port on this machine; the next free one if it is in use."""
-    size: Pixels = 512
-    """Height of the pictures, pixels; a third of it while the camera moves."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -309,7 +300,6 @@ OPTIONS: dict[str, type] = {
     "reconstruct": ReconstructRequest,
     "refine": RefineCommand,
     "render": RenderCommand,
-    "view": ViewCommand,
     "export": ExportCommand,
     "export-onnx": ExportOnnxCommand,
     "merge": MergeCommand,

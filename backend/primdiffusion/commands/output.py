@@ -24,7 +24,7 @@ from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import save_body, save_human
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.image import Background, depth_to_png, rgba_to_png, to_png
+from primdiffusion.render.image import Background, depth_to_png, rgba_to_png
 from primdiffusion.render.march import RELEASED, Rendering, march
 
 INTERVAL_S = 0.4
@@ -33,7 +33,8 @@ TIME_SHARE = 0.25
 """Largest fraction of the time spent on previews."""
 PREVIEWS = 2
 """Files at a time: one may still be being read when the next one appears."""
-THREE_QUARTERS = math.radians(20)
+THREE_QUARTERS = 20
+"""Degrees."""
 ARMS_DOWN = math.radians(62)
 BLACK = (0.0, 0.0, 0.0)
 
@@ -70,9 +71,9 @@ def write_human(
     """
     write_files(folder / FILES.human, human, compact=compact)
     primitives = place(human)
-    front = draw(folder / FILES.front, primitives, framing(primitives, 0.0, size, size), BLACK, compositing)
-    depth_to_png(folder / FILES.depth, front)
-    draw(folder / FILES.side, primitives, framing(primitives, math.pi / 2, size, size), BLACK, compositing)
+    front = draw(folder / FILES.front, primitives, framing(primitives, 0, size, size), BLACK, compositing)
+    depth_to_png(folder / FILES.depth, front.depth, front.alpha)
+    draw(folder / FILES.side, primitives, framing(primitives, 90, size, size), BLACK, compositing)
 
 
 def write_files(path: Path, human: Human, *, compact: bool = False) -> None:
@@ -174,7 +175,7 @@ def draw(
         rgba_to_png(path, decoded(rendering, background), background)
     else:
         rendering = march(primitives, camera)
-        to_png(path, rendering, background)
+        rendering.save(path, background)
     return rendering
 
 
@@ -199,15 +200,15 @@ def decoded(rendering: Rendering, background: Background | None) -> Float[Tensor
 def draw_front(path: Path, human: Human, px: int, compositing: Compositing = "linear") -> None:
     """Draw the human in the T pose from the front, px x px pixels with a transparent background."""
     primitives = place(human)
-    draw(path, primitives, framing(primitives, 0.0, px, px), None, compositing)
+    draw(path, primitives, framing(primitives, 0, px, px), None, compositing)
 
 
 def draw_front_and_back(path: Path, human: Human, px: int) -> None:
     """Draw the human with lowered arms, front and back side by side, px x px pixels with a transparent background."""
     primitives = place(human, a_pose())
     views = []
-    for yaw in (THREE_QUARTERS, THREE_QUARTERS + math.pi):
-        view = march(primitives, framing(primitives, yaw, px // 2, px))
+    for degrees in (THREE_QUARTERS, THREE_QUARTERS + 180):
+        view = march(primitives, framing(primitives, degrees, px // 2, px))
         views.append(torch.cat([view.rgb, view.alpha[..., None]], dim=-1))
     rgba_to_png(path, torch.cat(views, dim=1), None)
 

@@ -6,8 +6,9 @@ import collections
 import contextlib
 import itertools
 import statistics
+import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -76,3 +77,9 @@ def progress_bar(label: str | None = None) -> Iterator[ReportProgress]:
                 bar.update(step - bar.n)
 
         yield report
+
+
+def print_warnings(warnings: Iterable[str]) -> None:
+    """Print a line on stderr for each."""
+    for warning in warnings:
+        print(f"primdiffusion: warning: {warning}", file=sys.stderr)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.capture.reader import Captures
 from primdiffusion.commands.options import RefineCommand
 from primdiffusion.commands.output import FILES, write_human
-from primdiffusion.commands.progress import ReportProgress, progress_bar
+from primdiffusion.commands.progress import ReportProgress, print_warnings, progress_bar
 from primdiffusion.commands.session import Session
 from primdiffusion.device import best_device
 from primdiffusion.diffusion.model import DiffusionModel
@@ -106,8 +105,7 @@ def run(request: ReconstructRequest) -> None:
     """Reconstruct, and print the output folder; raises as `reconstruct`."""
     with progress_bar() as report:
         answer = reconstruct(request, Session(), report)
-    for warning in answer.warnings:
-        print(f"primdiffusion: warning: {warning}", file=sys.stderr)
+    print_warnings(answer.warnings)
     if request.pictures:
         print(f"{request.out_dir}  {len(request.pictures)} pictures, {answer.seconds:.1f} s")
         return
@@ -145,12 +143,9 @@ def run_refine(command: RefineCommand) -> None:
         before, after = (float(view_psnr(one, held_out).mean()) for one in (human, refined.human))
         print(f"held-out views  {before:.2f} -> {after:.2f} dB (cameras {', '.join(map(str, held))})")
         if after < before:
-            print("primdiffusion: warning: the held-out PSNR decreased: use more views", file=sys.stderr)
+            print_warnings(["the held-out PSNR decreased: use more views"])
     if refined.steps < command.steps:
-        print(
-            f"primdiffusion: warning: the time limit of {command.minutes:g} minutes was reached after {seconds}",
-            file=sys.stderr,
-        )
+        print_warnings([f"the time limit of {command.minutes:g} minutes was reached after {seconds}"])
 
 
 def _start(command: RefineCommand, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:
@@ -231,7 +226,7 @@ def _read(
     request: ReconstructRequest | FitPostureRequest, session: Session, report: ReportProgress
 ) -> tuple[DiffusionModel, list[Photograph], Start, list[str]]:
     report("read", 0, 1, None)
-    photographs = read_photographs(request.pictures, request.masks)
+    photographs = read_photographs(request.pictures, request.masks, mask_label=request.mask_label)
     report("load", 0, 1, None)
     model = session.model(request.checkpoint)
     start = start_of(photographs, model, request.pose, request.cameras)

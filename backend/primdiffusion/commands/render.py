@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import time
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import body_of, framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.pose_file import pose_from_numbers, read_pose
-from primdiffusion.render.image import depth_to_png, rgba_to_png, to_png
+from primdiffusion.render.image import depth_to_png, rgba_to_png
 from primdiffusion.render.march import RELEASED, MarchSettings, march
 
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
@@ -39,12 +38,12 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
         pose = read_pose(given) if isinstance(given, Path) else pose_from_numbers(given, "the parameter pose")
     primitives = place(human, pose)
     report("render", 0, 1, None)
-    rendering = march(primitives, framing(primitives, request.yaw, request.width, request.height))
+    rendering = march(primitives, framing(primitives, request.yaw_degrees, request.width, request.height))
     report("write", 1, 1, 0.0)
     with contextlib.ExitStack() as files:  # both files or none
-        to_png(files.enter_context(written_whole(request.out)), rendering)
+        rendering.save(files.enter_context(written_whole(request.out)), BACKGROUNDS["black"])
         if request.depth is not None:
-            depth_to_png(files.enter_context(written_whole(request.depth)), rendering)
+            depth_to_png(files.enter_context(written_whole(request.depth)), rendering.depth, rendering.alpha)
     return RenderAnswer(out=request.out, depth=request.depth, seconds=round(time.perf_counter() - began, 3))
 
 
@@ -57,9 +56,11 @@ def run(command: RenderCommand) -> None:
     """Render, and print the path."""
     look = ViewSettings(command.view, settings=MarchSettings(step=command.step))
     human = load_human(command.human)
-    primitives = place(human, None if command.pose is None else read_pose(command.pose, command.frame))
+    primitives = place(
+        human, None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
+    )
     width, height = (command.size if side is None else side for side in (command.width, command.height))
-    camera = framing(primitives, math.radians(command.yaw), width, height)
+    camera = framing(primitives, command.yaw, width, height)
     background = BACKGROUNDS[command.background]
     if command.compositing == "released":
         look = ViewSettings(settings=RELEASED)
@@ -71,5 +72,5 @@ def run(command: RenderCommand) -> None:
         rgba_to_png(files.enter_context(written_whole(command.out)), rgba, background)
         if command.depth is not None:
             rendering = march(primitives, camera, look.settings)
-            depth_to_png(files.enter_context(written_whole(command.depth)), rendering)
+            depth_to_png(files.enter_context(written_whole(command.depth)), rendering.depth, rendering.alpha)
     print(command.out)

@@ -219,7 +219,7 @@ def seeded(seed: int) -> torch.Generator:
     Always on the CPU: each kind of device has its own random number generator, and a seed should give one person.
     """
     if not 0 <= seed < 2**63:
-        raise ValueError(f"seed {seed} is out of range; choose an integer from 0 to {2**63 - 1}")
+        raise ValueError(f"seed {seed} is out of range; choose an integer from 0 to 2^63 - 1")
     return torch.Generator().manual_seed(seed)
 
 

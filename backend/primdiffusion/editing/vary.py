@@ -9,6 +9,7 @@ import torch
 
 from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.reading import unfollowed
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.editing.edit import (
     OnStep,
@@ -66,7 +67,7 @@ def vary_batch(
     model = match_density(model, human)
     denoise = conditional_denoiser(model, attributes, guidance)
     chain = edit_timesteps(model, amount, steps)
-    payloads = [human.payload.to("cpu")] * len(seeds)
+    payloads, missed = [human.payload.to("cpu")] * len(seeds), [{}] * len(seeds)
     if chain:
         x0 = encoded(model, human)
         residual = difference(payloads[0], decoded(model, x0))
@@ -76,9 +77,10 @@ def vary_batch(
         varied = run_sampler(ddim(denoise, model.schedule, x, chain, generators), on_step)
         signal = model.schedule.signal(chain[0])
         payloads = [added(decoded(model, one[None]), residual, signal) for one in varied]
+        missed = [{"unfollowed": names} if names else {} for names in unfollowed(model, varied, attributes)]
     edit = {"edit": "vary", "amount": amount}
     shared = {"steps": steps, "attributes": dict(attributes), "guidance": guidance, **made_by(model)}
     return [
-        with_edit(human, {**edit, "seed": seed, **shared}, payload)
-        for seed, payload in zip(seeds, payloads, strict=True)
+        with_edit(human, {**edit, "seed": seed, **shared, **names}, payload)
+        for seed, payload, names in zip(seeds, payloads, missed, strict=True)
     ]

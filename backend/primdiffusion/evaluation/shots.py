@@ -70,7 +70,7 @@ class Shot:
 
 
 def body_camera(vertices: Float[Tensor, "V 3"], yaw: float, side: int = SIDE) -> Camera:
-    """A level camera whose view holds the sphere around the middle of the vertices; `yaw` as in `human.framing`."""
+    """A level camera whose view holds the sphere around the middle of the vertices; `yaw` in radians, 0: the front."""
     middle = (vertices.amin(0) + vertices.amax(0)) / 2
     radius = float((vertices - middle).norm(dim=-1).max())
     towards = vertices.new_tensor([math.sin(yaw), 0.0, math.cos(yaw)])

@@ -21,7 +21,7 @@ from primdiffusion.formats.requests import VOXEL, ProxySettings
 from primdiffusion.formats.whole_files import staged, written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
-from primdiffusion.human import Human, body_of, place
+from primdiffusion.human import Human, body_of, place, sole_height
 from primdiffusion.people.gltf import Skeleton, glb
 from primdiffusion.primitives.anchors import anchor_skin_weights
 from primdiffusion.primitives.primitives import Primitives
@@ -54,7 +54,7 @@ DEFAULT_PROXY = ProxySettings()
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class MeshProxy:
-    """A mesh in the T pose of the human's betas; metres, y up, facing z."""
+    """A mesh in the T pose of the human's betas; metres, y up, facing z; in the space of the body model."""
 
     vertices: Float64[Array, "v 3"]
     faces: Int64[Array, "f 3"]
@@ -66,6 +66,14 @@ class MeshProxy:
     texture: UInt8[Array, "h w 3"]
     """sRGB, top row first."""
     skeleton: Skeleton
+    sole_height: float
+    """Of the body (`human.sole_height`)."""
+
+    def on_floor(self) -> MeshProxy:
+        """The same with its soles at y = 0, as other programs expect it."""
+        up = np.array([0.0, -self.sole_height, 0.0])
+        skeleton = dataclasses.replace(self.skeleton, positions=self.skeleton.positions + up)
+        return dataclasses.replace(self, vertices=self.vertices + up, skeleton=skeleton, sole_height=0.0)
 
     def mesh(self) -> TexturedMesh:
         """Convert to a `TexturedMesh` of one part."""
@@ -107,7 +115,7 @@ def mesh_proxy(human: Human, settings: ProxySettings = DEFAULT_PROXY, on_stage: 
     texture = bake_texture(colours, surface, corner_uv, settings.texture_px, lambda: on_stage("texture", 2, 3))
     joints = body.shape(human.betas).joints.detach().double().numpy()
     skeleton = Skeleton(JOINT_NAMES, body.parents.tolist(), joints)
-    return MeshProxy(surface.vertices, surface.faces, corner_uv, weights, texture, skeleton)
+    return MeshProxy(surface.vertices, surface.faces, corner_uv, weights, texture, skeleton, sole_height(human))
 
 
 def skin_weights(
@@ -182,14 +190,18 @@ def _march_inwards(grid: Merged, origins: Array, directions: Array) -> tuple[Arr
 
 
 def write_proxy_glb(path: str | Path, proxy: MeshProxy, provenance: Mapping[str, Any]) -> None:
-    """Write one .glb: mesh, texture, skin and skeleton; y up, facing z, as glTF requires. Raises OSError."""
+    """Write one .glb: mesh, texture, skin and skeleton; y up, facing z, as glTF requires, soles at y = 0.
+
+    Raises OSError.
+    """
+    proxy = proxy.on_floor()
     with written_whole(path) as unfinished:
         unfinished.write_bytes(glb(proxy.mesh(), proxy.skeleton, {"primdiffusion": dict(provenance)}))
 
 
 def write_proxy_obj(path: str | Path, proxy: MeshProxy) -> None:
-    """Write an .obj, its .mtl and .png, all or none; OBJ has no skinning. Raises OSError."""
-    path = Path(path)
+    """Write an .obj, its .mtl and .png, all or none; soles at y = 0; OBJ has no skinning. Raises OSError."""
+    path, proxy = Path(path), proxy.on_floor()
     name = path.stem
     normals = vertex_normals(proxy.vertices, proxy.faces)
     lines = [f"mtllib {name}.mtl", "usemtl person"]

@@ -107,12 +107,15 @@ def SkelRoot "human"
 
 
 def write_proxy_usdz(path: str | Path, proxy: MeshProxy, provenance: Mapping[str, Any]) -> None:
-    """Write one .usdz: mesh, texture, skin and skeleton; metres, y up, facing z. Raises OSError."""
+    """Write one .usdz: mesh, texture, skin and skeleton; metres, y up, facing z, soles at y = 0.
+
+    Raises OSError.
+    """
     picture = io.BytesIO()
     Image.fromarray(proxy.texture).save(picture, format="PNG")
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
-        for name, content in ((STAGE, stage(proxy, provenance).encode()), (TEXTURE, picture.getvalue())):
+        for name, content in ((STAGE, stage(proxy.on_floor(), provenance).encode()), (TEXTURE, picture.getvalue())):
             entry = zipfile.ZipInfo(name)
             begins = packed.tell() + LOCAL_HEADER + len(name) + 4  # 4: identifier and length of the extra field
             padding = -begins % ALIGNMENT

@@ -26,6 +26,8 @@ class HumanAnswer(Open):
     """The human from the front, PNG."""
     side: Path | None = None
     depth: Path | None = None
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    """Sentences, such as on attributes that the human does not show."""
     seed: Count | None = None
     """None where nothing is drawn at random."""
     steps: Count | None = None
@@ -38,8 +40,6 @@ class HumanAnswer(Open):
 class ReconstructAnswer(HumanAnswer):
     """A reconstructed human."""
 
-    warnings: list[str]
-    """Sentences."""
     subject: str | None = None
     frame: Count | None = None
     views: list[Count] | None = None
@@ -75,6 +75,8 @@ class VariationsAnswer(Open):
 
     people: list[VariationFiles]
     seconds: Seconds
+    warnings: list[str] = dataclasses.field(default_factory=list)
+    """Sentences on humans that do not show what was asked for, which name their seeds."""
     peak_gb: float | None = None
 
 

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from .poses.rotation import ROTATION, first_improper
 from .schema import Checked, Length, Range, Slider
 
 Arrangement = Literal["rings", "sphere", "hemisphere"]
@@ -22,7 +23,10 @@ _LOWEST = -0.2
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class View:
-    """One camera: `x_pixel ~ intrinsics @ (rotation @ x_world + translation)`."""
+    """One camera: `x_pixel ~ intrinsics @ (rotation @ x_world + translation)`.
+
+    Raises ValueError for a matrix that is not a rotation, such as a reflection.
+    """
 
     intrinsics: NDArray[np.float64]
     """[3, 3], pixels."""
@@ -32,6 +36,10 @@ class View:
     """[3], metres."""
     width: int
     height: int
+
+    def __post_init__(self) -> None:
+        if first_improper(self.rotation[None, None]) is not None:
+            raise ValueError(f"R is not {ROTATION}")
 
     @property
     def position(self) -> NDArray[np.float64]:

@@ -13,7 +13,7 @@
     root/{id}/rgba/cameraNNNN/FFFF.png             sRGB with straight alpha; only where the background is transparent
     root/{id}/hdri/cameraNNNN/FFFF.jpg             sRGB over the environment of the HDRI; only with that background
     root/{id}/cameras.json                         {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}
-    root/{id}/joints.npz                           world [F,24,3], pixel [C,F,24,2], depth [C,F,24]
+    root/{id}/joints.npz                           world [F,24,3], pixel [C,F,24,2], depth [C,F,24], fitted
     root/{id}/outputs_re_fitting/refit_smpl_2nd.npz        "smpl": the released code's pickled dictionary
     root/{id}/outputs_re_fitting/refit_smpl_2nd_plain.npz  the same as plain arrays: read this one
     root/{id}/nerf/FFFF/transforms.json            camera to world, OpenGL axes; one static scene a frame
@@ -161,12 +161,17 @@ def write_smpl(subject: Path, global_orient: NDArray, body_pose: NDArray, betas:
     write_npz(subject / SMPL_FOLDER / SMPL_FILE, smpl=np.array(arrays, dtype=object))
 
 
-def write_joints(subject: Path, views: Sequence[View], world: NDArray) -> None:
-    """Write the joints [F,24,3] in the world and in every image."""
+def write_joints(subject: Path, views: Sequence[View], world: NDArray, fitted: NDArray | None = None) -> None:
+    """Write the joints [F,24,3] in the world and in every image.
+
+    `fitted` are those of the body whose betas are stored, where the subject has a rig of its own: they tell which body
+    that is, while the heads of other rigs' bones are centimetres from any body's joints.
+    """
     projected = [view.project(world) for view in views]
     write_npz(
         subject / "joints.npz",
         world=np.asarray(world, np.float32),
+        **({} if fitted is None else {"fitted": np.asarray(fitted, np.float32)}),
         pixel=np.stack([pixel for pixel, _ in projected]).astype(np.float32),
         depth=np.stack([depth for _, depth in projected]).astype(np.float32),
     )

@@ -239,6 +239,8 @@ class Pictures:
     """PNG or JPEG files of one person, who is marked by alpha or by `masks`."""
     masks: tuple[Path, ...] = ()
     """A mask for each picture, of its size: opaque or white where the person is; pictures with alpha need none."""
+    mask_label: Annotated[int, Range(0, 65535)] | None = None
+    """The person's label in masks of more than two: the index in their palette, or else the grey value."""
     pose: Path | None = None
     """Pose file: one pose for each picture or one for all (.json, .npz, .npy, .pkl, .bvh), or a posture.json; without
     it, the person is taken to stand upright, facing the camera."""
@@ -309,8 +311,8 @@ class RenderRequest:
     """Output PNG."""
     width: Pixels = 512
     height: Pixels = 512
-    yaw: float = 0.0
-    """Camera position around the human, radians: 0 in front, pi/2 at the human's left."""
+    yaw_degrees: float = 0.0
+    """Camera position around the human: 0 in front, 90 at the human's left."""
     pose: Path | list | None = None
     """72 axis-angle values (24 x 3, radians), or a pose file; None for the T pose."""
     depth: Annotated[Path, Ending((".png",))] | None = None

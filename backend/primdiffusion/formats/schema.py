@@ -76,9 +76,18 @@ class Range(Limit):
 
     def __str__(self) -> str:
         if self.most == math.inf:
-            return f"of at least {self.least:g}"
-        least, most = (str(limit) if isinstance(limit, int) else f"{limit:g}" for limit in (self.least, self.most))
-        return f"from {least} to {most}"
+            return f"of at least {_number(self.least)}"
+        return f"from {_number(self.least)} to {_number(self.most)}"
+
+
+def _number(limit: float) -> str:
+    """A limit as people write it: 2^63 - 1, not its 19 digits."""
+    if not isinstance(limit, int):
+        return f"{limit:g}"
+    bits = limit.bit_length()
+    if bits < 54 or abs(limit) != 2**bits - 1:
+        return str(limit)
+    return f"2^{bits} - 1" if limit > 0 else f"-2^{bits} + 1"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -233,7 +242,7 @@ def _value(kind: Any, value: Any, path: Names) -> Any:
     if origin in (types.UnionType, typing.Union):
         return _one_of(plain, value, path)
     if not _is(plain, value) or not all(mark.allows(value) for mark in marks if isinstance(mark, Limit)):
-        raise FieldError(path, f"is {value!r:.80}: give {_expected(kind)}")
+        raise FieldError(path, f"is {written(value)!r:.80}: give {_expected(kind)}")
     if dataclasses.is_dataclass(plain):
         return read(plain, value if isinstance(value, dict) else vars(value), *path)  # type: ignore[arg-type]
     if origin in (list, tuple) and arguments:
@@ -252,7 +261,7 @@ def _one_of(union: Any, value: Any, path: Names) -> Any:
     for kind in kinds:
         with contextlib.suppress(FieldError):
             return _value(kind, value, path)
-    raise FieldError(path, f"is {value!r:.80}: give {_expected(union)}")
+    raise FieldError(path, f"is {written(value)!r:.80}: give {_expected(union)}")
 
 
 def _alternatives(union: Any) -> list[Any]:

@@ -1,29 +1,33 @@
-"""Read the pickles in which SMPL is distributed, without executing code from them.
+"""Read the pickles in which SMPL and its poses are distributed, joblib's too, without executing code from them.
 
 A pickle is a program that may call any importable function. This reader maps every allowed global to one of the inert
 records below, which only store their arguments, and rejects all others. `as_array` rebuilds arrays afterwards, so not
-even numpy or scipy interprets the file's instructions. Before Python's unpickler runs, a scan of the operations rejects
-those that would take memory, time or C stack out of proportion to the file. Reads files written by Python 2 (latin1
-strings), chumpy, and old and new versions of numpy and scipy; chumpy need not be installed.
+even numpy or scipy interprets the file's instructions. Operations are counted and checked as they run: those that would
+take memory, time or C stack out of proportion to the file are rejected. Reads files written by Python 2 (latin1
+strings), chumpy, joblib, and old and new versions of numpy and scipy; chumpy and joblib need not be installed.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import pickle
-import pickletools
 import re
+import zlib
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .regular_files import FileContent, FileError
 
 MOST_OPERATIONS = 300_000
-"""SMPL's files have a few thousand: their arrays are one string each. Indices of the memo, for which the unpickler
-reserves memory, are below it too."""
-MOST_TUPLES = 2000
-"""Some six for each array. Tuples in tuples are hashed recursively if they are the key of a dictionary."""
+"""Operations of a small file; SMPL's have a few thousand: their arrays are one string each."""
+BYTES_AN_OPERATION = 8
+"""Of a larger file, in which trackers write a few small arrays for each frame."""
+LARGEST_UNPACKED = 256 * 2**20
+"""Bytes of a compressed file, unpacked."""
 MOST_NUMBERS = 10_000_000
 """In sparse matrices as they become dense; the regressor of SMPL's joints has 165,360."""
 MOST_LISTED = 2_000_000
@@ -31,10 +35,11 @@ MOST_LISTED = 2_000_000
 MAX_NESTING = 8
 """Limit on nested chumpy selections; body models nest less."""
 _DAMAGED = (
-    pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, EOFError,
+    pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError, OverflowError, EOFError, zlib.error,
 )  # fmt: skip
 """What the unpickler raises where operations do not fit their values."""
 _NUMBER_TYPE = re.compile(r"[biuf][1248]")
+_TYPE_SIZE = re.compile(r"[biufcSU](\d{1,6})")
 
 
 class Inert:
@@ -72,6 +77,27 @@ class _NumberType(Inert):
 
 class _Latin1Bytes(Inert):
     """Bytes written as text by protocol 2: arguments (text, "latin1")."""
+
+
+class _JoblibArray(Inert):
+    """joblib's array: state with shape, order, dtype; the bytes follow in the file itself, after a padding."""
+
+    stream: io.BytesIO
+    raw: bytes
+
+    def __setstate__(self, state: object) -> None:
+        """Store the state, and the bytes behind it."""
+        match state:
+            case {"shape": tuple() as shape, "dtype": _NumberType(arguments=(str() as kind, *_)), **rest}:
+                found = _TYPE_SIZE.fullmatch(kind)
+            case _:
+                raise ValueError("an array has no shape or type")
+        if found is None or not all(isinstance(n, int) and n >= 0 for n in shape):
+            raise ValueError("an array holds objects, not numbers")
+        size = int(found[1]) * (4 if kind[0] == "U" else 1) * math.prod(shape)
+        if rest.get("numpy_array_alignment_bytes") is not None:
+            self.stream.seek(ord(self.stream.read(1)), io.SEEK_CUR)
+        self.state, self.raw = state, self.stream.read(min(size, len(self.stream.getbuffer())))
 
 
 class _Chumpy(Inert):
@@ -117,13 +143,59 @@ _GLOBALS: dict[tuple[str, str], type] = {
 }
 
 
-class _Unpickler(pickle.Unpickler):
+class _Operations(dict[int, Callable[[Any], None]]):
+    """Operations by their byte, of which as many may run as the file's size allows."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__(pickle._Unpickler.dispatch)  # pyright: ignore[reportAttributeAccessIssue]
+        self._left = max(MOST_OPERATIONS, size // BYTES_AN_OPERATION)
+        hashed = {
+            pickle.SETITEM: lambda stack: stack[-2:-1],
+            pickle.SETITEMS: lambda stack: stack[::2],
+            pickle.DICT: lambda stack: stack[::2],
+            pickle.ADDITEMS: lambda stack: stack,
+            pickle.FROZENSET: lambda stack: stack,
+        }
+        for code, keys in hashed.items():
+            self[code[0]] = self._of_names(super().__getitem__(code[0]), keys)
+        self[pickle.BYTEARRAY8[0]] = super().__getitem__(pickle.BINBYTES8[0])  # which reads no more than there is
+
+    def __getitem__(self, code: int) -> Callable[[Any], None]:
+        """An operation, to run it. Raises ValueError after too many, and for a byte that is none."""
+        self._left -= 1
+        if self._left < 0:
+            raise ValueError("it has more operations than arrays need")
+        if code not in self:
+            raise ValueError(f"the byte {code} is no operation")
+        return super().__getitem__(code)
+
+    @staticmethod
+    def _of_names(operation: Callable[[Any], None], keys: Callable[[list], list]) -> Callable[[Any], None]:
+        """The operation for keys that are not tuples: Python hashes tuples in tuples recursively."""
+
+        def checked(unpickler: Any) -> None:
+            if any(isinstance(key, tuple | frozenset) for key in keys(unpickler.stack)):
+                raise ValueError("the key of a dictionary is a tuple")
+            operation(unpickler)
+
+        return checked
+
+
+class _Unpickler(pickle._Unpickler):  # pyright: ignore[reportAttributeAccessIssue]
+    """Python's unpickler in Python, which reads from its stream no more than an operation needs: joblib puts arrays
+    between operations."""
+
     def __init__(self, data: bytes, path: str | Path) -> None:
-        super().__init__(io.BytesIO(data), encoding="latin1")
+        stream = io.BytesIO(data)
+        super().__init__(stream, encoding="latin1")
+        self.dispatch = _Operations(len(data))  # pyright: ignore[reportAttributeAccessIssue]
         self._path = path
+        self._joblib_array = type("_JoblibArray", (_JoblibArray,), {"stream": stream})
 
     def find_class(self, module: str, name: str) -> type:
         """Return an inert record. Raises FileError for other globals."""
+        if (module, name) == ("joblib.numpy_pickle", "NumpyArrayWrapper"):
+            return self._joblib_array
         try:
             return _GLOBALS[module, name]
         except KeyError:
@@ -134,22 +206,15 @@ class _Unpickler(pickle.Unpickler):
             ) from None
 
 
-class _Scanned(io.BytesIO):
-    def readline(self, *_: object) -> bytes:
-        """An empty string for each in quotes: pickletools takes them for ASCII, and Python 2 wrote latin1."""
-        line = super().readline()
-        return b"''\n" if line[:1] in (b"'", b'"') and line.endswith(b"\n") else line
-
-
-def _scan(data: bytes) -> None:
-    """Raise ValueError for lengths beyond the data's end, and for numbers of operations beyond the limits."""
-    tuples = 0
-    for number, (operation, argument, _) in enumerate(pickletools.genops(_Scanned(data))):
-        tuples += operation.name.startswith("TUPLE")
-        if number >= MOST_OPERATIONS or tuples > MOST_TUPLES:
-            raise ValueError("it has more operations than arrays need")
-        if operation.name in ("PUT", "BINPUT", "LONG_BINPUT") and int(argument or 0) >= MOST_OPERATIONS:
-            raise ValueError(f"it remembers a value as number {argument!s:.20}")
+def _unpacked(data: bytes) -> bytes:
+    """The pickle in data that joblib may have compressed. Raises ValueError for one that is too large."""
+    if data[:1] != b"x":
+        return data
+    unpacking = zlib.decompressobj()
+    unpacked = unpacking.decompress(data, LARGEST_UNPACKED)
+    if not unpacking.eof:
+        raise ValueError("it is truncated, or too large unpacked")
+    return unpacked
 
 
 def read_pickle(file: FileContent) -> dict[str, object]:
@@ -169,12 +234,11 @@ def load_restricted(data: bytes, path: str | Path) -> object:
     """Load a pickle, the content of the file `path`, with inert records in place of objects.
 
     Raises:
-        FileError: it names a global outside the list above, is not a pickle, is truncated, or exceeds MOST_OPERATIONS
-            or MOST_TUPLES.
+        FileError: it names a global outside the list above, is not a pickle, is truncated, or has more operations than
+            MOST_OPERATIONS and its size allow.
     """
     try:
-        _scan(data)
-        return _Unpickler(data, path).load()
+        return _Unpickler(_unpacked(data), path).load()
     except FileError:
         raise
     except _DAMAGED as error:
@@ -219,6 +283,10 @@ def _as_array(value: object, nesting: int) -> np.ndarray:
         case _BufferArray(arguments=(raw, kind, tuple() as shape, str() as order)):
             array = np.frombuffer(_raw_bytes(raw), _number_type(kind)).reshape(
                 shape, order="F" if order == "F" else "C"
+            )
+        case _JoblibArray(state={"shape": tuple() as shape, "dtype": kind, **rest}, raw=raw):
+            array = np.frombuffer(raw, _number_type(kind)).reshape(
+                shape, order="F" if rest.get("order") == "F" else "C"
             )
         case _Scalar(arguments=(kind, raw)):
             array = np.frombuffer(_raw_bytes(raw), _number_type(kind)).reshape(())

@@ -101,6 +101,19 @@ def decoded(picture: Image.Image, mode: str) -> UInt8[np.ndarray, "H W *channels
     return pixels if bands > 1 else pixels[..., 0]
 
 
+def is_indexed(picture: Image.Image) -> bool:
+    """Whether pixels are indices of a palette with other colours than greys, which masks use for labels."""
+    colours = np.array(picture.getpalette() or [0, 0, 0]).reshape(-1, 3) if picture.mode == "P" else np.zeros((1, 3))
+    return bool(np.ptp(colours, axis=1).any())
+
+
+def label_values(picture: Image.Image) -> np.ndarray:
+    """The values [H, W] by which a mask marks areas: indices (`is_indexed`), up to 16 bits of grey, or brightness."""
+    if picture.mode.startswith("I"):
+        return np.concatenate([np.asarray(strip).astype(np.uint16) for _, strip in strips(picture)])
+    return decoded(picture, "P" if is_indexed(picture) else "L")
+
+
 def strips(picture: Image.Image, pixels: int | None = None) -> Iterator[tuple[int, Image.Image]]:
     """Yield the picture in strips of whole rows of about `pixels`, each with the number of its first row."""
     rows = max(1, (pixels or STRIP_PIXELS) // max(picture.width, 1))

@@ -104,9 +104,6 @@ def _views(named: Any, path: Path, sizes: Sequence[tuple[int, int]]) -> list[Vie
         raise FileError(path, f"has {count} cameras for {len(sizes)} pictures", "give one for each")
     views = views_in(named, path, size)
     for number, view in enumerate(views):
-        proper = np.allclose(view.rotation @ view.rotation.T, np.eye(3), atol=1e-3) and np.linalg.det(view.rotation) > 0
-        if not proper or min(view.intrinsics[0, 0], view.intrinsics[1, 1]) < 1:
-            raise FileError(
-                path, f"has no camera in camera{number:04d}", "R is a rotation, K has focal lengths in pixels"
-            )
+        if min(view.intrinsics[0, 0], view.intrinsics[1, 1]) < 1:
+            raise FileError(path, f"has no camera in camera{number:04d}", "K has focal lengths in pixels")
     return views

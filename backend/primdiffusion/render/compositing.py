@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.render.image import Background, over, rgba_to_png
 
 SURFACE_OPACITY = 0.5
 """Accumulated opacity that defines the first hit."""
@@ -27,6 +29,19 @@ class Rendering(TensorRecord):
     first_hit: Float[Tensor, "*r"]
     """Distance along the ray, metres, of the first sample at which the opacity has reached 0.5; inf if there is none.
     Not differentiable."""
+
+    def save(self, path: str | Path, background: Background | None = None) -> None:
+        """Write an image [h, w] as an 8-bit sRGB PNG: with straight alpha, or over a background (linear RGB).
+
+        The file appears whole or not at all. Raises ValueError for a name that does not end in .png, and OSError.
+        """
+        if Path(path).suffix.lower() != ".png":
+            raise ValueError(f"{path} does not end in .png: pictures are saved as PNG")
+        rgba_to_png(path, torch.cat([self.rgb, self.alpha[..., None]], dim=-1), background)
+
+    def over(self, background: Background) -> Float[Tensor, "*r 3"]:
+        """The image over a background; both linear RGB."""
+        return over(self.rgb, self.alpha, background)
 
 
 def composite(

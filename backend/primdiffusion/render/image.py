@@ -13,50 +13,36 @@ from torch import Tensor
 
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import encode_srgb
-from primdiffusion.render.compositing import Rendering
 
 Background = tuple[float, float, float]
 NEAR_TO_FAR = ((1.0, 0.95, 0.75), (0.98, 0.62, 0.25), (0.80, 0.25, 0.33), (0.42, 0.12, 0.47), (0.10, 0.07, 0.28))
 """Colour ramp of depth images, sRGB-encoded, darker with distance."""
 
 
-def over(rendering: Rendering, background: Background) -> Float[Tensor, "*r 3"]:
-    """Composite the rendering over a linear background colour."""
-    return _over(rendering.rgb, rendering.alpha, background)
-
-
-def to_png(path: str | Path, rendering: Rendering, background: Background | None = (0.0, 0.0, 0.0)) -> None:
-    """Write an 8 bit sRGB image over `background` (linear RGB), or with straight alpha if it is None.
-
-    The file is written atomically. Raises OSError as `written_whole` does.
-    """
-    rgba_to_png(path, torch.cat([rendering.rgb, rendering.alpha[..., None]], dim=-1), background)
-
-
 def rgba_to_png(path: str | Path, rgba: Float[Tensor, "h w 4"], background: Background | None) -> None:
-    """As `to_png`, from linear RGB premultiplied by alpha, and alpha."""
+    """Write linear RGB premultiplied by alpha, and alpha, as an 8-bit sRGB PNG: see `Rendering.save`."""
     rgb, alpha = rgba[..., :3], rgba[..., 3]
     if background is not None:
-        _save(path, _to_bytes(encode_srgb(_over(rgb, alpha, background))))
+        _save(path, _to_bytes(encode_srgb(over(rgb, alpha, background))))
         return
     straight = rgb / alpha.clamp_min(1e-6)[..., None]
     _save(path, _to_bytes(torch.cat([encode_srgb(straight.clamp(0, 1)), alpha[..., None]], dim=-1)))
 
 
-def _over(rgb: Float[Tensor, "*r 3"], alpha: Float[Tensor, "*r"], background: Background) -> Float[Tensor, "*r 3"]:
+def over(rgb: Float[Tensor, "*r 3"], alpha: Float[Tensor, "*r"], background: Background) -> Float[Tensor, "*r 3"]:
+    """Composite premultiplied colours over a linear background colour."""
     return rgb + (1 - alpha)[..., None] * torch.tensor(background).to(rgb)
 
 
-def depth_to_png(path: str | Path, rendering: Rendering) -> None:
+def depth_to_png(path: str | Path, distance: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]) -> None:
     """Write the expected depth in false colours, bright for near, black for background.
 
     The ramp spans the range of depth of pixels with alpha of at least 0.5.
     """
-    depth = rendering.depth.detach().double().cpu().numpy()
-    solid = depth[(rendering.alpha >= 0.5).cpu().numpy()]
+    depth = distance.detach().double().cpu().numpy()
+    solid = depth[(alpha >= 0.5).cpu().numpy()]
     colour = depth_colours(depth, float(solid.min(initial=np.inf)), float(solid.max(initial=-np.inf)))
-    alpha = rendering.alpha.detach().double().cpu().numpy()[..., None]
-    _save(path, _to_bytes(torch.from_numpy(colour * alpha)))
+    _save(path, _to_bytes(torch.from_numpy(colour * alpha.detach().double().cpu().numpy()[..., None])))
 
 
 def depth_colours(depth: Float[ndarray, "*r"], near: float, far: float) -> Float64[ndarray, "*r 3"]:

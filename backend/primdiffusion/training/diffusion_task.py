@@ -24,7 +24,7 @@ from primdiffusion.training.state import TrainingState
 SEEDS = (0, 1, 2, 3)
 """Seeds of the samples in pictures."""
 WIDTH, HEIGHT = 256, 256
-YAW = 0.4
+YAW_DEGREES = 23
 """Radians."""
 STEP = 0.006
 """Metres between samples of a ray."""
@@ -76,7 +76,7 @@ def write_samples(
     pictures = []
     for human in generate_batch(model, seeds, steps):
         primitives = place(human)
-        camera = framing(primitives, YAW, WIDTH, HEIGHT).to(model.device)
+        camera = framing(primitives, YAW_DEGREES, WIDTH, HEIGHT).to(model.device)
         rendering = march(primitives.to(model.device), camera, MarchSettings(step=STEP))
         pictures.append(encode_srgb(rendering.rgb.clamp(0, 1)).cpu())
     write_picture(path, torch.cat(pictures, dim=1))

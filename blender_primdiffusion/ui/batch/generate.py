@@ -83,7 +83,10 @@ class _Person:
         check_unlinked(self._folder)
         if not (self._folder / PERSON_FILE).is_file():
             with staging(self._folder) as made:
-                ask(backend, "generate", {**self._params, "out_dir": str(made)}, self._stop, self._print_progress)
+                asked = {**self._params, "out_dir": str(made)}
+                answer = ask(backend, "generate", asked, self._stop, self._print_progress)
+                for warning in answer.warnings:
+                    self.say(f"{self.which} {self.name}: {warning}")
                 publish(made, self._folder, last=PERSON_FILE)
         if self._blend is not None:
             with staging(self._folder) as made:

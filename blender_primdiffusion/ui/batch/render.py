@@ -20,7 +20,8 @@ from ...backend.requests import Backend
 from ...console import Report, Stop, Stopped
 from ...engine import studio
 from ...engine.engine import ENGINE
-from ...formats.regular_files import check_regular, exists_in_its_folder, real_path, remove_file, remove_folder
+from ...formats.picture_files import is_whole_picture
+from ...formats.regular_files import check_regular, exists_in_its_folder, real_path, remove_folder
 from ...formats.whole_files import replacing
 from ...jobs.deferred_volumes import deferred_volumes
 from ...jobs.export import opened
@@ -173,7 +174,7 @@ class _Drawing:
             scene.frame_set(shot.frame)
             if extent is not None and shot.yaw is not None:
                 (go_round if self._options.turntable else look_from)(scene, shot.yaw, extent)
-            _draw(scene, shot.path)
+            draw(scene, shot.path)
             if len(shots) > 1:
                 self.say(f"{source.name}: picture {number + 1} of {len(shots)}")
         if not source.is_blend:
@@ -238,7 +239,6 @@ class _Drawing:
             render.image_settings.media_type = "IMAGE"
         render.image_settings.file_format = "PNG"
         render.image_settings.color_mode = "RGBA" if render.film_transparent else "RGB"
-        render.use_file_extension = False
 
 
 def _check_volumes(scene: bpy.types.Scene) -> None:
@@ -253,13 +253,11 @@ def _check_volumes(scene: bpy.types.Scene) -> None:
         )
 
 
-def _draw(scene: bpy.types.Scene, path: Path) -> None:
+def draw(scene: bpy.types.Scene, path: Path) -> None:
+    """Render the scene to a PNG. Raises OSError, and RuntimeError where Blender cannot render."""
+    bpy.ops.render.render()
+    result = next(image for image in bpy.data.images if image.type == "RENDER_RESULT")
     with replacing(path) as unfinished:
-        scene.render.filepath = str(unfinished)
-        try:
-            bpy.ops.render.render(write_still=True)
-        except RuntimeError:
-            remove_file(unfinished, unfinished.parent)
-            raise
-        if not unfinished.is_file():
+        result.save_render(str(unfinished), scene=scene)  # in render.filepath, Blender 5 takes {braces} for templates
+        if not is_whole_picture(unfinished):  # on a full disk Blender saves what fits, and says nothing
             raise OSError(f"{path} was not written: is the disk full?")

@@ -195,7 +195,7 @@ def test_the_face_is_that_of_the_whole_body(bodies):
         moved = dataclasses.replace(subject, smpl=dataclasses.replace(subject.smpl, betas=betas))
         joints = np.stack([posed.joints[:, :3, 3].numpy() for posed in poses])
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr("primdiffusion.capture.coco.joints_of", lambda _, joints=joints: joints)
+            patch.setattr("primdiffusion.capture.sheet._stored_joints", lambda _, joints=joints: {"world": joints})
             np.testing.assert_allclose(keypoints_of(moved)[:, : len(FACE)], face, rtol=0, atol=1e-12)
 
 
@@ -256,6 +256,17 @@ def test_the_face_is_unknown_on_another_body(root):
     for annotation in annotations(root)["annotations"]:
         face = annotation["keypoints"][: 3 * len(FACE)]
         assert any(face) == (annotation["image_id"] > 12)
+
+
+def test_the_face_of_a_rig_of_its_own_moves_with_its_head(root):
+    before = keypoints_of(open_captures(root).subject(NAME))
+    with np.load(root / NAME / "joints.npz") as noted:
+        arrays = dict(noted)
+    up = np.float32([0, 0.05, 0])
+    capture_layout.write_npz(
+        root / NAME / "joints.npz", **arrays | {"world": arrays["world"] + up}, fitted=arrays["world"]
+    )
+    np.testing.assert_allclose(keypoints_of(open_captures(root).subject(NAME)), before + up, atol=1e-5)
 
 
 def test_unfinished_subjects_are_left_out(root):

@@ -21,7 +21,7 @@ from primdiffusion.capture.reader import Subject, open_captures
 from primdiffusion.capture.render import render
 from primdiffusion.capture.smpl_parameters import SmplParameters
 from primdiffusion.formats.camera_rig import Rig
-from primdiffusion.formats.capture_layout import picture_path, write_smpl
+from primdiffusion.formats.capture_layout import picture_path, write_npz, write_smpl
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from support.errors import refused
@@ -140,6 +140,17 @@ def test_more_betas_than_the_default_body_has_are_rejected(folder):
 
 def test_betas_whose_body_has_other_joints_than_were_noted_are_rejected(folder):
     rewrite_betas(folder, [4.0, -4.0, 4.0, 0, 0, 0, 0, 0, 0, 0])
+    with refused(ValueError, "joints"):
+        captured_person(folder, FIRST)
+
+
+def test_a_rig_whose_joints_are_far_from_any_bodys_is_judged_by_the_body_fitted_to_it(folder):
+    path = folder / FIRST / "joints.npz"
+    with np.load(path) as noted:
+        world = noted["world"]
+    write_npz(path, world=world + np.float32([0, 0.1, 0]), fitted=world)
+    assert captured_person(folder, FIRST).subject == FIRST
+    write_npz(path, world=world, fitted=world + np.float32([0, 0.1, 0]))
     with refused(ValueError, "joints"):
         captured_person(folder, FIRST)
 

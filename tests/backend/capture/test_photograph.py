@@ -5,6 +5,7 @@ import pytest
 from PIL import Image
 from primdiffusion.capture.photograph import LARGEST_SIDE, read_photographs
 from primdiffusion.formats.regular_files import FileError
+from scipy import ndimage
 from support.errors import refused
 
 RED, GREEN = (200, 30, 30), (30, 200, 30)
@@ -115,14 +116,94 @@ def two_people():
     return mask
 
 
+def dim():
+    return (ndimage.gaussian_filter(figure()[1].astype(float), 9.0) / 3).astype(np.uint8)
+
+
 @pytest.mark.parametrize(
     ("mask", "word"),
-    [(pixels(160, 200, 0), "no person"), (two_people(), "2 separate figures"), (pixels(160, 201, 255), "201 x 160")],
+    [
+        (pixels(160, 200, 0), "no person"),
+        (dim(), "half covered"),
+        (two_people(), "2 separate figures"),
+        (pixels(160, 201, 255), "201 x 160"),
+    ],
 )
 def test_masks_of_nobody_two_people_or_another_size_are_refused(tmp_path, mask, word):
     picture = save(tmp_path / "a.jpg", figure()[0])
     with refused(FileError, str(tmp_path / "m.png"), word):
         read_photographs([picture], [save(tmp_path / "m.png", mask)])
+
+
+def palette(labels, *colours):
+    image = Image.fromarray(labels, "P")
+    image.putpalette([channel for colour in colours for channel in colour])
+    return image
+
+
+def labelled(*values):
+    """A figure of the last value, with areas of the others beside it."""
+    labels = np.full((160, 200), values[0])
+    for place, value in enumerate(values[1:-1]):
+        labels[10 * place : 10 * place + 8, 110:190] = value
+    labels[20:140, 60:100] = values[-1]
+    return labels
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        Image.fromarray(labelled(0, 1).astype(np.uint8)),
+        Image.fromarray(labelled(0, 1).astype(np.uint16)),
+        Image.fromarray(labelled(0, 65535).astype(np.uint16)),
+        Image.fromarray(labelled(0, 100).astype(np.uint8)),
+        Image.fromarray(labelled(False, True)),
+        palette(labelled(0, 1).astype(np.uint8), (0, 0, 0), (128, 0, 0)),
+        palette(labelled(1, 0).astype(np.uint8), (0, 0, 90), (0, 0, 0)),
+        palette(labelled(1, 0).astype(np.uint8), (255, 255, 255), (0, 0, 0)),
+        Image.fromarray(np.where(labelled(0, 1)[..., None] > 0, (90, 0, 0), (0, 0, 0)).astype(np.uint8)),
+    ],
+)
+def test_of_two_labels_the_brighter_is_the_person(tmp_path, mask):
+    mask.save(tmp_path / "m.png")
+    picture, white = figure()
+    (found,) = read_photographs([save(tmp_path / "a.png", picture)], [tmp_path / "m.png"])
+    (expected,) = read_photographs([tmp_path / "a.png"], [save(tmp_path / "white.png", white)])
+    assert np.array_equal(found.rgba, expected.rgba)
+
+
+@pytest.mark.parametrize(
+    "mask",
+    [
+        Image.fromarray(labelled(0, 1, 15).astype(np.uint8)),
+        Image.fromarray(labelled(0, 1, 255, 15).astype(np.uint8)),
+        Image.fromarray(labelled(0, 1, 15).astype(np.uint16)),
+        palette(labelled(0, 1, 15).astype(np.uint8), *[(8 * i, 0, 128 - 8 * i) for i in range(16)]),
+    ],
+)
+def test_a_mask_of_several_labels_asks_which_is_the_person(tmp_path, mask):
+    mask.save(tmp_path / "m.png")
+    picture, white = figure()
+    pair = [save(tmp_path / "a.png", picture)], [tmp_path / "m.png"]
+    with refused(FileError, "m.png", "labels, 0, 1, 15", "mask_label"):
+        read_photographs(*pair)
+    with refused(FileError, "m.png", "label 3", "0, 1, 15"):
+        read_photographs(*pair, mask_label=3)
+    (found,) = read_photographs(*pair, mask_label=15)
+    (expected,) = read_photographs(pair[0], [save(tmp_path / "white.png", white)])
+    assert np.array_equal(found.rgba, expected.rgba)
+
+
+@pytest.mark.parametrize("name", ["m.png", "m.jpg", "m16.png"])
+def test_soft_edges_are_not_labels(tmp_path, name):
+    picture, mask = figure()
+    soft = ndimage.gaussian_filter(mask.astype(float), 2.0).round()
+    soft = soft.astype(np.uint8) if "16" not in name else (soft * 257).astype(np.uint16)
+    pair = [save(tmp_path / "a.png", picture)], [save(tmp_path / name, soft)]
+    (found,) = read_photographs(*pair)
+    assert 20 < len(np.unique(found.rgba[..., 3])) <= 256
+    (hard,) = read_photographs([save(tmp_path / "a.png", picture)], [save(tmp_path / "hard.png", mask)])
+    assert abs(found.rgba[..., 3].mean() - hard.rgba[..., 3].mean()) < 10
 
 
 def test_pictures_that_tell_nobody_are_refused(tmp_path):

@@ -28,6 +28,8 @@ from primdiffusion.raster.multisample import render_view
 from support.errors import refused
 
 NAME = "person_000000"
+_MIRRORED = {"K": np.eye(3).tolist(), "R": np.diag([-1.0, 1, 1]).tolist(), "T": [0, 0, 3]}
+REFLECTION = json.dumps({f"camera{number:04d}": _MIRRORED for number in range(4)}).encode()
 
 
 def test_a_view_comes_back_as_it_was_drawn(root):
@@ -87,7 +89,7 @@ def test_cameras_as_far_as_no_camera_is_are_rejected(root):
     cameras = json.loads(path.read_text())
     cameras["camera0001"]["K"][0][2] = 2.0**63
     path.write_text(json.dumps(cameras))
-    with refused(FileError, "camera 1"):
+    with refused(FileError, "camera0001"):
         open_captures(root).view(NAME, 1, 2)
 
 
@@ -175,6 +177,7 @@ def test_zip_paths_that_lead_out_are_not_followed(tmp_path):
         ("cameras.json", b"[1, 2]", "not a list of cameras"),
         ("cameras.json", b'{"camera0000": {"K": [[1]]}}', "not a list of cameras"),
         ("cameras.json", b"{}", "contains no camera"),
+        ("cameras.json", REFLECTION, "camera0000: R is not a rotation"),
     ],
 )
 def test_wrong_and_missing_files_are_named(root, file, content, why):
@@ -284,3 +287,18 @@ def test_colour_and_mask_are_those_of_the_files(root):
     rgba = subject.rgba(1, 2)
     assert np.array_equal(rgba[..., :3], subject.picture("img", 1, 2))
     assert np.array_equal(rgba[..., 3], subject.picture("mask", 1, 2))
+
+
+@pytest.mark.parametrize("labels", [(1, 1), (3, 15)])
+@pytest.mark.parametrize("mode", ["L", "P"])
+def test_in_masks_of_labels_the_person_is_what_is_not_0(root, labels, mode):
+    path = root / NAME / "mask/camera0002/0001.png"
+    covered = np.asarray(Image.open(path)) > 127
+    values = np.where(covered, labels[0], 0).astype(np.uint8)
+    values[:, 16:] = np.where(covered[:, 16:], labels[1], 0)
+    image = Image.fromarray(values, mode)
+    if mode == "P":
+        image.putpalette([channel for number in range(16) for channel in (8 * number, 0, 90 * (number > 0))])
+    image.save(path)
+    found = open_captures(root).view(NAME, 1, 2).mask.numpy()
+    assert np.array_equal(found, np.where(covered, 255, 0))

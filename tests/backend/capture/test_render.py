@@ -97,7 +97,7 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
     child = subprocess.Popen([sys.executable, "-c", program])
     began = time.monotonic()
     while not list(job.out.glob("*/img/*/0003.jpg")):
-        assert time.monotonic() - began < 120
+        assert time.monotonic() - began < 300
         assert child.poll() is None
         time.sleep(0.002)
     os.kill(child.pid, signal.SIGKILL)
@@ -125,13 +125,13 @@ def test_workers_end_when_the_command_is_killed(tmp_path):
     line = ["captures", "render", "--people", tmp_path / "people", "--out", tmp_path / "out", "--workers", "2"]
     process = subprocess.Popen([sys.executable, "-m", "primdiffusion.cli", *line], stdout=subprocess.DEVNULL)
     try:
-        assert within(90, lambda: list((tmp_path / "out").glob("*/img/*/*.jpg")))
+        assert within(300, lambda: list((tmp_path / "out").glob("*/img/*/*.jpg")))
         workers = psutil.Process(process.pid).children(recursive=True)
         assert len(workers) >= 2
     finally:
         process.kill()
         process.wait()
-    assert within(10, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
+    assert within(300, lambda: not any(worker.is_running() and worker.status() != "zombie" for worker in workers))
 
 
 def test_files_of_poses_that_cannot_be_read_are_left_out_and_reported(tmp_path, fails):

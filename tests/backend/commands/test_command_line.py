@@ -1,6 +1,7 @@
 """Command lines of declared records: options, help and errors come from the declaration."""
 
 import dataclasses
+import re
 from pathlib import Path
 from typing import Annotated
 
@@ -73,3 +74,4 @@ def test_every_command_has_help(name, capsys):
     with pytest.raises(SystemExit) as end:
         parse(OPTIONS[name], ["--help"], name)
     assert end.value.code == 0
+    assert not re.search(r"\d{12}|\de[+]\d|Posix|Windows(Path|Posix)", capsys.readouterr().out), "limits nobody reaches"

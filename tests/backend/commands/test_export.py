@@ -39,13 +39,15 @@ def test_a_posed_person_becomes_gaussians(saved):
     pose.write_text(str([0.0] * 49 + [-1.2] + [0.0] * 22))
     bent = saved.with_name("b.ply")
     cli.run(["export", str(saved), "--out", str(bent), "--gaussians", "3000", "--pose", str(pose)])
-    assert float(place(person()).position[:, 0].max()) > splatter.read_ply(bent)["x"].max() + 0.05
+    ply = splatter.read_ply(bent)
+    assert float(place(person()).position[:, 0].max()) > ply["x"].max() + 0.05
+    assert ply["y"].min() == pytest.approx(0, abs=0.05), "the soles are on the floor"
 
 
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        (["--out", "anna.stl"], "^out is "),
+        (["--out", "anna.stl"], "^out is 'anna.stl': give"),
         (["--out", "anna.glb", "--pose", "pose.json"], "^pose cannot be stored"),
         (["--out", "anna.ply", "--frame", "2"], "^frame is 2"),
         (["--out", "nowhere/anna.glb"], "there is no folder"),

@@ -38,7 +38,7 @@ def pose():
 @pytest.fixture
 def params(human, pose, tmp_path) -> DrawRequest:
     save_human(tmp_path / "a.human.safetensors", human)
-    camera = framing(place(human, pose), 0.4, WIDTH, HEIGHT)
+    camera = framing(place(human, pose), 23, WIDTH, HEIGHT)
     joints = pose_body(human.betas, pose).skinning[:, :3].tolist()
     return DrawRequest(
         frame=new_frame(tmp_path / "frame", WIDTH, HEIGHT),
@@ -63,7 +63,7 @@ def drawn(params: DrawRequest, drawer: FrameDrawer | None = None, reports: list 
 
 def test_the_frame_holds_the_picture_of_the_placed_person_from_its_bottom_row(human, pose, params):
     primitives = place(human, pose)
-    want = draw(Scene(primitives), framing(primitives, 0.4, WIDTH, HEIGHT), ViewSettings(clip=(0.0, 1e10)))
+    want = draw(Scene(primitives), framing(primitives, 23, WIDTH, HEIGHT), ViewSettings(clip=(0.0, 1e10)))
     assert (want.combined[..., 3] > 0.9).mean() > 0.05
     drawn(params)
     values = np.fromfile(params.frame, np.float32)
@@ -78,7 +78,7 @@ def test_other_betas_draw_the_reshaped_person_whose_boxes_have_grown(human, pose
     joints = pose_body(betas, pose).skinning[:, :3].tolist()
     person = dataclasses.replace(params.people[0], joints=joints, betas=betas.tolist())
     got = drawn(dataclasses.replace(params, people=[person])).combined
-    camera = framing(place(human, pose), 0.4, WIDTH, HEIGHT)
+    camera = framing(place(human, pose), 23, WIDTH, HEIGHT)
     grown, ungrown = (
         draw(Scene(place(one, pose)), camera, ViewSettings(clip=(0.0, 1e10))).combined
         for one in (reshaped(human, betas), dataclasses.replace(human, betas=betas))
@@ -129,7 +129,7 @@ def test_several_people_stand_in_one_picture(human, pose, params):
     two = dataclasses.replace(params, people=[params.people[0], dataclasses.replace(params.people[0], object=beside)])
     first = place(human, pose)
     second = dataclasses.replace(first, position=first.position + torch.tensor([0.3, 0, -0.5]))
-    camera = framing(first, 0.4, WIDTH, HEIGHT)
+    camera = framing(first, 23, WIDTH, HEIGHT)
     want = draw(Scene(Primitives.together([first, second])), camera, ViewSettings())
     alone = draw(Scene(first), camera, ViewSettings())
     assert np.allclose(drawn(two).combined, want.combined, atol=2e-3)

@@ -2,7 +2,6 @@
 
 import dataclasses
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from primdiffusion.commands import generate as generate_module
 from primdiffusion.commands import session
 from primdiffusion.commands.generate import generate
 from primdiffusion.commands.session import Session
-from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
 from primdiffusion.diffusion.model import sample
 from primdiffusion.diffusion.samplers import RELEASED_END
 from primdiffusion.formats.requests import Conditioning, GenerateRequest
@@ -24,7 +23,7 @@ from primdiffusion.human_file import load_human
 from primdiffusion.render.march import RELEASED
 from primdiffusion.render.reference import march_reference
 from support.runs import ended_at_each_report
-from tiny_model import save_tiny_checkpoint
+from tiny_model import model_of_two_kinds, save_tiny_checkpoint
 
 
 @pytest.fixture
@@ -102,7 +101,7 @@ def test_released_compositing_keeps_the_noise_of_ddims_last_level_and_encodes_pr
     assert found["released"].provenance["end"] == 0
     assert "end" not in found["linear"].provenance
     primitives = place(found["released"]).to(dtype=torch.float64)
-    for name, yaw in (("front", 0.0), ("side", math.pi / 2)):
+    for name, yaw in (("front", 0), ("side", 90)):
         camera = framing(place(found["released"]), yaw, 24, 24).to(dtype=torch.float64)
         camera.intrinsics[:2, 2] += 0.5  # rays through corners of pixels
         encoded = dataclasses.replace(primitives, rgb=encode_srgb(primitives.rgb))
@@ -131,3 +130,19 @@ def test_released_compositing_changes_no_other_sampler(checkpoint, tmp_path):
 def test_only_ddim_ends_above_the_clean_sample(checkpoint):
     with pytest.raises(ValueError, match="dpmpp_2m ends at the clean sample"):
         generate_human(load_checkpoint(checkpoint), 1, 2, "dpmpp_2m", end=RELEASED_END)
+
+
+def test_what_a_human_does_not_show_is_in_the_answer_and_on_stderr(tmp_path, capsys, only_sampling):
+    path = tmp_path / "two_kinds.safetensors"
+    save_checkpoint(path, model_of_two_kinds(), "linear")
+    asked = {"sex": "female", "outfit": "suit"}
+    request = GenerateRequest(seed=1, out_dir=tmp_path / "out", steps=2, checkpoint=path, attributes=asked)
+    (warning,) = generate(request, Session(), lambda *_, **__: None).warnings
+    assert "instead" in warning
+    words = ["--seed", "1", "--count", "2", "--steps", "2", "--checkpoint", str(path), "--out", str(tmp_path / "two")]
+    cli.main(["generate", *words, "--attributes", "sex=female", "outfit=suit"])
+    said = capsys.readouterr().err
+    assert f"primdiffusion: warning: seed 1: {warning}\n" in said
+    assert "primdiffusion: warning: seed 2: the human does not show" in said
+    cli.main(["generate", *words, "--attributes", "outfit=suit"])
+    assert "warning" not in capsys.readouterr().err

@@ -9,12 +9,13 @@ from PIL import Image
 from primdiffusion.commands.generate import variations
 from primdiffusion.commands.output import PreviewBudget
 from primdiffusion.commands.session import Session
-from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.checkpoint import load_checkpoint, save_checkpoint
 from primdiffusion.editing.vary import vary
 from primdiffusion.formats.requests import VariationsRequest
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from support.runs import ended_at_each_report
+from tiny_model import model_of_two_kinds
 
 
 @pytest.fixture
@@ -87,3 +88,17 @@ def test_variants_of_a_person_are_those_that_vary_makes(checkpoint, model, tmp_p
 def test_it_can_be_ended_at_every_report_and_then_leaves_nothing(checkpoint, tmp_path):
     request = VariationsRequest(seeds=[1, 2], out_dir=tmp_path / "out", steps=2, checkpoint=checkpoint, size=16)
     ended_at_each_report(lambda report: variations(request, Session(), report), tmp_path / "out")
+
+
+@pytest.mark.parametrize("around", [False, True])
+def test_humans_that_do_not_show_what_was_asked_for_are_named(tmp_path, around):
+    model, path, person = model_of_two_kinds(), tmp_path / "two.safetensors", tmp_path / "a.human.safetensors"
+    save_checkpoint(path, model, "linear")
+    save_human(person, generate(model, 3, 2, attributes={"sex": "female"}))
+    asked = {"sex": "male", "outfit": "jeans"}
+    of_whom = {"person": person, "amount": 0.05} if around else {}
+    request = VariationsRequest(
+        seeds=[5, 6], out_dir=tmp_path / "out", steps=2, size=16, checkpoint=path, attributes=asked, **of_whom
+    )
+    warnings = variations(request, Session(), Listener()).warnings
+    assert [warning.partition(": the human does not show ")[0] for warning in warnings] == ["seed 5", "seed 6"]

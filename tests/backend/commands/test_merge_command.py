@@ -43,6 +43,7 @@ def test_several_stand_side_by_side(saved, tmp_path):
     cli.run(["merge", str(saved), "--out", str(tmp_path / "one.npz"), *COARSE])
     one, two = (grid_of(tmp_path / f"{name}.npz") for name in ("one", "two"))
     assert (two["density"].shape[0] - one["density"].shape[0]) * 0.03 == pytest.approx(3, abs=0.07)
+    assert two["origin"][2] == pytest.approx(0, abs=0.2), "the soles are on the floor"
     middles = [float(grid["origin"][0] + 0.03 * (grid["density"].shape[0] - 1) / 2) for grid in (one, two)]
     assert middles[1] == pytest.approx(middles[0], abs=0.07), "around the place of one"
     masses = [grid["density"].sum(dtype=np.float64) for grid in (one, two)]

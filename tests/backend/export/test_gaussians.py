@@ -44,7 +44,7 @@ def test_splatted_they_look_like_the_marched_person(tmp_path, bent):
     theta[1, 0] = -bent
     primitives = place(person(), BodyPose.from_axis_angle(theta.flatten()))
     write_gaussians(tmp_path / "p.ply", gaussians_of(primitives))
-    camera = framing(primitives, 0.5, 288, 288)
+    camera = framing(primitives, 29, 288, 288)
     mine, alpha = drawn(splatter.read_ply(tmp_path / "p.ply"), camera)
     truth, opacity = marched(primitives, camera)
     somebody = (alpha > 0.5) | (opacity > 0.5)

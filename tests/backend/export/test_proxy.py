@@ -63,7 +63,7 @@ def test_each_leg_follows_itself_though_boxes_of_the_other_reach_it():
 
 def test_rays_inwards_see_what_the_marcher_draws():
     primitives = place(person())
-    camera = framing(primitives, 0.4, 48, 48)
+    camera = framing(primitives, 23, 48, 48)
     drawn = march(primitives, camera, MarchSettings(step=0.001))
     full = drawn.alpha.reshape(-1) > 0.99
     origin, directions = camera.rays()
@@ -82,7 +82,7 @@ def test_posed_it_looks_like_the_marched_person(raised):
     pose = BodyPose.from_axis_angle(theta.flatten())
     primitives = place(person(), pose)
     skinning = pose_body(person().betas, pose).skinning.double().numpy()
-    camera = framing(primitives, 0.3, 160, 160)
+    camera = framing(primitives, 17, 160, 160)
     marched, drawn = march(primitives, camera), rasterise(proxy().mesh().posed(skinning), camera, 2)
     there, covered = marched.alpha.numpy() > 0.5, drawn.alpha > 0.5
     assert (there & covered).sum() / (there | covered).sum() > 0.93
@@ -100,7 +100,8 @@ def test_glb_is_read_by_trimesh_with_texture_and_the_same_surface(tmp_path):
     scene = trimesh.load(tmp_path / "p.glb")
     mesh = scene.geometry["person"]
     assert len(mesh.faces) == len(proxy().faces)
-    np.testing.assert_allclose(mesh.bounds, [proxy().vertices.min(0), proxy().vertices.max(0)], atol=1e-6)
+    standing = proxy().on_floor().vertices
+    np.testing.assert_allclose(mesh.bounds, [standing.min(0), standing.max(0)], atol=1e-6)
     assert mesh.visual.material.baseColorTexture.size == (256, 256)
     assert list(tmp_path.iterdir()) == [tmp_path / "p.glb"]
 
@@ -110,6 +111,27 @@ def test_obj_has_material_and_texture_beside_it(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"eine Frau ä.obj", "eine Frau ä.mtl", "eine Frau ä.png"}
     mesh = trimesh.load(tmp_path / "eine Frau ä.obj", process=False)
     assert len(mesh.faces) == len(proxy().faces)
+
+
+@pytest.mark.parametrize("ending", [".glb", ".obj"])
+def test_files_for_other_programs_have_the_soles_at_0(tmp_path, ending):
+    path = tmp_path / f"p{ending}"
+    if ending == ".glb":
+        write_proxy_glb(path, proxy(), {})
+    else:
+        write_proxy_obj(path, proxy())
+    low, high = trimesh.load(path, force="mesh", process=False).bounds[:, 1]
+    assert low == pytest.approx(0, abs=0.05)  # the surface is off the body's by clothes and voxels
+    assert 1.5 < high < 2.0
+    body = default_body().shape(torch.as_tensor(person().betas)).vertices[:, 1]
+    assert low == pytest.approx(proxy().vertices[:, 1].min() - float(body.min()), abs=1e-5)
+
+
+def test_the_skeleton_stands_where_its_mesh_does(tmp_path):
+    there, standing = proxy(), proxy().on_floor()
+    moved = standing.vertices - there.vertices
+    assert np.abs(moved - moved[0]).max() < 1e-12
+    np.testing.assert_allclose(standing.skeleton.positions - there.skeleton.positions, np.tile(moved[0], (24, 1)))
 
 
 def test_arrays_for_blender_are_plain_and_complete(tmp_path):

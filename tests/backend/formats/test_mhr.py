@@ -1,5 +1,7 @@
 """Poses of SAM 3D Body, on MHR's rig."""
 
+import json
+
 import numpy as np
 import pytest
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -79,7 +81,9 @@ def test_parameters_without_joints_are_refused_with_what_to_save(tmp_path, key):
             read_motion(write_mhr(tmp_path / f"a.{ending}", arrays))
 
 
-def test_several_humans_are_one_too_many(tmp_path):
-    (tmp_path / "a.json").write_text('[{"pred_cam_t": [0, 0, 1]}, {"pred_cam_t": [0, 0, 1]}]')
-    with refused(FileError, "a.json", "2 humans"):
-        read_motion(tmp_path / "a.json")
+def test_of_several_humans_one_is_chosen(tmp_path):
+    people = [{key: array.tolist() for key, array in mhr_arrays(THETA, MOVE + n).items()} for n in (0, 1)]
+    (tmp_path / "a.json").write_text(json.dumps(people))
+    motion = read_motion(tmp_path / "a.json", person="1")
+    assert motion.detected.people == ("0", "1")
+    np.testing.assert_allclose(motion.translations, MOVE + 1, atol=1e-3)

@@ -126,6 +126,24 @@ def test_the_sentence_says_what_to_give():
         read(REQUESTS["generate"], {"seed": 1, "out_dir": "x", "steps": 0})
 
 
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        ({"picture": Path("x/a.gif")}, "picture is 'x/a.gif': give"),
+        ({"pose": Path("x" * 40_000)}, "pose is 'xxx"),
+        ({"sizes": (Path("a"), 2)}, "sizes[0] is 'a': give"),
+        ({"cameras": (Path("a"),)}, "cameras[0] is 'a': give"),
+        ({"seeds": (Path("a"),) * 4}, "seeds is ['a', 'a', 'a', 'a']: give"),
+        ({"first": 2**64}, "give an integer from -2^63 + 1 to 2^63 - 1"),
+        ({"count": 0}, "give an integer from 1 to 1000"),
+    ],
+)
+def test_paths_and_limits_are_written_as_people_write_them(value, shown):
+    with pytest.raises(FieldError) as error:
+        read(Settings, {"count": 1, **value})
+    assert str(error.value).startswith(shown) or str(error.value).endswith(shown)
+
+
 def test_limits_themselves_are_allowed():
     for count in (1, 1000):
         assert read(Settings, {"count": count}).count == count

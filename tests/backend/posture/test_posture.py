@@ -52,7 +52,8 @@ def a_posture(count: int = 1, size: int = 64) -> Posture:
     pose, betas = standing(count, 50.0), torch.linspace(-0.3, 0.3, 10)
     posture = Posture(pose, betas, None)
     cameras = [
-        framing(Primitives.place(frames, PAYLOAD), 0.2 * i, size, size) for i, frames in enumerate(posture.frames())
+        framing(Primitives.place(frames, PAYLOAD), math.degrees(0.2) * i, size, size)
+        for i, frames in enumerate(posture.frames())
     ]
     return dataclasses.replace(posture, camera=stack(cameras))
 
@@ -135,7 +136,7 @@ def test_a_framed_body_covers_the_mask_and_cameras_of_windows_are_those_of_pictu
 
 def test_a_posture_before_another_camera_looks_the_same():
     posture = a_posture()
-    turned = framing(Primitives.place(posture.frames()[0], PAYLOAD), 1.9, 64, 64)
+    turned = framing(Primitives.place(posture.frames()[0], PAYLOAD), 109, 64, 64)
     other = dataclasses.replace(posture.camera, world_to_camera=turned.world_to_camera[None])
     moved = before_cameras(posture, other)
     assert torch.allclose(joints_px(moved), joints_px(posture), atol=1e-2)

@@ -113,7 +113,7 @@ def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_
     human = dataclasses.replace(human, payload=payload)
     save_human(tmp_path / "a.human.safetensors", human)
     primitives, still = place(human), torch.eye(3, 4).tolist()
-    camera = framing(primitives, 0.4, 40, 56)
+    camera = framing(primitives, 23, 40, 56)
     for view, chart in (("colour", None), ("boxes", human.body_setup.anchors.chart)):
         np.full(40 * 56 * 5, np.nan, np.float32).tofile(tmp_path / "frame")
         params = DrawRequest(

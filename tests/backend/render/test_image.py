@@ -8,7 +8,8 @@ import torch
 from PIL import Image
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.render.compositing import Rendering
-from primdiffusion.render.image import depth_to_png, to_png
+from primdiffusion.render.image import depth_to_png
+from support.errors import refused
 
 KNOWN = {0.0: 0.0, 0.0031308: 0.04044994, 0.2140411: 0.5, 0.5: 0.7353570, 1.0: 1.0}
 
@@ -48,9 +49,9 @@ def test_gradients_are_finite_at_black():
         assert torch.autograd.gradcheck(convert, linear)
 
 
-def test_a_transparent_picture_holds_straight_colour(tmp_path):
+def test_a_saved_rendering_holds_straight_colour_and_alpha(tmp_path):
     """Half covered by linear 0.8 red: premultiplied 0.4; the file must say 0.8 encoded, and alpha 128."""
-    to_png(tmp_path / "a.png", rendering((0.4, 0.0, 0.1), 0.5), background=None)
+    rendering((0.4, 0.0, 0.1), 0.5).save(tmp_path / "a.png")
     got = pixels(tmp_path / "a.png")
     assert got.shape == (1, 2, 4)
     assert got[0, 0].tolist() == [round(255 * 0.9063317), 0, round(255 * 0.4845292), 128]
@@ -58,18 +59,19 @@ def test_a_transparent_picture_holds_straight_colour(tmp_path):
 
 
 def test_over_a_background_colours_mix_in_linear_light(tmp_path):
-    to_png(tmp_path / "a.png", rendering((0.25, 0.0, 0.0), 0.5), background=(0.5, 1.0, 0.0))
+    rendering((0.25, 0.0, 0.0), 0.5).save(tmp_path / "a.png", background=(0.5, 1.0, 0.0))
     assert pixels(tmp_path / "a.png")[0].tolist() == [[188, 188, 0], [188, 255, 0]]
 
 
-def test_the_default_background_is_black(tmp_path):
-    to_png(tmp_path / "a.png", rendering((0.25, 0.0, 0.0), 0.5))
-    assert pixels(tmp_path / "a.png")[0].tolist() == [[137, 0, 0], [0, 0, 0]]
+def test_a_name_of_another_format_is_refused_and_nothing_written(tmp_path):
+    with refused(ValueError, "a.jpg does not end in .png"):
+        rendering((0.25, 0.0, 0.0), 0.5).save(tmp_path / "a.jpg")
+    assert not list(tmp_path.iterdir())
 
 
 def test_written_pictures_can_be_read_by_others(tmp_path):
     """Temporary files are private by default; the finished picture must have the usual permissions."""
-    to_png(tmp_path / "a.png", rendering((0.25, 0.0, 0.0), 0.5))
+    rendering((0.25, 0.0, 0.0), 0.5).save(tmp_path / "a.png")
     (tmp_path / "b").touch()
     assert (tmp_path / "a.png").stat().st_mode == (tmp_path / "b").stat().st_mode
 
@@ -77,8 +79,8 @@ def test_written_pictures_can_be_read_by_others(tmp_path):
 def test_depth_is_brighter_where_nearer_and_black_where_empty(tmp_path):
     alpha = torch.tensor([[1.0, 1.0, 1.0, 0.0]])
     depth = torch.tensor([[1.0, 2.0, 3.0, math.inf]])
-    depth_to_png(tmp_path / "d.png", Rendering(torch.zeros(1, 4, 3), alpha, depth, depth))
+    depth_to_png(tmp_path / "d.png", depth, alpha)
     near, middle, far, nothing = pixels(tmp_path / "d.png")[0].astype(int).sum(-1)
     assert near > middle > far > nothing == 0
-    depth_to_png(tmp_path / "d.png", Rendering(torch.zeros(1, 4, 3), 0 * alpha, torch.full((1, 4), math.inf), depth))
+    depth_to_png(tmp_path / "d.png", torch.full((1, 4), math.inf), 0 * alpha)
     assert pixels(tmp_path / "d.png").max() == 0

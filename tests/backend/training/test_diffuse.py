@@ -194,7 +194,7 @@ def test_a_checkpoint_of_other_slabs_or_densities_is_no_start(people, few, paper
 def test_a_kill_in_the_middle_of_a_save_loses_one_interval(people, whole, run):
     died = subprocess.run(
         [sys.executable, "-c", DIES_IN_THE_FIFTH_SAVE, str(people), str(run)],
-        env=child_environment(), capture_output=True, timeout=300, check=False,
+        env=child_environment(), capture_output=True, timeout=500, check=False,
     )  # fmt: skip
     assert died.returncode == -signal.SIGKILL
     assert logged(run) == [("person", step) for step in range(1, 6)]

@@ -33,7 +33,7 @@ def launched(*words: str) -> subprocess.CompletedProcess:
         env=child_environment(),
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=500,
         check=False,
     )
 

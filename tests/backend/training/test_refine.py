@@ -28,7 +28,7 @@ from support.errors import refused
 
 QUICK = DescentSettings(steps=15, views=1, density_rate=0.01)
 """So few steps on so few pixels of random boxes: density, which is right at the start, must not run ahead of colour."""
-FRONT, SIDE, BACK = 0.0, math.pi / 2, math.pi
+FRONT, SIDE, BACK = 0.0, 90.0, 180.0
 
 
 def person(seed: int) -> Human:
@@ -57,12 +57,12 @@ def views_of(human: Human, yaws=(FRONT, SIDE, BACK), turn: float = 0.0, size: in
 @pytest.fixture(scope="module")
 def views() -> list[Views]:
     wanted = person(1)
-    return [views_of(wanted), views_of(wanted, (0.5,), turn=-0.8)]
+    return [views_of(wanted), views_of(wanted, (29,), turn=-0.8)]
 
 
 def test_a_person_comes_to_look_like_the_pictures_and_like_those_it_was_not_shown(views):
     start = person(2)
-    unseen = [views_of(person(1), (FRONT + 0.2, BACK + 0.2), turn=-0.4)]
+    unseen = [views_of(person(1), (FRONT + 11, BACK + 11), turn=-0.4)]
     before = float(view_psnr(start, unseen).mean())
     refined = refine(start, views, QUICK)
     assert refined.steps == 15

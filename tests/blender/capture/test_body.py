@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
-from blender_primdiffusion.capture.body import read_body
+from blender_primdiffusion.capture.body import fit_joints, read_body
 
 pytestmark = pytest.mark.any_blender
 
@@ -103,3 +104,25 @@ def test_a_body_of_another_form_is_named(tmp_path, change, name):
 def test_a_missing_body_is_named(tmp_path):
     with refused(FileError):
         read_body(tmp_path / "none.npz")
+
+
+def rig_of(body, betas, off: float, seed: int = 0) -> dict[str, np.ndarray]:
+    """Joints of a rig whose bones begin about `off` metres from the joints of the body."""
+    joints = body.rest(betas)[1]
+    return dict(zip(JOINT_NAMES, joints + np.random.default_rng(seed).normal(0, off, joints.shape), strict=True))
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("off", [0.0, 0.02, 0.04, 0.06])
+def test_a_rig_of_the_size_of_a_body_keeps_its_size_however_badly_it_fits(body, seed, off):
+    fit = fit_joints(body, rig_of(body, np.random.default_rng(seed + 9).normal(size=10), off, seed))
+    assert fit.scale == 1.0
+    assert np.abs(fit.betas).max() <= 4.0
+
+
+@pytest.mark.parametrize(("size", "scale"), [(0.6, 1.25), (1.6, 0.8)])
+def test_children_and_giants_are_brought_nearer_to_the_sizes_of_the_body(body, size, scale):
+    joints = {name: size * place for name, place in rig_of(body, np.zeros(10), 0.0).items()}
+    fit = fit_joints(body, joints)
+    assert abs(fit.scale - scale) < 0.15
+    assert np.abs(fit.betas).max() <= 4.0

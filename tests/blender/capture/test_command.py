@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import io
+import json
 
+import numpy as np
 import pytest
 from blender_primdiffusion.formats.camera_rig import Rig
+from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.capture import command
@@ -79,6 +82,15 @@ def test_each_option_reaches_its_setting(tmp_path):
         tmp_path, rig=rig, pose_count=3, samples=7, together=2, light="dome", shadows=True, float_depth=True,
         denoise=True,
     )  # fmt: skip
+
+
+def test_a_camera_file_with_a_reflection_is_refused_and_its_camera_named(tmp_path):
+    path = tmp_path / "cameras.json"
+    cameras = {f"camera000{i}": {"K": np.eye(3).tolist(), "R": np.eye(3).tolist(), "T": [0, 0, 3]} for i in range(2)}
+    cameras["camera0001"]["R"] = np.diag([-1.0, 1, 1]).tolist()
+    path.write_text(json.dumps(cameras))
+    with refused(FileError, str(path), "camera0001", "rotation"):
+        settings_of(parse(["--out", str(tmp_path), "--camera-file", str(path)]))
 
 
 @pytest.mark.parametrize("seed", ["-1", str(2**63)])

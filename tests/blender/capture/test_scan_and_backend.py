@@ -7,14 +7,26 @@ import pytest
 
 pytest.importorskip("torch", reason="the backend has another Python than this Blender")
 
+import bpy
+import scan_fixtures
 import torch
 from blender_primdiffusion.formats.camera_rig import Rig, bounding_sphere
-from loaded_scans import load, own_person
+from capture_child import small
+from capture_person import two_poses
+from loaded_scans import BETAS, BODY, load, own_person
+from mathutils import Vector
 from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.coco import FACE, keypoints_of
+from primdiffusion.capture.conditioning import default_betas
 from primdiffusion.capture.people_files import read_person
+from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import set_up_capture
+from primdiffusion.capture.sheet import joints_of
 from primdiffusion.formats import camera_rig as backend_rig
 
+from blender_primdiffusion.capture.job import run
+from blender_primdiffusion.capture.scan import find_scans, load_scan
+from blender_primdiffusion.console import Report
 from blender_primdiffusion.motion.poses import built_in_poses
 
 pytestmark = pytest.mark.any_blender
@@ -35,3 +47,21 @@ def test_both_programs_put_cameras_and_joints_in_the_same_places(tmp_path, empty
         np.testing.assert_allclose(ours.rotation, other.rotation, atol=1e-9)
         np.testing.assert_allclose(ours.translation, other.translation, atol=1e-5)
         np.testing.assert_allclose(ours.project(joints)[0], other.project(theirs.joints)[0], atol=1e-3)
+
+
+def test_a_rig_with_other_spines_is_captured_for_the_encoder_and_has_a_face(tmp_path, empty_scene):
+    _, armature = scan_fixtures.person(BODY, BETAS, None, scan_fixtures.MIXAMO)
+    bpy.context.view_layer.objects.active = armature
+    bpy.ops.object.mode_set(mode="EDIT")
+    for bone in ("Spine", "Spine1", "Spine2", "Neck"):
+        armature.data.edit_bones[f"mixamorig:{bone}"].translate(Vector((0, 0.03, 0.12)))
+    bpy.ops.object.mode_set(mode="OBJECT")
+    path = scan_fixtures.save(tmp_path / "people" / "anna.glb")
+    report = Report()
+    for _ in run(bpy.context, small(tmp_path / "out"), find_scans(path), report, poses=two_poses(), load=load_scan):
+        pass
+    assert report.failed == []
+    anna = open_captures(tmp_path / "out").subject("anna")
+    assert np.abs(default_betas(anna).numpy()).max() <= 4
+    face, joints = keypoints_of(anna)[:, : len(FACE)], joints_of(anna)
+    assert np.linalg.norm(face - joints[:, None, 15], axis=-1).max() < 0.2

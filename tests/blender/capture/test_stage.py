@@ -239,6 +239,22 @@ def test_a_users_camera_and_ours_see_the_same(empty_scene):
     assert np.allclose(view.project(point)[0], (x * 80, (1 - y) * 50), atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("own", "parents"),
+    [((-1, -1, -1), (1, 1, 1)), ((-1, 1, 1), (1, 1, 1)), ((1, 1, 1), (1, 1, 3)), ((0, 1, 1), (1, 1, 1))],
+)
+def test_cameras_whose_picture_is_no_view_of_a_camera_are_refused(empty_scene, own, parents):
+    """Mirrored by a negative scale, or sheared by a parent that is scaled unevenly."""
+    camera = bpy.data.objects.new("mine", bpy.data.cameras.new("mine"))
+    parent = bpy.data.objects.new("dolly", None)
+    for obj in (camera, parent):
+        empty_scene.scene.collection.objects.link(obj)
+    camera.parent, camera.rotation_euler, camera.scale, parent.scale = parent, (0.4, 0.3, 0.2), own, parents
+    bpy.context.view_layer.update()
+    with refused(ValueError, "'mine'", "scale"):
+        view_of(camera, empty_scene.evaluated_depsgraph_get(), (80, 50))
+
+
 def test_cameras_inside_are_found_and_those_between_the_legs_are_not(stage):
     person = put(stage, frame=0)
     places = [(0.0, 0.0, 0.0), (0.0, -0.9, 0.0), (0.0, 0.0, 3.0), (0.35, 0.26, 0.02), (0.4, -0.2, 0.0)]

@@ -222,7 +222,7 @@ def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage,
     monkeypatch.setattr(studio, "IDLE_S", 0.3)
     render()
     pid = studio.drawing_child().pid
-    end = time.monotonic() + 5
+    end = time.monotonic() + 300
     while studio.drawing_child().pid is not None and time.monotonic() < end:
         studio.advance()  # a timer does
         time.sleep(0.05)
@@ -254,9 +254,9 @@ if sys.argv[2] == "killed":
 def test_ending_blender_during_a_picture_leaves_no_process_and_no_memory(how):
     command = [sys.executable, "-c", EXIT_WHILE_DRAWING, str(FAKE_CHILD), how]
     root, environment = Path(__file__).parents[3], {**os.environ, "FAKE_STEP_S": "1.0"}
-    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=500, check=False)
     pid, folder = done.stdout.strip().splitlines()[-1].split()
-    end = time.monotonic() + 8
+    end = time.monotonic() + 300
     while Path(f"/proc/{pid}").exists() and time.monotonic() < end:
         time.sleep(0.05)
     assert not Path(f"/proc/{pid}").exists()

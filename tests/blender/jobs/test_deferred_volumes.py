@@ -193,7 +193,7 @@ def test_several_humans_are_written_one_after_another(hidden):
     people = [generated(seed) for seed in (11, 12)]
     began = time.monotonic()
     while deferred_volumes.work(0.0):
-        assert time.monotonic() - began < 60
+        assert time.monotonic() - began < 300
     for person in people:
         check_complete(person)
 

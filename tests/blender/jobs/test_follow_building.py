@@ -36,7 +36,7 @@ def on_their_way(addon, tmp_path, monkeypatch):
     return addon
 
 
-def until(true, seconds: float = 30.0) -> None:
+def until(true, seconds: float = 300.0) -> None:
     end = time.monotonic() + seconds
     while not true():
         assert time.monotonic() < end

@@ -57,7 +57,7 @@ def vary(person, seed: int = FINE) -> None:
     queue.add(bpy.context, VaryJob.of(person, {"steps": 2, "amount": 0.5, "seed": seed}))
 
 
-def until_written(seconds: float = 30.0) -> None:
+def until_written(seconds: float = 300.0) -> None:
     """Until the volumes are written, which the scene does not show yet."""
     end = time.monotonic() + seconds
     while building._preparing is None or not building._preparing.over:

@@ -45,6 +45,13 @@ def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes
     assert set(queue.last.seconds) == {"work", "finish"}
 
 
+def test_what_the_human_does_not_show_is_said(addon):
+    bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="hat=fedora")
+    assert "The human does not show hat." in " ".join(panel_texts(addon))
+    bpy.ops.primdiffusion.generate(seed=8, steps=1, attributes="outfit=suit")
+    assert "not show" not in " ".join(panel_texts(addon))
+
+
 def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
     asked = []
     monkeypatch.setattr(generate, "bring_into_view", lambda *given: asked.append(given))

@@ -28,7 +28,7 @@ def started_and_idle() -> int:
     return queue.child_pid
 
 
-def ended(pid: int, seconds: float = 3.0) -> bool:
+def ended(pid: int, seconds: float = 300.0) -> bool:
     end = time.monotonic() + seconds
     while time.monotonic() < end:
         queue.listen()  # as a timer does

@@ -18,7 +18,7 @@ from blender_primdiffusion.scene.human import humans
 
 def until_ready() -> None:
     """Until the child's result is there, and built but for the step into the scene."""
-    end = time.monotonic() + 60
+    end = time.monotonic() + 300
     while not queue.ready:
         assert time.monotonic() < end
         queue.tick()

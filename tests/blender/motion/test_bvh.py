@@ -11,10 +11,12 @@ import scan_fixtures
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.bvh import parse_bvh
 from blender_primdiffusion.formats.poses.files import read_motion
-from blender_primdiffusion.formats.poses.rotation import about_axis, to_axis_angle
+from blender_primdiffusion.formats.poses.rigs import map_bones
+from blender_primdiffusion.formats.poses.rotation import about_axis, axis_direction, between, to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joint_positions
 from blender_primdiffusion.formats.regular_files import FileError
-from bvh_files import FRAMES, motion_of, write_bvh
+from bvh_files import FRAMES, along_x, motion_of, write_bvh
+from support.errors import refused
 
 from blender_primdiffusion.scene.armature import build_armature, keyframe_poses
 from blender_primdiffusion.scene.convention import points_to_blender
@@ -31,18 +33,104 @@ def test_euler_channels_are_read_in_the_order_they_are_written(tmp_path):
     np.testing.assert_allclose(hierarchy.rest()[index], REST_JOINTS, atol=1e-6)
 
 
-@pytest.mark.parametrize("rig", ["MIXAMO", "UNREAL", "RIGIFY", "RENDERPEOPLE", "OWN"])
+RIGS = ["MIXAMO", "RPM", "UNREAL", "RIGIFY", "RENDERPEOPLE", "SOMA", "VROID", "MOCAPNET", "ROKOKO", "OWN"]
+
+
+@pytest.mark.parametrize("rig", RIGS)
 @pytest.mark.parametrize("unit", [1.0, 100.0])
 def test_a_rig_at_smpls_rest_gives_smpls_rotations(tmp_path, rig, unit):
     rotations, moves = motion_of()
+    names = getattr(scan_fixtures, rig)
+    found = map_bones(names.values())
+    rotations[:, [joint for joint, name in enumerate(JOINT_NAMES) if name not in found.joints]] = np.eye(3)
     rotations[:, [JOINT_NAMES.index("left_hand"), JOINT_NAMES.index("right_hand")]] = np.eye(3)
     root = (REST_JOINTS[0] + moves) * unit
-    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS * unit, rotations, root, getattr(scan_fixtures, rig))
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS * unit, rotations, root, names)
     motion = read_motion(path)
     np.testing.assert_allclose(motion.rotations, rotations, atol=1e-6)
     np.testing.assert_allclose(motion.translations, moves, atol=1e-5)
     assert motion.fps == pytest.approx(120, abs=0.01)
     assert any(("metres" if unit == 1 else "centimetres") in note for note in motion.notes)
+    assert motion.detected.doubt == ""
+
+
+def standing_first(spread: float = 0.5) -> np.ndarray:
+    """A motion of people who bend and turn, whose third frame is close to the T pose."""
+    rotations, _ = motion_of(spread, 4)
+    rotations[2] = np.eye(3)
+    return rotations
+
+
+def test_bones_along_one_axis_at_rest_still_give_a_standing_person_and_a_note(tmp_path):
+    rotations, root = standing_first(), np.tile(REST_JOINTS[0], (FRAMES, 1))
+    rotations[:, 22:] = np.eye(3)
+    path = write_bvh(tmp_path / "m.bvh", *along_x(REST_JOINTS, rotations), root, scan_fixtures.ROKOKO)
+    motion = read_motion(path)
+    assert np.abs(motion.joints() - joint_positions(rotations)).max() < 0.005
+    assert motion.detected.up == "y"
+    assert any("frame 3, in which one stands" in note for note in motion.notes)
+
+
+@pytest.mark.parametrize("up", ["y", "z", "-y", "x"])
+def test_the_up_axis_of_such_a_file_is_that_along_which_the_person_stands(tmp_path, up):
+    turn = between(np.array([0.0, 1, 0]), axis_direction(up))
+    rotations, root = standing_first(), np.tile(REST_JOINTS[0], (FRAMES, 1))
+    rotations[:, 22:] = np.eye(3)
+    flat, turned = along_x(REST_JOINTS, rotations)
+    turned[:, 0] = turn @ turned[:, 0]
+    motion = read_motion(write_bvh(tmp_path / "m.bvh", flat, turned, root @ turn.T, scan_fixtures.ROKOKO))
+    places = motion.joints() - motion.joints()[:, :1]
+    height = joint_positions(rotations)[..., 1] - joint_positions(rotations)[:, :1, 1]
+    assert motion.detected.up == up
+    assert np.abs(places[..., 1] - height).max() < 0.005
+
+
+def test_a_rest_of_bones_along_one_axis_whose_person_never_stands_is_an_error(tmp_path):
+    rotations = np.tile(np.eye(3), (FRAMES, 24, 1, 1))
+    rotations[:, [JOINT_NAMES.index("left_hip"), JOINT_NAMES.index("right_hip")]] = about_axis(0, -1.7)
+    root = np.tile(REST_JOINTS[0], (FRAMES, 1))
+    path = write_bvh(tmp_path / "m.bvh", *along_x(REST_JOINTS, rotations), root, scan_fixtures.ROKOKO)
+    with refused(FileError, "m.bvh", "no frame in which one stands"):
+        read_motion(path)
+
+
+def test_who_stands_in_no_frame_is_read_with_a_note_and_by_hand_as_told(tmp_path):
+    rotations, moves = motion_of(0.05)
+    rotations[:, [JOINT_NAMES.index("left_hip"), JOINT_NAMES.index("right_hip")]] = about_axis(0, -2.0)
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, REST_JOINTS[0] + moves, scan_fixtures.MIXAMO)
+    found = read_motion(path)
+    assert any("stands in no frame" in note for note in found.notes)
+    by_hand = read_motion(path, up="z")
+    assert by_hand.detected.up == "z"
+    np.testing.assert_allclose(by_hand.rotations[:, 0], about_axis(0, -np.pi / 2) @ rotations[:, 0], atol=1e-6)
+    assert not any("stands in no frame" in note for note in by_hand.notes)
+
+
+def test_an_axis_set_by_hand_holds_for_a_rest_that_faces_between_two_axes(tmp_path):
+    turn = about_axis(1, 0.7)
+    rotations, moves = motion_of()
+    rotations[:, 22:] = np.eye(3)
+    root = (REST_JOINTS[0] + moves) @ turn.T
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS @ turn.T, turn @ rotations @ turn.T, root, scan_fixtures.MIXAMO)
+    upright, lying = read_motion(path, up="y"), read_motion(path, up="x")
+    np.testing.assert_allclose(upright.rotations, rotations, atol=1e-3)
+    x_in_person = turn.T @ np.array([1.0, 0, 0])
+    heights = (joint_positions(rotations) - joint_positions(rotations)[:, :1]) @ x_in_person
+    assert np.abs((lying.joints() - lying.joints()[:, :1])[..., 1] - heights).max() < 0.005
+
+
+def test_who_lies_down_for_most_of_a_motion_does_not_turn_the_world(tmp_path):
+    rotations = np.tile(np.eye(3), (FRAMES, 24, 1, 1))
+    rotations[2:, 0] = about_axis(0, -1.5)
+    root = np.tile(REST_JOINTS[0], (FRAMES, 1))
+    path = write_bvh(tmp_path / "m.bvh", REST_JOINTS, rotations, root, scan_fixtures.MIXAMO)
+    assert read_motion(path).detected.up == "y"
+
+
+def test_missing_joints_and_bones_are_listed_by_whole_words():
+    bones = [f"a_bone_with_a_long_name_{number}" for number in range(30)]
+    with refused(ValueError, "'pelvis', 'left_hip', 'right_hip'", "and 10 more", repr(bones[0]), "and 29 more"):
+        map_bones(bones)
 
 
 def test_a_rig_at_an_a_rest_puts_the_joints_where_the_file_has_them(tmp_path):

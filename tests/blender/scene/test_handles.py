@@ -175,6 +175,21 @@ def test_a_walk_stays_the_same_with_handles_and_after_baking(armature):
     assert len(paths) == 25, "24 rotations and the pelvis' location"
 
 
+def test_handles_of_scaled_bones_turn_as_the_bones_do(armature):
+    frames = walking(armature)
+    armature.pose.bones["left_wrist"].scale = (2, 2, 2)
+    before = [{name: unscaled(matrix) for name, matrix in shown.items()} for shown in each(armature, frames)]
+    add_handles(bpy.context, armature)
+    after = [{name: unscaled(matrix) for name, matrix in shown.items()} for shown in each(armature, frames)]
+    for expected, seen in zip(before, after, strict=True):
+        assert distances(expected, seen, ["left_wrist"])[1] < HALF_A_DEGREE
+
+
+def unscaled(matrix: np.ndarray) -> np.ndarray:
+    matrix[:3, :3] /= np.linalg.norm(matrix[:3, :3], axis=0)
+    return matrix
+
+
 def test_a_walk_with_the_pelvis_lowered_and_a_handle_keyed_is_baked_on_every_frame(armature):
     frames = walking(armature)
     before = each(armature, frames)

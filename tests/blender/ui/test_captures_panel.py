@@ -91,7 +91,7 @@ def command(*words: str, **changes) -> subprocess.CompletedProcess:
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     environment = {**os.environ, "PYTHONPATH": path}
     return subprocess.run(
-        line, capture_output=True, text=True, check=False, timeout=200, cwd=ROOT, env=environment, **changes
+        line, capture_output=True, text=True, check=False, timeout=500, cwd=ROOT, env=environment, **changes
     )
 
 
@@ -102,7 +102,7 @@ def first_message(child: subprocess.Popen) -> dict:
     return json.loads(line[len(MARK) :])
 
 
-def follow(until=lambda: False, seconds: float = 120) -> None:
+def follow(until=lambda: False, seconds: float = 300) -> None:
     """Tick as Blender's timer does."""
     end = time.monotonic() + seconds
     while captures.busy and not until():
@@ -111,7 +111,6 @@ def follow(until=lambda: False, seconds: float = 120) -> None:
         time.sleep(0.02)
 
 
-@pytest.mark.timeout(300)
 def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(extension, only_good, tmp_path):
     before = {(block.id_type, block.name) for block in data_blocks()}
     out = tmp_path / "captures"
@@ -144,7 +143,6 @@ def test_the_operator_reports_an_error_in_one_sentence(extension, people, tmp_pa
         render(people=str(people), out=str(tmp_path / "a"), options=f"{SMALL} --pose-files {tmp_path / 'none.npz'}")
 
 
-@pytest.mark.timeout(300)
 def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(people, tmp_path):
     out = tmp_path / "captures"
     done = command("--people", str(people), "--out", str(out), *SMALL.split())
@@ -189,7 +187,6 @@ def test_shards_are_named_without_rendering(people, tmp_path):
     assert not (tmp_path / "a").exists()
 
 
-@pytest.mark.timeout(300)
 def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp_path):
     out = tmp_path / "captures"
     asked = extension.scene.primdiffusion_captures
@@ -211,7 +208,6 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
     assert "seed is 0, not 3" in captures.error
 
 
-@pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("message", "fault"),
     [("[1]", "give an object"), ('{"line"', ""), ('{"line": 3}', "line is 3"),
@@ -219,11 +215,11 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
      ('{"subject": "a", "done": 1, "total": 2, "eta_s": null, "news": [3]}', "news[0] is 3")],
 )  # fmt: skip
 def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypatch, message, fault):
-    program = f"import time; print({MARK + message!r}, flush=True); time.sleep(60)"
+    program = f"import time; print({MARK + message!r}, flush=True); time.sleep(600)"
     monkeypatch.setattr(captures_session, "child_command", lambda: [sys.executable, "-c", program])
     session = captures_session.CaptureSession()
     session.start([])
-    end = time.monotonic() + 30
+    end = time.monotonic() + 300
     while session.busy and time.monotonic() < end:
         session.tick()
         time.sleep(0.01)
@@ -257,7 +253,7 @@ def test_a_child_whose_parent_is_gone_stops(only_good, tmp_path):
     )  # fmt: skip
     assert first_message(child)["total"] == 20 * 36
     child.stdin.close()
-    assert child.wait(30) == CANCELLED
+    assert child.wait(300) == CANCELLED
     child.stdout.close()
 
 
@@ -271,7 +267,7 @@ def test_a_polite_kill_in_the_midst_of_a_view_ends_the_command_after_it(only_goo
     first_message(child)
     time.sleep(moment)
     child.send_signal(signal.SIGTERM)
-    _, complaints = child.communicate(timeout=30)
+    _, complaints = child.communicate(timeout=300)
     assert child.returncode == CANCELLED
     assert complaints == ""
 

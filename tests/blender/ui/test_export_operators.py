@@ -202,6 +202,13 @@ def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
     assert len(turns) == 3
 
 
+def test_a_mirrored_bone_is_exported_as_a_turn_that_can_be_imported(anna, out):
+    moving(anna)
+    armature_of(anna).pose.bones["left_elbow"].scale = (-1, 2, 1)
+    OPERATORS.export(filepath=str(out / "a.human"), motion=True)
+    assert OPERATORS.import_human(filepath=str(out / "a.human")) == {"FINISHED"}
+
+
 def test_a_human_file_without_motion_holds_the_person_alone(anna, out):
     OPERATORS.export(filepath=str(out / "a"), motion=False)
     kept = read_tensors(out / "a.human")

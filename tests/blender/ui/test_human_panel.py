@@ -334,14 +334,20 @@ def test_a_frame_is_put_around_a_human_where_a_viewport_is_open(person, addon):
 
 def test_the_panels_show_height_provenance_and_counts(person, addon):
     person[MARK] = json.dumps(
-        {**json.loads(person[MARK]), "edits": [{"edit": "vary", "amount": 0.5}], "attributes": {"sex": "female"}}
+        {
+            **json.loads(person[MARK]),
+            "edits": [{"edit": "vary", "amount": 0.5}],
+            "attributes": {"sex": "female", "hair": "bald"},
+            "unfollowed": {"hair": "long"},
+        }
     )
     addon.scene.unit_settings.system = "IMPERIAL"
     panel = " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
     assert "In the scene: " in panel
     assert "'" in panel
     details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
-    for text in ("Seed: 0", "Steps: 5", "Sex: female", "Edit: vary", "amount 0.5", "Volumes: 12", "Files: 0 MB"):
+    made = ("Seed: 0", "Steps: 5", "Sex: female", "Not followed: hair (shows long)", "Edit: vary", "amount 0.5")
+    for text in (*made, "Volumes: 12", "Files: 0 MB"):
         assert text in details
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 from types import SimpleNamespace
 
 import bpy
@@ -180,7 +181,7 @@ def test_the_person_under_the_mouse_is_whose_joints_surround_it():
 def test_files_are_dropped_onto_the_import(addon):
     handler = bpy.types.PRIMDIFFUSION_FH_motion
     assert handler.bl_import_operator == PRIMDIFFUSION_OT_import_motion.bl_idname
-    assert set(handler.bl_file_extensions.split(";")) == {".npz", ".bvh"}
+    assert set(handler.bl_file_extensions.split(";")) == {".npz", ".pkl", ".bvh"}
     assert handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="VIEW_3D")))
     assert not handler.poll_drop(SimpleNamespace(area=SimpleNamespace(type="IMAGE_EDITOR")))
 
@@ -188,7 +189,7 @@ def test_files_are_dropped_onto_the_import(addon):
 def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature, tmp_path):
     def drawn(path: str, **settings) -> tuple[list[str], list[str]]:
         values = {"filepath": path, "person": "", "into": "NEW", "bones": "AUTO", **settings}
-        operator = SimpleNamespace(layout=Layout(), axis=lambda: "", **values)
+        operator = SimpleNamespace(layout=Layout(), axis=lambda: "", tracked_person="", **values)
         operator._draw_found = lambda *a: PRIMDIFFUSION_OT_import_motion._draw_found(operator, *a)
         PRIMDIFFUSION_OT_import_motion.draw(operator, addon)
         return operator.layout.of("text"), operator.layout.of("prop")
@@ -203,3 +204,24 @@ def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature,
         tmp_path / "m.bvh", REST_JOINTS, *motion_of(), {name: f"x{i}" for i, name in enumerate(JOINT_NAMES)}
     )
     assert "bone_left_knee" in drawn(str(path), bones="CHOSEN")[1]
+
+
+def test_a_person_of_a_trackers_file_is_chosen_among_those_that_are_listed(addon, armature, tmp_path):
+    path, theta = tmp_path / "wham_output.pkl", np.random.default_rng(2).normal(0, 0.2, (5, 72))
+    path.write_bytes(pickle.dumps({0: {"pose_world": theta}, 4: {"pose_world": theta[:3] * 0.5}}))
+    look = look_at(str(path))
+    assert (look.people, look.facts["People"]) == (("0", "4"), "2: 0, 4")
+    ops.import_motion(filepath=str(path), tracked_person="4", timing="SOURCE")
+    assert len(action_curves(armature)[0].keyframe_points) == 3
+    with refused(RuntimeError, "'9'"):
+        ops.import_motion(filepath=str(path), tracked_person="9")
+
+
+def test_who_never_stands_is_shown_as_doubtful_until_the_axis_is_set(addon, tmp_path):
+    theta = np.zeros((2, 24, 3))
+    theta[:, 1:3, 0] = -2.0
+    np.savez(tmp_path / "m.npz", poses=theta.reshape(2, 72), trans=np.zeros((2, 3)))
+    look = look_at(str(tmp_path / "m.npz"))
+    assert "stands in no frame" in look.error
+    assert look.facts["Up Axis"] == "y (uncertain)"
+    assert look_at(str(tmp_path / "m.npz"), "y").error == ""

@@ -133,12 +133,14 @@ def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
 def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, picture, tmp_path):
     mask = tmp_path / "mask.png"
     write_png(mask, np.full((HEIGHT, WIDTH), 255, np.uint8))
+    chosen.scene.primdiffusion_picture.mask_label = 3
     camera = chosen.scene.camera
     before = np.array(camera.matrix_world.translation)
     assert bpy.ops.primdiffusion.human_from_picture(mask=str(mask), seed=5) == {"FINISHED"}
     (person,) = humans(chosen.scene)
     sent = request_of(person_file(person))
     assert (sent["pictures"], sent["masks"], sent["seed"]) == ([str(picture)], [str(mask)], 5)
+    assert sent["mask_label"] == 3
     assert Path(sent["cameras"]).name == "cameras.json"
     assert "pose" not in sent
     armature = armature_of(person)
@@ -197,7 +199,7 @@ def test_a_picture_dropped_onto_the_view_is_chosen_while_the_tab_is_open(addon):
 
 def test_progress_is_shown_and_cancel_leaves_no_human(chosen, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "takes long")
-    queue.add(chosen, PictureJob(PictureTask.of(chosen, "", None)))
+    queue.add(chosen, PictureJob(PictureTask.of(chosen, "", -1, None)))
     until_running()
     texts = shown(PRIMDIFFUSION_PT_human_from_picture, chosen)
     assert texts[:2] == ["primdiffusion.choose_picture", "anna.png"]

@@ -17,6 +17,7 @@ from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion
 from .rigs import MATCH_BONES, UNMATCHED, BoneMap, chosen_bones, map_bones, retarget
 from .rotation import about_axis
 from .skeleton import REST_JOINTS
+from .standing import is_standing, straightness
 
 LARGEST_BYTES = 64 * 2**20
 LONGEST_HIERARCHY = 2**20
@@ -31,6 +32,8 @@ UNBACKED_ROTATIONS = 1_000_000
 around them take at least six, but joints need not have angles."""
 LONGEST_FRAME_TIME, SHORTEST_FRAME_TIME = 10.0, 1e-4
 """Seconds."""
+_MOST_TRIED = 2000
+"""Frames among which a standing one is looked for."""
 _CHANNELS = {f"{axis}{kind}": (kind, "XYZ".index(axis)) for axis in "XYZ" for kind in ("position", "rotation")}
 _MOTION = re.compile(r"\s*Frames:\s*(\d{1,15})\s+Frame\s+Time:\s*(\S{1,40})", re.IGNORECASE)
 _UNITS = {"metres": 1.0, "centimetres": 0.01, "millimetres": 0.001, "inches": 0.0254, "decimetres": 0.1}
@@ -61,6 +64,14 @@ class Hierarchy:
                 places[joint] += places[parent]
         return places
 
+    def places(self, turned: NDArray) -> NDArray[np.float64]:
+        """Joints [F, n, 3] under rotations in the world [F, n, 3, 3], the root where it is at rest."""
+        places = np.tile(self.offsets, (len(turned), 1, 1))
+        for joint, parent in enumerate(self.parents):
+            if parent >= 0:
+                places[:, joint] = places[:, parent] + turned[:, parent] @ self.offsets[joint]
+        return places
+
     def world(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Rotations in the world [F, n, 3, 3] and positions of the root [F, 3].
 
@@ -87,14 +98,18 @@ def read_bvh(path: Path, chosen: Mapping[str, str] | None = None) -> tuple[Motio
     """The motion of a BVH file on SMPL's skeleton, y up judging by the rest pose, and the rotation [3, 3] from the
     file's axes.
 
-    See `rigs.retarget`. The root's path is scaled by the length of the legs, so feet slide little. Positions of joints
-    other than the root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises FileError.
+    See `rigs.retarget`. Where the rest is no pose of a person (as Rokoko writes it, all bones along x), a frame in
+    which the person stands with straight limbs takes its place.
+
+    The root's path is scaled by the length of the legs, so feet slide little. Positions of joints other than the
+    root are ignored. `chosen` maps SMPL's joints to bones; without it, names do. Raises FileError.
     """
     hierarchy = parse_bvh(path)
     names = bone_names(hierarchy)
     with as_file_error(path, UNMATCHED, MATCH_BONES):
         bones = map_bones(names) if chosen is None else chosen_bones(names, chosen)
-    with as_file_error(path, "has no rest pose of a human", "export the motion again"):
+    remedy = "export it with a T pose as its first frame"
+    with as_file_error(path, "has no rest pose of a human, and no frame in which one stands", remedy):
         return _retarget(hierarchy, bones, path)
 
 
@@ -200,20 +215,37 @@ def _parse_motion(text: str, columns: int, joints: int) -> tuple[NDArray[np.floa
 def _retarget(hierarchy: Hierarchy, bones: BoneMap, path: Path) -> tuple[Motion, NDArray[np.float64]]:
     places = hierarchy.rest()
     index = {name: number for number, name in reversed(list(enumerate(hierarchy.names)))}
-    rest = {name: places[number] for name, number in index.items()}
     tips = {joint: f"{bones.joints[joint]}_end" for joint in ("left_wrist", "right_wrist")}
     tips = {joint: end for joint, end in tips.items() if end in index} | bones.tips
     turned, root = hierarchy.world()
-    turns = {bone: turned[:, index[bone]] for bone in bones.joints.values()}
+    notes = [f"bones as {bones.rig} names them"]
+    at_rest = turned
+    if not is_standing({joint: places[index[bone]] for joint, bone in bones.joints.items()}):
+        frame = _standing_frame(hierarchy, turned, {joint: index[bone] for joint, bone in bones.joints.items()})
+        places = hierarchy.places(turned[frame : frame + 1])[0]
+        at_rest = turned @ np.swapaxes(turned[frame], -1, -2)
+        notes.append(f"its rest is no pose of a person: frame {frame + 1}, in which one stands, takes its place")
+    rest = {name: places[number] for name, number in index.items()}
+    turns = {bone: at_rest[:, index[bone]] for bone in bones.joints.values()}
     rotations, from_file = retarget(dataclasses.replace(bones, tips=tips), rest, turns)
     metres, unit = _unit({joint: rest[bone] for joint, bone in bones.joints.items()})
     pelvis = _pelvis(hierarchy, turned, root, index[bones.joints["pelvis"]]) @ from_file.T
     stated = 1 / hierarchy.frame_time if hierarchy.frame_time > 0 else 0.0
-    notes = [f"bones as {bones.rig} names them"] + ([] if stated else [NO_RATE])
+    notes += [] if stated else [NO_RATE]
     notes.append(f"lengths in {unit}, 1 taken as {metres:.4g} m so that the legs are an average person's")
     detected = Detected(bones.rig, "y", f"{unit} (1 = {metres:.4g} m)", stated, bones.joints, average_legs=True)
     moved = pelvis * metres - REST_JOINTS[0]
     return Motion(rotations, moved, stated or DEFAULT_FPS, path.stem, tuple(notes), detected), from_file
+
+
+def _standing_frame(hierarchy: Hierarchy, turned: NDArray, joints: Mapping[str, int]) -> int:
+    """The frame in which a person stands with the straightest limbs. Raises ValueError where none stands."""
+    chosen = np.unique(np.linspace(0, len(turned) - 1, min(len(turned), _MOST_TRIED)).astype(int))
+    places = hierarchy.places(turned[chosen])
+    heads = {joint: places[:, number] for joint, number in joints.items()}
+    if not is_standing(heads).any():
+        raise ValueError("the shoulders are never above the hips, and these above the ankles")
+    return int(chosen[np.where(is_standing(heads), straightness(heads), -1.0).argmax()])
 
 
 def _pelvis(hierarchy: Hierarchy, turned: NDArray, root: NDArray, pelvis: int) -> NDArray[np.float64]:

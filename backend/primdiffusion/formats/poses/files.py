@@ -1,11 +1,11 @@
-"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, and SAM 3D Body's poses of MHR; and the
-writer of AMASS."""
+"""The one reader of poses and motion: AMASS, npz, npy, JSON, pickles, BVH, trackers, SAM 3D Body, Kimodo; and
+the writer of AMASS."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from ..arrays import array_names, read_arrays, read_npy
 from ..json_files import read_json
 from ..regular_files import FileError, read_regular
-from ..smpl_pickle import as_array, load_restricted
+from ..smpl_pickle import Inert, as_array, load_restricted
 from ..whole_files import replacing
-from . import mhr
+from . import mhr, soma
 from .bvh import read_bvh
 from .motion import (
     DEFAULT_FPS,
@@ -30,11 +30,11 @@ from .motion import (
     first_of,
     stated_rate,
 )
+from .people import choose, listed, people_in
 from .rotation import (
     about_axis,
     axis_direction,
     axis_name,
-    find_up,
     first_improper,
     from_axis_angle,
     improper_text,
@@ -43,36 +43,44 @@ from .rotation import (
     turn_y_up,
 )
 from .skeleton import REST_JOINTS
+from .standing import find_up, pelvis_up
 
 LARGEST_PICKLE = 64 * 2**20
 """Bytes of a .pkl."""
-_POSES = ("poses", "pose", "theta", "fullpose")
+_POSES = ("pose_world", "poses", "pose", "theta", "fullpose")
 _ROOT, _REST = ("global_orient", "root_orient"), ("body_pose", "pose_body")
-_TRANSLATIONS = ("trans", "transl", "translation")
+_TRANSLATIONS = ("trans_world", "trans", "transl", "translation")
 POSE_KEYS = (*_POSES, *_ROOT, *_REST, *_TRANSLATIONS, *RATES)
 """Names of arrays in pose files."""
-_KEYS = tuple(dict.fromkeys((*POSE_KEYS, *mhr.KEYS)))
+_KEYS = tuple(dict.fromkeys((*POSE_KEYS, *mhr.KEYS, *soma.KEYS)))
+_HOLDING = (*_POSES, *_REST, *mhr.POSES)
+"""Arrays of which a person has at least one."""
 ENDINGS = (".npz", ".npy", ".json", ".pkl", ".bvh")
 """Of the files that are read."""
 UP_AXES = ("", "x", "-x", "y", "-y", "z", "-z")
 """Axes that may point up in a file; the empty one stands for detection."""
 _BODIES = {24: "SMPL", 22: "SMPL without hands", 52: "SMPL-H", 55: "SMPL-X"}
+_MOST_TRIED = 2000
+"""Frames by which the up axis is found."""
 _BODY_JOINTS = 22
 """Joints before the hands, the same in SMPL, SMPL-H and SMPL-X."""
 
 
-def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None = None) -> Motion:
+def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None = None, person: str = "") -> Motion:
     """The motion in a file, y up.
 
     `up` is the file's axis that points up ("y", "-z", ...), detected where empty; `bones` maps SMPL's joints to the
-    bones of a .bvh, likewise.
+    bones of a .bvh, likewise. `person` is one of several in a tracker's output (`Detected.people`); where it is empty,
+    who has the most frames.
 
     - .npz of AMASS: `poses` [F, 72 | 156 | 165] (SMPL, SMPL-H, SMPL-X; fingers, jaw and eyes are left out), `trans`,
       `mocap_framerate`, `mocap_frame_rate` or `fps`. z should be up; the actual axis is detected from the pelvis.
     - .npz of poses, y up: `global_orient` with `body_pose`, or `pose`; axis-angle or matrices; `transl` is optional.
     - .npy: [F, 72], [72], [F, 24, 3] or [F, 24, 3, 3]. .json: the same as lists, or an object with the names above.
-    - .pkl: a dictionary of such arrays, as estimators of SMPL write it; nothing in it is run (`smpl_pickle`).
-    - .npz, .json and .pkl of SAM 3D Body: see `mhr`.
+    - .pkl: a dictionary of such arrays, as estimators of SMPL write it, joblib too; nothing in it is run
+      (`smpl_pickle`).
+    - .pkl and .json of trackers, of several people or frame by frame: see `people`.
+    - .npz, .json and .pkl of SAM 3D Body: see `mhr`; .npz of Kimodo: see `soma`.
     - .bvh: any rig that `rigs` knows.
 
     Without a frame rate it is `DEFAULT_FPS`, with a note. Raises FileError where there is no such file, or it
@@ -84,29 +92,38 @@ def read_motion(path: str | Path, up: str = "", bones: Mapping[str, str] | None 
     if up not in UP_AXES:
         raise ValueError(f"the axis {up!r} cannot be up: give one of {_listed(list(UP_AXES[1:]))}")
     suffix = path.suffix.lower()
+    if suffix in (".pt", ".pth"):
+        raise FileError(path, "is a file of PyTorch, which poses are not read from", "save its arrays as .npz")
     if suffix not in ENDINGS:
         raise FileError(path, "is not a pose file", f"give a {', '.join(ENDINGS[:-1])} or {ENDINGS[-1]} file")
-    axes = np.eye(3)
+    axes, expected = np.eye(3), ""
     try:
         if suffix == ".bvh":
-            (motion, axes), detect_up = read_bvh(path, bones), True
-        else:
-            arrays = _READERS[suffix](path)
+            (motion, axes), expected = read_bvh(path, bones), "y"
+        elif suffix in _TREES:
+            arrays, lengths = _arrays_of(path, _TREES[suffix](path), person)
             motion = motion_from_arrays(arrays, path)
-            detect_up = suffix == ".npz" and "trans" in arrays and ("poses" in arrays or "pose_body" in arrays)
+            if lengths:
+                motion, expected = _with_people(motion, lengths), "" if mhr.holds_some(arrays) else "y"
+        else:
+            arrays = _read_npz(path) if suffix == ".npz" else {"pose": read_npy(path)}
+            motion = motion_from_arrays(arrays, path)
+            expected = "z" if "trans" in arrays and ("poses" in arrays or "pose_body" in arrays) else ""
     except OSError as e:
         raise FileError(path, f"cannot be read ({e.strerror or e})", "check that it may be opened") from e
     if up:
-        return _turned(motion, axis_name(axes @ axis_direction(up)), up)
-    return _upright(motion, axes) if detect_up else motion
+        return _turned(motion, axes @ axis_direction(up), up)
+    return _upright(motion, axes, expected) if expected else motion
 
 
 def motion_from_arrays(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     """The motion of arrays of a file, axes unchanged. Raises FileError, and OSError where there is no such file.
 
-    Their names are `POSE_KEYS` or `mhr.KEYS`.
+    Their names are `POSE_KEYS`, `mhr.KEYS` or `soma.KEYS`.
     """
     check_motion_size(path, max((array.size for array in arrays.values()), default=0))
+    if soma.holds_some(arrays):
+        return soma.motion_of(arrays, path)
     if mhr.ROTATIONS in arrays or (mhr.holds_some(arrays) and not _holds_smpl(arrays)):
         return mhr.motion_of(arrays, path)
     return motion_from_numbers(arrays, str(path))
@@ -158,7 +175,7 @@ def _holds_smpl(arrays: Mapping[str, NDArray]) -> bool:
 def _read_npz(path: Path) -> dict[str, NDArray]:
     names = array_names(path)
     arrays = read_arrays(path, optional=_KEYS)
-    if not (_holds_smpl(arrays) or mhr.holds_some(arrays)):
+    if not (_holds_smpl(arrays) or mhr.holds_some(arrays) or soma.holds_some(arrays)):
         if "smpl" in names:
             raise FileError(path, "holds pickled objects, which are never read", "use the version with plain arrays")
         remedy = "give a file with 'poses', or with 'global_orient' and 'body_pose'"
@@ -166,41 +183,52 @@ def _read_npz(path: Path) -> dict[str, NDArray]:
     return arrays
 
 
-def _read_npy(path: Path) -> dict[str, NDArray]:
-    return {"pose": read_npy(path)}
-
-
-def _read_json(path: Path) -> dict[str, NDArray]:
+def _read_json(path: Path) -> Any:
     try:
-        content = read_json(path)
+        return read_json(path)
     except (ValueError, OSError) as e:
         raise FileError(path, f"is not JSON that can be read ({e!s:.120})", "export it again") from e
-    return _arrays(_one_human(content, path), str(path))
 
 
-def _read_pickle(path: Path) -> dict[str, NDArray]:
+def _read_pickle(path: Path) -> Any:
+    content = load_restricted(read_regular(path, LARGEST_PICKLE), path)
+    if not isinstance(content, dict | list):
+        reason = f"is not a pickled dictionary of poses (it contains a {type(content).__name__})"
+        raise FileError(path, reason, "save it as .npz")
+    return content
+
+
+_TREES: dict[str, Callable[[Path], Any]] = {".json": _read_json, ".pkl": _read_pickle}
+
+
+def _arrays_of(path: Path, content: Any, person: str) -> tuple[dict[str, NDArray], dict[str, int]]:
+    """The arrays of the person in a file's lists and dictionaries, and the frames of each; none without a level above.
+
+    Raises FileError.
+    """
     try:
-        content = _one_human(load_restricted(read_regular(path, LARGEST_PICKLE), path), path)
-        if not isinstance(content, dict):
-            raise ValueError(f"it contains a {type(content).__name__}")
-        found = {key: content[key] for key in _KEYS if key in content}
-        return {key: np.asarray(value) if key == mhr.NAMES else as_array(value) for key, value in found.items()}
-    except FileError:
-        raise
+        people = people_in(content, _HOLDING)
+        found = {name: _arrays(own, str(path)) for name, own in people.items()}
     except (ValueError, TypeError) as e:
-        raise FileError(path, f"is not a pickled dictionary of poses ({e!s:.160})", "save it as .npz") from e
+        raise FileError(path, f"is not a file of poses ({e!s:.160})", "save it as .npz") from e
+    if not found:
+        return _arrays(content, str(path)), {}
+    lengths = {name: _length(arrays) for name, arrays in found.items()}
+    chosen = choose(found, lengths, person, path)
+    return found[chosen], {} if chosen == "" else lengths
 
 
-_READERS = {".npz": _read_npz, ".npy": _read_npy, ".json": _read_json, ".pkl": _read_pickle}
+def _length(arrays: Mapping[str, NDArray]) -> int:
+    values = first_of(arrays, _HOLDING)
+    assert values is not None
+    return len(values) if values.ndim > 1 and not (values.ndim == 3 and values.shape[1:] == (3, 3)) else 1
 
 
-def _one_human(content: Any, path: Path) -> Any:
-    """SAM 3D Body's list of humans as its only one; other content as it is. Raises FileError for several."""
-    if not isinstance(content, list) or not content or not all(isinstance(human, dict) for human in content):
-        return content
-    if len(content) > 1:
-        raise FileError(path, f"holds {len(content)} humans", "save one of them in a file of its own")
-    return content[0]
+def _with_people(motion: Motion, lengths: Mapping[str, int]) -> Motion:
+    """The motion of one of the people in a file."""
+    detected = dataclasses.replace(motion.detected, people=tuple(lengths))
+    notes = (f"holds {len(lengths)} people: {listed(lengths)}",) if len(lengths) > 1 else ()
+    return dataclasses.replace(motion, notes=(*motion.notes, *notes), detected=detected)
 
 
 def _arrays(content: Any, name: str) -> dict[str, NDArray]:
@@ -208,22 +236,30 @@ def _arrays(content: Any, name: str) -> dict[str, NDArray]:
     if not isinstance(content, Mapping):
         content = {"pose": content}
     try:
-        return {key: np.asarray(content[key]) for key in _KEYS if key in content}
+        return {
+            key: as_array(content[key]) if isinstance(content[key], Inert) else np.asarray(content[key])
+            for key in _KEYS
+            if key in content
+        }
     except (ValueError, TypeError, OverflowError) as e:
         raise FileError(name, f"holds no lists of numbers of equal length ({e!s:.80})", "export it again") from e
 
 
-def _upright(motion: Motion, axes: NDArray) -> Motion:
+def _upright(motion: Motion, axes: NDArray, expected: str) -> Motion:
     """The motion with its detected up axis turned to y; `axes` is the rotation from the file's axes so far."""
-    up = find_up(motion.rotations[:, 0])
-    if not up:
-        unknown = dataclasses.replace(motion.detected, up="")
-        note = "does not state which axis is up: y is assumed"
-        return dataclasses.replace(motion, notes=(*motion.notes, note), detected=unknown)
-    return _turned(motion, up, axis_name(axes.T @ axis_direction(up)))
+    few = motion.frames(np.unique(np.linspace(0, len(motion) - 1, min(len(motion), _MOST_TRIED)).astype(int)))
+    up = find_up(few.joints(), expected)
+    if up:
+        return _turned(motion, axis_direction(up), axis_name(axes.T @ axis_direction(up)))
+    up = axis_direction(pelvis_up(few.rotations[:, 0]))
+    lying = _turned(motion, up, axis_name(axes.T @ up))
+    doubt = "The person stands in no frame, whichever axis is up: set the up axis by hand if it is another one"
+    return dataclasses.replace(
+        lying, notes=(*lying.notes, doubt), detected=dataclasses.replace(lying.detected, doubt=doubt)
+    )
 
 
-def _turned(motion: Motion, up: str, in_file: str) -> Motion:
+def _turned(motion: Motion, up: NDArray, in_file: str) -> Motion:
     rotations, translations = turn_y_up(motion.rotations, motion.translations, up)
     return dataclasses.replace(
         motion,

@@ -28,8 +28,10 @@ from .skeleton import REST_JOINTS
 
 ROTATIONS, PLACES, CAMERA, NAMES = "pred_global_rots", "pred_joint_coords", "pred_cam_t", "joint_names"
 _ANGLES = ("mhr_model_params", "body_pose_params")
-KEYS = (ROTATIONS, PLACES, CAMERA, NAMES, *_ANGLES, *RATES)
-"""Names of arrays."""
+POSES = (ROTATIONS, PLACES, *_ANGLES)
+"""Names of arrays, of which a file of MHR has some."""
+KEYS = (*POSES, CAMERA, NAMES, *RATES)
+"""Names of all arrays that are read."""
 Y_UP = np.array([1.0, -1.0, -1.0])
 """Times a place in a camera's axes: y up, facing the camera."""
 
@@ -101,7 +103,7 @@ _TURNS = {f"{side}_foot": f"{side}_transversetarsal" for side in "lr"}
 
 def holds_some(arrays: Mapping[str, NDArray]) -> bool:
     """Whether arrays are those of SAM 3D Body, all or some."""
-    return any(key in arrays for key in (ROTATIONS, PLACES, *_ANGLES))
+    return any(key in arrays for key in POSES)
 
 
 def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
@@ -117,9 +119,9 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     names = _names(arrays.get(NAMES), path)
     numbers = {key: array for key, array in arrays.items() if key in (ROTATIONS, PLACES, CAMERA, *RATES)}
     check_numbers(numbers, str(path))
-    turns = _frames(arrays[ROTATIONS], (len(names), 3, 3), ROTATIONS, path)
-    places = _frames(arrays[PLACES], (len(names), 3), PLACES, path)
-    camera = _frames(arrays.get(CAMERA, np.zeros(3)), (3,), CAMERA, path)
+    turns = frames_of(arrays[ROTATIONS], (len(names), 3, 3), ROTATIONS, path)
+    places = frames_of(arrays[PLACES], (len(names), 3), PLACES, path)
+    camera = frames_of(arrays.get(CAMERA, np.zeros(3)), (3,), CAMERA, path)
     if len(places) != len(turns) or len(camera) not in (1, len(turns)):
         raise FileError(
             path,
@@ -137,7 +139,7 @@ def motion_of(arrays: Mapping[str, NDArray], path: Path) -> Motion:
     bones = map_bones(REST)
     turned = {bone: world[_TURNS.get(bone, bone)] @ REST[_TURNS.get(bone, bone)][1].T for bone in bones.joints.values()}
     try:
-        rotations, from_file = retarget(bones, _places_at_rest(world, at), turned)
+        rotations, from_file = retarget(bones, places_at_rest(REST, world, at), turned)
     except ValueError as e:
         raise FileError(path, f"has joints of no human ({e})", "save the poses again") from e
     pelvis = (at["root"] + camera * Y_UP) @ from_file.T
@@ -160,22 +162,28 @@ def _names(given: NDArray | None, path: Path) -> list[str]:
     return names
 
 
-def _frames(values: NDArray, shape: tuple[int, ...], key: str, path: Path) -> NDArray[np.float64]:
+def frames_of(values: NDArray, shape: tuple[int, ...], key: str, path: Path) -> NDArray[np.float64]:
     """Numbers of one frame or many as those of many [F, *shape]."""
     values = values if values.ndim > len(shape) else values[None]
     if values.shape[1:] != shape:
         wanted = f"{key} of shape {values.shape} instead of [F, {', '.join(map(str, shape))}]"
-        raise FileError(path, f"has {wanted}", f"save MHR's {len(JOINTS)} joints, or their {NAMES} too")
+        raise FileError(path, f"has {wanted}", "save all joints of the rig, in its own order")
     return np.asarray(values, np.float64)
 
 
-def _places_at_rest(world: Mapping[str, NDArray], at: Mapping[str, NDArray]) -> dict[str, NDArray[np.float64]]:
-    """Places of the joints [3] at rest: each is fixed to its parent, on average over the frames."""
+def places_at_rest(
+    rest: Mapping[str, tuple[str, NDArray]], world: Mapping[str, NDArray], at: Mapping[str, NDArray]
+) -> dict[str, NDArray[np.float64]]:
+    """Places of joints [3] at rest: each is fixed to its parent, on average over the frames.
+
+    `rest` are the joints' parents and orientations at rest, parents first; `world` and `at` their orientations
+    [F, 3, 3] and places [F, 3].
+    """
     places: dict[str, NDArray[np.float64]] = {}
-    for name, (parent, _) in REST.items():
+    for name, (parent, _) in rest.items():
         if not parent:
             places[name] = np.zeros(3)
             continue
         offset = np.einsum("fji,fj->fi", world[parent], at[name] - at[parent]).mean(0)
-        places[name] = places[parent] + REST[parent][1] @ offset
+        places[name] = places[parent] + rest[parent][1] @ offset
     return places

@@ -28,15 +28,19 @@ class Detected:
     rig: str = ""
     """SMPL, SMPL-H, SMPL-X, or the naming of the bones; empty where unknown."""
     up: str = ""
-    """The file's axis that points up, such as "z" or "-y"; empty where it was not detected."""
+    """The file's axis that points up, such as "z" or "-y"."""
     unit: str = "metres"
     """Unit of lengths in the file."""
     fps: float = 0.0
     """Frame rate in the file; 0 where it states none."""
     bones: Mapping[str, str] = dataclasses.field(default_factory=dict)
     """SMPL's joint -> the file's bone, for files with bones."""
+    people: tuple[str, ...] = ()
+    """Names of the people in a tracker's output."""
     average_legs: bool = False
     """Whether lengths were scaled to average legs, so that they must be scaled to each body."""
+    doubt: str = ""
+    """A sentence about what makes the up axis doubtful."""
 
 
 LARGEST_NUMBER = 1e6

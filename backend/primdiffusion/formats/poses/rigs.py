@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ..joints import JOINT_NAMES, PARENTS
 from .rotation import about_axis, between
 from .skeleton import REST_JOINTS, unchain
+from .standing import is_standing
 
 _SIDED = ("hip", "knee", "ankle", "foot", "collar", "shoulder", "elbow", "wrist", "hand")
 RIGS: dict[str, dict[str, str]] = {
@@ -81,6 +82,31 @@ RIGS: dict[str, dict[str, str]] = {
         "collar": "{l}clavicle", "shoulder": "{l}uparm", "elbow": "{l}lowarm", "wrist": "{l}wrist",
         "tip": "{l}middle1",
     },
+    "SOMA": {
+        "pelvis": "hips", "hip": "{left}leg", "knee": "{left}shin", "ankle": "{left}foot", "foot": "{left}toebase",
+        "spine1": "spine1", "spine2": "spine2", "spine3": "chest", "neck": "neck1", "head": "head",
+        "collar": "{left}shoulder", "shoulder": "{left}arm", "elbow": "{left}forearm", "wrist": "{left}hand",
+        "tip": "{left}handmiddle1|{left}handmiddleend",
+    },
+    "VRoid": {
+        "pelvis": "jbipchips", "hip": "jbip{l}upperleg", "knee": "jbip{l}lowerleg", "ankle": "jbip{l}foot",
+        "foot": "jbip{l}toebase", "spine1": "jbipcspine", "spine2": "jbipcchest", "spine3": "jbipcupperchest",
+        "neck": "jbipcneck", "head": "jbipchead", "collar": "jbip{l}shoulder", "shoulder": "jbip{l}upperarm",
+        "elbow": "jbip{l}lowerarm", "wrist": "jbip{l}hand", "tip": "jbip{l}middle1",
+    },
+    "MocapNET": {
+        "pelvis": "hip", "hip": "{l}hip|{l}thigh", "knee": "{l}knee|{l}shin", "ankle": "{l}foot|{l}ankle",
+        "foot": "{l}toe", "spine1": "abdomen", "spine3": "chest", "neck": "neck", "head": "head",
+        "collar": "{l}collar", "shoulder": "{l}shoulder|{l}shldr", "elbow": "{l}elbow|{l}forearm",
+        "wrist": "{l}hand|{l}wrist", "tip": "{l}mid1|{l}finger31",
+    },
+    "Rokoko": {
+        "pelvis": "hips|hip", "hip": "{left}thigh|{left}upleg", "knee": "{left}shin|{left}leg",
+        "ankle": "{left}foot", "foot": "{left}toe|{left}toebase", "spine1": "spine1|spine", "spine2": "spine2|chest",
+        "spine3": "spine4|spine3", "neck": "neck", "head": "head", "collar": "{left}shoulder",
+        "shoulder": "{left}arm|{left}upperarm", "elbow": "{left}forearm|{left}lowerarm", "wrist": "{left}hand",
+        "tip": "{left}handmiddle1|{left}middleproximal|{left}finger3proximal",
+    },
 }  # fmt: skip
 """Common rigs: SMPL's body part -> the bone's name without separators, lower case; `{l}` and `{left}` stand for the
 side, `|` separates alternatives. A `tip` gives the direction of the hand and is not posed."""
@@ -91,12 +117,15 @@ NEEDED = (
 """A rig needs these to be posed, and one bone of spine, neck and head."""
 MANUAL = "chosen by hand"
 UNMATCHED = "has bones that cannot be matched to SMPL's joints"
-MATCH_BONES = "name them as in SMPL, Mixamo, Unreal, Rigify or RenderPeople, or choose one for each joint"
-"""What is wrong with a file where `map_bones` or `chosen_bones` fails, and what to do."""
+NAME_BONES = "name them as one of the rigs that the manual lists under Motion"
+MATCH_BONES = f"{NAME_BONES}, or choose one for each joint"
+"""What is wrong with a file where `map_bones` or `chosen_bones` fails, and what to do, without and with a choice."""
 _TRUNK = ("spine1", "spine2", "spine3", "neck", "head")
 _LIMBS = {"hip": "knee", "knee": "ankle", "shoulder": "elbow", "elbow": "wrist", "wrist": "hand"}
 """Parts whose direction towards the next part gives their rotation."""
 _SHORTEST = 1e-6
+_LISTED = 36
+"""Characters of names in a list."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -125,7 +154,7 @@ def map_bones(names: Iterable[str]) -> BoneMap:
     missing = _missing_joints(best.joints)
     if missing:
         raise ValueError(
-            f"none is known to be {_listed(missing):.50}; nearest rig: {best.rig}; the bones are {_listed(bones):.60}"
+            f"none is known to be {_listed(missing)}; nearest rig: {best.rig}; the bones are {_listed(bones)}"
         )
     return best
 
@@ -142,7 +171,7 @@ def chosen_bones(names: Iterable[str], joints: Mapping[str, str]) -> BoneMap:
         if joint not in JOINT_NAMES:
             raise ValueError(f"{joint!r} of the bone map is not a joint of SMPL")
         if bone not in bones:
-            raise ValueError(f"{bone!r:.40}, chosen for {joint}, is not there; the bones are {_listed(bones):.60}")
+            raise ValueError(f"{bone!r:.40}, chosen for {joint}, is not there; the bones are {_listed(bones)}")
     missing = _missing_joints(chosen)
     if missing:
         raise ValueError(f"none is chosen for {_listed(missing)}")
@@ -159,8 +188,11 @@ def facing(heads: Mapping[str, NDArray]) -> NDArray[np.float64]:
     """Rotation [3, 3] whose columns are left, up and front of a person in the rig's axes.
 
     `heads` are joint positions by SMPL's names. Rest poses stand upright, so up is snapped to the nearest axis unless
-    it is far off, and left where it nearly is an axis. Raises ValueError where the joints lie on a line.
+    it is far off, and left where it nearly is an axis. Raises ValueError where the joints lie on a line, or the trunk
+    does not continue the legs: bones that all lie along one axis at rest are no pose.
     """
+    if not is_standing(heads):
+        raise ValueError("the shoulders are not above the hips, and these above the ankles: this is no rest pose")
     hips = (heads["left_hip"] + heads["right_hip"]) / 2
     shoulders = (heads["left_shoulder"] + heads["right_shoulder"]) / 2
     ankles = (heads["left_ankle"] + heads["right_ankle"]) / 2
@@ -271,8 +303,14 @@ def _match(rig: str, prefix: str, plain: dict[str, str]) -> BoneMap:
 
 
 def _listed(names: list[str]) -> str:
-    shown = ", ".join(repr(name) for name in names[:8])
-    return shown if len(names) <= 8 else f"{shown} and {len(names) - 8} more"
+    """Whole names, as many as a sentence has room for, and how many are left out."""
+    shown = names[:1]
+    for name in names[1:]:
+        if sum(map(len, shown)) + len(name) > _LISTED:
+            break
+        shown.append(name)
+    text = ", ".join(f"{name!r:.40}" for name in shown)
+    return text if len(shown) == len(names) else f"{text} and {len(names) - len(shown)} more"
 
 
 def _towards_axis(direction: NDArray, degrees: float) -> NDArray[np.float64]:

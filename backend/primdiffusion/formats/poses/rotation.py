@@ -1,4 +1,4 @@
-"""Rotation matrices, column vectors: from and to other representations, checks of those in files, a motion's up axis.
+"""Rotation matrices, column vectors: from and to other representations, checks of those in files.
 
 Conversions take any batch shape, and radians.
 """
@@ -13,10 +13,9 @@ from .skeleton import REST_JOINTS
 
 TOLERANCE = 1e-3
 """Largest difference of a scalar product of two columns from that of a rotation."""
+ROTATION = f"a rotation (orthonormal within {TOLERANCE:g}, determinant 1)"
 _COMMON_JOINTS = 22
 """Joints that have the same names in SMPL, SMPL-H and SMPL-X."""
-_CLEARLY_UP = 0.6
-"""Least mean cosine between the pelvis' up direction and an axis for that axis to count as up."""
 _BLOCK = 100_000
 """Rotations made at once: each step below takes as much memory as its result."""
 
@@ -135,15 +134,6 @@ def _cross(vector: NDArray) -> NDArray[np.float64]:
     return np.stack([o, -z, y, z, o, -x, -y, x, o], -1).reshape(*x.shape, 3, 3)
 
 
-def find_up(pelvis: NDArray) -> str:
-    """The axis, such as "z" or "-y", along which pelvises [F, 3, 3] point up on average; "" where none is clear.
-
-    People stand, sit and walk more than they lie, so over a motion the mean is vertical.
-    """
-    mean = np.asarray(pelvis)[:, :, 1].mean(0)
-    return "" if np.abs(mean).max() < _CLEARLY_UP else axis_name(mean)
-
-
 def axis_name(direction: NDArray) -> str:
     """The axis, such as "z" or "-y", nearest to a direction [3]."""
     axis = int(np.abs(direction).argmax())
@@ -155,12 +145,16 @@ def axis_direction(name: str) -> NDArray[np.float64]:
     return np.eye(3)["xyz".index(name[-1])] * (-1 if name[0] == "-" else 1)
 
 
-def turn_y_up(rotations: NDArray, translations: NDArray, up: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Joint rotations [F, 24, 3, 3] and translations [F, 3] of a world in which `up` is up, turned to y up.
+def turn_y_up(
+    rotations: NDArray, translations: NDArray, up: NDArray
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Joint rotations [F, 24, 3, 3] and translations [F, 3] of a world in which the direction `up` [3] is up, turned to
+    y up.
 
+    A camera's axes, y down and z away, are turned about x: who faces the camera faces +z then.
     Translations as in SMPL's files: relative to a body whose pelvis is at its rest position, not at the origin.
     """
-    turn = between(axis_direction(up), np.array([0.0, 1.0, 0.0]))
+    turn = about_axis(0, np.pi) if up[1] < 1e-9 - 1 else between(up, np.array([0.0, 1.0, 0.0]))
     rotations = np.array(rotations, np.float64)
     rotations[:, 0] = turn @ rotations[:, 0]
     pelvis = REST_JOINTS[0]
@@ -187,7 +181,4 @@ def first_improper(matrices: NDArray) -> tuple[int, int] | None:
 def improper_text(frame: int | str, joint: int | str) -> str:
     """Describe a matrix that is not a rotation, as a part of a sentence."""
     name = JOINT_NAMES[joint] if isinstance(joint, int) and joint < _COMMON_JOINTS else joint
-    return (
-        f"a matrix for joint {name} in frame {frame} that is not a rotation (orthonormal within {TOLERANCE:g}, "
-        "determinant 1)"
-    )
+    return f"a matrix for joint {name} in frame {frame} that is not {ROTATION}"

@@ -55,6 +55,11 @@ def test_all_humans_has_a_folder_named_by_their_seed(out, capfd):
     assert "2/2 person_000008 done" in capfd.readouterr().out
 
 
+def test_what_a_human_does_not_show_is_printed(out, capfd):
+    assert generate(out, "--attributes", "hat=fedora") == DONE
+    assert "person_000000: the human does not show hat" in capfd.readouterr().out
+
+
 def test_the_same_command_continues_and_leaves_what_is_there(out):
     assert generate(out, "--seed", 7) == DONE
     before = (out / "person_000007" / "person.human.safetensors").stat()

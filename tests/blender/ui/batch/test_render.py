@@ -13,12 +13,15 @@ import pytest
 from bpy_extras.object_utils import world_to_camera_view
 from engine_stage import pixels
 from mathutils import Vector
+from support.errors import refused
 
 from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
+from blender_primdiffusion.scene.cycles import new_camera
 from blender_primdiffusion.scene.human import humans_folder
 from blender_primdiffusion.ui.batch import execute
 from blender_primdiffusion.ui.batch.people import go_round, moving_extent
+from blender_primdiffusion.ui.batch.render import draw
 
 pytestmark = pytest.mark.any_blender
 
@@ -54,6 +57,30 @@ def test_a_folder_of_people_becomes_a_picture_of_each(people, out):
     assert pictures(out) == ["person_000007.png", "person_000008.png"]
     assert pixels(out / "person_000007.png").shape == (16, 24, 4)
     assert report(out)["done"] == ["person_000007", "person_000008"]
+
+
+def test_braces_in_a_folder_s_name_are_no_template(people, tmp_path):
+    out = tmp_path / "a{b}" / "}{blend_name"
+    assert render(people / "person_000007", out, *SMALL) == DONE
+    assert pictures(out) == ["person_000007.png"]
+
+
+@pytest.mark.unix
+def test_a_picture_that_a_full_disk_cuts_off_is_not_kept(empty_scene, tmp_path):
+    import resource
+
+    scene = empty_scene.scene
+    scene.camera = new_camera(scene)
+    scene.render.engine, scene.render.resolution_x, scene.render.resolution_y = "CYCLES", 24, 16
+    scene.cycles.samples = 1
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
+    try:
+        with refused(OSError, "disk full"):
+            draw(scene, tmp_path / "a" / "b.png")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list((tmp_path / "a").iterdir())
 
 
 def test_existing_pictures_are_not_rendered_again(people, out):

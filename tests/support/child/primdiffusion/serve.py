@@ -101,6 +101,7 @@ def human(params: dict) -> dict:
     out.mkdir(parents=True, exist_ok=True)
     person = write_person(out / PERSON, params)
     warnings = ["only one view"] if params.get("views") == 1 else []
+    warnings += ["the human does not show hat"] if "hat" in params.get("attributes", {}) else []
     return {"person": str(person), "seed": params.get("seed"), "steps": params.get("steps"), "warnings": warnings}
 
 
