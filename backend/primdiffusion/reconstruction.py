@@ -35,7 +35,7 @@ from primdiffusion.encoder.model import EncoderModel, betas_of_frames, frames_of
 from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.human import Human, default_frames, made_by
-from primdiffusion.primitives.primitives import Frames, K, Payload, S
+from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.render.cpu_linear import apply_to_codes
 from primdiffusion.render.descent import DescentSettings, PosedView, descend
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
@@ -225,9 +225,7 @@ class PersonComponents:
         latents = self.prior.mean + self.prior.picture(coefficients[None]) + rest
         return payload_from_cells(self.codec.decode(latents)[0], self.full_density, self.codec.zone)
 
-    def start(
-        self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None
-    ) -> Explanation:
+    def start(self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None) -> Explanation:
         """The people nearest to the human in views with these frames; reports `start_steps` times."""
         every, steps = math.ceil(len(frames) / TRIAL_VIEWS), self.start_steps
         candidates = [self._mean_of(group, None) for group in range(len(self.prior.log_weight))]

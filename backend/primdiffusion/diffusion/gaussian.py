@@ -31,6 +31,8 @@ from primdiffusion.geometry.records import TensorRecord
 
 IMPOSSIBLE = -1e4
 """Log weight of a kind that contradicts the condition, or is padding."""
+CLEAN_NOISE = 1e-3
+"""Noise of coefficients that are read as they are; some directions have no variance of their own."""
 TOGETHER = 32
 """Samples whose distances to all kinds are in memory at once."""
 
@@ -160,6 +162,17 @@ class PersonPrior(TensorRecord):
             for weights, *chunk in zip(*(each.split(TOGETHER) for each in (log_weights, y, signal, noise)), strict=True)
         ]
         return torch.cat(found).to(y)
+
+    def kind_shares(self, c: Float[Tensor, "b r"]) -> Float[Tensor, "b g m"]:
+        """Probability of each kind given clean person coefficients."""
+        kinds = torch.arange(self.log_weight.numel(), device=c.device)
+        blocks, weights = self._blocks(kinds), _double(self.log_weight).flatten()[None]
+        one = torch.ones(len(c), 1, device=c.device)
+        shares = [
+            _posterior(blocks, weights, *(_double(each) for each in chunk))[0]
+            for chunk in zip(*(each.split(TOGETHER) for each in (c, one, CLEAN_NOISE * one)), strict=True)
+        ]
+        return torch.cat(shares).unflatten(1, self.log_weight.shape)
 
     def _blocks(self, kinds: Int[Tensor, "n"]) -> tuple[_Block, _Block]:
         """Clothes and heads of some kinds, given as places in the flattened [G, M]."""
@@ -354,12 +367,11 @@ def _evidence(block: _Block, y: Tensor, signal: Tensor, noise: Tensor) -> _Evide
     return _Evidence(distance, pull, gram)
 
 
-def _expected(
+def _posterior(
     blocks: tuple[_Block, _Block], log_weights: Tensor, y: Tensor, signal: Tensor, noise: Tensor
-) -> Float[Tensor, "b r"]:
-    """E[c | y] over the kinds of the blocks, whose log weights are [b, n]."""
-    sizes = [block.centre.shape[1] for block in blocks]
-    each_y = y.split(sizes, dim=1)
+) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n q"]]:
+    """Probability of each kind of the blocks given y, for log weights [b, n], and the shared part that it expects."""
+    each_y = y.split([block.centre.shape[1] for block in blocks], dim=1)
     found = [_evidence(block, own, signal, noise) for block, own in zip(blocks, each_y, strict=True)]
     pairs, pair = torch.stack([block.of for block in blocks], dim=1).unique(dim=0, return_inverse=True)
     gram = sum(one.gram[:, of] for one, of in zip(found, pairs.unbind(1), strict=True))
@@ -368,11 +380,17 @@ def _expected(
     u = torch.cholesky_solve(pull[..., None], factor[:, pair])[..., 0]
     determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)[:, pair]
     distance = sum(one.distance for one in found) - (pull * u).sum(-1) + determinant
-    share = (log_weights - distance / 2).softmax(1)
-    return torch.cat(
-        [_mean_of_block(block, share, u, own, signal, noise) for block, own in zip(blocks, each_y, strict=True)],
-        dim=1,
-    )
+    return (log_weights - distance / 2).softmax(1), u
+
+
+def _expected(
+    blocks: tuple[_Block, _Block], log_weights: Tensor, y: Tensor, signal: Tensor, noise: Tensor
+) -> Float[Tensor, "b r"]:
+    """E[c | y] over the kinds of the blocks, whose log weights are [b, n]."""
+    share, u = _posterior(blocks, log_weights, y, signal, noise)
+    each_y = y.split([block.centre.shape[1] for block in blocks], dim=1)
+    means = [_mean_of_block(block, share, u, own, signal, noise) for block, own in zip(blocks, each_y, strict=True)]
+    return torch.cat(means, dim=1)
 
 
 def _mean_of_block(

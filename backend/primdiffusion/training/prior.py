@@ -2,8 +2,8 @@
 
 The mixture has all kinds of person that the training people suggest. Kinds are many (16 outfits of a sex, 9 styles of
 hair and hat, 6 pairs of shoes, plain or patterned) and people of one kind few or none, so kinds share what they can: a
-covariance of clothes for each group (outfit and pattern) and one of the head for each hair style, for which small groups
-lean on their like, and a mean that is a sum of effects: of the group, of the hair, of the shoes.
+covariance of clothes for each group (outfit and pattern) and one of the head for each hair style, for which small
+groups lean on their like, and a mean that is a sum of effects: of the group, of the hair, of the shoes.
 """
 
 from __future__ import annotations
@@ -200,12 +200,12 @@ def fit_prior(
     config: PriorConfig,
     part: Int[Tensor, "k"] | None = None,
 ) -> PersonPrior:
-    """Principal components of each part (None: `body_parts`) of people and their mirror images, and a mixture of Gaussians over them.
+    """Principal components of each part of people and their mirror images, and a mixture of Gaussians of the people.
 
     Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under
     the mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest
     too small: both are corrected by leaving `config.folds` parts of the geometries out in turn. Mean and rest are those
-    of detailed people.
+    of detailed people. `part` is that of each cell (None: `body_parts`).
     """
     part = body_parts() if part is None else part
     detailed = int(people.detailed)
@@ -233,7 +233,7 @@ def fit_prior(
 
 
 def body_parts() -> Int[Tensor, "k"]:
-    """The part of each primitive that has components of its own; the head is the last one, its neck a part of the torso.
+    """The part of each primitive: torso and neck, arms, legs, feet, hands, head.
 
     A collar goes with the shirt, and hair with the head.
     """

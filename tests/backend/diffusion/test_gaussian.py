@@ -87,6 +87,17 @@ def test_mixture_denoiser_is_bayes_rule(prior, asked):
         assert torch.allclose(guess.flatten(), share @ torch.stack(means), atol=1e-9)
 
 
+def test_shares_of_kinds_of_clean_coefficients_are_bayes_rule(prior):
+    coefficients = prior.split(prior.sample(5, torch.Generator().manual_seed(1)))[0]
+    for one, found in zip(coefficients, prior.kind_shares(coefficients), strict=True):
+        weight = torch.zeros(2, 3, dtype=F64)
+        for group, part in itertools.product(range(2), range(3)):
+            covariance = coefficient_covariance(prior, group, part)
+            density = multivariate_normal(prior.centre[group, part].numpy(), covariance.numpy()).pdf(one)
+            weight[group, part] = prior.log_weight[group, part].exp() * float(density)
+        assert torch.allclose(found, weight / weight.sum(), atol=1e-4)
+
+
 @pytest.mark.parametrize("head", [None, 1])
 def test_people_of_a_group_are_one_gaussian_with_their_mean_and_covariance(head):
     prior = prior_of_parts(seed=1)
