@@ -17,6 +17,7 @@ from primdiffusion.commands.options import (
 )
 from primdiffusion.device import best_device
 from primdiffusion.encoder.model import load_encoder
+from primdiffusion.folder_lock import lock_folder
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people, unknown_licences
 from primdiffusion.people.payloads import make_payloads
@@ -30,7 +31,7 @@ def run_people(command: PeopleCommand) -> None:
     """Make the humans, show progress, and print the folder. Raises ValueError, FileNotFoundError, OSError."""
     people = PeopleSet(command.out, command.seed, command.count)
     assets = open_assets(command.assets, required_meshes())
-    with tqdm(total=command.count, unit="human", desc="people", disable=None) as bar:
+    with lock_folder(command.out), tqdm(total=command.count, unit="human", desc="people", disable=None) as bar:
         for done in make_people(assets, people, command.workers):
             bar.update(done - bar.n)
     unknown = unknown_licences(command.out)
@@ -75,11 +76,12 @@ def run_encode(command: EncodePayloadsCommand) -> None:
     model = load_encoder(command.encoder, best_device())
     outcomes = Counter()
     work = encode_people(model, captures, command.out, settings, cards)
-    for outcome in tqdm(work, total=len(captures.subjects), unit="human", disable=None):
-        outcomes[outcome.status] += 1
-        unknown = command.people is not None and outcome.subject not in cards
-        note = outcome.error or ("attributes unknown" if unknown else "")
-        print(f"{outcome.subject}  {outcome.status}  {note}".rstrip(), flush=True)
+    with lock_folder(command.out):
+        for outcome in tqdm(work, total=len(captures.subjects), unit="human", disable=None):
+            outcomes[outcome.status] += 1
+            unknown = command.people is not None and outcome.subject not in cards
+            note = outcome.error or ("attributes unknown" if unknown else "")
+            print(f"{outcome.subject}  {outcome.status}  {note}".rstrip(), flush=True)
     if outcomes["failed"]:
         raise ValueError(f"{outcomes['failed']} of {len(captures.subjects)} humans failed: see the lines above")
 

@@ -211,9 +211,27 @@ def remove_folder(path: Path, folder: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
 
 
-def check_unlinked(folder: Path) -> None:
-    """Raise FileError where a folder is, or contains, a link to a folder: writing would leave it."""
-    below = (os.path.join(inner, name) for inner, names, _ in os.walk(folder) for name in names)
-    for path in (str(folder), *below):
-        if os.path.islink(path):
-            raise FileError(path, "is a link to another folder", "remove the link, or choose a new folder")
+def check_unlinked(path: Path) -> None:
+    """Raise FileError for a link, and for a folder that contains a link to a folder outside: writing would leave it.
+
+    Folders are listed to their ends. Call it for a folder before files are written below it, of which a library may
+    write some; a folder that the user has named may be a link: pass its `real_path`.
+    """
+    if os.path.islink(path):
+        raise FileError(path, "is a link", "remove the link, or choose a new folder")
+    root = real_path(path)
+    for inner, names, _ in os.walk(path):
+        for link in filter(os.path.islink, (os.path.join(inner, name) for name in names)):
+            if not real_path(link).is_relative_to(root):
+                raise FileError(link, "is a link to another folder", "remove the link, or choose a new folder")
+
+
+def open_to_append(path: Path) -> io.BufferedWriter:
+    """Open a regular file, made if it is missing, to add to its end. Raises FileError for a link, OSError."""
+    check_unlinked(path)
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    file = open(os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666), "wb")  # noqa: SIM115  the caller closes it
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):  # a device; to open a pipe that nobody reads fails
+        file.close()
+        raise PermissionError(errno.EPERM, "this is not a regular file", str(path))
+    return file

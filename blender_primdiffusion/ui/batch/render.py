@@ -173,7 +173,7 @@ class _Drawing:
             scene.frame_set(shot.frame)
             if extent is not None and shot.yaw is not None:
                 (go_round if self._options.turntable else look_from)(scene, shot.yaw, extent)
-            _draw(scene, shot.path)
+            _draw(scene, shot.path, self._options.out)
             if len(shots) > 1:
                 self.say(f"{source.name}: picture {number + 1} of {len(shots)}")
         if not source.is_blend:
@@ -253,8 +253,8 @@ def _check_volumes(scene: bpy.types.Scene) -> None:
         )
 
 
-def _draw(scene: bpy.types.Scene, path: Path) -> None:
-    with replacing(path) as unfinished:
+def _draw(scene: bpy.types.Scene, path: Path, folder: Path) -> None:
+    with replacing(path, folder) as unfinished:
         scene.render.filepath = str(unfinished)
         try:
             bpy.ops.render.render(write_still=True)
