@@ -37,7 +37,7 @@ ATTACHMENT_ITEMS = (
     ("SURFACE", "Surface", "Volumes are placed on the posed skin in each pose, as in the PrimDiffusion engine"),
     ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
 )
-_MOST_FRAMES = 10_000
+_MOST_FRAMES = 3_000
 
 
 class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
