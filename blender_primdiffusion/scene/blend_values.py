@@ -17,7 +17,7 @@ from typing import Any, cast
 import bpy
 
 from ..formats.json_files import parse_json
-from ..formats.regular_files import is_local_path, real_path
+from ..formats.regular_files import is_local_path, printable, real_path
 
 LONGEST_TEXT = 1 << 16
 """Characters of a text; the longest is the state of a merged sequence, 20 characters a frame. Panels read texts at each
@@ -84,8 +84,8 @@ def as_shown(value: object) -> str:
     if isinstance(value, dict | list):
         return "..."
     text = value[: _LONGEST_SHOWN + 1] if isinstance(value, str) else f"{value}"
-    printable = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return printable if len(printable) <= _LONGEST_SHOWN else f"{printable[:_LONGEST_SHOWN]}..."
+    shown = printable(text)
+    return shown if len(shown) <= _LONGEST_SHOWN else f"{shown[:_LONGEST_SHOWN]}..."
 
 
 def file_path(stored: str, library: bpy.types.Library | None) -> Path | None:

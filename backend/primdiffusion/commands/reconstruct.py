@@ -33,6 +33,7 @@ from primdiffusion.device import best_device
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import EncoderModel, load_encoder
 from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer
+from primdiffusion.formats.regular_files import printable
 from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
 from primdiffusion.formats.whole_files import staged
 from primdiffusion.from_pictures import (
@@ -107,7 +108,7 @@ def run(request: ReconstructRequest) -> None:
     with progress_bar() as report:
         answer = reconstruct(request, Session(), report)
     for warning in answer.warnings:
-        print(f"primdiffusion: warning: {warning}", file=sys.stderr)
+        print(printable(f"primdiffusion: warning: {warning}"), file=sys.stderr)
     if request.pictures:
         print(f"{request.out_dir}  {len(request.pictures)} pictures, {answer.seconds:.1f} s")
         return

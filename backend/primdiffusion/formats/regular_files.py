@@ -172,6 +172,17 @@ def is_local_path(path: str) -> bool:
     return 0 < len(path) <= _LONGEST_PATH and "\0" not in path and not _REMOTE.match(path) and os.path.isabs(path)
 
 
+def printable(text: str) -> str:
+    """Return `text` of a file, or with the name of one, for a terminal or a panel.
+
+    Spaces of all kinds, line ends and tabs become spaces; characters that control the screen or the order of letters,
+    and bytes that are not UTF-8, become "?".
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in text)
+
+
 def portable_name(name: str) -> str:
     """Return `name` as a file or folder may be called on every system: CON, nul.png and `x. ` are not, on Windows."""
     return _DEVICE.sub(r"\1_", name.rstrip(". "))
