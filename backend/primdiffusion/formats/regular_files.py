@@ -20,6 +20,7 @@ _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 """Starts of UNC paths, Windows' devices and URLs."""
 _DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(?=\.|$)", re.IGNORECASE)
 """Stems of names that are devices in every folder of Windows."""
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _LONGEST_PATH = 4096
 COPIED_BYTES = 256 * 2**20
 """Files up to this size are copied into memory before they are checked and used; larger ones are mapped."""
@@ -54,7 +55,7 @@ def as_file_error(path: Path | str | FileContent, reason: str, remedy: str, *als
     except (ValueError, TypeError, LookupError, AttributeError, OverflowError, *also) as error:
         text = f"it lacks {error}" if isinstance(error, KeyError) else str(error).removeprefix(f"{path}: ")
         words = " ".join(text.split())
-        raise FileError(path, f"{reason} ({words:.160})", remedy) from error
+        raise FileError(path, f"{reason} ({words:.120})", remedy) from error
 
 
 def real_path(path: str | Path) -> Path:
@@ -165,6 +166,11 @@ def check_size(path: str | Path | FileContent, size: int, limit: int) -> None:
 def is_plain_path(path: str) -> bool:
     """Return whether a path named in a file may be looked up: no server, device, URL or control character."""
     return 0 < len(path) <= _LONGEST_PATH and path.isprintable() and not _REMOTE.match(path)
+
+
+def may_be_written(path: str) -> bool:
+    """Return whether a path of a request may be written to: no server, device, URL or control character."""
+    return not _REMOTE.match(path) and not _CONTROL.search(path)
 
 
 def is_local_path(path: str) -> bool:
