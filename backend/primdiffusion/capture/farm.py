@@ -71,10 +71,12 @@ def subjects_of(command: Sequence[str]) -> list[str]:
         raise ValueError(
             f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it printed nothing'}"
         )
-    names = [line.get("line") if isinstance(line, dict) else line for line in listed]
-    for name in names:
+    names: list[str] = []
+    for line in listed:
+        name = line.get("line") if isinstance(line, dict) else line
         if not isinstance(name, str) or not _SUBJECT.fullmatch(name):
             raise ValueError(f"{command[0]} lists the subject {name!r:.80}: give its file a name of letters and digits")
+        names.append(name)
     return names
 
 

@@ -246,9 +246,7 @@ def check_unlinked(path: Path) -> None:
 def open_to_append(path: Path) -> io.BufferedWriter:
     """Open a regular file, made if it is missing, to add to its end. Raises FileError for a link, OSError."""
     check_unlinked(path)
-    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
-    file = open(os.open(path, flags | getattr(os, "O_BINARY", 0), 0o666), "wb")  # noqa: SIM115  the caller closes it
-    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):  # a device; to open a pipe that nobody reads fails
-        file.close()
-        raise PermissionError(errno.EPERM, "this is not a regular file", str(path))
-    return file
+    if os.path.exists(path):
+        check_regular(path)  # before it is opened: a pipe would wait for its reader
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    return open(os.open(path, flags, 0o666), "wb")
