@@ -15,6 +15,9 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
   readers must think the same (`tests/fuzz`)
 - blends: a stranger's names and paths in a .blend: how many properties were tried, and how many files they changed
   outside of the folder beside it (`tests/blender/blend_tampering.py`)
+- attacks: a stranger's lists of packages, links, texts, terminal escapes and requests, which are the inputs of the
+  tests in ATTACKS: how many there are, and how many did no harm; writers: how many of 200 results of two processes that
+  write into one folder at once are mixed (`tests/backend/two_writers.py`)
 - kills: of the programs in KILLED, in as many processes as there are cores, at most two; a loss is a file that is
   half-written, gone, set back, or other than that of an undisturbed run. disks, deaths (of the extension's child) and
   environments are `tests/chaos` too
@@ -33,6 +36,7 @@ import itertools
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 import tempfile
@@ -52,6 +56,28 @@ BATCHES = (1, 8)
 KILLED = ("captures render", "captures pack", "train", "fit", "payloads", "payloads encode", "payloads pack",
           "export .glb", "export .obj", "export .ply")  # fmt: skip
 """Programs that write what took long, as `tests/chaos/programs.py` names them."""
+ATTACKS = (
+    "tests/contract/test_setup_choice.py::test_only_whole_lines_of_a_requirement_or_an_index_are_read",
+    "tests/contract/test_setup_choice.py::test_a_second_index_is_refused",
+    "tests/contract/test_setup_choice.py::test_pip_gets_no_line_that_was_not_read",
+    "tests/contract/test_setup_environment.py::test_a_web_page_among_the_wheels_is_named_before_anything_is_made",
+    "tests/backend/capture/test_farm.py::test_a_subject_that_would_be_an_option_or_a_path_is_handed_to_no_renderer",
+    "tests/backend/capture/test_render.py::test_no_worker_writes_through_a_link_in_the_folder_of_a_human",
+    "tests/backend/formats/test_regular_files_removing.py",
+    "tests/backend/formats/test_whole_files.py::test_no_file_is_written_through_a_link_out_of_the_folder",
+    "tests/backend/released/test_inventory.py::"
+    "test_names_of_a_strangers_tensors_make_no_long_sentence_without_the_file",
+    "tests/backend/serve/test_server_rpc.py::test_nothing_is_written_to_a_server_or_a_path_of_control_characters",
+    "tests/backend/test_failures.py::test_no_terminal_escape_of_a_file_is_in_a_sentence",
+    "tests/backend/test_failures.py::test_the_command_line_prints_no_escape",
+    "tests/backend/test_folder_lock.py::test_a_link_in_place_of_the_lock_is_named_and_its_target_stays",
+    "tests/backend/training/test_run_folder.py::test_nothing_is_written_through_a_link_in_a_strangers_run_folder",
+    "tests/blender/scene/test_blend_values.py::test_a_record_is_parsed_once_however_often_panels_draw",
+    "tests/blender/scene/test_export_model.py::test_textures_are_not_written_through_a_link",
+    "tests/blender/ui/test_attributes.py::test_a_checkpoint_that_is_damaged_or_claims_much_is_read_once",
+    "tests/blender/ui/test_captures_panel.py::test_paths_that_begin_with_a_hyphen_are_no_options",
+)
+"""Tests whose inputs are attacks."""
 Figure = float | int | bool | str | None
 
 
@@ -152,6 +178,13 @@ def kills(count: int) -> dict[str, Figure]:
     return {name: sum(int(one[name] or 0) for one in found) for name in PARTS["kills"].figures}
 
 
+def attacks() -> dict[str, Figure]:
+    """The attacks that were tried, and those that did no harm. Ends with a sentence where a test is gone."""
+    said = run("-m", "pytest", "-q", "-p", "no:cacheprovider", *ATTACKS, is_shown=False).splitlines()[-1]
+    counts = {outcome: int(number) for number, outcome in re.findall(r"(\d+) (passed|failed|errors?)", said)}
+    return {"attack_cases": sum(counts.values()), "attack_cases_held": counts.get("passed", 0)}
+
+
 def chaos(attack: str, *options: str) -> dict[str, Figure]:
     with tempfile.TemporaryDirectory(prefix="primdiffusion_faults_") as name:
         figures = Path(name) / "figures.json"
@@ -216,6 +249,8 @@ PARTS: dict[str, Part] = {
         ("blend_properties_tried", "files_written_outside"),
         lambda _: tool("tests/blender/blend_tampering.py", is_shown=False),
     ),
+    "attacks": Part(("attack_cases", "attack_cases_held"), lambda _: attacks()),
+    "writers": Part(("two_writers_mixed",), lambda _: tool("tests/backend/two_writers.py", "--rounds", "200")),
     "kills": Part(("kills", "kills_lost"), lambda given: kills(given.kills)),
     "deaths": Part(
         ("child_deaths", "child_deaths_lost", "child_hangs"),

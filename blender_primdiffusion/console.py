@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
+from .formats.regular_files import printable
 from .formats.schema import descriptions, field_types, split
 from .formats.whole_files import write_atomically
 
@@ -65,7 +66,7 @@ def separate_stdout() -> Iterator[Callable[[str], None]]:
     os.close(nowhere)
 
     def say(line: str) -> None:
-        os.write(ours, f"{line}\n".encode())
+        os.write(ours, f"{printable(line)}\n".encode())
 
     try:
         yield say
@@ -134,7 +135,7 @@ class Report:
 
     def fail(self, subject: str, what: str, why: str) -> str:
         """Note a failure; returns it as one line."""
-        why = " ".join(why.split())
+        why = printable(" ".join(why.split()))
         self.failed.append({"subject": subject, "what": what, "why": why})
         return f"{subject or what}: {why}"
 

@@ -12,12 +12,11 @@ import importlib
 import io
 import os
 import sys
-import traceback
 from collections.abc import Sequence
 from typing import Any, NoReturn
 
 from primdiffusion.commands.options import OPTIONS
-from primdiffusion.failures import describe
+from primdiffusion.failures import describe, traceback_of
 from primdiffusion.machine import DEVICES, choose_device, share_processors
 from primdiffusion.version import __version__
 
@@ -147,7 +146,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         failure = describe(e)
         if failure is None or TRACEBACK in given:
             with contextlib.suppress(BrokenPipeError):
-                traceback.print_exc()
+                print(traceback_of(e), end="", file=sys.stderr)
         if failure is None:
             _end(DEFECT)
         _end(1, str(failure))

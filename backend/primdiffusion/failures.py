@@ -9,7 +9,10 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import re
+import traceback
 from types import ModuleType
+
+from primdiffusion.formats.regular_files import printable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +65,17 @@ MEMORY_REMEDY = "close other programs, or choose a smaller checkpoint or picture
 
 
 def describe(error: BaseException) -> ErrorDescription | None:
-    """Return the description of a domain error, or None for a bug."""
+    """Return the description of a domain error, or None for a bug. It holds no terminal escapes of a file."""
+    found = _described(error)
+    return None if found is None else dataclasses.replace(found, sentence=printable(found.sentence))
+
+
+def traceback_of(error: BaseException) -> str:
+    """Return the traceback of an error, whose message may quote a file, as lines for a terminal."""
+    return "".join(f"{printable(line)}\n" for line in "".join(traceback.format_exception(error)).splitlines())
+
+
+def _described(error: BaseException) -> ErrorDescription | None:
     sentence = shortened(" ".join(str(error).split())) or type(error).__name__
     if isinstance(error, PictureOutOfMemory):
         return ErrorDescription("out_of_memory", sentence, PICTURE_REMEDY)

@@ -26,9 +26,10 @@ NAMES = {"cpu": "CPU", "cuda": "NVIDIA (CUDA)", "apple": "Apple Silicon"}
 _SYSTEMS = {"Linux": "linux", "Windows": "windows", "Darwin": "macos"}
 _CHIPS = {"x86_64": "x86_64", "AMD64": "x86_64", "arm64": "arm64", "aarch64": "arm64"}
 _REQUIREMENT = re.compile(
-    r"(?P<name>[A-Za-z0-9._-]+)==(?P<version>[^\s;#]+) +--hash=sha256:[0-9a-f]{64}"
-    r"(?: +# (?P<bytes>\d+) bytes, (?P<installed>\d+|\?) installed)?"
+    r"(?P<whole>(?P<name>[A-Za-z0-9][A-Za-z0-9._-]*)==(?P<version>[A-Za-z0-9][A-Za-z0-9.+!_-]*)"
+    r"(?: +--hash=sha256:[0-9a-f]{64})+)(?: +# (?P<bytes>\d{1,15}) bytes, (?P<installed>\d{1,15}|\?) installed)?"
 )
+_INDEX = re.compile(r"--extra-index-url https://[A-Za-z0-9.-]+(?::\d+)?(?:/[A-Za-z0-9._~%/+-]*)?")
 _LARGEST_LOCK = 4 << 20
 """Bytes."""
 _UNPACKED_TO_PACKED = 3.0
@@ -55,8 +56,9 @@ class Lock:
     digest: str
     """SHA-256 of the file: says whether an environment was made of this very lock."""
     packages: tuple[Package, ...]
-    content: bytes
-    """The file as it was read and checked: pip gets a copy of it."""
+    requirements: str
+    """The lines that were read, for pip: of the file itself pip would also read what a coding line or a backslash hides
+    from us."""
 
     @property
     def download_bytes(self) -> int:
@@ -70,22 +72,32 @@ class Lock:
 
 
 def read_lock(path: Path) -> Lock:
-    """The lock in a file. Raises OSError, and ValueError for a line that is not `name==version --hash=sha256:...`."""
+    """The lock in a file: requirements with their hashes, comments, and at most one --extra-index-url.
+
+    Raises OSError, and ValueError for any other line.
+    """
     data = read_regular(path, _LARGEST_LOCK)
-    packages = []
+    packages, lines = [], []
     for number, line in enumerate(map(str.strip, data.decode("utf-8", "replace").splitlines()), 1):
-        if not line or line.startswith(("#", "--extra-index-url ")):
+        if not line or line.startswith("#"):
+            continue
+        if _INDEX.fullmatch(line) and not any(map(_INDEX.fullmatch, lines)):
+            lines.append(line)
             continue
         found = _REQUIREMENT.fullmatch(line)
         if found is None:
-            raise ValueError(f"line {number} of {path} is not 'name==version --hash=sha256:...': {line[:60]!r:.80}")
+            raise ValueError(
+                f"line {number} of {path} is neither 'name==version --hash=sha256:...' nor the one line "
+                f"'--extra-index-url https://...': {line[:60]!r:.80}"
+            )
+        lines.append(found["whole"])
         size = int(found["bytes"] or 0)
         unknown = found["installed"] in (None, "?")
         installed = int(size * _UNPACKED_TO_PACKED) if unknown else int(found["installed"])
         packages.append(Package(found["name"], found["version"], size, installed))
     if not packages:
         raise ValueError(f"{path} names no packages")
-    return Lock(path, hashlib.sha256(data).hexdigest(), tuple(packages), data)
+    return Lock(path, hashlib.sha256(data).hexdigest(), tuple(packages), "".join(f"{line}\n" for line in lines))
 
 
 def locks_for(folder: Path, platform: str, python: tuple[int, int]) -> dict[str, Path]:

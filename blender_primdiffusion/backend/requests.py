@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar
 
 from ..formats.answers import Progress
+from ..formats.regular_files import printable
 from ..formats.whole_files import remove_of_process
 from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
 
@@ -18,12 +19,12 @@ _LONGEST_NAME = 120
 
 
 def error_text(error: BaseException | str) -> str:
-    """What an error says: the system's with the file first, whose name is cut if it is very long."""
+    """What an error says, in one line: the system's with the file first, whose name is cut if it is very long."""
     if isinstance(error, OSError) and error.strerror and error.filename:
         name = str(error.filename)
         name = name if len(name) <= _LONGEST_NAME else f"{name[:40]}...{name[40 - _LONGEST_NAME :]}"
-        return f"{name}: {error.strerror[:1].lower()}{error.strerror[1:]}"
-    return str(error).strip()
+        return printable(f"{name}: {error.strerror[:1].lower()}{error.strerror[1:]}")
+    return printable(str(error).strip())
 
 
 def sentence(text: BaseException | str) -> str:

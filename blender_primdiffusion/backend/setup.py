@@ -14,6 +14,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
+import mimetypes
 import os
 import sys
 import time
@@ -83,6 +84,8 @@ def set_up(
     python, host = folder.python, sys.executable
     _check_own(folder)
     for path in () if wheels is None else wheels.iterdir():
+        if mimetypes.guess_type(path.name)[0] == "text/html":
+            raise RuntimeError(f"{path} is a web page, whose links pip would follow: remove it from the folder")
         with contextlib.suppress(IsADirectoryError, FileNotFoundError):  # pip says so of those that it needs
             check_regular(path)  # pip would wait for ever for a pipe
     folder.root.mkdir(parents=True, exist_ok=True)
@@ -96,8 +99,8 @@ def set_up(
     for _ in followed(making, folder.log, environment, _no_venv):
         yield Step("Making the environment", 0.0)
     source = [] if wheels is None else ["--no-index", "--find-links", str(wheels)]
-    requirements = folder.temporary / "requirements.txt"  # of what was checked
-    write_atomically(requirements, lock.content)
+    requirements = folder.temporary / "requirements.txt"
+    write_atomically(requirements, lock.requirements)
     command = [*_pip(python), *_INSTALL, *source, "-r", str(requirements)]
     for said in followed(command, folder.log, environment, what_went_wrong):
         yield _installing(folder, lock, said)

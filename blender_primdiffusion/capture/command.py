@@ -39,7 +39,7 @@ from ..formats.camera_rig import Rig, View
 from ..formats.capture_repair import repair, verify
 from ..formats.json_files import read_json
 from ..formats.poses.files import ENDINGS
-from ..formats.regular_files import FileError, as_file_error
+from ..formats.regular_files import FileError, as_file_error, printable
 from ..formats.requests import LAYOUTS, PASSES
 from .job import CaptureProgress, run
 from .scan import ScanFile, find_scans
@@ -160,7 +160,7 @@ def main(argv: Sequence[str]) -> int:
     try:
         options = parse(argv)
     except ValueError as error:
-        print(f"capture: {error}; --help names all options", file=sys.stderr, flush=True)
+        print(printable(f"capture: {error}; --help names all options"), file=sys.stderr, flush=True)
         return UNUSABLE
     with separate_stdout() as write:
         say = _json_lines(write) if options.progress == "json" else write
@@ -170,7 +170,7 @@ def main(argv: Sequence[str]) -> int:
             with stopped_by_signals() as stop:
                 return _run(options, say, stop)
         except (OSError, ValueError) as error:
-            print(f"capture: {error}", file=sys.stderr, flush=True)
+            print(printable(f"capture: {error}"), file=sys.stderr, flush=True)
             return UNUSABLE
         except Stopped:
             say("Stopped; the same command resumes from here.")

@@ -32,7 +32,7 @@ class ScanFile:
     """One human on disk."""
 
     name: str
-    """Name of the subject: unique, `[A-Za-z0-9._-]+`, not starting with a dot."""
+    """Name of the subject: unique, `[A-Za-z0-9._-]+`, not starting with a dot or a hyphen."""
     path: Path
     """The .glb, .gltf, .fbx or .obj."""
     parameters: Path | None
@@ -114,7 +114,7 @@ def _rank(path: Path) -> int:
 
 def _slug(path: Path) -> str:
     stem = path.stem if path.stem.lower() not in _GENERIC else real_path(path).parent.name
-    return portable_name(re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("_.")) or "person"
+    return portable_name(re.sub(r"[^A-Za-z0-9._-]+", "_", stem).strip("_.-")) or "person"
 
 
 def _parameters(path: Path) -> Path | None:

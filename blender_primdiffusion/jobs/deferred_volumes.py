@@ -12,7 +12,7 @@ from bpy.app.handlers import persistent
 from ..backend.requests import sentence
 from ..engine.engine import ENGINE
 from ..engine.gpu.overlay import overlay
-from ..formats.regular_files import FileError
+from ..formats.regular_files import FileError, printable
 from ..places import EXTENSION
 from ..scene.collect import collect_pending
 from ..scene.earlier_files import convert_earlier
@@ -96,7 +96,7 @@ class DeferredVolumes:
             change()
         except (OSError, FileError) as error:
             if self.error != str(error):
-                print(f"PrimDiffusion: {error}")
+                print(printable(f"PrimDiffusion: {error}"))
             self.error = str(error)
 
     def finish(self) -> None:
@@ -120,7 +120,7 @@ class DeferredVolumes:
         notice = sentence(newer_text(newer))
         if self.notice != notice:
             self.notice = notice
-            print(f"PrimDiffusion: {notice}")
+            print(printable(f"PrimDiffusion: {notice}"))
         try:
             for one in newer:
                 if one.in_views:
@@ -151,7 +151,7 @@ class DeferredVolumes:
 
     def _report(self, error: Exception) -> None:
         self.error, self.notice = str(error), ""
-        print(f"PrimDiffusion: {error}")
+        print(printable(f"PrimDiffusion: {error}"))
 
 
 deferred_volumes = DeferredVolumes()

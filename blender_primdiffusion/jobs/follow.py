@@ -16,6 +16,7 @@ import bpy
 from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import error_text, sentence
 from ..formats.answers import HumanAnswer
+from ..formats.regular_files import printable
 from ..places import backend_is_named
 from ..scene.states import Preparation, PreparedHuman
 from .deferred_volumes import keep_writing
@@ -217,7 +218,7 @@ def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -
     if outcome.error is not None:
         operator.report({"ERROR"}, outcome.sentence)
         return {"CANCELLED"}
-    print(f"PrimDiffusion: {outcome.notice}", flush=True)
+    print(printable(f"PrimDiffusion: {outcome.notice}"), flush=True)
     return {"FINISHED"}
 
 
@@ -263,7 +264,7 @@ def _wait_for(entry: Entry) -> JobOutcome:
     while queue.last is None or queue.last.entry is not entry:
         if queue.tick() and queue.request is not None and time.monotonic() - printed > _PRINT_S:
             printed = time.monotonic()
-            print(f"PrimDiffusion: {queue.request.message}", flush=True)
+            print(printable(f"PrimDiffusion: {queue.request.message}"), flush=True)
         if queue.ready:
             enter()
         else:

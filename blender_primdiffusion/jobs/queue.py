@@ -16,7 +16,7 @@ import bpy
 
 from ..backend.client import Died, Silent
 from ..backend.environment import NOT_ABSOLUTE
-from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError
+from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError, error_text
 from ..formats.regular_files import is_local_path, remove_folder
 from ..places import new_backend, preference
 from .remedies import defect_in_the_scene, error_in_the_scene
@@ -118,7 +118,7 @@ class JobOutcome:
     @property
     def sentence(self) -> str:
         """Why it failed; empty when it did not."""
-        return str(self.error) if self.error is not None else ""
+        return error_text(self.error) if self.error is not None else ""
 
     @property
     def went_well(self) -> bool:

@@ -17,10 +17,11 @@ from typing import Any, cast
 import bpy
 
 from ..formats.json_files import parse_json
-from ..formats.regular_files import is_local_path, real_path
+from ..formats.regular_files import is_local_path, printable, real_path
 
-LONGEST_TEXT = 4 << 20
-"""Characters of a text; the longest is the state of a merged sequence, 20 characters a frame."""
+LONGEST_TEXT = 1 << 16
+"""Characters of a text; the longest is the state of a merged sequence, 20 characters a frame. Panels read texts at each
+draw."""
 LARGEST_NUMBER = 1e6
 _LONGEST_PART = 255
 """Bytes of a name in a path: file systems take no more, and `stat` raises OSError."""
@@ -49,11 +50,7 @@ def stored_folder(holder: bpy.types.bpy_struct, name: str) -> Path | None:
 def stored_record(holder: bpy.types.bpy_struct, name: str) -> dict[str, Any]:
     """A custom property that is a JSON object; empty for any other."""
     text = stored_text(holder, name)
-    try:
-        record = {} if text is None else parse_json(text)
-    except ValueError:
-        return {}
-    return record if isinstance(record, dict) else {}
+    return {} if text is None else dict(_record(text))
 
 
 def stored_numbers(holder: bpy.types.bpy_struct, name: str, count: int) -> list[float] | None:
@@ -87,8 +84,8 @@ def as_shown(value: object) -> str:
     if isinstance(value, dict | list):
         return "..."
     text = value[: _LONGEST_SHOWN + 1] if isinstance(value, str) else f"{value}"
-    printable = "".join(letter if letter.isprintable() else "?" for letter in text)
-    return printable if len(printable) <= _LONGEST_SHOWN else f"{printable[:_LONGEST_SHOWN]}..."
+    shown = printable(text)
+    return shown if len(shown) <= _LONGEST_SHOWN else f"{shown[:_LONGEST_SHOWN]}..."
 
 
 def file_path(stored: str, library: bpy.types.Library | None) -> Path | None:
@@ -113,6 +110,16 @@ def setting_path(stored: str, label: str) -> str:
             "choose it again"
         )
     return path
+
+
+@functools.lru_cache(maxsize=64)
+def _record(text: str) -> dict[str, Any]:
+    """Parsed once: panels draw again at each movement of the mouse."""
+    try:
+        record = parse_json(text)
+    except ValueError:
+        return {}
+    return record if isinstance(record, dict) else {}
 
 
 @functools.lru_cache(maxsize=256)

@@ -17,7 +17,7 @@ from pathlib import Path
 import bpy
 from bpy.app.handlers import persistent
 
-from ..formats.regular_files import FileError, exists_in_its_folder, portable_name, real_path, remove_file
+from ..formats.regular_files import FileError, exists_in_its_folder, portable_name, printable, real_path, remove_file
 from ..formats.whole_files import remove_empty
 from .blend_values import as_shown, stored_folder, stored_text
 from .earlier_files import EARLIER, earlier_volumes
@@ -145,11 +145,11 @@ def collect_before_saving(blend_path: str, *_: object) -> None:
     if not os.path.isdir(os.path.dirname(blend_path)):  # the start-up file has no path; others cannot be written
         return
     for fault in ignored_values():
-        print(f"PrimDiffusion: {fault}")
+        print(printable(f"PrimDiffusion: {fault}"))
     try:
         collect_own_files(blend_path)
     except (OSError, FileError) as error:
-        print(f"PrimDiffusion: humans of this file depend on files elsewhere: {error}")
+        print(printable(f"PrimDiffusion: humans of this file depend on files elsewhere: {error}"))
 
 
 def finish_saving(blend_path: str) -> None:

@@ -19,7 +19,7 @@ import bpy
 from numpy.typing import NDArray
 
 from ..formats.arrays import MOST_BODY_VALUES, read_numbers
-from ..formats.regular_files import FileError, exists_in_its_folder, portable_name
+from ..formats.regular_files import FileError, exists_in_its_folder, portable_name, printable
 from .blend_values import file_path, stored_name
 from .human import (
     BODY_FILE,
@@ -103,5 +103,5 @@ def _converted(person: bpy.types.Collection, own: Path, volumes: set[Path]) -> P
         remove_state(state)
         raise write_error(state, error) from error
     except ValueError as error:  # a damaged file: the human has no body until the file is replaced
-        print(f"PrimDiffusion: {error}")
+        print(printable(f"PrimDiffusion: {error}"))
     return state

@@ -194,5 +194,5 @@ def _publish(folder: Path, path: Path) -> None:
     for source in sorted(folder.rglob("*"), key=lambda source: source == folder / path.name):
         if source.is_dir():
             continue
-        with replacing(path.parent / source.relative_to(folder)) as unfinished:
+        with replacing(path.parent / source.relative_to(folder), path.parent) as unfinished:
             shutil.copyfile(source, unfinished)

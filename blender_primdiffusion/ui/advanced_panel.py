@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..backend.requests import sentence
+from ..formats.regular_files import printable
 from ..formats.requests import DENSITY_GAIN, VOXEL
 from ..jobs.deferred_volumes import deferred_volumes
 from ..jobs.export import show, shown
@@ -37,7 +38,7 @@ ATTACHMENT_ITEMS = (
     ("SURFACE", "Surface", "Volumes are placed on the posed skin in each pose, as in the PrimDiffusion engine"),
     ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
 )
-_MOST_FRAMES = 10_000
+_MOST_FRAMES = 3_000
 
 
 class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
@@ -182,7 +183,7 @@ def _set_gain(person: bpy.types.Collection, gain: float) -> None:
     try:
         set_density_gain(person, gain)
     except ValueError as error:  # a property has no report
-        print(f"PrimDiffusion: {error}")
+        print(printable(f"PrimDiffusion: {error}"))
 
 
 def gain_property() -> bpy.props.FloatProperty:

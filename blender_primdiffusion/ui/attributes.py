@@ -5,6 +5,7 @@ The backend writes them into the checkpoint's metadata, which are read without t
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import re
 import zlib
@@ -20,6 +21,8 @@ from ..places import backend_module_path, preference
 
 _LARGEST_FILE = 16 << 30
 """Bytes, as in the backend's `tensor_file`."""
+_LONGEST_TEXT = 1 << 16
+"""Characters of a model's settings; those of the default one have a thousand."""
 _LARGEST_NUMBER = 1e9
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
@@ -55,7 +58,10 @@ def read_vocabulary(path: Path) -> Vocabulary:
         with open_regular(path, _LARGEST_FILE) as file:
             layout = read_layout(file)
         check_limits(layout)
-        tree = parse_json(layout.metadata["architecture"]).get("vocabulary") or {}
+        text = layout.metadata["architecture"]
+        if len(text) > _LONGEST_TEXT:
+            raise ValueError(f"its architecture has {len(text)} characters, and {_LONGEST_TEXT} are the most")
+        tree = parse_json(text).get("vocabulary") or {}
         categories = {name: tuple(map(str, values)) for name, values in tree.get("categories", {}).items()}
         scalars = {name: (float(mean), float(std)) for name, (mean, std) in tree.get("scalars", {}).items()}
         if not all(abs(mean) <= _LARGEST_NUMBER and 0 < std <= _LARGEST_NUMBER for mean, std in scalars.values()):
@@ -77,10 +83,13 @@ def known() -> Vocabulary:
         return Vocabulary()
     try:
         time = path.stat().st_mtime
-        if path not in _read or _read[path][0] != time:
-            _read[path] = (time, read_vocabulary(path))
     except (OSError, ValueError):
         return Vocabulary()
+    if path not in _read or _read[path][0] != time:
+        found = Vocabulary()  # a damaged file is read once, too: panels ask at each draw
+        with contextlib.suppress(OSError, ValueError):
+            found = read_vocabulary(path)
+        _read[path] = (time, found)
     return _read[path][1]
 
 

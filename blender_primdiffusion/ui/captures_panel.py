@@ -11,12 +11,14 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
+from ..backend.requests import error_text
 from ..capture.cameras import aim
 from ..capture.command import ASK_FROM, describe, estimate, parse, scans_in, settings_of
 from ..capture.job import run
 from ..console import Report, report_path
 from ..formats.camera_rig import bounding_sphere
 from ..formats.capture_repair import repair, verify
+from ..formats.regular_files import printable
 from ..jobs.follow import Reporting, redraw
 from ..places import shows_captures
 from ..scene.blend_values import setting_path
@@ -72,7 +74,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
             settings_of(parse(words))  # report impossible settings at once
             captures.start(words)
         except (OSError, ValueError, RuntimeError) as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
         return {"FINISHED"}
@@ -85,7 +87,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
         with contextlib.closing(run(context, settings, scans, report)) as steps:
             for progress in steps:
                 for line in progress.news:
-                    print(f"PrimDiffusion: {line}", flush=True)
+                    print(printable(f"PrimDiffusion: {line}"), flush=True)
                 if time.monotonic() - printed > _PRINT_S:
                     printed = time.monotonic()
                     print(f"PrimDiffusion: {describe(progress)}", flush=True)
@@ -121,7 +123,7 @@ class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
         root = parse(words).out
         wrong = verify(root)
         for path, what in wrong.items():
-            print(f"PrimDiffusion: {path}: {what}")
+            print(printable(f"PrimDiffusion: {path}: {what}"))
         if self.repair:
             repair(root, wrong)
         elif wrong:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 
 import bpy
@@ -173,8 +174,8 @@ def words_of(
 
     `people` and `out` go before the panel's. Raises ValueError where something is missing or a path is impossible.
     """
-    people = bpy.path.abspath(people) or setting_path(asked.people, "People")
-    out = bpy.path.abspath(out) or setting_path(asked.out, "Captures")
+    people = os.path.abspath(bpy.path.abspath(people)) if people else setting_path(asked.people, "People")
+    out = os.path.abspath(bpy.path.abspath(out)) if out else setting_path(asked.out, "Captures")
     if not people or not out:
         raise ValueError(f"choose a folder {'of people' if not people else 'for the captures'} first")
     words = ["--people", people, "--out", out, "--seed", str(asked.seed)]

@@ -8,6 +8,7 @@ import textwrap
 import bpy
 
 from ..backend.requests import RequestError
+from ..formats.regular_files import printable
 from ..jobs.follow import building, in_the_way
 from ..jobs.pictures import so_far
 from ..jobs.queue import JobOutcome, queue
@@ -106,7 +107,7 @@ def draw_lines(layout: bpy.types.UILayout, text: str, icon: str, width: int = _L
 
 def _wrapped(text: str, width: int = _LINE) -> list[str]:
     """Lines that fit; numbers keep their units."""
-    together = _QUANTITY.sub(lambda match: match[0].replace(" ", _NO_BREAK), text)
+    together = _QUANTITY.sub(lambda match: match[0].replace(" ", _NO_BREAK), printable(text))
     return [line.replace(_NO_BREAK, " ") for line in textwrap.wrap(together, width)]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import bpy
 
+from ..backend.requests import error_text
 from ..formats.requests import GaussiansRequest, MergeFramesRequest, ProxyRequest
 from ..jobs.export import (
     AddProxyJob,
@@ -168,7 +169,7 @@ class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
         try:
             person = self.person(context)
         except ValueError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         settings = context.scene.primdiffusion_export
         self.format = self.chosen("format", settings)

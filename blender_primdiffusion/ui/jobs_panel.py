@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator
 import bpy
 from bpy.app.handlers import persistent
 
+from ..backend.requests import error_text
 from ..jobs import follow, memory
 from ..jobs.follow import Reporting, building, redraw, submit
 from ..jobs.memory import device_line
@@ -222,7 +223,7 @@ class PRIMDIFFUSION_OT_release_memory(bpy.types.Operator):
         try:
             freed = memory.release()
         except RuntimeError as error:
-            self.report({"ERROR"}, str(error))
+            self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
         self.report({"INFO"}, freed)
         redraw()

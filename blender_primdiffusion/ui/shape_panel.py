@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.requests import sentence
+from ..formats.regular_files import printable
 from ..jobs.target import selected_person
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from ..scene.copies import rename_human
@@ -106,7 +107,7 @@ def _printed(change) -> None:
     try:
         change()
     except (OSError, ValueError) as error:
-        print(f"PrimDiffusion: {error}")
+        print(printable(f"PrimDiffusion: {error}"))
 
 
 def _looped(self: PRIMDIFFUSION_PG_human) -> bool:

@@ -4,7 +4,9 @@ import pickle
 
 import pytest
 import torch
-from primdiffusion.failures import PictureOutOfMemory, describe
+from primdiffusion import cli
+from primdiffusion.failures import PictureOutOfMemory, describe, traceback_of
+from primdiffusion.formats.regular_files import FileError, printable
 from primdiffusion.formats.schema import FieldError
 
 
@@ -55,6 +57,48 @@ def test_a_domain_error_is_one_sentence_of_its_kind(error, kind, text):
     assert failure.kind == kind
     assert text in failure.sentence
     assert "\n" not in str(failure)
+
+
+ESCAPE = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp.exe"
+"""Sets a terminal's title, clears it, colours it, and turns letters round."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        FileError(f"{ESCAPE}.glb", f"has joints {ESCAPE}", "rig it again"),
+        FileNotFoundError(2, "No such file or directory", f"/{ESCAPE}"),
+        PermissionError(13, "Permission denied", f"/{ESCAPE}"),
+        OSError(ESCAPE),
+        ValueError(f"version {ESCAPE}"),
+        ImportError(ESCAPE),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_no_terminal_escape_of_a_file_is_in_a_sentence(error):
+    assert "owned" in describe(error).sentence
+    assert str(describe(error)).isprintable()
+
+
+def test_no_terminal_escape_is_in_a_traceback():
+    lines = traceback_of(RuntimeError(f"{ESCAPE}\nand more")).splitlines()
+    assert all(line.isprintable() for line in lines)
+    assert lines[-1] == "and more"
+
+
+def test_letters_of_all_languages_stay_and_spaces_are_spaces():
+    assert printable("\u5199\u771f\u3000\u5e74 Mu\u0308ller\u00a0b.png") == "\u5199\u771f \u5e74 Mu\u0308ller b.png"
+    assert printable("a\tb\r\nc\udcff") == "a b  c?"
+
+
+def test_the_command_line_prints_no_escape(tmp_path, capsys):
+    path = tmp_path / f"{ESCAPE}.safetensors"
+    for arguments in (["info", str(path)], ["captures", "verify", str(path)], ["--traceback", "info", str(path)]):
+        with pytest.raises(SystemExit):
+            cli.main(arguments)
+        said = capsys.readouterr()
+        assert all(line.isprintable() for line in (said.out + said.err).splitlines())
+        assert "owned" in said.err
 
 
 @pytest.mark.parametrize("error", [KeyError("x"), RuntimeError("shape mismatch"), TypeError(), AssertionError()])

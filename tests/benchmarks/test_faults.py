@@ -12,7 +12,7 @@ NAMES = {
     "fuzz_tracebacks", "fuzz_garbage", "fuzz_hangs", "fuzz_over_500mb", "executions", "reader_verdicts_compared",
     "reader_verdicts_differ", "blend_properties_tried", "files_written_outside", "kills", "kills_lost", "child_deaths",
     "child_deaths_lost", "child_hangs", "disk_full_commands", "disk_full_losses", "environments",
-    "environments_failed", "window_rounds", "window_crashes",
+    "environments_failed", "window_rounds", "window_crashes", "attack_cases", "attack_cases_held", "two_writers_mixed",
 }  # fmt: skip
 
 
@@ -103,3 +103,9 @@ def test_the_programs_that_are_killed_exist():
 
     known = {program.name for program in all_programs(Inputs(Path()))}
     assert set(faults.KILLED) - {"payloads"} <= known  # payloads: where MakeHuman's assets are
+
+
+def test_every_attack_is_a_test_that_is_there():
+    for path, _, name in (attack.partition("::") for attack in faults.ATTACKS):
+        text = (faults.ROOT / path).read_text(encoding="utf-8")
+        assert f"def {name or 'test_'}" in text

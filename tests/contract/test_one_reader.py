@@ -49,7 +49,6 @@ ALLOWED = {
         "formats/picture_files.py",
         "formats/poses/files.py",
         "scene/human_file.py",
-        "training/run_folder.py",
         "backend/packages.py",
         "ui/jobs_panel.py",
         "cli.py",

@@ -154,3 +154,51 @@ def test_a_folder_in_place_of_a_wheel_is_named():
     idna==3.10 from file:///srv/wheels/idna-3.10-py3-none-any.whl (from -r /srv/wheels/requirements.txt (line 1))
 """
     assert what_went_wrong(said, 1).startswith("idna-3.10-py3-none-any.whl is a folder")
+
+
+HASH = f"--hash=sha256:{'0' * 64}"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "--extra-index-url https://x --no-binary :all:",
+        "--extra-index-url https://x\\",
+        "--extra-index-url http://x",
+        "--extra-index-url file:///srv",
+        "--extra-index-url https://${HOME}",
+        "--extra-index-url https://x -r https://x/more.txt",
+        "-r http://x/more.txt",
+        "--find-links http://x",
+        "-c /etc/passwd",
+        f"-r==more.txt {HASH}",
+        f"--no-binary==:all: {HASH}",
+        f"torch==1.0;python_version>'3' {HASH}",
+        f"torch==${{HOME}} {HASH}",
+        f"torch==1.0 {HASH} --global-option=x",
+        f"torch==1.0 {HASH} \\",
+        f"./torch-1.0.tar.gz {HASH}",
+        f"torch @ https://x/torch.whl {HASH}",
+        "torch==1.0",
+    ],
+)
+def test_only_whole_lines_of_a_requirement_or_an_index_are_read(tmp_path, line):
+    path = tmp_path / "requirements.txt"
+    path.write_text(f"idna==3.10 {HASH}\n{line}\n")
+    with refused(ValueError, "line 2", str(path)):
+        read_lock(path)
+
+
+def test_a_second_index_is_refused(tmp_path):
+    path = tmp_path / "requirements.txt"
+    path.write_text(f"--extra-index-url https://x\n--extra-index-url https://y/whl/cpu\nidna==3.10 {HASH}\n")
+    with refused(ValueError, "line 2", "https://y/whl/cpu"):
+        read_lock(path)
+
+
+def test_pip_gets_no_line_that_was_not_read(tmp_path):
+    path = tmp_path / "requirements.txt"
+    index, one = "--extra-index-url https://x:8080/whl/cu130", f"idna==3.10+cpu.1 {HASH} {HASH}"
+    hidden = "# coding: utf-7\n#+AAo--r https://y/more.txt"
+    path.write_text(f"{hidden}\n{index}\n\n{one}  # 5 bytes, ? installed\n")
+    assert read_lock(path).requirements == f"{index}\n{one}\n"

@@ -142,6 +142,12 @@ def test_pip_gets_the_lock_as_it_was_checked(place):
         read_lock(place.lock)
 
 
+def test_a_web_page_among_the_wheels_is_named_before_anything_is_made(place):
+    (place.wheels / "links.HTM").write_text('<a href="http://localhost:9/torch-9-py3-none-any.whl">')
+    assert "links.HTM is a web page" in failed(place.from_folder())
+    assert not place.folder.root.exists()
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
 def test_a_pipe_among_the_wheels_is_named_before_anything_is_made(place):
     os.mkfifo(place.wheels / "torch-9-py3-none-any.whl")

@@ -151,7 +151,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "run folders: settings, metrics": (
         ("run: settings", "run: starts", "run: metrics"),
-        ("tests/backend/training/test_run_folder_lock.py::test_of_two_processes_the_second_is_rejected_in_one_sentence",),
+        ("tests/backend/test_folder_lock.py::test_of_two_processes_the_second_is_rejected_in_one_sentence",),
     ),
     "requirements in a folder of wheels": (
         ("lock of packages",),

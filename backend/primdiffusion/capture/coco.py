@@ -42,7 +42,7 @@ from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.whole_files import replacing
+from primdiffusion.formats.whole_files import staged
 
 ANNOTATIONS_FILE, TABLE_FILE = "annotations.json", "images.csv"
 PASSES = ("img", "mask", "depth")
@@ -103,11 +103,10 @@ def write_coco(
     """
     if missing := [kind for kind in PASSES if kind not in captures.passes]:
         raise FileError(captures.root, f"has no {' and no '.join(missing)}", f"render with {', '.join(PASSES)}")
-    table, annotations = captures.root / TABLE_FILE, captures.root / ANNOTATIONS_FILE
-    with replacing(table) as rows_to, replacing(annotations) as annotations_to:
-        with rows_to.open("w", encoding="utf-8", newline="") as file:
+    with staged(captures.root) as folder:
+        with (folder / TABLE_FILE).open("w", encoding="utf-8", newline="") as file:
             csv.writer(file, lineterminator="\n").writerows(_rows(captures, attributes, backgrounds))
-        with annotations_to.open("w", encoding="utf-8", newline="\n") as file:
+        with (folder / ANNOTATIONS_FILE).open("w", encoding="utf-8", newline="\n") as file:
             file.write('{"info":{"description":"PrimDiffusion captures"},"licenses":[],')
             file.write(f'"categories":[{_line(CATEGORY)}],\n"images":[\n')
             file.writelines(_separated(_line(image.record) for image in _images(captures, backgrounds)))

@@ -16,7 +16,7 @@ from primdiffusion.capture.reader import Subject
 from primdiffusion.capture.render import JPEG_QUALITY
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.formats.regular_files import as_file_error, check_inside
+from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, BYTE_STEPS, LINEAR_OF_BYTE
@@ -61,12 +61,11 @@ def write_composed(
         FileError, OSError: the file cannot be written, or lies behind a link out of the captures.
     """
     path, view = composed_path(subject, frame, camera), subject.views[camera]
-    check_inside(path, subject.folder.parent)
     image = np.zeros((view.height, view.width, 3), np.uint8)
     if background is not None:
         image = read_background(background, view.width, view.height)
     image[box] = compose(views, shares, image[box])
-    with replacing(path) as partial:
+    with replacing(path, subject.folder.parent) as partial:
         Image.fromarray(image).save(partial, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
 
 

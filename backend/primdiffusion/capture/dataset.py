@@ -32,7 +32,7 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.arrays import map_npy
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.json_files import LARGEST_BYTES, read_json
-from primdiffusion.formats.regular_files import FileError, check_inside, read_regular
+from primdiffusion.formats.regular_files import FileError, read_regular
 from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
@@ -72,10 +72,10 @@ def pack_subject(subject: Subject) -> None:
         raise FileError(
             subject.folder, "has images of several sizes, which cannot be packed", "render it with one size"
         )
-    check_inside(pack_path(subject), subject.folder.parent)
     stamp = source_stamp(subject)
     shape = (subject.frames, len(subject.views), *sizes.pop(), 4)
-    with replacing(pack_path(subject)) as path, path.open("wb") as file:  # a full disk kills a writer of mapped memory
+    whole = replacing(pack_path(subject), subject.folder.parent)
+    with whole as path, path.open("wb") as file:  # a full disk kills a writer of mapped memory
         header = {"descr": "|u1", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(file, header)
         for frame in range(shape[0]):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
+import re
 import signal
 import subprocess
 import sys
@@ -21,6 +22,8 @@ from primdiffusion.formats.json_files import parse_json
 LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
 """Options that a renderer must support: list its subjects as {"line": NAME} on marked lines, and render one."""
 MARK = "PRIMDIFFUSION "
+_SUBJECT = re.compile(r"[A-Za-z0-9_][A-Za-z0-9._-]{0,199}")
+"""No option and no path: it is handed to another program."""
 _LINES_OF_ERROR = 5
 _SET_PARENT_DEATH_SIGNAL = 1
 _NO_WINDOW = getattr(subprocess, "CREATE_NO_WINDOW", 0)
@@ -68,7 +71,13 @@ def subjects_of(command: Sequence[str]) -> list[str]:
         raise ValueError(
             f"{' '.join([*command, *LIST])} names no subjects: {_tail(ran.stderr) or 'it printed nothing'}"
         )
-    return [line["line"] for line in listed]
+    names: list[str] = []
+    for line in listed:
+        name = line.get("line") if isinstance(line, dict) else line
+        if not isinstance(name, str) or not _SUBJECT.fullmatch(name):
+            raise ValueError(f"{command[0]} lists the subject {name!r:.80}: give its file a name of letters and digits")
+        names.append(name)
+    return names
 
 
 def render_on(

@@ -338,8 +338,8 @@ def _try(job: RenderJob, name: str, frames: Sequence[int]) -> SubjectResult:
     """Render some frames of a subject; errors of input and files become a failed result."""
     try:
         setup = _set_up(job, name)
+        check_unlinked(job.out / name)
         if frames[0] == 0:
-            check_unlinked(job.out / name)
             write_parameters(job.out / name, setup)
         views = sum(1 for _ in render_frames(job.out / name, setup, frames, job.passes, job.samples))
         return SubjectResult(name, "done", views=views)

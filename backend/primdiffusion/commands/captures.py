@@ -28,6 +28,7 @@ from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.group_places import MOST
+from primdiffusion.formats.regular_files import printable
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.schema import Range, check
 from primdiffusion.pose_file import read_motion
@@ -112,11 +113,12 @@ class RenderCaptures:
             part="report" if count == 1 else f"report-{index}-of-{count}",
         )
         for error in unread:
-            print(f"poses  failed  {error}", flush=True)
+            print(printable(f"poses  failed  {error}"), flush=True)
         outcomes = Counter()
         for outcome in tqdm(render(job, self.workers), total=len(names), unit="human", disable=None):
             outcomes[outcome.status] += 1
-            print(f"{outcome.subject}  {outcome.status}  {outcome.error or f'{outcome.views} views'}", flush=True)
+            said = outcome.error or f"{outcome.views} views"
+            print(printable(f"{outcome.subject}  {outcome.status}  {said}"), flush=True)
         if outcomes["failed"] or unread:
             poses_too = f" and {len(unread)} of {len(self.poses)} pose files" if unread else ""
             raise ValueError(
@@ -177,7 +179,7 @@ class VerifyCaptures:
         """Print a line for each finding; raises ValueError if there is any."""
         findings = verify(self.root, checksums=not self.quick)
         for path, what in findings.items():
-            print(f"{path}: {what}")
+            print(printable(f"{path}: {what}"))
         if not findings:
             print(f"{self.root}: {len(subject_folders(self.root))} subjects, nothing wrong")
             return
@@ -299,7 +301,8 @@ class FarmCaptures:
         """Render, and print a line for each human. Raises ValueError if the cluster cannot start or a human fails."""
 
         def show(outcome: FarmResult, done: int, total: int) -> None:
-            print(f"{done}/{total}  {outcome.subject}  {outcome.error or f'{outcome.seconds:.0f} s'}", flush=True)
+            said = outcome.error or f"{outcome.seconds:.0f} s"
+            print(printable(f"{done}/{total}  {outcome.subject}  {said}"), flush=True)
 
         farm = Farm(self.address, self.workers, self.processors_each, self.gpus_each, self.attempts)
         outcomes = render_on(farm, self.command, show)

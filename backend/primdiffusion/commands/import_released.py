@@ -17,6 +17,7 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.capture.smpl_parameters import read_smpl
 from primdiffusion.diffusion.checkpoint import file_hash, under
 from primdiffusion.diffusion.model import BETAS
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.primitives.anchors import grid_points_outside
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
@@ -39,7 +40,7 @@ def read_released(path: Path) -> tuple[dict[str, Tensor], Inventory]:
     try:
         return weights, take_inventory(weights)
     except ValueError as error:
-        raise type(error)(f"{path}: {error}") from error
+        raise FileError(f"{path}: {error}") from error
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,6 +17,8 @@ from primdiffusion.commands.options import (
 )
 from primdiffusion.device import best_device
 from primdiffusion.encoder.model import load_encoder
+from primdiffusion.folder_lock import lock_folder
+from primdiffusion.formats.regular_files import printable
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people, unknown_licences
 from primdiffusion.people.payloads import make_payloads
@@ -30,14 +32,14 @@ def run_people(command: PeopleCommand) -> None:
     """Make the humans, show progress, and print the folder. Raises ValueError, FileNotFoundError, OSError."""
     people = PeopleSet(command.out, command.seed, command.count)
     assets = open_assets(command.assets, required_meshes())
-    with tqdm(total=command.count, unit="human", desc="people", disable=None) as bar:
+    with lock_folder(command.out), tqdm(total=command.count, unit="human", desc="people", disable=None) as bar:
         for done in make_people(assets, people, command.workers):
             bar.update(done - bar.n)
     unknown = unknown_licences(command.out)
     if unknown:
         print(
-            f"primdiffusion: {len(unknown)} asset files state no licence ({unknown[0]}, ...), so the manifest "
-            "lists it as unknown: list them in a LICENSES.txt beside the asset folder",
+            f"primdiffusion: {len(unknown)} asset files state no licence ({printable(unknown[0])}, ...), so the "
+            "manifest lists it as unknown: list them in a LICENSES.txt beside the asset folder",
             file=sys.stderr,
         )
     print(command.out)
@@ -75,11 +77,12 @@ def run_encode(command: EncodePayloadsCommand) -> None:
     model = load_encoder(command.encoder, best_device())
     outcomes = Counter()
     work = encode_people(model, captures, command.out, settings, cards)
-    for outcome in tqdm(work, total=len(captures.subjects), unit="human", disable=None):
-        outcomes[outcome.status] += 1
-        unknown = command.people is not None and outcome.subject not in cards
-        note = outcome.error or ("attributes unknown" if unknown else "")
-        print(f"{outcome.subject}  {outcome.status}  {note}".rstrip(), flush=True)
+    with lock_folder(command.out):
+        for outcome in tqdm(work, total=len(captures.subjects), unit="human", disable=None):
+            outcomes[outcome.status] += 1
+            unknown = command.people is not None and outcome.subject not in cards
+            note = outcome.error or ("attributes unknown" if unknown else "")
+            print(printable(f"{outcome.subject}  {outcome.status}  {note}").rstrip(), flush=True)
     if outcomes["failed"]:
         raise ValueError(f"{outcomes['failed']} of {len(captures.subjects)} humans failed: see the lines above")
 
@@ -97,7 +100,7 @@ def run_verify(command: VerifyPayloadsCommand) -> None:
     """Print a line for each damaged shard; raises ValueError if there is any."""
     found = damaged_shards(command.folder)
     for sentence in found:
-        print(sentence)
+        print(printable(sentence))
     if found:
         raise ValueError(f"{len(found)} shards of {command.folder} are damaged: pack the humans again")
     print(f"{command.folder}: nothing wrong")

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from tqdm import tqdm
 
+from primdiffusion.formats.regular_files import printable
+
 if TYPE_CHECKING:
     from primdiffusion.diffusion.samplers import SamplerStep
 
@@ -82,4 +84,4 @@ def progress_bar(label: str | None = None) -> Iterator[ReportProgress]:
 def print_warnings(warnings: Iterable[str]) -> None:
     """Print a line on stderr for each."""
     for warning in warnings:
-        print(f"primdiffusion: warning: {warning}", file=sys.stderr)
+        print(printable(f"primdiffusion: warning: {warning}"), file=sys.stderr)

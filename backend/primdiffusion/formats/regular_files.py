@@ -20,6 +20,7 @@ _REMOTE = re.compile(r"[\\/]{2}|[a-z][a-z0-9+.-]+:[\\/]", re.IGNORECASE)
 """Starts of UNC paths, Windows' devices and URLs."""
 _DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(?=\.|$)", re.IGNORECASE)
 """Stems of names that are devices in every folder of Windows."""
+_CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _LONGEST_PATH = 4096
 COPIED_BYTES = 256 * 2**20
 """Files up to this size are copied into memory before they are checked and used; larger ones are mapped."""
@@ -54,7 +55,7 @@ def as_file_error(path: Path | str | FileContent, reason: str, remedy: str, *als
     except (ValueError, TypeError, LookupError, AttributeError, OverflowError, *also) as error:
         text = f"it lacks {error}" if isinstance(error, KeyError) else str(error).removeprefix(f"{path}: ")
         words = " ".join(text.split())
-        raise FileError(path, f"{reason} ({words:.160})", remedy) from error
+        raise FileError(path, f"{reason} ({words:.120})", remedy) from error
 
 
 def real_path(path: str | Path) -> Path:
@@ -167,9 +168,25 @@ def is_plain_path(path: str) -> bool:
     return 0 < len(path) <= _LONGEST_PATH and path.isprintable() and not _REMOTE.match(path)
 
 
+def may_be_written(path: str) -> bool:
+    """Return whether a path of a request may be written to: no server, device, URL or control character."""
+    return not _REMOTE.match(path) and not _CONTROL.search(path)
+
+
 def is_local_path(path: str) -> bool:
     """Return whether a path is absolute and of this computer: no server, device or URL. Folders may have any name."""
     return 0 < len(path) <= _LONGEST_PATH and "\0" not in path and not _REMOTE.match(path) and os.path.isabs(path)
+
+
+def printable(text: str) -> str:
+    """Return `text` of a file, or with the name of one, for a terminal or a panel.
+
+    Spaces of all kinds, line ends and tabs become spaces; characters that control the screen or the order of letters,
+    and bytes that are not UTF-8, become "?".
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else " " if letter.isspace() else "?" for letter in text)
 
 
 def portable_name(name: str) -> str:
@@ -211,9 +228,25 @@ def remove_folder(path: Path, folder: Path) -> None:
     shutil.rmtree(path, ignore_errors=True)
 
 
-def check_unlinked(folder: Path) -> None:
-    """Raise FileError where a folder is, or contains, a link to a folder: writing would leave it."""
-    below = (os.path.join(inner, name) for inner, names, _ in os.walk(folder) for name in names)
-    for path in (str(folder), *below):
-        if os.path.islink(path):
-            raise FileError(path, "is a link to another folder", "remove the link, or choose a new folder")
+def check_unlinked(path: Path) -> None:
+    """Raise FileError for a link, and for a folder that contains a link to a folder outside: writing would leave it.
+
+    Folders are listed to their ends. Call it for a folder before files are written below it, of which a library may
+    write some; a folder that the user has named may be a link: pass its `real_path`.
+    """
+    if os.path.islink(path):
+        raise FileError(path, "is a link", "remove the link, or choose a new folder")
+    root = real_path(path)
+    for inner, names, _ in os.walk(path):
+        for link in filter(os.path.islink, (os.path.join(inner, name) for name in names)):
+            if not real_path(link).is_relative_to(root):
+                raise FileError(link, "is a link to another folder", "remove the link, or choose a new folder")
+
+
+def open_to_append(path: Path) -> io.BufferedWriter:
+    """Open a regular file, made if it is missing, to add to its end. Raises FileError for a link, OSError."""
+    check_unlinked(path)
+    if os.path.exists(path):
+        check_regular(path)  # before it is opened: a pipe would wait for its reader
+    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_BINARY", 0)
+    return open(os.open(path, flags, 0o666), "wb")

@@ -22,7 +22,12 @@ from collections.abc import Iterator, Sequence
 from functools import lru_cache
 from pathlib import Path
 
-from .regular_files import remove_file, remove_folder
+from .regular_files import check_inside, open_to_append, real_path, remove_file, remove_folder
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
 
 ABANDONED_AFTER_S = 86_400.0
 """Age of a temporary file, seconds, from which its writer counts as ended where that cannot be asked."""
@@ -118,8 +123,13 @@ def written_whole(path: str | Path) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """`written_whole`, after creating the folder of `path`."""
+def replacing(path: Path, folder: Path | None = None) -> Iterator[Path]:
+    """`written_whole`, after creating the folder of `path`; in `folder`, if given, out of which no link may lead.
+
+    Raises FileError where one does.
+    """
+    if folder is not None:
+        check_inside(path, folder)
     path.parent.mkdir(parents=True, exist_ok=True)
     with written_whole(path) as unfinished:
         yield unfinished
@@ -175,8 +185,16 @@ def publish(moves: Sequence[tuple[Path, Path]], last: str = "") -> None:
     """Move the content of folders into others of the same disk: all of it, or after an error nothing.
 
     A file replaces a file of the same name, and a folder a folder. Of each pair the entry named `last` moves last.
-    Raises OSError; IsADirectoryError or NotADirectoryError, before anything moves, where a folder meets a file.
+    Of two processes one waits for the other, so that files of two results do not mix. Raises OSError;
+    IsADirectoryError or NotADirectoryError, before anything moves, where a folder meets a file.
     """
+    with contextlib.ExitStack() as held:
+        for folder in sorted({real_path(folder) for _, folder in moves}):  # in one order: no process waits in a circle
+            held.enter_context(_alone_in(folder))
+        _publish(moves, last)
+
+
+def _publish(moves: Sequence[tuple[Path, Path]], last: str) -> None:
     pieces = [
         (path, folder / path.name, made / _REPLACED / path.name)
         for made, folder in moves
@@ -205,6 +223,30 @@ def publish(moves: Sequence[tuple[Path, Path]], last: str = "") -> None:
     finally:
         for made, _ in moves:
             remove_folder(made / _REPLACED, made)
+
+
+@contextlib.contextmanager
+def _alone_in(folder: Path) -> Iterator[None]:
+    """Wait until no other process publishes in a folder, which lasts as long as a few files take to be renamed.
+
+    The system ends the wait when that process ends. Nothing stays in the folder. A disk without locks lets all in.
+    """
+    if sys.platform == "win32":
+        lock = folder / ".publishing"
+        with open_to_append(lock) as file:
+            with contextlib.suppress(OSError):
+                msvcrt.locking(file.fileno(), msvcrt.LK_LOCK, 1)  # waits for ten seconds
+            yield
+        with contextlib.suppress(OSError):  # the next process has it open
+            remove_file(lock, folder)
+        return
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        with contextlib.suppress(OSError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(descriptor)
 
 
 def _keep(target: Path, old: Path) -> None:

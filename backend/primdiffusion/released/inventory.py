@@ -185,8 +185,8 @@ def take_inventory(weights: Mapping[str, Tensor]) -> Inventory:
         if not any(key.partition(".")[0] in stage_one.TENSORS for key in weights):
             names = ", ".join(map(repr, list(weights)[:4])) or "none"
             raise ValueError(
-                f"none of the {len(weights)} tensors belongs to a released checkpoint (first: {names}): give the "
-                "authors' primdiffusion.pt"
+                f"none of the {len(weights)} tensors belongs to a released checkpoint (first: {names:.120}): "
+                "give the authors' primdiffusion.pt"
             )
         return Inventory(Account(tuple(stage_one.account_stage_one(weights, prefix=""))), None)
     if all(key.startswith(stage_one.PREFIX) for key in weights):

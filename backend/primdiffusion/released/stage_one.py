@@ -154,8 +154,8 @@ def account_stage_one(tensors: Mapping[str, Tensor], prefix: str = PREFIX) -> li
         if len(found) != TENSORS[group]:
             names = ", ".join(found) or "none"
             raise ValueError(
-                f"'{prefix}{group}' has {len(found)} tensors, not {TENSORS[group]}: {names}; download the checkpoint "
-                "again"
+                f"'{prefix}{group}' has {len(found)} tensors, not {TENSORS[group]}: {names:.120}; download the "
+                "checkpoint again"
             )
     _check_attention(groups["transformer"], prefix)
     for group, found in groups.items():
@@ -225,7 +225,7 @@ def _matched(group: str, found: Mapping[str, Tensor]) -> dict[str, Convolution]:
             rest = "; ".join(f"{_written(layer.weight)} with {_written(layer.bias)}" for layer in left) or "none"
             raise ValueError(
                 f"{keys.weight!r} {shapes[0]} with {keys.bias!r} {shapes[1]} matches no layer of {group}; unmatched "
-                f"layers: {rest}"
+                f"layers: {rest:.120}"
             )
         before = by_shapes.setdefault(shapes, module)
         if before != module and _NUMBER.sub("", before) != _NUMBER.sub("", module):
@@ -255,7 +255,7 @@ def _convolution(module: str, found: Mapping[str, Tensor]) -> Convolution:
     gains = [key for key in found if key not in weights + biases]
     if not len(weights) == len(biases) == len(gains) == 1:
         given = ", ".join(f"{key!r} {tuple(value.shape)}" for key, value in found.items())
-        raise ValueError(f"{module!r} is not a convolution with weight, gain and bias: it has {given}")
+        raise ValueError(f"{module!r} is not a convolution with weight, gain and bias: it has {given:.190}")
     channels = found[biases[0]].shape[0]
     if found[gains[0]].numel() != channels:
         raise ValueError(

@@ -22,14 +22,14 @@ import platform
 import queue
 import sys
 import threading
-import traceback
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from primdiffusion.commands.options import ServeCommand
-from primdiffusion.failures import ErrorDescription, describe, shortened
+from primdiffusion.failures import ErrorDescription, describe, shortened, traceback_of
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
 from primdiffusion.formats.json_files import LARGEST_BYTES, parse_message
+from primdiffusion.formats.regular_files import may_be_written, printable
 from primdiffusion.formats.requests import REQUESTS
 from primdiffusion.formats.schema import FieldError, read, written
 from primdiffusion.machine import memory, share_processors
@@ -69,6 +69,8 @@ FUNCTIONS = {
     "open_human": "export:open_human",
 }
 """Module of `commands` and function by method; the functions run on the main thread, one at a time."""
+OUTPUTS = ("out_dir", "out", "depth", "frame")
+"""Fields of requests that are files and folders to write."""
 GRACE_S = 3.0
 """Time for a running request to stop and clean up when the parent has exited; then the process exits anyway."""
 
@@ -332,19 +334,24 @@ class Server:
 def _parameters(message: RpcRequest) -> Any:
     """Read the parameters of a message. Raises RpcError(INVALID_PARAMS)."""
     try:
-        return read(REQUESTS[message.method], message.params, message.method)
+        request = read(REQUESTS[message.method], message.params, message.method)
+        for name in OUTPUTS:
+            path = getattr(request, name, None)
+            if path is not None and not may_be_written(str(path)):
+                raise FieldError((message.method, name), f"is {str(path)!r:.80}: give a path on this computer")
+        return request
     except FieldError as e:
-        raise RpcError(INVALID_PARAMS, shortened(str(e))) from e
+        raise RpcError(INVALID_PARAMS, printable(shortened(str(e)))) from e
 
 
 def _as_rpc_error(error: Exception) -> RpcError:
     """Convert an error for a response, and print its traceback to stderr, whose last lines the client keeps."""
     if isinstance(error, RpcError):
         return error
-    traceback.print_exception(error, file=sys.stderr)
+    print(traceback_of(error), end="", file=sys.stderr, flush=True)
     failure = describe(error)
     if failure is None:
-        sentence = f"defect in the backend: {type(error).__name__}: {error}"
+        sentence = printable(f"defect in the backend: {type(error).__name__}: {error}")
         remedy = "report it with the lines of the backend's log"
         return RpcError(INTERNAL_ERROR, sentence, {"kind": "defect", "remedy": remedy})
     return RpcError(DOMAIN_ERROR, failure.sentence, _data(failure))

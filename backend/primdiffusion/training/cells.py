@@ -22,7 +22,7 @@ from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import write_atomically
-from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.loop import Step
@@ -58,8 +58,8 @@ def prepare(
 
     With a `base` (`load_base`) all but the latents are those of that model. `more` are blurred people to train on.
 
-    Raises ValueError for a person's file, or prepared ones, that are damaged, and for people of another full density
-    than the others or those of `base`; OSError.
+    Raises ValueError for a person's file, or prepared ones, that are damaged, for people of another full density than
+    the others or those of `base`, and for too few people; OSError.
     """
     path = config.run / PREPARED
     if path.exists():
@@ -69,6 +69,7 @@ def prepare(
         prepared = _prepared_with(base, people, train, held, more)
         _save_prepared(path, prepared)
         return prepared
+    _check_enough([people.variants[index] for index in train] + list(more.variants if more else ()), config.prior)
     generator = torch.Generator().manual_seed(config.seed)
     known = [each for index in train for each in people.known(index)]
     if more is not None:
@@ -81,6 +82,19 @@ def prepare(
     prepared = Prepared(latents, unseen, codec, prior, shapes, vocabulary, people.full_density)
     _save_prepared(path, prepared)
     return prepared
+
+
+def _check_enough(samples: Sequence[int], config: PriorConfig) -> None:
+    """Raise ValueError for people, of so many samples each, whose variance the components would explain to the last.
+
+    Without a rest in each fold there is nothing to compare that of new people with.
+    """
+    fitted = min(sum(samples) - sum(samples[fold :: config.folds]) for fold in range(config.folds))
+    if config.components >= 2 * fitted - 1:  # components of even and of odd parts
+        raise ValueError(
+            f"{len(samples)} humans with {sum(samples)} colourings are too few to train {config.components} person "
+            "components on: make more with primdiffusion payloads, or give a smaller --prior.components"
+        )
 
 
 def load_base(path: Path) -> DiffusionModel:

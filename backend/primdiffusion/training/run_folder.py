@@ -23,21 +23,15 @@ from typing import Any
 import accelerate
 import torch
 from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
-from filelock import BaseFileLock, FileLock, SoftFileLock, Timeout
 from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
 from primdiffusion.failures import optional_package
+from primdiffusion.folder_lock import lock_folder
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error, read_regular, remove_file
-from primdiffusion.formats.whole_files import (
-    create_folders,
-    remove_abandoned,
-    remove_empty,
-    write_atomically,
-    written_whole,
-)
+from primdiffusion.formats.regular_files import as_file_error, check_unlinked, open_to_append, read_regular, real_path
+from primdiffusion.formats.whole_files import remove_abandoned, replacing, write_atomically
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.state import accelerator_of, saved_step
 from primdiffusion.version import __version__
@@ -49,8 +43,6 @@ LARGEST_TEXT = 2**30
 """Bytes of any of them."""
 PROJECT = "primdiffusion"
 """Name in Weights & Biases."""
-LOCK = ".lock"
-"""The lock file in the folder. It stays there: removing it while another process opens it would let two in."""
 
 
 @contextlib.contextmanager
@@ -64,6 +56,8 @@ def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accel
     if config.tracker is not None:
         optional_package(config.tracker, "tracking")
     is_first = os.environ.get("RANK", "0") == "0"
+    if is_first:
+        check_unlinked(real_path(config.run))  # TensorBoard and Weights & Biases write there, too
     with lock_folder(config.run) if is_first else contextlib.nullcontext():
         accelerator = accelerator_of(mixed_precision)
         yield accelerator
@@ -73,8 +67,7 @@ def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accel
 def write_picture(path: Path, picture: Float[Tensor, "H W 3"]) -> None:
     """Write an sRGB-encoded picture as a PNG, atomically; its folder is created if missing. Raises OSError."""
     values = (picture.clamp(0, 1) * 255).round().to(torch.uint8).contiguous().numpy()
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with written_whole(path) as unfinished:
+    with replacing(path) as unfinished:
         Image.fromarray(values).save(unfinished, format="PNG")
 
 
@@ -125,8 +118,8 @@ class Metrics:
         """
         path = self.run / METRICS
         try:
-            with path.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(row) + "\n")
+            with open_to_append(path) as file:
+                file.write(json.dumps(row).encode() + b"\n")
         except OSError as error:
             raise type(error)(error.errno, error.strerror, str(path)) from error
         if self.tracker is not None:
@@ -212,46 +205,3 @@ def _git(folder: Path, *arguments: str) -> str:
 
 def _text(path: Path) -> str:
     return read_regular(path, LARGEST_TEXT).decode("utf-8", "replace")
-
-
-@contextlib.contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
-    """Hold a folder, created if need be, for one process at a time. Raises ValueError, OSError.
-
-    The system releases the lock when the process ends, however it ends. On a disk without locks the file itself is the
-    lock: it names its process, and counts for nothing once that has ended. A created folder that holds nothing else in
-    the end is removed.
-    """
-    made = create_folders(folder)
-    lock: BaseFileLock | None = None
-    try:
-        lock = _acquired(folder)
-        yield
-    finally:
-        if lock is not None:
-            if made:
-                _remove_if_alone(folder / LOCK)  # while it is held: the next process then makes a new one
-            lock.release()
-            if made:
-                _remove_if_alone(folder / LOCK)  # Windows removes no open files
-        remove_empty(made)
-
-
-def _acquired(folder: Path) -> BaseFileLock:
-    for kind in (FileLock, SoftFileLock):
-        lock = kind(folder / LOCK)
-        try:
-            lock.acquire(timeout=0)
-            return lock
-        except Timeout:
-            raise ValueError(f"another process works in {folder}: wait for it, or give another folder") from None
-        except (OSError, NotImplementedError):
-            if kind is SoftFileLock:
-                raise
-    raise AssertionError("one of the two returns or raises")
-
-
-def _remove_if_alone(path: Path) -> None:
-    with contextlib.suppress(OSError):
-        if list(path.parent.iterdir()) == [path]:
-            remove_file(path, path.parent)

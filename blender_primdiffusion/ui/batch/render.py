@@ -174,7 +174,7 @@ class _Drawing:
             scene.frame_set(shot.frame)
             if extent is not None and shot.yaw is not None:
                 (go_round if self._options.turntable else look_from)(scene, shot.yaw, extent)
-            draw(scene, shot.path)
+            draw(scene, shot.path, self._options.out)
             if len(shots) > 1:
                 self.say(f"{source.name}: picture {number + 1} of {len(shots)}")
         if not source.is_blend:
@@ -253,11 +253,14 @@ def _check_volumes(scene: bpy.types.Scene) -> None:
         )
 
 
-def draw(scene: bpy.types.Scene, path: Path) -> None:
-    """Render the scene to a PNG. Raises OSError, and RuntimeError where Blender cannot render."""
+def draw(scene: bpy.types.Scene, path: Path, folder: Path) -> None:
+    """Render the scene to a PNG in `folder`, out of which no link may lead.
+
+    Raises OSError, and RuntimeError where Blender cannot render.
+    """
     bpy.ops.render.render()
     result = next(image for image in bpy.data.images if image.type == "RENDER_RESULT")
-    with replacing(path) as unfinished:
+    with replacing(path, folder) as unfinished:
         result.save_render(str(unfinished), scene=scene)  # in render.filepath, Blender 5 takes {braces} for templates
         if not is_whole_picture(unfinished):  # on a full disk Blender saves what fits, and says nothing
             raise OSError(f"{path} was not written: is the disk full?")

@@ -33,7 +33,7 @@ from ...console import (
 )
 from ...formats import whole_files
 from ...formats.json_files import parse_json, read_json
-from ...formats.regular_files import as_file_error, remove_file
+from ...formats.regular_files import as_file_error, printable, remove_file
 from ...formats.whole_files import remove_abandoned, temporary_folder, write_atomically
 from ...places import EXTENSION, new_backend, preference
 
@@ -226,7 +226,7 @@ def reason(error: Exception) -> str:
 
 
 def _failed(name: str, sentence: str, code: int) -> int:
-    print(f"{name}: {sentence}", file=sys.stderr, flush=True)
+    print(printable(f"{name}: {sentence}"), file=sys.stderr, flush=True)
     return code
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from pathlib import Path
 
@@ -42,3 +43,10 @@ def test_a_renderer_that_is_not_there_is_one_sentence():
 def test_a_renderer_without_people_is_one_sentence():
     with refused(ValueError, "the folder is empty"):
         subjects_of([sys.executable, "-c", "import sys; sys.exit('the folder is empty')"])
+
+
+@pytest.mark.parametrize("name", ["--python=evil.py", "-x", "../anna", "", "anna bert", 7])
+def test_a_subject_that_would_be_an_option_or_a_path_is_handed_to_no_renderer(name):
+    listed = f"print({'PRIMDIFFUSION ' + json.dumps({'line': name})!r})"
+    with refused(ValueError, repr(name)):
+        subjects_of([sys.executable, "-c", listed])

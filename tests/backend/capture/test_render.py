@@ -108,6 +108,17 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
     assert verify(job.out) == {}
 
 
+@pytest.mark.parametrize("folder", ["img", "colmap", "outputs_re_fitting", ""])
+def test_no_worker_writes_through_a_link_in_the_folder_of_a_human(tmp_path, folder):
+    outside, job = tmp_path / "outside", small_job(tmp_path)
+    outside.mkdir()
+    capture_layout.claim(job.out, job.about)
+    (job.out / NAMES[0] / folder).parent.mkdir(exist_ok=True)
+    (job.out / NAMES[0] / folder).symlink_to(outside)
+    assert {outcome.subject: outcome.status for outcome in render(job, 2)}[NAMES[0]] == "failed"
+    assert not list(outside.iterdir())
+
+
 def test_what_a_killed_process_left_half_written_goes(tmp_path):
     job = small_job(tmp_path)
     left = job.out / NAMES[0] / "img/camera0000/.0000.4242.partial.jpg"

@@ -1,9 +1,9 @@
-"""Removal that stays within a folder."""
+"""Removal and writing that stay within a folder."""
 
 import os
 
 import pytest
-from primdiffusion.formats.regular_files import FileError, check_unlinked, remove_file, remove_folder
+from primdiffusion.formats.regular_files import FileError, check_unlinked, open_to_append, remove_file, remove_folder
 from support.errors import refused
 
 
@@ -42,6 +42,36 @@ def test_links_to_folders_are_found_before_anything_is_written(linked):
     for folder in (linked, linked / "extra"):
         with refused(FileError):
             check_unlinked(folder)
+
+
+def test_links_within_a_folder_are_no_reason_to_reject_it(tmp_path):
+    (tmp_path / "run-1").mkdir()
+    (tmp_path / "latest").symlink_to("run-1")
+    (tmp_path / "state").symlink_to(tmp_path.parent / "file of another run")
+    check_unlinked(tmp_path)
+
+
+def test_lines_are_added_to_a_regular_file_alone(tmp_path):
+    for _ in range(2):
+        with open_to_append(tmp_path / "lines") as file:
+            file.write(b"one\n")
+    assert (tmp_path / "lines").read_bytes() == b"one\none\n"
+    (tmp_path / "link").symlink_to(tmp_path / "lines")
+    (tmp_path / "dangling").symlink_to(tmp_path / "new")
+    for name in ("link", "dangling"):
+        with refused(FileError, name):
+            open_to_append(tmp_path / name)
+    with refused(OSError, tmp_path.name):
+        open_to_append(tmp_path)
+    assert (tmp_path / "lines").read_bytes() == b"one\none\n"
+    assert not (tmp_path / "new").exists()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
+def test_no_line_is_added_to_a_pipe_and_no_reader_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    with refused(OSError, "pipe"):
+        open_to_append(tmp_path / "pipe")
 
 
 def test_links_in_a_circle_are_an_error_of_files(tmp_path):

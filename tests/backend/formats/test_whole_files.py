@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from primdiffusion.formats import whole_files
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.formats.whole_files import (
     ABANDONED_AFTER_S,
     has_ended,
@@ -16,6 +17,7 @@ from primdiffusion.formats.whole_files import (
     publish,
     remove_abandoned,
     remove_of_process,
+    replacing,
     staged,
     staged_together,
     temporary_name,
@@ -23,6 +25,7 @@ from primdiffusion.formats.whole_files import (
     written_whole,
 )
 from support.errors import refused
+from two_writers import mixed
 
 PATH = Path("x/figure.tar.gz")
 
@@ -54,6 +57,27 @@ def test_files_arrive_together_and_replace_older_ones(tmp_path):
             if text == "two":
                 assert (target / "a").read_text() == "one"
         assert contents(target) == {"a": text, "b": text}
+
+
+def test_files_of_two_processes_that_publish_at_once_are_not_mixed(tmp_path):
+    assert mixed(100, tmp_path) == 0
+
+
+def test_a_folder_named_twice_is_not_waited_for(tmp_path):
+    with staged_together([tmp_path, tmp_path]) as (one, two):
+        (one / "a").write_text("a")
+        (two / "b").write_text("b")
+    assert contents(tmp_path) == {"a": "a", "b": "b"}
+
+
+def test_no_file_is_written_through_a_link_out_of_the_folder(tmp_path):
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "textures").symlink_to(tmp_path / "outside")
+    path = tmp_path / "out" / "textures" / "a.png"
+    with refused(FileError, "a.png"), replacing(path, tmp_path / "out") as unfinished:
+        unfinished.write_text("mine")
+    assert not list((tmp_path / "outside").iterdir())
 
 
 def test_an_error_leaves_an_old_folder_as_it_was_and_no_new_one(tmp_path):

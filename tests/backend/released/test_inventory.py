@@ -5,8 +5,11 @@ import pickle
 
 import pytest
 import torch
+from primdiffusion.commands.import_released import read_released
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet
+from primdiffusion.failures import describe
+from primdiffusion.formats.regular_files import FileError
 from primdiffusion.released.imported import SCHEDULE
 from primdiffusion.released.inventory import take_inventory
 from primdiffusion.released.reading import read_weights
@@ -195,3 +198,13 @@ def test_what_is_no_released_checkpoint_is_rejected_in_one_sentence(tmp_path, mo
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
     assert not (tmp_path / "ran").exists()
+
+
+def test_names_of_a_strangers_tensors_make_no_long_sentence_without_the_file(tmp_path):
+    path = tmp_path / "x.pt"
+    names = (["w"], [f"{number}{'a' * 70}" for number in range(9)], [f"img_encoder.{'b' * 50}{i}" for i in range(20)])
+    for each in names:
+        torch.save({name: torch.zeros(2) for name in each}, path)
+        with refused(FileError, str(path)) as caught:
+            read_released(path)
+        assert len(str(describe(caught.value))) - len(str(tmp_path)) <= 300

@@ -24,7 +24,7 @@ from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import S
 from primdiffusion.training import slabs
 from primdiffusion.training.cells import CellTask, prepare
-from primdiffusion.training.config import PhaseConfig, TrainingConfig
+from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
 from primdiffusion.training.loop import Interrupt, Step, StepTimer, step_seed
 from primdiffusion.training.losses import LEVELS
@@ -352,3 +352,11 @@ def test_settings_that_cannot_be_are_rejected(settings_of, changes, word):
     given = {"steps": 1, "batch": 1} if settings_of is PhaseConfig else {"data": Path("a"), "run": Path("b")}
     with pytest.raises(ValueError, match=word):
         settings_of(**{**given, **changes})
+
+
+@pytest.mark.parametrize("variants", [1, 2])
+def test_too_few_humans_for_the_person_components_are_counted_before_anything_is_computed(tmp_path, variants):
+    write_people(tmp_path / "people", geometries=6, variants=variants)
+    with refused(ValueError, "5 humans", f"{5 * variants} colourings", "128", "--prior.components"):
+        train(settings(tmp_path / "people", tmp_path / "run", prior=PriorConfig()))
+    assert not (tmp_path / "run" / "prepared.safetensors").exists()

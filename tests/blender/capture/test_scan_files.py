@@ -53,9 +53,10 @@ def test_names_are_made_fit_for_folders_and_unlike_each_other(tmp_path):
         tmp_path / "c" / "Ann M.ller.glb",
         tmp_path / "d" / "_x_.glb",
         tmp_path / "e" / "Ann_M_ller.glb",
+        tmp_path / "f" / "--python=x.glb",
     )
     names = [scan.name for scan in find_scans(tmp_path)]
-    assert names == ["Ann_M_ller", "ann-m_ller", "Ann_M.ller", "x", "Ann_M_ller_2"]
+    assert names == ["Ann_M_ller", "ann-m_ller", "Ann_M.ller", "x", "Ann_M_ller_2", "python_x"]
 
 
 def test_of_one_person_in_several_formats_one_counts(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import dataclasses
 import importlib
 import json
 import os
@@ -34,7 +35,9 @@ from blender_primdiffusion.scene.blend_values import (
 )
 from blender_primdiffusion.scene.earlier_files import _PERSON as PERSON
 from blender_primdiffusion.scene.earlier_files import _PERSON_FILE as PERSON_FILES
-from blender_primdiffusion.scene.human import HOME
+from blender_primdiffusion.scene.human import HOME, MARK
+from blender_primdiffusion.scene.merged import MergedState
+from blender_primdiffusion.ui.advanced_panel import _MOST_FRAMES
 
 pytestmark = pytest.mark.any_blender
 ROOT = Path(blender_primdiffusion.__file__).parent
@@ -136,6 +139,24 @@ def test_only_the_reader_and_operators_on_the_users_own_paths_resolve_paths():
         if calls.search(path.read_text(encoding="utf-8").replace("os.path.abspath(", ""))
     }
     assert found == OPERATORS_OWN
+
+
+def test_a_record_is_parsed_once_however_often_panels_draw(holder, monkeypatch):
+    parsed = []
+    monkeypatch.setattr(blend_values, "parse_json", lambda text: parsed.append(text) or json.loads(text))
+    for text in (json.dumps({"seed": list(range(9_000))}), "{" * 60_000):
+        holder[MARK] = text
+        for _ in range(3):
+            found = stored_record(holder, MARK)
+            found["mine"] = 1
+        assert parsed.pop() == text
+        assert not parsed
+        assert "mine" not in stored_record(holder, MARK)
+
+
+def test_the_longest_merged_sequence_fits_into_a_text():
+    state = MergedState(("0123456789abcdef",) * _MOST_FRAMES, 0.0012345678901234567, -1_048_574)
+    assert len(json.dumps(dataclasses.asdict(state))) <= blend_values.LONGEST_TEXT
 
 
 @pytest.mark.parametrize("value", ODD, ids=lambda value: type(value).__name__)

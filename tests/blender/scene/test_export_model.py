@@ -7,6 +7,7 @@ import exporting
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses
@@ -93,6 +94,18 @@ def test_joints_and_surface_are_where_they_were(moving, store, tmp_path, kind, e
     picture = textures(mesh)[0]
     assert tuple(picture.size) == (16, 16)
     assert picture.pixels[0] == pytest.approx(1.0)
+
+
+def test_textures_are_not_written_through_a_link(moving, store, tmp_path):
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    bpy.context.scene.collection.objects.link(proxy)
+    (tmp_path / "outside").mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "textures").symlink_to(tmp_path / "outside")
+    with refused(FileError, "textures"):
+        write_model(bpy.context, armature_of(moving), proxy, tmp_path / "out" / "a.usdc", "USD", FrameRange(1, 1))
+    assert not list((tmp_path / "outside").iterdir())
+    assert not (tmp_path / "out" / "a.usdc").exists()
 
 
 @pytest.mark.parametrize(("kind", "ending"), [("GLB", ".glb"), ("FBX", ".fbx"), ("USD", ".usdc")])

@@ -117,6 +117,17 @@ def test_a_checkpoint_that_cannot_be_read_or_knows_nothing_leaves_the_menus_empt
     assert attributes.asked(addon.scene.primdiffusion.attributes) == {}
 
 
+@pytest.mark.parametrize("vocabulary", [{"categories": {"sex": ["x" * 70_000]}}, {"scalars": {"height": [0, -1]}}])
+def test_a_checkpoint_that_is_damaged_or_claims_much_is_read_once(known, tmp_path, monkeypatch, vocabulary):
+    path, read = checkpoint(tmp_path / "odd.safetensors", vocabulary), []
+    monkeypatch.setattr(attributes, "preference", lambda name: str(path) if name == "checkpoint" else "")
+    once = attributes.read_vocabulary
+    monkeypatch.setattr(attributes, "read_vocabulary", lambda path: read.append(path) or once(path))
+    for _ in range(3):
+        assert attributes.known() == attributes.Vocabulary()
+    assert read == [path]
+
+
 def test_the_panel_draws_menus_and_numbers_that_the_checkpoint_knows(addon, known):
     layout = MagicMock()
     PRIMDIFFUSION_PT_attributes.draw(SimpleNamespace(layout=layout), addon)

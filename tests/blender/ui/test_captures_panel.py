@@ -275,9 +275,15 @@ def test_a_polite_kill_in_the_midst_of_a_view_ends_the_command_after_it(only_goo
 def test_the_panels_defaults_are_the_commands(extension, tmp_path):
     asked = extension.scene.primdiffusion_captures
     from_panel = settings_of(parse(words_of(asked, extension, tmp_path, "people", "out")))
-    from_line = settings_of(parse(["--people", "people", "--out", bpy.path.abspath("out")]))
+    from_line = settings_of(parse(["--people", "people", "--out", str(Path("out").absolute())]))
     assert from_panel == from_line
     assert (from_line.camera_count, from_line.pose_count, from_line.size, from_line.samples) == (36, 20, (512, 512), 16)
+
+
+def test_paths_that_begin_with_a_hyphen_are_no_options(extension, tmp_path):
+    words = words_of(extension.scene.primdiffusion_captures, extension, tmp_path, "-people", "--out")
+    assert parse(words).people == [Path("-people").absolute()]
+    assert parse(words).out == Path("--out").absolute()
 
 
 def test_cameras_of_the_scene_are_taken_by_name(extension, tmp_path):

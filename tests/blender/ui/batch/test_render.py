@@ -77,7 +77,7 @@ def test_a_picture_that_a_full_disk_cuts_off_is_not_kept(empty_scene, tmp_path):
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limits[1]))
     try:
         with refused(OSError, "disk full"):
-            draw(scene, tmp_path / "a" / "b.png")
+            draw(scene, tmp_path / "a" / "b.png", tmp_path)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert not list((tmp_path / "a").iterdir())

@@ -6,13 +6,14 @@ import sys
 from pathlib import Path
 
 from filelock import FileLock
-from primdiffusion.training.run_folder import LOCK, lock_folder
+from primdiffusion.folder_lock import LOCK, lock_folder
+from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 HOLD = """
 import sys
 from pathlib import Path
-from primdiffusion.training.run_folder import lock_folder
+from primdiffusion.folder_lock import lock_folder
 with lock_folder(Path(sys.argv[1])):
     print("held", flush=True)
     sys.stdin.read()
@@ -63,6 +64,16 @@ def test_a_created_folder_without_files_is_removed_and_others_stay(tmp_path):
     with lock_folder(tmp_path / "own"):
         pass
     assert (tmp_path / "own").is_dir()
+
+
+def test_a_link_in_place_of_the_lock_is_named_and_its_target_stays(tmp_path):
+    mine = tmp_path / "mine"
+    mine.write_text("mine")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / LOCK).symlink_to(mine)
+    with refused(FileError, LOCK), lock_folder(tmp_path / "run"):
+        pass
+    assert mine.read_text() == "mine"
 
 
 def test_a_disk_without_locks_is_held_too(tmp_path, monkeypatch):
