@@ -154,7 +154,7 @@ class Explanation(NamedTuple):
 
     group: int | None
     head: int | None
-    weights: Float[Tensor, "w"]
+    weights: Float[Tensor, "n"]
     """Posterior mean of their `GaussianOfKinds`, or a draw, for pictures linearised at the weights before the step."""
     evidence: float
     """Logarithm of the probability of these pictures."""
