@@ -15,7 +15,10 @@ def test_the_prior_s_components_are_even_or_odd_in_the_mirror(prepared_once):
     _, prepared = prepared_once
     prior, codec = prepared.prior, prepared.codec
     pictures = prior.picture(torch.eye(len(prior.parity)))
-    assert torch.allclose(codec.mirror(pictures), pictures * prior.parity[:, None, None, None], atol=1e-3)
+    varying = prior.marginal_variance() > 1e-3  # people of few kinds leave some components without variance
+    assert varying.sum() >= 12
+    mirrored = pictures * prior.parity[:, None, None, None]
+    assert torch.allclose(codec.mirror(pictures)[varying], mirrored[varying], atol=1e-3)
     rows = pictures.flatten(1)
     assert torch.allclose(rows @ rows.T, torch.eye(len(rows)), atol=1e-4)
     assert torch.allclose(codec.mirror(prior.mean), prior.mean, atol=1e-3)

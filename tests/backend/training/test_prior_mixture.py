@@ -106,7 +106,7 @@ def test_heads_keep_the_variance_of_their_hair(mixture):
         head = mixture.head[part(mixture, **DRESS, hair=hair, shoes="boots")]
         spread.append(variances(mixture.head_axes[head], mixture.head_variance[head], mixture.head_left[head])[1])
     assert spread[0].item() == pytest.approx(1.0, rel=0.3)
-    assert spread[1] < 0.05
+    assert spread[1] < 0.2
 
 
 def test_skin_is_shared_by_hands_and_head_and_by_clothes_that_show_it(mixture):
