@@ -274,7 +274,8 @@ def by_mirror(model: DiffusionModel, person: CapturedPerson) -> Human:
     camera = dataclasses.replace(views.camera, intrinsics=intrinsics, world_to_camera=turned)
     back = dataclasses.replace(views, rgba=views.rgba.flip(2), camera=camera)
     targets = [target for side in (views, back) for target in targets_of(side, [frames], SIZE)]
-    payload = fit_payload(components.payload(components.mean), targets, components.full_density)
+    mean_human = components.payload(components.coefficients(components.everyone()))
+    payload = fit_payload(mean_human, targets, components.full_density)
     return Human(payload, person.betas, {})
 
 

@@ -306,7 +306,8 @@ def prepared(
     print("codec of", len(codec.cells), "cells", flush=True)
     people = encoded(paths, vocabulary, codec, grids())
     print("latents", tuple(people.latents.shape), flush=True)
-    prior = fit_prior(people, codec, vocabulary, PriorConfig())  # pyright: ignore[reportArgumentType] - mirrors alike
+    whole = torch.zeros(len(codec.cells), dtype=torch.int64)
+    prior = fit_prior(people, codec, vocabulary, PriorConfig(), whole)  # pyright: ignore[reportArgumentType] - mirrors alike
     records = {"codec": codec, "people": people, "prior": prior}
     contents = {
         f"{part}.{name}": value.contiguous() for part, one in records.items() for name, value in vars(one).items()

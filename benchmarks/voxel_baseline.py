@@ -384,7 +384,7 @@ def voxel_denoiser(
     """Build an untrained denoiser: the default model's with a 3D U-Net for the cells."""
     person = PersonNetworkConfig(blocks=blocks)
     denoiser = PersonDenoiser(DenoiserConfig(person=person, local=None), prior, SCHEDULES[SCHEDULE]())
-    denoiser.local = VoxelUNet(len(codec.basis), len(prior.basis), codec.cells, config)
+    denoiser.local = VoxelUNet(len(codec.basis), len(prior.parity), codec.cells, config)
     return denoiser.eval().requires_grad_(False)
 
 

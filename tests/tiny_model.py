@@ -36,7 +36,7 @@ def tiny_model(local: LocalUNetConfig | None = None) -> DiffusionModel:
     )
     person = torch.zeros(COMPONENTS, CHANNELS, GRID * GRID)
     person[torch.arange(COMPONENTS), torch.arange(COMPONENTS)] = 1 / GRID
-    prior = PersonPrior(
+    prior = PersonPrior.of_whole_body(
         mean=torch.zeros(CHANNELS, GRID, GRID),
         basis=person.flatten(1),
         parity=torch.ones(COMPONENTS),

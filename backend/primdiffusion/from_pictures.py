@@ -90,7 +90,7 @@ def start_of(
 def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: Sequence[View] | None) -> Posture:
     """The standing body whose arms fit the outline best."""
     components, betas = PersonComponents.of(model), model.shapes.bias.clone()
-    payload = components.payload(components.mean)
+    payload = components.payload(components.coefficients(components.everyone()))
     lenses = [photograph.lens() for photograph in photographs] if views is None else views
     found = []
     for arms in STANDING_ARMS:
@@ -108,12 +108,13 @@ def fit_posture_in(
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
     """
     components = PersonComponents.of(model)
-    fit, coefficients = PostureFit(start.posture, model.shapes, start.tightness), components.mean
+    fit, people = PostureFit(start.posture, model.shapes, start.tightness), components.everyone()
     for side, stage, coefficient_steps in ROUNDS:
-        fit.refine(components.payload(coefficients), _targets(photographs, fit.posture(), side), stage, on_step)
+        payload = components.payload(components.coefficients(people))
+        fit.refine(payload, _targets(photographs, fit.posture(), side), stage, on_step)
         targets = _targets(photographs, fit.posture(), side)
         for _ in range(coefficient_steps):
-            coefficients = components.closer(coefficients, targets).coefficients
+            people = components.closer(people, targets)
             on_step()
     return fit.posture()
 
@@ -137,8 +138,8 @@ def human_in(
     """
     components, views, frames = PersonComponents.of(model), _views(photographs, posture), posture.frames()
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    coefficients = components.start(views, frames, on_step)
-    payload = components.fit(views, frames, coefficients, on_step, generator)
+    people = components.start(views, frames, on_step)
+    payload = components.fit(views, frames, people, on_step, generator)
     names = [photograph.path.name for photograph in photographs]
     origin: dict[str, Any] = {"reconstructed_from": names} | ({} if seed is None else {"seed": seed})
     return Human(payload, posture.betas, {**origin, **made_by(model)}).validate()
@@ -148,7 +149,7 @@ def outline_overlap(model: DiffusionModel, photographs: Sequence[Photograph], po
     """Intersection over union of the mean human in the posture and the masks."""
     components = PersonComponents.of(model)
     targets = _targets(photographs, posture, ROUNDS[0].side)
-    return overlap(components.payload(components.mean), targets)
+    return overlap(components.payload(components.coefficients(components.everyone())), targets)
 
 
 def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:

@@ -1,11 +1,11 @@
 """Reconstruct a captured subject as a `Human`: from several views with the encoder, or from one or more with the prior.
 
 `reconstruct_by_prior` finds the person coefficients c of the diffusion model that explain the pictures. Near an
-estimate a picture is linear in c (`cpu_linear`), and the prior is a mixture of Gaussians, so the posterior mean of c
-has a closed form; a few Gauss-Newton steps repeat it. They end in the outfit that they start near, so they start from
-each, and go on from those that explain the pictures best. What no picture shows thus has the most probable colours and
-shape given what they show: the back of a jacket belongs to its front. The network draws what c cannot. Then the voxels
-themselves are fitted to the pictures (`render.inverse`), which keeps the others close to that human.
+estimate a picture is linear in c (`cpu_linear`), and the people of one outfit are Gaussian, so the posterior mean of c
+has a closed form; a few Gauss-Newton steps repeat it, for each outfit and then for each hair style of the outfits that
+explain the pictures best. What no picture shows thus has the most probable colours and shape given what they show: the
+back of a jacket belongs to its front. The network draws what c cannot. Then the voxels themselves are fitted to the
+pictures (`render.inverse`), which keeps the others close to that human.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views
 from primdiffusion.diffusion.codec import VOXEL_VALUES, CellCodec, LinearCodec, payload_from_cells
 from primdiffusion.diffusion.denoiser import PersonDenoiser
-from primdiffusion.diffusion.gaussian import PersonPrior
+from primdiffusion.diffusion.gaussian import GaussianOfKinds, PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames, frames_of
 from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.human import Human, default_frames, made_by
-from primdiffusion.primitives.primitives import Frames, K, Payload, S
+from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.render.cpu_linear import apply_to_codes
 from primdiffusion.render.descent import DescentSettings, PosedView, descend
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
@@ -43,7 +43,7 @@ from primdiffusion.version import __version__
 
 
 class Trial(NamedTuple):
-    """A round that thins out candidates for where to start: the mean human, and the mean of each outfit."""
+    """A round that thins out the candidates: the outfits, then their hair styles."""
 
     side: int
     """Largest side of the pictures, pixels."""
@@ -53,7 +53,12 @@ class Trial(NamedTuple):
     """Gauss-Newton steps of each."""
 
 
-TRIALS = (Trial(64, sys.maxsize, 1), Trial(64, 6, 2), Trial(176, 2, 3))
+OUTFITS = (Trial(64, sys.maxsize, 1), Trial(64, 4, 2))
+HEADS = (Trial(64, sys.maxsize, 1), Trial(176, 2, 3))
+"""Trials of whole outfits, and of the two best outfits with each head."""
+BEST_OUTFITS = 2
+DIRECTIONS = 128
+"""Leading directions of an outfit's people in which its coefficients are sought."""
 TRIAL_VIEWS = 2
 """Views, evenly spaced, that trials look at."""
 STEPS = 2
@@ -138,17 +143,19 @@ def reconstruct_by_prior(
             on_step(next(done), components.start_steps + FIT_STEPS)
 
     generator = None if seed is None else torch.Generator().manual_seed(seed)
-    coefficients = components.start(person.views, frames, report)
-    payload = components.fit(person.views, frames, coefficients, report, generator)
+    explanation = components.start(person.views, frames, report)
+    payload = components.fit(person.views, frames, explanation, report, generator)
     drawn = {} if seed is None else {"seed": seed}
     return Human(payload, person.betas, {**_origin(person), **drawn, **made_by(model)}).validate()
 
 
 class Explanation(NamedTuple):
-    """Person coefficients after a step of Gauss-Newton."""
+    """People of one outfit, or of one outfit and head, or all people (None), after a step of Gauss-Newton."""
 
-    coefficients: Float[Tensor, "r"]
-    """Their posterior mean, or a draw, for pictures linearised at the coefficients before the step."""
+    group: int | None
+    head: int | None
+    weights: Float[Tensor, "n"]
+    """Posterior mean of their `GaussianOfKinds`, or a draw, for pictures linearised at the weights before the step."""
     evidence: float
     """Logarithm of the probability of these pictures."""
 
@@ -163,6 +170,7 @@ class PersonComponents:
     prior: PersonPrior
     codec: LinearCodec
     full_density: float
+    _latest: list = dataclasses.field(default_factory=lambda: [None, None], repr=False)
 
     @classmethod
     def of(cls, model: DiffusionModel) -> PersonComponents:
@@ -178,65 +186,94 @@ class PersonComponents:
         return cls(model.denoiser, chain, model.denoiser.prior.to("cpu"), codec, model.full_density)
 
     @property
-    def mean(self) -> Float[Tensor, "r"]:
-        """Coefficients of the mean human."""
-        return torch.zeros(len(self.prior.basis))
-
-    @property
     def start_steps(self) -> int:
         """How often `start` reports."""
-        return sum(min(trial.most, 1 + len(self.prior.centre)) * trial.steps for trial in TRIALS)
+        groups = len(self.prior.log_weight)
+        heads = min(groups, BEST_OUTFITS) * max(len(self.prior.heads_of(group)) for group in range(groups))
+        rounds = [(trial, groups) for trial in OUTFITS] + [(trial, heads) for trial in HEADS]
+        return sum(min(trial.most, count) * trial.steps for trial, count in rounds)
 
     @functools.cached_property
     def _voxel_basis(self) -> Float32[ndarray, "b 512 4 c"]:
-        return self.codec.voxel_basis(self.prior.basis.shape[1] // K).contiguous().numpy()
+        return self.codec.voxel_basis(self.prior.basis.shape[1]).contiguous().numpy()
 
     @functools.cached_property
-    def _codes(self) -> Float32[ndarray, "k c r"]:
-        """Channels of each box by component."""
-        return self.prior.basis.unflatten(1, (-1, K)).permute(2, 1, 0).contiguous().numpy()
+    def _components(self) -> Float[Tensor, "k d n"]:
+        """What the components of a box's part add to its channels; boxes in their own order."""
+        order = self.prior.part.argsort(stable=True)
+        return self.prior.basis[order.argsort()]
+
+    def _kinds(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
+        """People of an outfit and head, and channels of each box by their weights; those asked for last are kept."""
+        if (group, head) != self._latest[0]:
+            self._latest[:] = [(group, head), self._kinds_of(group, head)]
+        return self._latest[1]
+
+    def _kinds_of(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
+        everyone = group is None
+        kinds = self.prior.gaussian_of_all(DIRECTIONS) if everyone else self.prior.gaussian_of(group, head, DIRECTIONS)
+        by_part = kinds.factor.unflatten(1, (-1, self.prior.basis.shape[2])).permute(1, 2, 0)
+        return kinds, torch.bmm(self._components, by_part[self.prior.part]).numpy()
+
+    def coefficients(self, explanation: Explanation) -> Float[Tensor, "r"]:
+        """Person coefficients of these people."""
+        kinds, _ = self._kinds(explanation.group, explanation.head)
+        return kinds.mean + explanation.weights @ kinds.factor
 
     def payload(self, coefficients: Float[Tensor, "r"], rest: Float[Tensor, "c h w"] | float = 0.0) -> Payload:
         """Decode."""
         latents = self.prior.mean + self.prior.picture(coefficients[None]) + rest
         return payload_from_cells(self.codec.decode(latents)[0], self.full_density, self.codec.zone)
 
-    def start(
-        self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None
-    ) -> Float[Tensor, "r"]:
-        """Coefficients near those of the human in views with these frames; reports `start_steps` times."""
-        every = math.ceil(len(frames) / TRIAL_VIEWS)
-        candidates = [Explanation(start, 0.0) for start in (self.mean, *self.prior.group_means())]
-        for trial in TRIALS:
-            targets = targets_of(views, frames, trial.side)[::every]
-            candidates = sorted(candidates, key=lambda one: one.evidence, reverse=True)[: trial.most]
-            for number, explanation in enumerate(candidates):
-                for _ in range(trial.steps):
-                    explanation = self.closer(explanation.coefficients, targets)
-                    on_step()
-                candidates[number] = explanation
-        return max(candidates, key=lambda one: one.evidence).coefficients
+    def start(self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None) -> Explanation:
+        """The people nearest to the human in views with these frames; reports `start_steps` times."""
+        every, steps = math.ceil(len(frames) / TRIAL_VIEWS), self.start_steps
+        candidates = [self._mean_of(group, None) for group in range(len(self.prior.log_weight))]
+        for trials in (OUTFITS, HEADS):
+            for trial in trials:
+                targets = targets_of(views, frames, trial.side)[::every]
+                candidates = best(candidates, trial.most)
+                for number, explanation in enumerate(candidates):
+                    for _ in range(trial.steps):
+                        explanation = self.closer(explanation, targets)
+                        on_step()
+                        steps -= 1
+                    candidates[number] = explanation
+            if trials is OUTFITS:
+                groups = [int(one.group or 0) for one in best(candidates, BEST_OUTFITS)]
+                candidates = [self._mean_of(group, head) for group in groups for head in self.prior.heads_of(group)]
+        for _ in range(steps):  # of outfits with fewer hair styles than others
+            on_step()
+        return best(candidates, 1)[0]
+
+    def everyone(self) -> Explanation:
+        """All people, at the mean human."""
+        return self._mean_of(None, None)
+
+    def _mean_of(self, group: int | None, head: int | None) -> Explanation:
+        kinds, _ = self._kinds(group, head)
+        return Explanation(group, head, torch.zeros(len(kinds.factor)), 0.0)
 
     def fit(
         self,
         views: Views,
         frames: Sequence[Frames],
-        coefficients: Float[Tensor, "r"],
+        explanation: Explanation,
         on_step: Callable[[], None] = lambda: None,
         generator: torch.Generator | None = None,
     ) -> Payload:
-        """The human in views with these frames: STEPS steps from `coefficients`, then voxels. Reports FIT_STEPS times.
+        """The human in views with these frames: STEPS steps from there, then voxels. Reports FIT_STEPS times.
 
         With a generator, coefficients are drawn from their distribution given the views, and the rest from that given
         the coefficients, instead of their means: what no view shows varies with it.
         """
         targets = targets_of(views, frames, COARSE_SIDE)
         for step in range(STEPS):
-            drawn_by = generator if step == STEPS - 1 else None
-            coefficients = self.closer(coefficients, targets, drawn_by).coefficients
+            explanation = self.closer(explanation, targets, generator if step == STEPS - 1 else None)
             on_step()
         targets = targets_of(views, frames, FINE_SIDE)
         settings = InverseSettings(pull=PULL / len(targets), smoothness=SMOOTHNESS / len(targets))
+        coefficients = self.coefficients(explanation)
         rest = self.expected_rest(coefficients) if generator is None else self.drawn_rest(coefficients, generator)
         start = self.payload(coefficients, rest)
         payload = fit_payload(start, targets, self.full_density, settings)
@@ -267,39 +304,47 @@ class PersonComponents:
         return self.prior.outside(rest.cpu().clone())
 
     def closer(
-        self,
-        coefficients: Float[Tensor, "r"],
-        targets: Sequence[TargetImage],
-        generator: torch.Generator | None = None,
+        self, explanation: Explanation, targets: Sequence[TargetImage], generator: torch.Generator | None = None
     ) -> Explanation:
-        """A step of Gauss-Newton from `coefficients`, to their posterior mean or, with a generator, to a draw."""
+        """A step of Gauss-Newton from these weights, to their posterior mean or, with a generator, to a draw."""
         prior, codec = self.prior, self.codec
-        cells = codec.decode(prior.mean + prior.picture(coefficients[None]))[0].requires_grad_()
+        kinds, codes = self._kinds(explanation.group, explanation.head)
+        weights = explanation.weights
+        latents = prior.mean + prior.picture((kinds.mean + weights @ kinds.factor)[None])
+        cells = codec.decode(latents)[0].requires_grad_()
         payload = payload_from_cells(cells, self.full_density, codec.zone)
         # Each colour and density depends on its own value of the cells, so the gradient of their sum has all
         # derivatives.
         (by_cell,) = torch.autograd.grad(payload.rgb.sum() + payload.density.sum(), cells)
         slope = by_cell[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1).numpy()
         payload, region = payload.map(Tensor.detach), codec.region.numpy()
-        precision, vector = torch.zeros(len(prior.basis), len(prior.basis)), torch.zeros(len(prior.basis))
-        misfit = 0.0  # of coefficients of 0, by the linearisation
+        precision, vector = torch.eye(len(weights)), torch.zeros(len(weights))
+        misfit = 0.0  # of weights of 0, by the linearisation
         for target in targets:
             view = LinearisedView.of(target, payload, InverseSettings())
             seen = np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0
-            by_code = apply_to_codes(view.jacobian, slope, self._voxel_basis, region, self._codes, view.alpha_free)
+            by_code = apply_to_codes(view.jacobian, slope, self._voxel_basis, region, codes, view.alpha_free)
             matrix = torch.from_numpy(by_code[seen]).flatten(0, 1)
-            weights = view.weight * np.float32(OBSERVATIONS / PIXEL_STD**2)
-            weight = torch.from_numpy(weights[seen]).flatten()
-            wanted = torch.from_numpy(view.residual[seen]).flatten() + matrix @ coefficients
+            pixel_weights = view.weight * np.float32(OBSERVATIONS / PIXEL_STD**2)
+            weight = torch.from_numpy(pixel_weights[seen]).flatten()
+            wanted = torch.from_numpy(view.residual[seen]).flatten() + matrix @ weights
             weighted = matrix.mT * weight
             precision += weighted @ matrix
             vector += weighted @ wanted
             misfit += float(weight.double() @ wanted.double().square()) / 2
-            misfit += float((weights[~seen] * view.residual[~seen] ** 2).sum(dtype=np.float64)) / 2
-        mean, evidence = prior.posterior(precision, vector)
+            misfit += float((pixel_weights[~seen] * view.residual[~seen] ** 2).sum(dtype=np.float64)) / 2
+        factor = torch.linalg.cholesky(precision.double())
+        mean = torch.cholesky_solve(vector.double()[:, None], factor)[:, 0]
+        evidence = float(mean @ vector.double()) / 2 - float(factor.diagonal().log().sum()) - misfit
         if generator is not None:
-            mean = prior.posterior_sample(precision, vector, generator)
-        return Explanation(mean, evidence - misfit)
+            noise = torch.randn(len(mean), 1, generator=generator, dtype=mean.dtype)
+            mean = mean + torch.linalg.solve_triangular(factor.mT, noise, upper=True)[:, 0]
+        return Explanation(explanation.group, explanation.head, mean.float(), evidence)
+
+
+def best(candidates: Sequence[Explanation], count: int) -> list[Explanation]:
+    """Those that explain the pictures best."""
+    return sorted(candidates, key=lambda one: one.evidence, reverse=True)[:count]
 
 
 def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[TargetImage]:

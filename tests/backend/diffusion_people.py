@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -33,7 +34,7 @@ def random_prior(
         return torch.randn(size, generator=generator, dtype=torch.float64)
 
     size = shape[0] * shape[1] * shape[2]
-    return PersonPrior(
+    return PersonPrior.of_whole_body(
         mean=normal(*shape),
         basis=torch.linalg.qr(normal(size, components))[0].T.contiguous(),
         parity=torch.ones(components),
@@ -52,11 +53,46 @@ def random_prior(
     )
 
 
+def prior_of_parts(seed: int, asked: int = 0) -> PersonPrior:
+    """Latents [2, 2, 3] of three parts with two components each; the second and the third part are the head."""
+    shape, groups, kinds, heads = (2, 2, 3), 2, 3, 2
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*size: int) -> torch.Tensor:
+        return torch.randn(size, generator=generator, dtype=torch.float64)
+
+    def uniform(*size: int) -> torch.Tensor:
+        return torch.rand(size, generator=generator, dtype=torch.float64)
+
+    part = torch.tensor([0, 1, 0, 2, 2, 2])
+    counts = part.bincount().tolist()
+    basis = [torch.linalg.qr(normal(count * shape[0], 2))[0].view(count, shape[0], 2) for count in counts]
+    kind = torch.nn.functional.one_hot(torch.arange(groups * kinds) % max(asked, 1), max(asked, 1))[:, :asked].double()
+    return PersonPrior(
+        mean=normal(*shape),
+        basis=torch.cat(basis),
+        part=part,
+        parity=torch.ones(6),
+        rest_variance=0.02 + 0.05 * uniform(*shape),
+        log_weight=uniform(groups, kinds).flatten().log_softmax(0).view(groups, kinds),
+        centre=2 * normal(groups, kinds, 6),
+        axes=torch.linalg.qr(normal(groups, 2, 1))[0].mT,
+        variance=0.5 + uniform(groups, 1),
+        left=0.1 + 0.2 * uniform(groups),
+        head=torch.arange(groups * kinds).view(groups, kinds) % heads,
+        head_axes=torch.linalg.qr(normal(heads, 4, 3))[0].mT,
+        head_variance=0.5 + uniform(heads, 3),
+        head_left=0.1 + 0.2 * uniform(heads),
+        shared=normal(1, 2, 6).repeat(groups, 1, 1) + torch.nn.functional.pad(normal(groups, 2, 2), (0, 4)),
+        kind=kind.view(groups, kinds, asked),
+    )
+
+
 def small_model(seed: int = 0, scale: float = 3.0) -> DiffusionModel:
     """A model of the default architecture with few channels; its networks' outputs are made to differ from 0."""
     asked = VOCABULARY.width
     prior = random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, seed, asked=asked).to(dtype=torch.float32)
-    prior = PersonPrior(**{**vars(prior), "centre": prior.centre * scale, "variance": prior.variance * scale**2})
+    prior = dataclasses.replace(prior, centre=prior.centre * scale, variance=prior.variance * scale**2)
     torch.manual_seed(seed)
     denoiser = PersonDenoiser(SMALL, prior, linear()).eval()
     torch.nn.init.normal_(denoiser.person.outer.weight, std=0.1)

@@ -8,6 +8,7 @@ from primdiffusion import reconstruction
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import sample
 from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.encoder.network import Encoder
@@ -114,9 +115,11 @@ def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
     # the mean human is so bright that its colours are clipped: no picture tells which way they should go
     white = torch.zeros_like(PRIOR.mean)
     white[:3] = 150 / 32
-    prior = dataclasses.replace(
-        PRIOR,
+    prior = PersonPrior.of_whole_body(
         mean=white,
+        basis=PRIOR.basis.permute(2, 1, 0).flatten(1),
+        parity=PRIOR.parity,
+        rest_variance=PRIOR.rest_variance,
         log_weight=torch.tensor([[0.8], [0.2]]).log(),
         centre=torch.tensor([30.0, -150.0])[:, None, None].repeat(1, 1, 3),
         axes=PRIOR.axes.repeat(2, 1, 1),
@@ -128,11 +131,11 @@ def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
     human = Human(components.payload(wanted), BETAS, {})
     person = captured(human, BodyPose.rest(), [0.0])
     frames = [frames_of(human)]
-    from_mean = components.mean
+    from_mean = components.everyone()
     for _ in range(4):
-        from_mean = components.closer(from_mean, targets_of(person.views, frames, 64)).coefficients
-    assert (from_mean - wanted).norm() > 100
-    assert (components.start(person.views, frames) - wanted).norm() < 10
+        from_mean = components.closer(from_mean, targets_of(person.views, frames, 64))
+    assert (components.coefficients(from_mean) - wanted).norm() > 100
+    assert (components.coefficients(components.start(person.views, frames)) - wanted).norm() < 10
 
 
 def test_evidence_is_the_pictures_probability_where_the_prior_leaves_no_choice():
@@ -140,9 +143,11 @@ def test_evidence_is_the_pictures_probability_where_the_prior_leaves_no_choice()
     components = dataclasses.replace(PersonComponents.of(MODEL), prior=prior)
     human = human_of(COLOURS)
     targets = targets_of(captured(human, BodyPose.rest(), [0.0]).views, [frames_of(human)], 64)
-    view = LinearisedView.of(targets[0], components.payload(components.mean), InverseSettings())
+    everyone = components.everyone()
+    mean_human = components.payload(components.coefficients(everyone))
+    view = LinearisedView.of(targets[0], mean_human, InverseSettings())
     wanted = -OBSERVATIONS / PIXEL_STD**2 * float((view.weight * view.residual**2).sum()) / 2
-    assert components.closer(components.mean, targets).evidence == pytest.approx(wanted, rel=1e-3)
+    assert components.closer(everyone, targets).evidence == pytest.approx(wanted, rel=1e-3)
 
 
 def test_a_seed_draws_the_rest_too():

@@ -144,7 +144,7 @@ def test_mirror_of_latents_is_the_mirror_of_grids(codec):
 def model(codec) -> VoxelModel:
     shape = (16, len(codec.cells), 1)
     size, generator = shape[0] * shape[1], torch.Generator().manual_seed(0)
-    prior = PersonPrior(
+    prior = PersonPrior.of_whole_body(
         mean=torch.zeros(shape),
         basis=torch.linalg.qr(torch.randn(size, 3, generator=generator))[0].T.contiguous(),
         parity=torch.ones(3),

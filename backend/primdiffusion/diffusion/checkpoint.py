@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion import tensor_file
@@ -43,7 +43,7 @@ ENCODER_FORMAT = "primdiffusion-encoder"
 FORMAT_VERSION = 2
 _READABLE = {FORMAT: str(FORMAT_VERSION), ENCODER_FORMAT: "1"}
 _HALVED = ("codec.mean", "codec.basis", "denoiser.")
-_WHOLE = ("prior_variance", "prior_log_weight")
+_WHOLE = ("prior_variance", "prior_head_variance", "prior_log_weight")
 WEIGHTS = "model.safetensors"
 """The checkpoint in a folder of `save_pretrained` or of the Hugging Face hub."""
 _COMMIT = re.compile(r"[0-9a-zA-Z_-]{1,64}", re.ASCII)
@@ -225,7 +225,7 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
     else:
         codec = CellCodec(_linear_codec(under(tensors, "codec.")))
         check_codec(codec.codec)
-        _restore_half(weights, codec.codec)
+        _restore_prior(weights, codec.codec)
         prior = PersonPrior(**under(weights, "prior_"))
         shapes = ShapePrior(**under(tensors, "shapes."))
         check_parts(codec.codec, prior, shapes, vocabulary)
@@ -238,27 +238,41 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
 
 def _store_half(tensors: dict[str, Tensor], codec: LinearCodec) -> None:
     """Keep the left half of each person component where the right one is its mirror image times its parity."""
-    basis, parity = tensors["denoiser.prior_basis"], tensors["denoiser.prior_parity"]
-    half = basis.unflatten(1, (-1, GRID, GRID))[..., : GRID // 2]
-    if torch.allclose(_whole_components(half, parity, codec), basis, atol=SYMMETRIC):
+    part, parity = tensors["denoiser.prior_part"], tensors["denoiser.prior_parity"]
+    basis = tensors["denoiser.prior_basis"][part.argsort(stable=True).argsort()].permute(2, 1, 0)
+    half = basis.unflatten(2, (GRID, GRID))[..., : GRID // 2]
+    if torch.allclose(_whole_components(half, part, parity, codec), basis, atol=SYMMETRIC):
         del tensors["denoiser.prior_basis"]
         tensors["denoiser.prior_basis_half"] = half
 
 
-def _restore_half(weights: dict[str, Tensor], codec: LinearCodec) -> None:
-    """Undo `_store_half`, in what `_model` reads; older files hold whole components."""
+def _restore_prior(weights: dict[str, Tensor], codec: LinearCodec) -> None:
+    """Undo `_store_half`, in what `_model` reads, and complete priors of older files, whose components are of the whole
+    body.
+    """
+    older = "prior_part" not in weights
+    part = torch.zeros(K, dtype=torch.int64) if older else weights["prior_part"].long()
     half = weights.pop("prior_basis_half", None)
     if half is not None:
         if half.ndim != 4 or half.shape[2:] != (GRID, GRID // 2) or half.shape[1] > codec.channels:
             raise ValueError(f"halves of person components have shape {tuple(half.shape)}")
-        weights["prior_basis"] = _whole_components(half, weights["prior_parity"], codec)
+        whole = _whole_components(half, part, weights["prior_parity"], codec)
+        weights["prior_basis"] = whole.flatten(1) if older else whole.permute(2, 1, 0)[part.argsort(stable=True)]
+    if older:
+        prior = PersonPrior.of_whole_body(**under(weights, "prior_"))
+        weights |= {f"prior_{field.name}": getattr(prior, field.name) for field in dataclasses.fields(prior)}
+    for name in ("prior_part", "prior_head"):
+        weights[name] = weights[name].long()
 
 
 def _whole_components(
-    half: Float[Tensor, "r c 32 16"], parity: Float[Tensor, "r"], codec: LinearCodec
-) -> Float[Tensor, "r d"]:
+    half: Float[Tensor, "n d 32 16"], part: Int[Tensor, "k"], parity: Float[Tensor, "r"], codec: LinearCodec
+) -> Float[Tensor, "n d k"]:
     left = torch.nn.functional.pad(half, (0, GRID // 2))
-    return (left + parity[:, None, None, None] * codec.mirror(left)).flatten(1)
+    if len(parity) % len(half) or not bool(((part >= 0) & (part < len(parity) // len(half))).all()):
+        raise ValueError(f"{len(parity)} parities are not those of {len(half)} components of each part")
+    signs = parity.unflatten(0, (-1, len(half)))[part].T.unflatten(1, (1, GRID, GRID))
+    return (left + signs * codec.mirror(left)).flatten(2)
 
 
 def _linear_codec(tensors: Mapping[str, Tensor]) -> LinearCodec:

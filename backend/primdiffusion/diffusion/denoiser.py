@@ -281,11 +281,12 @@ class PersonDenoiser(nn.Module):
             self.register_buffer(f"prior_{field.name}", getattr(prior, field.name))
         component_std = prior.marginal_variance().sqrt()
         self.register_buffer("component_std", component_std, persistent=False)
-        self.register_buffer("picture_std", _picture_std(prior, component_std), persistent=False)
-        channels, grid, components = prior.mean.shape[0], prior.mean.shape[-1], prior.basis.shape[0]
+        picture = prior.picture_variance(component_std**2).mean((1, 2)).sqrt().clamp_min(1e-6)
+        self.register_buffer("picture_std", picture, persistent=False)
+        channels, grid, components = prior.mean.shape[0], prior.mean.shape[-1], len(prior.parity)
         asked = prior.kind.shape[-1]
         self.person = PersonNetwork(components, asked, config.person) if config.person else None
-        drawn = -(-prior.basis.shape[1] // grid**2)  # channels that person components draw in
+        drawn = prior.basis.shape[1]
         self.local = LocalUNet(channels, components, grid, asked, config.local, drawn) if config.local else None
         if self.local is not None:
             self.local = self.local.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
@@ -366,10 +367,3 @@ class PersonDenoiser(nn.Module):
     def _precision(self, like: Tensor) -> torch.autocast:
         """Autocast for the networks only: the closed form needs full precision."""
         return torch.autocast(like.device.type, self.network_dtype, enabled=self.network_dtype != torch.float32)
-
-
-def _picture_std(prior: PersonPrior, component_std: Float[Tensor, "r"]) -> Float[Tensor, "c"]:
-    """Root mean square over the grid of what the person components draw in each channel."""
-    energy = component_std**2 @ prior.basis**2
-    energy = functional.pad(energy, (0, prior.mean.numel() - len(energy)))
-    return energy.unflatten(0, prior.mean.shape).mean((1, 2)).sqrt().clamp_min(1e-6)

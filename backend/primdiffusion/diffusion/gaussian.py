@@ -2,49 +2,101 @@
 
 A latent is z = mean + sum_i c_i u_i + r with orthonormal person components u and a rest r orthogonal to them. White
 noise splits the same way, so the c and r parts of a noisy person are diffusions of their own, each with its own
-denoiser. For c ~ sum_k weight_k N(centre_k, cov_g(k)) and r of independent entries, the posterior means below are exact
-up to the projection of r. They are the baseline that a network has to beat and the base that it corrects.
+denoiser. The posterior means below are exact up to the projection of r. They are the baseline that a network has to
+beat and the base that it corrects.
 
-Parts k of the mixture are kinds of people (an outfit, a hair style, shoes): many, with few people each. So parts lie in
-groups of one covariance, and what is common to a group is computed once.
+Each part of the body has components of its own: among components of the whole body, the colour of a shirt bleeds into
+trousers and skin. What belongs together is in the distribution of c. A kind of person is an outfit, a hair style and
+shoes:
+
+    c = centre of the kind + clothes + head + u shared,    u ~ N(0, 1)
+
+`clothes` are Gaussian over all parts but the head, with a covariance for each group (an outfit of a sex, plain or
+patterned), `head` is one with a covariance for each hair style, and `shared` are directions that join the two, such as
+the tone of the skin. Kinds are many, with few people each, so what is common to a group is computed once.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from primdiffusion.diffusion.kinds import Block, expected, posterior
 from primdiffusion.geometry.records import TensorRecord
 
 IMPOSSIBLE = -1e4
-"""Log weight of a part that contradicts the condition, or is padding."""
+"""Log weight of a kind that contradicts the condition, or is padding."""
+CLEAN_NOISE = 1e-3
+"""Noise of coefficients that are read as they are; some directions have no variance of their own."""
+TOGETHER = 32
+"""Samples whose distances to all kinds are in memory at once."""
 
 
 @dataclasses.dataclass(frozen=True)
 class PersonPrior(TensorRecord):
-    """Distribution of latents [C, H, W]; D = C*H*W, R person components, G groups of M mixture parts."""
+    """Distribution of latents [C, H, W] on K = H*W cells, with P parts of N components (R = P*N), and G groups of at
+    most M kinds."""
 
     mean: Float[Tensor, "c h w"]
-    basis: Float[Tensor, "r d"]
-    """Orthonormal rows: person components in the order of their variance. They may live in the leading channels alone:
-    d is a multiple of H*W, up to D."""
+    basis: Float[Tensor, "k d n"]
+    """Components, orthonormal in each part, in the order of their variance: [i, :, j] is what component j of a cell's
+    part adds to its d leading channels. Cells are in the order of their parts, `part.argsort(stable=True)`."""
+    part: Int[Tensor, "k"]
+    """Part of each cell, equal to its own mirror image; the last one is the head."""
     parity: Float[Tensor, "r"]
-    """Sign of each component in the mirror image of a person."""
+    """Sign of each coefficient in the mirror image of a person."""
     rest_variance: Float[Tensor, "c h w"]
     """Variance of the entries of r."""
     log_weight: Float[Tensor, "g m"]
-    """Logarithm of the probability of each part; IMPOSSIBLE where a group has fewer parts."""
+    """Logarithm of the probability of each kind; IMPOSSIBLE where a group has fewer kinds."""
     centre: Float[Tensor, "g m r"]
-    axes: Float[Tensor, "g r r"]
-    """Orthonormal rows: principal axes of each group among the person components."""
-    variance: Float[Tensor, "g r"]
+    axes: Float[Tensor, "g a o"]
+    """Orthonormal rows: principal axes of the clothes of each group, among the leading o coefficients."""
+    variance: Float[Tensor, "g a"]
     """Variance along each axis."""
-    kind: Float[Tensor, "g m a"]
-    """The condition (`AttributeVocabulary.encode`) of each part; a may be 0."""
+    left: Float[Tensor, "g"]
+    """Variance in all directions without an axis."""
+    head: Int[Tensor, "g m"]
+    """Which of the F heads each kind has."""
+    head_axes: Float[Tensor, "f e s"]
+    """As `axes`, of heads, among the last s = R - o coefficients; s may be 0."""
+    head_variance: Float[Tensor, "f e"]
+    head_left: Float[Tensor, "f"]
+    shared: Float[Tensor, "g q r"]
+    """Directions that clothes and head share in each group, as long as their standard deviations; the head's are those
+    of the first group."""
+    kind: Float[Tensor, "g m x"]
+    """The condition (`AttributeVocabulary.encode`) of each kind; x may be 0."""
+
+    @classmethod
+    def of_whole_body(
+        cls,
+        mean: Float[Tensor, "c h w"],
+        basis: Float[Tensor, "r d"],
+        parity: Float[Tensor, "r"],
+        rest_variance: Float[Tensor, "c h w"],
+        log_weight: Float[Tensor, "g m"],
+        centre: Float[Tensor, "g m r"],
+        axes: Float[Tensor, "g r r"],
+        variance: Float[Tensor, "g r"],
+        kind: Float[Tensor, "g m x"],
+    ) -> PersonPrior:
+        """One part, whose components are rows over whole channels, with one Gaussian for each group."""
+        cells, groups = mean[0].numel(), len(log_weight)
+        return cls(
+            mean=mean, basis=basis.unflatten(1, (-1, cells)).permute(2, 1, 0).contiguous(),
+            part=torch.zeros(cells, dtype=torch.int64), parity=parity, rest_variance=rest_variance,
+            log_weight=log_weight, centre=centre, axes=axes, variance=variance, left=variance.new_zeros(groups),
+            head=torch.zeros(log_weight.shape, dtype=torch.int64), head_axes=axes.new_zeros(1, 0, 0),
+            head_variance=axes.new_zeros(1, 0), head_left=axes.new_zeros(1),
+            shared=axes.new_zeros(groups, 0, len(parity)), kind=kind,
+        )  # fmt: skip
 
     def split(self, z: Float[Tensor, "b c h w"], signal: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
         """Person coefficients [b, R] and rest [b, C, H, W] of latents whose mean is scaled by `signal` [b, 1, 1, 1]."""
@@ -62,108 +114,113 @@ class PersonPrior(TensorRecord):
 
     def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
         """Return the contribution of person coefficients to latents, without the mean."""
-        flat = coefficients @ self.basis
-        return functional.pad(flat, (0, self.mean.numel() - flat.shape[1])).unflatten(1, self.mean.shape)
+        own = coefficients.unflatten(1, (-1, self.basis.shape[2])).unbind(1)
+        drawn = torch.cat([part @ basis.flatten(0, 1).T for part, basis in zip(own, self._bases(), strict=True)], dim=1)
+        channels = self.basis.shape[1]
+        picture = coefficients.new_zeros((len(coefficients), *self.mean.flatten(1).shape))
+        picture[:, :channels, self._order] = drawn.unflatten(1, (-1, channels)).mT
+        return picture.unflatten(2, self.mean.shape[1:])
 
     def _along(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b r"]:
-        return z.flatten(1)[:, : self.basis.shape[1]] @ self.basis.T
+        cells = z.flatten(2)[:, : self.basis.shape[1], self._order].mT
+        own = cells.split([len(basis) for basis in self._bases()], dim=1)
+        return torch.cat(
+            [part.flatten(1) @ basis.flatten(0, 1) for part, basis in zip(own, self._bases(), strict=True)], dim=1
+        )
 
-    def log_weights(self, condition: Float[Tensor, "b a"] | None) -> Float[Tensor, "b g m"] | Float[Tensor, "1 g m"]:
-        """Return the log weights of the parts, lowered by IMPOSSIBLE where a part contradicts the condition.
+    @property
+    def _order(self) -> Int[Tensor, "k"]:
+        return self.part.argsort(stable=True)
 
-        A category is requested where its block of the condition is not 0; a part without its value is excluded. A value
-        that no part has excludes none.
+    def _bases(self) -> tuple[Tensor, ...]:
+        """The components of each part [cells, d, n]."""
+        return self.basis.split(self.part.bincount().tolist())
+
+    def log_weights(self, condition: Float[Tensor, "b x"] | None) -> Float[Tensor, "b g m"] | Float[Tensor, "1 g m"]:
+        """Return the log weights of the kinds, lowered by IMPOSSIBLE where a kind contradicts the condition.
+
+        A category is requested where its block of the condition is not 0; a kind without its value is excluded. A value
+        that no kind has excludes none.
         """
         if condition is None or not condition.shape[-1]:
             return self.log_weight[None]
-        asked = (condition[:, None, None, :] * self.kind).sum(-1)  # requested values that a part has
+        asked = (condition[:, None, None, :] * self.kind).sum(-1)  # requested values that a kind has
         return self.log_weight + IMPOSSIBLE * (asked.amax((1, 2), keepdim=True) - asked)
 
     def denoise_coefficients(
-        self, y: Float[Tensor, "b r"], signal: Tensor, noise: Tensor, condition: Float[Tensor, "b a"] | None = None
+        self, y: Float[Tensor, "b r"], signal: Tensor, noise: Tensor, condition: Float[Tensor, "b x"] | None = None
     ) -> Float[Tensor, "b r"]:
         """E[c | y = signal c + noise eps]; `signal` and `noise` are [b, 1].
 
         Computed in float64: distances to centres are squares of numbers up to a hundred over noise down to 0.01;
         on the CPU for Apple GPUs, which have no float64.
         """
-        given, (y, signal, noise) = y, (_double(part) for part in (y, signal, noise))
-        axes, variance = _double(self.axes), _double(self.variance)
-        centre = torch.einsum("gmr,gir->gmi", _double(self.centre), axes)
-        in_axes = torch.einsum("br,gir->bgi", y, axes)
-        total = signal[:, :, None] ** 2 * variance + noise[:, :, None] ** 2
-        distance = (
-            (in_axes.square() / total).sum(-1)[..., None]
-            - 2 * signal[:, :, None] * torch.einsum("bgi,gmi->bgm", in_axes / total, centre)
-            + signal[:, :, None] ** 2 * torch.einsum("bgi,gmi->bgm", 1 / total, centre.square())
-        )
-        evidence = _double(self.log_weights(condition)) - 0.5 * (distance + total.log().sum(-1)[..., None])
-        share = evidence.flatten(1).softmax(-1).view_as(evidence)
-        expected = torch.einsum("bgm,gmi->bgi", share, centre)
-        gain = signal[:, :, None] * variance / total
-        mean = gain * (share.sum(-1)[..., None] * in_axes - signal[:, :, None] * expected) + expected
-        return torch.einsum("bgi,gir->br", mean, axes).to(given)
+        log_weights = _double(self.log_weights(condition)).flatten(1).expand(len(y), -1)
+        possible = (log_weights > IMPOSSIBLE / 2).any(0).nonzero()[:, 0]
+        blocks = self._blocks(possible)
+        found = [
+            expected(blocks, weights[:, possible], *(_double(each) for each in chunk))
+            for weights, *chunk in zip(*(each.split(TOGETHER) for each in (log_weights, y, signal, noise)), strict=True)
+        ]
+        return torch.cat(found).to(y)
+
+    def kind_shares(self, c: Float[Tensor, "b r"]) -> Float[Tensor, "b g m"]:
+        """Probability of each kind given clean person coefficients."""
+        kinds = torch.arange(self.log_weight.numel(), device=c.device)
+        blocks, weights = self._blocks(kinds), _double(self.log_weight).flatten()[None]
+        one = torch.ones(len(c), 1, device=c.device)
+        shares = [
+            posterior(blocks, weights, *(_double(each) for each in chunk))[0]
+            for chunk in zip(*(each.split(TOGETHER) for each in (c, one, CLEAN_NOISE * one)), strict=True)
+        ]
+        return torch.cat(shares).unflatten(1, self.log_weight.shape)
+
+    def _blocks(self, kinds: Int[Tensor, "n"]) -> tuple[Block, Block]:
+        """Clothes and heads of some kinds, given as places in the flattened [G, M]."""
+        inner = self.axes.shape[2]
+        centre, shared = _double(self.centre).flatten(0, 1)[kinds], _double(self.shared)
+        clothes = Block(
+            *(_double(each) for each in (self.axes, self.variance, self.left)),
+            kinds // self.head.shape[1], centre[:, :inner], shared[..., :inner],
+        )  # fmt: skip
+        heads = Block(
+            *(_double(each) for each in (self.head_axes, self.head_variance, self.head_left)),
+            self.head.flatten()[kinds], centre[:, inner:], shared[:1, :, inner:].expand(len(self.head_left), -1, -1),
+        )  # fmt: skip
+        return clothes, heads
 
     def denoise_rest(self, rest: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor) -> Float[Tensor, "b c h w"]:
         """E[r | rest = signal r + noise eps]; `signal` and `noise` are [b, 1, 1, 1]."""
         return signal * self.rest_variance / (signal**2 * self.rest_variance + noise**2) * rest
 
     def denoise(
-        self, x: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor, condition: Float[Tensor, "b a"] | None = None
+        self, x: Float[Tensor, "b c h w"], signal: Tensor, noise: Tensor, condition: Float[Tensor, "b x"] | None = None
     ) -> Float[Tensor, "b c h w"]:
         """E[z | x = signal z + noise eps]; `signal` and `noise` are [b, 1, 1, 1]."""
         y, rest = self.split(x, signal)
         coefficients = self.denoise_coefficients(y, signal[..., 0, 0], noise[..., 0, 0], condition)
         return self.join(coefficients, self.denoise_rest(rest, signal, noise))
 
-    def posterior(
-        self, precision: Float[Tensor, "r r"], vector: Float[Tensor, "r"]
-    ) -> tuple[Float[Tensor, "r"], float]:
-        """E[c] given an observation of likelihood exp(vector^T c - c^T precision c / 2), and the logarithm of that
-        likelihood's mean over the prior.
-        """
-        logits, mean, _ = self._posterior(precision, vector)
-        share = logits.flatten().softmax(0).view_as(logits)
-        return torch.einsum("gm,gmr->r", share, mean).to(vector), float(logits.flatten().logsumexp(0))
-
-    def posterior_sample(
-        self, precision: Float[Tensor, "r r"], vector: Float[Tensor, "r"], generator: torch.Generator
-    ) -> Float[Tensor, "r"]:
-        """A draw of c given such an observation: a part of the mixture, then its Gaussian."""
-        logits, mean, factor = self._posterior(precision, vector)
-        part = int(torch.multinomial(logits.flatten().softmax(0), 1, generator=generator))
-        noise = torch.randn(len(vector), 1, generator=generator, dtype=mean.dtype)
-        spread = torch.linalg.solve_triangular(factor[part // logits.shape[1]].mT, noise, upper=True)
-        return (mean.flatten(0, 1)[part] + spread[:, 0]).to(vector)
-
-    def _posterior(self, precision: Tensor, vector: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Logarithms of the parts' weights times their mean likelihoods [g, m], their means given the observation
-        [g, m, r], and lower factors of their precisions [g, r, r].
-        """
-        axes, variance, centre = (_double(part) for part in (self.axes, self.variance, self.centre))
-        own = (axes.mT / variance[:, None, :]) @ axes
-        from_centre = centre @ own
-        factor = torch.linalg.cholesky(_double(precision) + own)
-        total = from_centre + _double(vector)
-        mean = torch.cholesky_solve(total.mT, factor).mT
-        spread = factor.diagonal(dim1=-2, dim2=-1).log().sum(-1) + 0.5 * variance.log().sum(-1)
-        evidence = (mean * total).sum(-1) / 2 - (from_centre * centre).sum(-1) / 2 - spread[:, None]
-        return _double(self.log_weight) + evidence, mean, factor
-
-    def group_means(self) -> Float[Tensor, "g r"]:
-        """Mean coefficients of each group's parts."""
-        weight = self.log_weight.softmax(1)
-        return torch.einsum("gm,gmr->gr", weight, self.centre)
-
     def marginal_variance(self) -> Float[Tensor, "r"]:
         """Variance of each person coefficient over the whole mixture."""
         weight = self.log_weight.exp()
-        within = torch.einsum("g,gij,gi->j", weight.sum(1), self.axes.square(), self.variance)
         mean = torch.einsum("gm,gmr->r", weight, self.centre)
-        return within + torch.einsum("gm,gmr->r", weight, (self.centre - mean).square())
+        between = torch.einsum("gm,gmr->r", weight, (self.centre - mean).square())
+        heads = torch.zeros_like(self.head_left).index_add(0, self.head.flatten(), weight.flatten())
+        clothes = torch.einsum("g,gi->i", weight.sum(1), _diagonal(self.axes, self.variance, self.left))
+        head = torch.einsum("f,fi->i", heads, _diagonal(self.head_axes, self.head_variance, self.head_left))
+        return torch.cat([clothes, head]) + torch.einsum("g,gqr->r", weight.sum(1), self.shared.square()) + between
+
+    def picture_variance(self, variance: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
+        """Variance of `picture` for independent coefficients of these variances."""
+        own = variance.unflatten(0, (-1, self.basis.shape[2]))
+        drawn = torch.cat([basis.square() @ part for part, basis in zip(own, self._bases(), strict=True)])
+        picture = torch.zeros_like(self.mean).flatten(1)
+        picture[: drawn.shape[1], self._order] = drawn.T
+        return picture.view_as(self.mean)
 
     def sample(
-        self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 a"] | None = None
+        self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 x"] | None = None
     ) -> Float[Tensor, "count c h w"]:
         """Draw latents given the condition; drawn on the generator's device, returned on the prior's."""
 
@@ -171,30 +228,66 @@ class PersonPrior(TensorRecord):
             draws = torch.randn(shape, generator=generator, dtype=self.mean.dtype, device=generator.device)
             return draws.to(self.mean.device)
 
-        part = self._draw_parts(count, generator, condition)
-        group = part // self.log_weight.shape[1]
-        in_axes = self.variance[group].sqrt() * normal(count, self.basis.shape[0])
-        coefficients = torch.einsum("bij,bi->bj", self.axes[group], in_axes) + self.centre.flatten(0, 1)[part]
+        kinds = self._draw_kinds(count, generator, condition)
+        group, head = kinds // self.head.shape[1], self.head.flatten()[kinds]
+        clothes = _drawn(normal, self.axes[group], self.variance[group], self.left[group])
+        heads = _drawn(normal, self.head_axes[head], self.head_variance[head], self.head_left[head])
+        shared = torch.einsum("bq,bqr->br", normal(count, self.shared.shape[1]), self.shared[group])
+        coefficients = self.centre.flatten(0, 1)[kinds] + shared + torch.cat([clothes, heads], dim=1)
         return self.join(coefficients, self.rest_variance.sqrt() * normal(count, *self.mean.shape))
 
     def sample_kinds(
-        self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 a"] | None = None
-    ) -> Float[Tensor, "count a"]:
+        self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 x"] | None = None
+    ) -> Float[Tensor, "count x"]:
         """Draw kinds of people as conditions, as often as they occur among those that agree with `condition`."""
-        return self.kind.flatten(0, 1)[self._draw_parts(count, generator, condition)]
+        return self.kind.flatten(0, 1)[self._draw_kinds(count, generator, condition)]
 
-    def _draw_parts(self, count: int, generator: torch.Generator, condition: Tensor | None) -> Int[Tensor, "n"]:
+    def _draw_kinds(self, count: int, generator: torch.Generator, condition: Tensor | None) -> Int[Tensor, "n"]:
         weight = self.log_weights(condition)[0].flatten().softmax(0)
         drawn = torch.multinomial(weight.to(generator.device), count, replacement=True, generator=generator)
         return drawn.to(self.mean.device)
+
+    def heads_of(self, group: int) -> list[int]:
+        """The heads that kinds of a group have."""
+        return self.head[group][self.log_weight[group] > IMPOSSIBLE / 2].unique().tolist()
+
+    def gaussian_of(self, group: int, head: int | None, directions: int) -> GaussianOfKinds:
+        """The mean and the leading directions of the covariance of all kinds of a group, or of those with one head."""
+        chosen = self.log_weight[group] > IMPOSSIBLE / 2
+        if head is not None:
+            chosen &= self.head[group] == head
+        weight, centre = self.log_weight[group][chosen].softmax(0), self.centre[group][chosen]
+        heads = torch.zeros_like(self.head_left).index_add(0, self.head[group][chosen], weight)
+        mean, inner = weight @ centre, self.axes.shape[2]
+        own = self.variance[group].sqrt()[:, None] * self.axes[group]
+        of_heads = ((heads[:, None] * self.head_variance).sqrt()[..., None] * self.head_axes)[heads > 0].flatten(0, 1)
+        rows = [
+            functional.pad(own, (0, len(mean) - inner)),
+            functional.pad(of_heads, (inner, 0)),
+            self.shared[group],
+            weight.sqrt()[:, None] * (centre - mean),
+        ]
+        factor = torch.cat(rows)
+        _, vectors = torch.linalg.eigh((factor @ factor.T).double())
+        return GaussianOfKinds(mean, vectors.flip(1)[:, :directions].T.to(factor) @ factor)
+
+    def gaussian_of_all(self, directions: int) -> GaussianOfKinds:
+        """The mean and the leading directions of the covariance of all people."""
+        whole = self.gaussian()
+        factor = whole.variance[0].sqrt()[:, None] * whole.axes[0]
+        return GaussianOfKinds(whole.centre[0, 0], factor[-directions:].flip(0))
 
     def gaussian(self) -> PersonPrior:
         """Return the single Gaussian with this mixture's mean and covariance, as a baseline."""
         weight = self.log_weight.exp()
         mean = torch.einsum("gm,gmr->r", weight, self.centre)
-        within = torch.einsum("g,gij,gi,gik->jk", weight.sum(1), self.axes, self.variance, self.axes)
-        offset = self.centre - mean
-        covariance = within + torch.einsum("gm,gmj,gmk->jk", weight, offset, offset)
+        offset = (self.centre - mean).flatten(0, 1)
+        covariance = offset.T @ (weight.flatten()[:, None] * offset)
+        covariance += torch.einsum("g,gqi,gqj->ij", weight.sum(1), self.shared, self.shared)
+        inner = self.axes.shape[2]
+        heads = torch.zeros_like(self.head_left).index_add(0, self.head.flatten(), weight.flatten())
+        covariance[:inner, :inner] += _pooled(weight.sum(1), self.axes, self.variance, self.left)
+        covariance[inner:, inner:] += _pooled(heads, self.head_axes, self.head_variance, self.head_left)
         variance, vectors = torch.linalg.eigh(covariance)
         return dataclasses.replace(
             self,
@@ -202,8 +295,48 @@ class PersonPrior(TensorRecord):
             centre=mean[None, None],
             axes=vectors.T[None],
             variance=variance.clamp_min(0)[None],
+            left=self.left[:1] * 0,
+            head=self.head[:1, :1] * 0,
+            head_axes=self.head_axes[:1, :0, :0],
+            head_variance=self.head_variance[:1, :0],
+            head_left=self.head_left[:1],
+            shared=self.shared[:1, :0],
             kind=self.kind[:1, :1] * 0,
         )
+
+
+class GaussianOfKinds(NamedTuple):
+    """Coefficients c = mean + weights @ factor, with weights ~ N(0, 1)."""
+
+    mean: Float[Tensor, "r"]
+    factor: Float[Tensor, "w r"]
+
+
+def _diagonal(axes: Float[Tensor, "g a i"], variance: Float[Tensor, "g a"], left: Float[Tensor, "g"]) -> Tensor:
+    """Variance of each coefficient in each group."""
+    return left[:, None] + torch.einsum("gai,ga->gi", axes.square(), variance - left[:, None])
+
+
+def _pooled(
+    weight: Float[Tensor, "g"], axes: Float[Tensor, "g a i"], variance: Float[Tensor, "g a"], left: Float[Tensor, "g"]
+) -> Float[Tensor, "i i"]:
+    """The weighted mean of the groups' covariances."""
+    own = torch.einsum("g,gai,ga,gaj->ij", weight, axes, variance - left[:, None], axes)
+    return own + (weight @ left) * torch.eye(axes.shape[2]).to(own)
+
+
+def _drawn(
+    normal: Callable[..., Tensor],
+    axes: Float[Tensor, "b a i"],
+    variance: Float[Tensor, "b a"],
+    left: Float[Tensor, "b"],
+) -> Float[Tensor, "b i"]:
+    """A draw of each sample's Gaussian."""
+    drawn = torch.einsum("ba,bai->bi", variance.sqrt() * normal(*variance.shape), axes)
+    if axes.shape[1] == axes.shape[2]:
+        return drawn
+    white = normal(len(axes), axes.shape[2])
+    return drawn + left.sqrt()[:, None] * (white - torch.einsum("bi,bai,baj->bj", white, axes, axes))
 
 
 def _double(tensor: Tensor) -> Tensor:

@@ -243,9 +243,17 @@ def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, voca
     check_shapes(codec, prior)
     check_shapes(shapes)
     _check_values(prior, shapes)
-    components, drawn = prior.basis.shape
-    if drawn % GRID**2 or not 0 < drawn <= prior.mean.numel():
-        raise ValueError(f"basis has rows of {drawn}, which are no whole channels of {tuple(prior.mean.shape)}")
+    cells, drawn, own = prior.basis.shape
+    parts, components = int(prior.part.max()) + 1, len(prior.parity)
+    if cells != K or not 0 < drawn <= codec.channels:
+        raise ValueError(f"components draw {drawn} channels of {cells} cells, not up to {codec.channels} of {K}")
+    if components != parts * own or components != prior.axes.shape[2] + prior.head_axes.shape[2]:
+        raise ValueError(f"{components} components are not {own} for each of {parts} parts")
+    for name, index, count in (("part", prior.part, parts), ("head", prior.head, len(prior.head_left))):
+        if bool((index < 0).any()) or bool((index >= count).any()):
+            raise ValueError(f"{name} has numbers that are not from 0 to {count - 1}")
+    if len(prior.part.bincount()) != parts or not bool((prior.part.bincount() > 0).all()):
+        raise ValueError("a part of the body has no cells")
     if shapes.weight.shape[1] > components:
         raise ValueError(f"body shapes depend on {shapes.weight.shape[1]} components of {components}")
     if prior.kind.shape[-1] not in (0, vocabulary.width):
@@ -253,11 +261,12 @@ def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, voca
 
 
 def _check_values(prior: PersonPrior, shapes: ShapePrior) -> None:
-    for name, values in (("rest_variance", prior.rest_variance), ("variance", prior.variance), ("limit", shapes.limit)):
+    variances = ("rest_variance", "variance", "left", "head_variance", "head_left")
+    for name, values in [*((name, getattr(prior, name)) for name in variances), ("limit", shapes.limit)]:
         if bool((values < 0).any()):
             raise ValueError(f"{name} has negative values")
     if bool((shapes.limit > LARGEST_BETA).any()):
         raise ValueError(f"body shapes may have betas over {LARGEST_BETA:g}")
-    for name, rows in (("basis", prior.basis), ("axes", prior.axes)):
+    for name, rows in (("basis", prior.basis), ("axes", prior.axes), ("head_axes", prior.head_axes)):
         if bool((rows.abs() > LARGEST_ENTRY).any()):
             raise ValueError(f"{name} has rows longer than 1")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -28,32 +27,12 @@ def unfollowed(model: DiffusionModel, x0: Float[Tensor, "b c h w"], attributes: 
         return [{} for _ in x0]
     blocks = model.vocabulary.blocks()
     found = []
-    for probability in kind_probabilities(prior, x0).cpu():
+    shares = prior.kind_shares(prior.split(x0)[0]).flatten(1)
+    for probability in (shares @ prior.kind.to(shares).flatten(0, 1)).cpu():
         shown = {name: probability[blocks[name]].max(0) for name in asked}
         values = {name: categories[name][int(best.indices)] for name, best in shown.items() if best.values > CERTAIN}
         found.append({name: value for name, value in values.items() if value != asked[name]})
     return found
-
-
-def kind_probabilities(prior: PersonPrior, x0: Float[Tensor, "b c h w"]) -> Float[Tensor, "b a"]:
-    """Return the probability of every value of a condition given clean samples.
-
-    Bayes' rule for the parts of the mixture, each of which is a kind of person; float64, as the prior's denoiser.
-    """
-    device = "cpu" if x0.device.type == "mps" else x0.device
-    coefficients, axes, variance, centre, weight, kind = (
-        part.to(device, torch.float64)
-        for part in (prior.split(x0)[0], prior.axes, prior.variance, prior.centre, prior.log_weight, prior.kind)
-    )
-    along = torch.einsum("br,gir->bgi", coefficients, axes)
-    centre = torch.einsum("gmr,gir->gmi", centre, axes)
-    distance = (
-        (along.square() / variance).sum(-1)[..., None]
-        - 2 * torch.einsum("bgi,gmi->bgm", along / variance, centre)
-        + (centre.square() / variance[:, None]).sum(-1)
-    )
-    evidence = weight - 0.5 * (distance + variance.log().sum(-1)[:, None])
-    return evidence.flatten(1).softmax(-1) @ kind.flatten(0, 1)
 
 
 def warnings_of(made: Mapping[str, Any]) -> list[str]:

@@ -36,16 +36,23 @@ class CodecConfig:
 class PriorConfig:
     """The closed-form person prior."""
 
-    components: int = 128
-    """Person components."""
-    channels: int = 64
+    components: int = 192
+    """Person components of each part of the body."""
+    channels: int = 128
     """Leading latent channels that the person components span; global differences are in these."""
     groups: tuple[str, ...] = ("sex", "outfit", "pattern")
-    """Attributes that define the groups, each with its own covariance; attributes missing in the data are ignored."""
-    features: tuple[tuple[str, ...], ...] = (("sex", "hair", "hat"), ("shoes",))
-    """Attributes that shift the mean of a group, each list independently; one mixture part for each choice."""
-    lean: float = 0.1
-    """Shrinkage of the groups' covariances to that of all data: its weight as samples, relative to `components`."""
+    """Attributes that define the groups, each with its own covariance of clothes; attributes missing in the data are
+    ignored."""
+    heads: tuple[str, ...] = ("sex", "hair", "hat")
+    """Attributes that define the heads, each with its own covariance."""
+    features: tuple[tuple[str, ...], ...] = (("shoes",),)
+    """Further attributes that shift the mean, each list independently."""
+    axes: int = 96
+    """Principal axes of a covariance."""
+    shared: int = 4
+    """Directions of the skin, which clothes and heads share."""
+    lean: float = 4.0
+    """Shrinkage of the groups' covariances to those of all data: its weight as samples."""
     folds: int = 4
     """Folds of the cross-validation that measures how much variance of each component generalises to new people."""
 

@@ -80,8 +80,6 @@ class PersonObjective:
         weights, indices = blends(self.people, t, self.config.blend, generator)
         condition = blend_conditions(self.people, indices, weights, self.vocabulary, self.config.unasked, generator)
         c = torch.einsum("bk,bkr->br", weights, self.coefficients[indices])
-        flip = torch.rand(len(c), 1, generator=generator, device=generator.device) < 0.5
-        c = torch.where(flip, c * self.denoiser.prior_parity, c)
         y = self.denoiser.schedule.q_sample(c, t, gaussian_noise(c, generator))
         signal, noise = self.denoiser.schedule.levels(t, c)
         std = self.denoiser.component_std

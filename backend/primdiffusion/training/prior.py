@@ -1,13 +1,14 @@
 """Fit the closed-form person prior, a mixture of Gaussians over person components, and the body shapes that go with it.
 
-The mixture has one part for each kind of person that the training people suggest. Kinds are many (16 outfits of a sex,
-9 styles of hair and hat, 6 pairs of shoes, plain or patterned) and people of one kind few or none, so parts share what
-they can: a covariance for each group (outfit and pattern), which small groups lean on their like for, and a mean that
-is a sum of effects: of the group, of the hair, of the shoes.
+The mixture has all kinds of person that the training people suggest. Kinds are many (16 outfits of a sex, 9 styles of
+hair and hat, 6 pairs of shoes, plain or patterned) and people of one kind few or none, so kinds share what they can: a
+covariance of clothes for each group (outfit and pattern) and one of the head for each hair style, for which small
+groups lean on their like, and a mean that is a sum of effects: of the group, of the hair, of the shoes.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -21,6 +22,7 @@ from primdiffusion.diffusion.codec import LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE, PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
+from primdiffusion.editing.regions import region_of
 from primdiffusion.training.config import PriorConfig
 from primdiffusion.training.latents import CHUNK, LatentSet
 
@@ -32,39 +34,82 @@ Values = tuple[int, ...]
 
 
 class Mixture(NamedTuple):
-    """Fields of `PersonPrior`: G groups of at most M parts over R components."""
+    """Fields of `PersonPrior`."""
 
     log_weight: Float[Tensor, "g m"]
     centre: Float[Tensor, "g m r"]
-    axes: Float[Tensor, "g r r"]
-    variance: Float[Tensor, "g r"]
-    kind: Float[Tensor, "g m a"]
+    axes: Float[Tensor, "g a o"]
+    variance: Float[Tensor, "g a"]
+    left: Float[Tensor, "g"]
+    head: Int[Tensor, "g m"]
+    head_axes: Float[Tensor, "f e s"]
+    head_variance: Float[Tensor, "f e"]
+    head_left: Float[Tensor, "f"]
+    shared: Float[Tensor, "g q r"]
+    kind: Float[Tensor, "g m x"]
 
 
 def fit_mixture(
-    c: Float[Tensor, "n r"], condition: Float[Tensor, "n a"], vocabulary: AttributeVocabulary, config: PriorConfig
+    c: Float[Tensor, "n r"],
+    clothes: int,
+    condition: Float[Tensor, "n x"],
+    vocabulary: AttributeVocabulary,
+    config: PriorConfig,
 ) -> Mixture:
-    """Parts for all kinds that can be put together of the people's attributes; a single Gaussian if they have none."""
-    names = [name for name in config.groups if name in vocabulary.categories]
-    features = [kept for feature in config.features if (kept := [n for n in feature if n in vocabulary.categories])]
+    """Kinds for all that can be put together of the people's attributes; a single one if they have none.
+
+    The leading `clothes` coefficients are those of the clothes, the others the head's.
+    """
+    groups, heads, *features = [
+        [name for name in key if name in vocabulary.categories]
+        for key in (config.groups, config.heads, *config.features)
+    ]
+    keys = [groups, heads, *filter(None, features)]
     values = _values(condition, vocabulary)
-    keys = [names, *features]
     rows = [[tuple(values[name][i] for name in key) for i in range(len(c))] for key in keys]
     choices = [sorted(set(row)) for row in rows]
     effects = _effects(c, rows, choices)
-    left = c - sum(effects[k][[choices[k].index(v) for v in rows[k]]] for k in range(len(keys)))
-    axes, variance = _covariances(left, rows[0], choices[0], config.lean * c.shape[1])
-    groups = [_parts(group, keys, rows, choices) for group in choices[0]]
-    most = max(map(len, groups))
-    log_weight = torch.full((len(groups), most), IMPOSSIBLE)
-    centre = torch.zeros(len(groups), most, c.shape[1])
-    kind = torch.zeros(len(groups), most, condition.shape[1])
-    for g, parts in enumerate(groups):
-        for m, (log_share, part) in enumerate(parts):
+    remainder = c - sum(effects[k][[choices[k].index(v) for v in rows[k]]] for k in range(len(keys)))
+    shared, remainder = _shared(remainder, clothes, rows[0], choices[0], config)
+    axes = _covariances(remainder[:, :clothes], rows[0], choices[0], config)
+    head_axes = _covariances(remainder[:, clothes:], rows[1], choices[1], config)
+    all_kinds = [_kinds(group, keys, rows, choices) for group in choices[0]]
+    size = len(all_kinds), max(map(len, all_kinds))
+    log_weight, head = torch.full(size, IMPOSSIBLE), torch.zeros(size, dtype=torch.int64)
+    centre, kind = torch.zeros(*size, c.shape[1]), torch.zeros(*size, condition.shape[1])
+    for g, kinds in enumerate(all_kinds):
+        for m, (log_share, chosen) in enumerate(kinds):
             log_weight[g, m] = log_share
-            centre[g, m] = sum(effects[k][choices[k].index(v)] for k, v in enumerate(part))
-            kind[g, m] = _condition(part, keys, vocabulary)
-    return Mixture(log_weight - log_weight.flatten().logsumexp(0), centre, axes, variance, kind)
+            centre[g, m] = sum(effects[k][choices[k].index(v)] for k, v in enumerate(chosen))
+            head[g, m] = choices[1].index(chosen[1])
+            kind[g, m] = _condition(chosen, keys, vocabulary)
+    log_weight = log_weight - log_weight.flatten().logsumexp(0)
+    return Mixture(log_weight, centre, *axes, head, *head_axes, shared, kind)
+
+
+def _shared(
+    c: Float[Tensor, "n r"], clothes: int, group: Sequence[Values], groups: Sequence[Values], config: PriorConfig
+) -> tuple[Float[Tensor, "g q r"], Float[Tensor, "n r"]]:
+    """Leading principal directions of hands, with what goes with them elsewhere, and what they leave.
+
+    Hands are bare in every outfit, so these are the directions of skin. Bare legs have its tone, trousers do not: so
+    clothes have a regression for each outfit, plain and patterned together, which leans on that of all.
+    """
+    hands = c[:, clothes : (c.shape[1] + clothes) // 2]
+    value, vector = torch.linalg.eigh((hands.T @ hands).double() / len(hands))
+    value, vector = value.flip(0)[: config.shared].clamp_min(1e-12).float(), vector.flip(1)[:, : config.shared].float()
+    scores = hands @ vector / value.sqrt()
+    pooled = scores.T @ c / len(c)
+    shared, remainder = pooled.repeat(len(groups), 1, 1), c.clone()
+    for g, values in enumerate(groups):
+        alike = torch.tensor([v[:2] == values[:2] for v in group])
+        own = scores[alike]
+        lean = config.lean * torch.eye(own.shape[1])
+        fitted = torch.linalg.solve(own.T @ own + lean, own.T @ c[alike] + lean @ pooled)
+        shared[g, :, :clothes] = fitted[:, :clothes]
+        of_group = torch.tensor([v == values for v in group])
+        remainder[of_group] = c[of_group] - scores[of_group] @ shared[g]
+    return shared, remainder
 
 
 def _values(condition: Float[Tensor, "n a"], vocabulary: AttributeVocabulary) -> dict[str, list[int]]:
@@ -91,51 +136,57 @@ def _effects(
 
 
 def _covariances(
-    left: Float[Tensor, "n r"], group: Sequence[Values], groups: Sequence[Values], pull: float
-) -> tuple[Float[Tensor, "g r r"], Float[Tensor, "g r"]]:
-    """Principal axes and variances of each group's people, and of `pull` of all groups that agree in the last value."""
+    c: Float[Tensor, "n i"], group: Sequence[Values], groups: Sequence[Values], config: PriorConfig
+) -> tuple[Float[Tensor, "g a i"], Float[Tensor, "g a"], Float[Tensor, "g"]]:
+    """Principal axes and variances of each group's people, and of `config.lean` of all groups alike in the last value.
+
+    `config.axes` axes are kept; the mean variance of the others is that of all directions left.
+    """
     of = torch.tensor([groups.index(v) for v in group])
-    scatter = [left[of == g].T @ left[of == g] for g in range(len(groups))]
+    scatter = [c[of == g].T @ c[of == g] for g in range(len(groups))]
     counts = [int((of == g).sum()) for g in range(len(groups))]
-    axes, variances = [], []
+    axes, variances, left = [], [], []
     for g, own in enumerate(groups):
         like = [other for other, values in enumerate(groups) if values[-1:] == own[-1:]]
         pooled = sum(scatter[other] for other in like) / sum(counts[other] for other in like)
-        covariance = (scatter[g] + pull * pooled) / (counts[g] + pull)
+        covariance = (scatter[g] + config.lean * pooled) / (counts[g] + config.lean)
         value, vector = torch.linalg.eigh(covariance.double())
-        axes.append(vector.T.float())
-        variances.append(value.clamp_min(max(float(value.max()) * 1e-7, 1e-12)).float())
-    return torch.stack(axes), torch.stack(variances)
+        value = value.flip(0).clamp_min(max(float(value.max()) * 1e-7, 1e-12) if len(value) else 0.0)
+        kept = min(config.axes, len(value))
+        axes.append(vector.flip(1)[:, :kept].T.float())
+        variances.append(value[:kept].float())
+        left.append(value[kept:].mean().float() if kept < len(value) else torch.tensor(0.0))
+    return torch.stack(axes), torch.stack(variances), torch.stack(left)
 
 
-def _parts(
+def _kinds(
     group: Values,
     keys: Sequence[Sequence[str]],
     rows: Sequence[Sequence[Values]],
     choices: Sequence[Sequence[Values]],
 ) -> list[tuple[float, tuple[Values, ...]]]:
-    """Logarithm of the share and the values of every part of a group: all choices of features that go with it.
+    """Logarithm of the share and the values of every kind of a group: all choices of features that go with it.
 
     Features go with a group where the attributes that both name agree; their shares are those among all people of whom
     these attributes are true.
     """
     total = len(rows[0])
-    parts = [(math.log(rows[0].count(group) / total), (group,))]
+    kinds = [(math.log(rows[0].count(group) / total), (group,))]
     for names, row, options in zip(keys[1:], rows[1:], choices[1:], strict=True):
         shared = [(names.index(name), keys[0].index(name)) for name in names if name in keys[0]]
         fitting = [v for v in options if all(v[mine] == group[theirs] for mine, theirs in shared)]
         counts = Counter(row)
         people = sum(counts[v] for v in fitting)
-        parts = [(share + math.log(counts[v] / people), (*values, v)) for share, values in parts for v in fitting]
-    return parts
+        kinds = [(share + math.log(counts[v] / people), (*values, v)) for share, values in kinds for v in fitting]
+    return kinds
 
 
 def _condition(
-    part: Sequence[Values], keys: Sequence[Sequence[str]], vocabulary: AttributeVocabulary
+    chosen: Sequence[Values], keys: Sequence[Sequence[str]], vocabulary: AttributeVocabulary
 ) -> Float[Tensor, "a"]:
-    """The condition that a part meets."""
+    """The condition that a kind meets."""
     condition, blocks = torch.zeros(vocabulary.width), vocabulary.blocks()
-    for names, values in zip(keys, part, strict=True):
+    for names, values in zip(keys, chosen, strict=True):
         for name, value in zip(names, values, strict=True):
             if value >= 0:
                 condition[blocks[name].start + value] = 1.0
@@ -143,51 +194,95 @@ def _condition(
 
 
 def fit_prior(
-    people: LatentSet, codec: LinearCodec, vocabulary: AttributeVocabulary, config: PriorConfig
+    people: LatentSet,
+    codec: LinearCodec,
+    vocabulary: AttributeVocabulary,
+    config: PriorConfig,
+    part: Int[Tensor, "k"] | None = None,
 ) -> PersonPrior:
-    """Principal components of people and their mirror images, and a mixture of Gaussians over them.
+    """Principal components of each part of people and their mirror images, and a mixture of Gaussians of the people.
 
     Components are found from Gram matrices of the even and the odd parts of people, so that each is even or odd under
     the mirror. Variances of trailing components fitted to few people are too large for new people and those of the rest
     too small: both are corrected by leaving `config.folds` parts of the geometries out in turn. Mean and rest are those
-    of detailed people.
+    of detailed people. `part` is that of each cell (None: `body_parts`).
     """
-    parts = _mirror_parts(people, codec, config.channels)
-    grams = [part @ part.T for _, part in parts]
-    vectors = [_principal(gram, config.components) for gram in grams]
-    signs, order = _merge([variance for variance, _ in vectors], config.components)
-    rows = [
-        (vector.T @ part) / (variance * len(people)).sqrt()[:, None]
-        for (_, part), (variance, vector) in zip(parts, vectors, strict=True)
-    ]
-    del parts
+    part = body_parts() if part is None else part
     detailed = int(people.detailed)
-    mean = people.latents[:detailed].float().mean(0)
+    mean = torch.stack([chunk.float().sum(0) for chunk in people.latents[:detailed].split(CHUNK)]).sum(0) / detailed
     mean = (mean + codec.mirror(mean)) / 2
-    basis = torch.linalg.qr(torch.cat(rows)[order].T)[0].T.contiguous()
-    kept, rest_ratio = _held_out_ratios(grams, people.geometry, config)
-    coefficients, rest_energy = [], torch.zeros(mean.numel())
+    fitted = [_components(people, codec, cells, config) for cells in _cells_of(part)]
+    count = min(len(one.signs) for one in fitted)
+    basis = torch.cat([one.basis[..., :count] for one in fitted])
+    signs = torch.cat([one.signs[:count] for one in fitted])
+    kept = torch.cat([one.kept[:count] for one in fitted])
+    nothing = torch.zeros(0)
+    inside = PersonPrior(mean, basis, part, signs, *[nothing] * 12)  # splits latents; its distribution follows
+    coefficients, rest_energy = [], torch.zeros_like(mean)
     for first in range(0, len(people), CHUNK):
-        centred = (people.latents[first : first + CHUNK].float() - mean).flatten(1)
-        c = centred[:, : basis.shape[1]] @ basis.T
+        c, rest = inside.split(people.latents[first : first + CHUNK].float())
         coefficients.append(c)
-        centred = centred[: max(0, detailed - first)]
-        centred[:, : basis.shape[1]] -= c[: len(centred)] @ basis
-        rest_energy += centred.square().sum(0)
-    rest = (rest_energy / detailed).unflatten(0, mean.shape)
+        rest_energy += rest[: max(0, detailed - first)].square().sum(0)
+    rest_ratio = torch.tensor([one.rest_ratio for one in fitted])[part].view(mean.shape[1:])
+    rest = rest_energy / detailed
     rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
     c = torch.cat(coefficients) * kept.sqrt()
-    mixture = fit_mixture(torch.cat([c, c * signs]), people.condition.repeat(2, 1), vocabulary, config)
-    return PersonPrior(mean, basis, signs, rest.clamp_min(1e-6), **mixture._asdict())
+    clothes = max(count, len(signs) - 2 * count)  # the others are hands and head; a single part is all
+    mixture = fit_mixture(c, clothes, people.condition, vocabulary, config)
+    return dataclasses.replace(inside, rest_variance=rest.clamp_min(1e-6), **mixture._asdict())
 
 
-def _mirror_parts(people: LatentSet, codec: LinearCodec, channels: int) -> list[tuple[Tensor, Tensor]]:
-    """Mean and centred rows of (z + Mz)/2, and zero and rows of (z - Mz)/2; of the leading channels."""
-    latents = people.latents[:, :channels].float()
-    mirrored = codec.mirror(latents)
-    even, odd = (latents + mirrored) / 2, (latents - mirrored) / 2
-    mean = even.mean(0)
-    return [(mean, (even - mean).flatten(1)), (torch.zeros_like(mean), odd.flatten(1))]
+def body_parts() -> Int[Tensor, "k"]:
+    """The part of each primitive: torso and neck, arms, legs, feet, hands, head.
+
+    A collar goes with the shirt, and hair with the head.
+    """
+    names = (("torso", "hips", "neck"), ("arms",), ("legs",), ("feet",), ("hands",), ("face", "hair"))
+    inside = torch.stack([region_of(part) for part in names])
+    return inside.int().argmax(0)
+
+
+def _cells_of(part: Int[Tensor, "k"]) -> list[Int[Tensor, "n"]]:
+    return [(part == number).nonzero()[:, 0] for number in range(int(part.max()) + 1)]
+
+
+class _Components(NamedTuple):
+    """Components of one part of the body, in the order of their variance."""
+
+    basis: Float[Tensor, "k d n"]
+    signs: Float[Tensor, "n"]
+    kept: Float[Tensor, "n"]
+    """Variance of new people over that of fitted people."""
+    rest_ratio: float
+    """The same of the rest."""
+
+
+def _components(people: LatentSet, codec: LinearCodec, cells: Int[Tensor, "k"], config: PriorConfig) -> _Components:
+    parts = _mirror_parts(people, codec, cells, config.channels)
+    grams = [part @ part.T for part in parts]
+    vectors = [_principal(gram, config.components) for gram in grams]
+    signs, order = _merge([variance for variance, _ in vectors], config.components)
+    rows = torch.cat(
+        [
+            (vector.T @ part) / (variance * len(people)).sqrt()[:, None]
+            for part, (variance, vector) in zip(parts, vectors, strict=True)
+        ]
+    )
+    basis = torch.linalg.qr(rows[order].T)[0].unflatten(0, (-1, len(cells))).transpose(0, 1).contiguous()
+    kept, rest_ratio = _held_out_ratios(grams, people.geometry, config)
+    return _Components(basis, signs, kept, rest_ratio)
+
+
+def _mirror_parts(people: LatentSet, codec: LinearCodec, cells: Int[Tensor, "k"], channels: int) -> list[Tensor]:
+    """Centred rows of (z + Mz)/2, and rows of (z - Mz)/2, in the leading channels of some cells."""
+    even, odd = [], []
+    for chunk in people.latents.split(CHUNK):
+        latents = chunk[:, :channels].float()
+        mirrored = codec.mirror(latents)
+        even.append(((latents + mirrored) / 2).flatten(2)[:, :, cells].flatten(1))
+        odd.append(((latents - mirrored) / 2).flatten(2)[:, :, cells].flatten(1))
+    whole = torch.cat(even)
+    return [whole - whole.mean(0), torch.cat(odd)]
 
 
 def _principal(gram: Float[Tensor, "n n"], components: int) -> tuple[Tensor, Tensor]:
@@ -237,14 +332,16 @@ def _smooth(values: Float[Tensor, "r"], width: int = 9) -> Float[Tensor, "r"]:
     return torch.nn.functional.avg_pool1d(padded, width, stride=1)[0, 0].exp()
 
 
-def fit_shapes(people: LatentSet, prior: PersonPrior, features: int = 24, ridge: float = 30.0) -> ShapePrior:
-    """Body shapes by ridge regression on the leading person coefficients in standard deviations."""
+def fit_shapes(people: LatentSet, prior: PersonPrior, ridge: float = 30.0) -> ShapePrior:
+    """Body shapes by ridge regression on the person coefficients in standard deviations."""
     first = torch.searchsorted(people.geometry, torch.arange(len(people.betas)))
-    x = torch.cat([prior.split(chunk.float())[0] for chunk in people.latents[first].split(256)])
-    x = (x / prior.marginal_variance().sqrt())[:, :features]
+    x = torch.cat([prior.split(chunk.float())[0] for chunk in people.latents[first].split(CHUNK)])
+    x = x / prior.marginal_variance().sqrt()
     bias = people.betas.mean(0)
     target = people.betas - bias
-    weight = torch.linalg.solve(x.T @ x + ridge * torch.eye(x.shape[1]), x.T @ target).T
-    left = target - x @ weight.T
+    gram = x @ x.T + ridge * torch.eye(len(x))  # people are fewer than coefficients
+    dual = torch.linalg.solve(gram, target)
+    left = dual / torch.linalg.inv(gram).diagonal()[:, None]  # of each person, by the regression on the others
     covariance = left.T @ left / len(left) + 1e-4 * torch.eye(left.shape[1])
-    return ShapePrior(weight, bias, torch.linalg.cholesky(covariance), people.betas.abs().amax(0).clamp_min(1.0))
+    limit = people.betas.abs().amax(0).clamp_min(1.0)
+    return ShapePrior((x.T @ dual).T, bias, torch.linalg.cholesky(covariance), limit)

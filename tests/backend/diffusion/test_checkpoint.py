@@ -4,14 +4,16 @@ import json
 
 import pytest
 import torch
-from diffusion_people import VOCABULARY, small_model
+from diffusion_people import COMPONENTS, VOCABULARY, small_model
 from primdiffusion.diffusion.checkpoint import default_checkpoint, load_checkpoint, read_card, save_checkpoint
 from primdiffusion.diffusion.codec import DEAD_ZONE, VALUES, WholeSlab
+from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.formats.regular_files import FileError
+from primdiffusion.primitives.primitives import GRID, K
 from safetensors import safe_open
 from safetensors.torch import save_file
 from support.errors import refused
@@ -62,12 +64,53 @@ def test_symmetric_person_components_are_stored_by_half(path):
     signs = denoiser.prior_parity[:, None, None, None]
     symmetric = torch.nn.functional.normalize((pictures + signs * codec.mirror(pictures)).flatten(1), dim=1)
     sizes = []
-    for basis in (denoiser.prior_basis.clone(), symmetric):
+    for basis in (denoiser.prior_basis.clone(), in_cells(symmetric)):
         denoiser.prior_basis.copy_(basis)
         save_checkpoint(path, model, "linear")
         sizes.append(path.stat().st_size)
         assert torch.allclose(load_checkpoint(path).denoiser.prior_basis, basis, atol=1e-4)
     assert sizes[0] - sizes[1] == pytest.approx(basis.numel(), abs=200)
+
+
+def in_cells(rows: torch.Tensor) -> torch.Tensor:
+    """Rows of components of the whole body as `PersonPrior.basis`."""
+    return rows.unflatten(1, (-1, K)).permute(2, 1, 0)
+
+
+def test_components_of_parts_are_stored_by_half_and_read_again(path):
+    model = small_model()
+    denoiser, codec = model.denoiser, model.codec.codec
+    codec.parity[0, 1] = -1.0
+    denoiser.prior_part[:] = (torch.arange(GRID)[:, None] % 2).expand(GRID, GRID).flatten()
+    order = denoiser.prior_part.argsort(stable=True)
+    pictures = torch.randn(COMPONENTS // 2, *model.codec.shape)
+    parity = torch.tensor([1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
+    signs = parity.view(2, -1)[denoiser.prior_part].T.reshape(-1, 1, GRID, GRID)
+    whole = (pictures + signs * codec.mirror(pictures)) / 100
+    basis = in_cells(whole.flatten(1))[order].contiguous()
+    prior = dataclasses.replace(denoiser.prior, basis=basis, parity=parity)
+    model = dataclasses.replace(model, denoiser=PersonDenoiser(DenoiserConfig(None, None), prior, model.schedule))
+    save_checkpoint(path, model, "linear")
+    read = load_checkpoint(path).denoiser.prior
+    with safe_open(path, framework="pt") as file:
+        assert "denoiser.prior_basis_half" in file.keys()  # noqa: SIM118
+    for field in dataclasses.fields(prior):
+        assert torch.allclose(getattr(read, field.name), getattr(prior, field.name), atol=1e-2), field.name
+
+
+def test_a_prior_of_before_parts_is_one_of_the_whole_body(path):
+    model = small_model()
+    save_checkpoint(path, model, "linear")
+    later = ("part", "left", "head", "head_axes", "head_variance", "head_left", "shared")
+
+    def before(tensors):
+        kept = {key: value for key, value in tensors.items() if key.removeprefix("denoiser.prior_") not in later}
+        return kept | {"denoiser.prior_basis": tensors["denoiser.prior_basis"].permute(2, 1, 0).flatten(1).contiguous()}
+
+    rewrite(path, before)
+    read, prior = load_checkpoint(path).denoiser.prior, model.denoiser.prior
+    for field in dataclasses.fields(prior):
+        assert torch.allclose(getattr(read, field.name), getattr(prior, field.name), atol=2e-2), field.name
 
 
 def test_a_codec_of_before_weights_is_read_as_it_was(path):

@@ -1,32 +1,16 @@
 """What a sample shows of the attributes that were asked for."""
 
 import dataclasses
-import itertools
 
 import pytest
 import torch
-from diffusion_people import random_prior
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
-from primdiffusion.diffusion.reading import kind_probabilities, unfollowed, warnings_of
+from primdiffusion.diffusion.reading import unfollowed, warnings_of
 from primdiffusion.editing.vary import vary
 from primdiffusion.human import generate
-from scipy.stats import multivariate_normal
 from tiny_model import model_of_two_kinds
 
 MODEL = model_of_two_kinds()
-
-
-def test_probabilities_of_kinds_are_bayes_rule():
-    prior = random_prior((2, 2, 3), components=4, parts=3, seed=0, groups=2, asked=3)
-    samples = prior.sample(5, torch.Generator().manual_seed(1))
-    for coefficients, found in zip(prior.split(samples)[0], kind_probabilities(prior, samples), strict=True):
-        weight = torch.zeros(2, 3, dtype=torch.float64)
-        for group, part in itertools.product(range(2), range(3)):
-            covariance = prior.axes[group].T @ torch.diag(prior.variance[group]) @ prior.axes[group]
-            density = multivariate_normal(prior.centre[group, part].numpy(), covariance.numpy()).pdf(coefficients)
-            weight[group, part] = prior.log_weight[group, part].exp() * float(density)
-        expected = torch.einsum("gm,gma->a", weight / weight.sum(), prior.kind)
-        assert torch.allclose(found, expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("seed", range(4))

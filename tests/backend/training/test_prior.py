@@ -14,9 +14,13 @@ from primdiffusion.training.prior import fit_prior
 def test_the_prior_s_components_are_even_or_odd_in_the_mirror(prepared_once):
     _, prepared = prepared_once
     prior, codec = prepared.prior, prepared.codec
-    pictures = prior.basis.unflatten(1, prior.mean.shape)
-    assert torch.allclose(codec.mirror(pictures), pictures * prior.parity[:, None, None, None], atol=1e-3)
-    assert torch.allclose(prior.basis @ prior.basis.T, torch.eye(6), atol=1e-4)
+    pictures = prior.picture(torch.eye(len(prior.parity)))
+    varying = prior.marginal_variance() > 1e-3  # people of few kinds leave some components without variance
+    assert varying.sum() >= 12
+    mirrored = pictures * prior.parity[:, None, None, None]
+    assert torch.allclose(codec.mirror(pictures)[varying], mirrored[varying], atol=1e-3)
+    rows = pictures.flatten(1)
+    assert torch.allclose(rows @ rows.T, torch.eye(len(rows)), atol=1e-4)
     assert torch.allclose(codec.mirror(prior.mean), prior.mean, atol=1e-3)
     assert torch.allclose(mirror_cells(codec.mean), codec.mean, atol=1e-3)
 
@@ -47,7 +51,7 @@ def test_person_components_live_in_the_leading_channels_alone(prepared_once):
     prior = fit_prior(
         prepared.train, prepared.codec, prepared.vocabulary, dataclasses.replace(config.prior, channels=2)
     )
-    assert prior.basis.shape[1] == 2 * GRID * GRID
+    assert prior.basis.shape[:2] == (GRID * GRID, 2)
     coefficients, rest = prior.split(z)
     assert torch.equal(rest[:, 2:], z[:, 2:] - prior.mean[2:])
     assert torch.allclose(prior.join(coefficients, rest), z, atol=1e-4)

@@ -16,7 +16,7 @@ WORDS = AttributeVocabulary(
     },
     {"height": (1.7, 0.1)},
 )
-CONFIG = PriorConfig(components=4, lean=0.1)
+CONFIG = PriorConfig(lean=0.4, axes=4, shared=1)
 DRESS = {"sex": "female", "outfit": "dress"}
 PEOPLE = [
     *[{**DRESS, "hair": "bob", "shoes": "boots"}] * 300,
@@ -24,23 +24,30 @@ PEOPLE = [
     *[{"sex": "female", "outfit": "jeans", "hair": "bob", "shoes": "pumps"}] * 200,
     *[{"sex": "male", "outfit": "jeans", "hair": "crew", "shoes": "boots"}] * 400,
 ]
+CLOTHES = 5
+"""Components of the clothes; of the other two, the first is the hands' and the second the head's."""
 
 
 def components(spread=0.1):
-    """Of PEOPLE: the outfit moves the first, long hair the second, pumps the third; jeans vary in the fourth."""
-    c = spread * torch.randn(len(PEOPLE), 4, generator=torch.Generator().manual_seed(0))
-    for row, person in zip(c, PEOPLE, strict=True):
+    """Of PEOPLE: the outfit moves the first, long hair the second, pumps the third; jeans vary in the fourth, and long
+    hair in the last. A tone of the skin is in the hands, in the head and, of dresses alone, in the fifth."""
+    generator = torch.Generator().manual_seed(0)
+    c = spread * torch.randn(len(PEOPLE), CLOTHES + 2, generator=generator)
+    for row, skin, person in zip(c, torch.randn(len(PEOPLE), generator=generator), PEOPLE, strict=True):
         row[0] += 10 * (person["outfit"] == "jeans")
         row[1] += 5 * (person["hair"] == "long")
         row[2] += 3 * (person["shoes"] == "pumps")
         row[3] *= 20 if person["outfit"] == "jeans" else 1
+        row[6] *= 10 if person["hair"] == "long" else 1
+        row[4] += 2 * skin * (person["outfit"] == "dress")
+        row[5:] += torch.stack([skin, 3 * skin])
     return c
 
 
 @pytest.fixture(scope="module")
 def mixture():
     condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in PEOPLE])
-    return fit_mixture(components(), condition, WORDS, CONFIG)
+    return fit_mixture(components(), CLOTHES, condition, WORDS, CONFIG)
 
 
 def part(mixture, **asked):
@@ -81,7 +88,7 @@ def test_shares_are_those_of_the_people_given_the_sex(mixture):
 
 def test_groups_keep_their_own_variance(mixture):
     spread = [
-        torch.einsum("i,ij,ij->j", mixture.variance[group], mixture.axes[group], mixture.axes[group])[3]
+        variances(mixture.axes[group], mixture.variance[group], mixture.left[group])[3]
         for group in (part(mixture, **DRESS, hair="bob", shoes="boots")[0],
                       part(mixture, sex="male", outfit="jeans", hair="crew", shoes="boots")[0])
     ]  # fmt: skip
@@ -89,7 +96,33 @@ def test_groups_keep_their_own_variance(mixture):
     assert spread[0] < 0.1
 
 
+def variances(axes, variance, left):
+    return torch.einsum("i,ij,ij->j", variance - left, axes, axes) + left
+
+
+def test_heads_keep_the_variance_of_their_hair(mixture):
+    spread = []
+    for hair in ("long", "bob"):
+        head = mixture.head[part(mixture, **DRESS, hair=hair, shoes="boots")]
+        spread.append(variances(mixture.head_axes[head], mixture.head_variance[head], mixture.head_left[head])[1])
+    assert spread[0].item() == pytest.approx(1.0, rel=0.3)
+    assert spread[1] < 0.2
+
+
+def test_skin_is_shared_by_hands_and_head_and_by_clothes_that_show_it(mixture):
+    dress, jeans = (
+        mixture.shared[part(mixture, sex="female", outfit=outfit, hair="bob", shoes="boots")[0], 0]
+        for outfit in ("dress", "jeans")
+    )
+    sign = dress[5].sign()
+    assert torch.allclose(sign * dress[4:], torch.tensor([2.0, 1.0, 3.0]), rtol=0.1)
+    assert jeans[4].abs() < 0.2
+    assert torch.equal(jeans[5:], dress[5:])
+    assert mixture.axes.shape == (3, 4, CLOTHES)
+    assert mixture.head_axes.shape == (3, 2, 2)
+
+
 def test_people_of_whom_nothing_is_known_are_one_gaussian():
-    mixture = fit_mixture(components(), torch.zeros(len(PEOPLE), 0), NOTHING, CONFIG)
+    mixture = fit_mixture(components(), CLOTHES, torch.zeros(len(PEOPLE), 0), NOTHING, CONFIG)
     assert mixture.log_weight.shape == (1, 1)
     assert torch.allclose(mixture.centre[0, 0], components().mean(0), atol=0.1)
