@@ -9,6 +9,7 @@ import pytest
 import torch
 from primdiffusion import cli
 from primdiffusion.device import best_device, device_info, has_bfloat16, has_fast_bfloat16
+from primdiffusion.diffusion.gaussian import PersonPrior, _double
 from primdiffusion.machine import choose_device, memory, share_processors
 from tiny_model import tiny_model
 from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
@@ -114,17 +115,26 @@ class PlainIndices(TorchFunctionMode):
             return self.simulated(torch.empty(shape, dtype=args[0].dtype, device="meta"))
 
 
-def test_the_denoiser_needs_no_float64_on_an_apple_gpu():
+def test_the_denoiser_needs_no_float64_on_an_apple_gpu(monkeypatch):
     fake, model = FakeTensorMode(allow_non_fake_inputs=True), tiny_model()
+    components, latents = len(model.denoiser.prior.parity), model.codec.shape
 
     def simulated(tensor):
         return FakeTensor(fake, tensor.to("meta"), torch.device("mps"))
 
     for name, buffer in model.denoiser.named_buffers():
         model.denoiser._buffers[name] = simulated(buffer)
-    x, t = simulated(torch.empty(2, *model.codec.shape)), simulated(torch.tensor([0, 1]))
+    x, t = simulated(torch.empty(2, *latents)), simulated(torch.tensor([0, 1]))
+    # which cells a part has, and which kinds are possible, are values, and simulated tensors have none
+    shapes = {"_along": (components,), "picture": latents, "denoise_coefficients": (components,)}
+    for name, shape in shapes.items():
+        monkeypatch.setattr(
+            PersonPrior, name, lambda self, of, *_, shape=shape: simulated(torch.empty(len(of), *shape))
+        )
     with fake, NoFloat64(), PlainIndices(simulated):
         x0 = model.denoiser(x, t)
+        in_float64 = _double(x)
+    assert (in_float64.device.type, in_float64.dtype) == ("cpu", torch.float64)
     assert (x0.device.type, x0.dtype, x0.shape) == ("mps", torch.float32, x.shape)
 
 

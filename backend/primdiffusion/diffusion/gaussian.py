@@ -166,8 +166,8 @@ class PersonPrior(TensorRecord):
 
     def kind_shares(self, c: Float[Tensor, "b r"]) -> Float[Tensor, "b g m"]:
         """Probability of each kind given clean person coefficients."""
-        kinds = torch.arange(self.log_weight.numel(), device=c.device)
-        blocks, weights = self._blocks(kinds), _double(self.log_weight).flatten()[None]
+        weights = _double(self.log_weight).flatten()[None]
+        blocks = self._blocks(torch.arange(weights.shape[1], device=weights.device))
         one = torch.ones(len(c), 1, device=c.device)
         shares = [
             posterior(blocks, weights, *(_double(each) for each in chunk))[0]
@@ -185,7 +185,7 @@ class PersonPrior(TensorRecord):
         )  # fmt: skip
         heads = Block(
             *(_double(each) for each in (self.head_axes, self.head_variance, self.head_left)),
-            self.head.flatten()[kinds], centre[:, inner:], shared[:1, :, inner:].expand(len(self.head_left), -1, -1),
+            self.head.flatten().to(kinds.device)[kinds], centre[:, inner:], shared[:1, :, inner:].expand(len(self.head_left), -1, -1),
         )  # fmt: skip
         return clothes, heads
 

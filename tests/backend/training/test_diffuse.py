@@ -357,6 +357,6 @@ def test_settings_that_cannot_be_are_rejected(settings_of, changes, word):
 @pytest.mark.parametrize("variants", [1, 2])
 def test_too_few_humans_for_the_person_components_are_counted_before_anything_is_computed(tmp_path, variants):
     write_people(tmp_path / "people", geometries=6, variants=variants)
-    with refused(ValueError, "5 humans", f"{5 * variants} colourings", "128", "--prior.components"):
+    with refused(ValueError, "5 humans", f"{5 * variants} colourings", "192", "--prior.components"):
         train(settings(tmp_path / "people", tmp_path / "run", prior=PriorConfig()))
     assert not (tmp_path / "run" / "prepared.safetensors").exists()
