@@ -185,7 +185,8 @@ class PersonPrior(TensorRecord):
         )  # fmt: skip
         heads = Block(
             *(_double(each) for each in (self.head_axes, self.head_variance, self.head_left)),
-            self.head.flatten().to(kinds.device)[kinds], centre[:, inner:], shared[:1, :, inner:].expand(len(self.head_left), -1, -1),
+            self.head.flatten().to(kinds.device)[kinds], centre[:, inner:],
+            shared[:1, :, inner:].expand(len(self.head_left), -1, -1),
         )  # fmt: skip
         return clothes, heads
 
