@@ -35,7 +35,6 @@ COMMANDS = {
     "refine": ("commands.reconstruct:run_refine", "Optimise a captured human to match the images"),
     "render": ("commands.render:run", "Render a human in a pose"),
     "export": ("commands.export:run", "Export a human to other programs: .glb, .obj or .ply"),
-    "export-onnx": ("commands.export_onnx:run", "Export the denoiser of a model to ONNX"),
     "merge": ("commands.merge:run", "Merge humans into one voxel grid: .vdb or .npz"),
     "serve": ("serve.server:run", "Be the backend of the Blender extension: answer JSON-RPC requests"),
     "info": ("commands.info:run", "Describe this installation, a checkpoint or a human, as JSON"),

@@ -154,16 +154,6 @@ class InfoCommand:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class ExportOnnxCommand:
-    """Export the denoiser of a model to ONNX: x [b, C, H, W], t [b] and condition [b, a] to the clean guess x0."""
-
-    checkpoint: Annotated[Path | None, Option(positional=True)] = None
-    """Trained model: a .safetensors file or a folder; the default is the one in the package."""
-    out: Annotated[Path, Ending((".onnx",))] = Path("denoiser.onnx")
-    """Output .onnx."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
 class RefineCommand:
     """Optimise a human to match captures: person.human.safetensors and previews.
 
@@ -301,7 +291,6 @@ OPTIONS: dict[str, type] = {
     "refine": RefineCommand,
     "render": RenderCommand,
     "export": ExportCommand,
-    "export-onnx": ExportOnnxCommand,
     "merge": MergeCommand,
     "serve": ServeCommand,
     "info": InfoCommand,

@@ -108,7 +108,7 @@ def test_one_who_fails_is_named_and_the_others_are_made(tmp_path, fails):
     assert f"{FIRST}  failed" in failed.out
     assert "0000.png" in failed.out
     assert "1 of 2 humans failed" in failed.err
-    assert [path.name for path in (tmp_path / "out").iterdir()] == [f"{SECOND}.npz"]
+    assert [path.name for path in (tmp_path / "out").glob("*.npz")] == [f"{SECOND}.npz"]
 
 
 @pytest.mark.parametrize("settings", [{"views": 0}, {"looks": 0}, {"refine_steps": -1}])
