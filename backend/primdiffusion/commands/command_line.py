@@ -51,7 +51,7 @@ def _with_option(kind: Any, about: str) -> Any:
 
 
 def _limits(mark: Range) -> str:
-    """A sentence of help on the limits of a number, without those that nobody reaches."""
+    """A sentence of help on the limits of a number, without those that no input reaches."""
     if mark.least <= -_HUGE:
         return ""
     shown = Range(mark.least) if mark.most >= _HUGE else mark

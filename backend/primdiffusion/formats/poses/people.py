@@ -27,7 +27,7 @@ MOST = 1000
 def people_in(content: Any, keys: Collection[str]) -> dict[str, Mapping[str, Any]]:
     """Arrays by their names of each person, by name; the only person of a file without a level above is called "".
 
-    A person's arrays have one of the `keys`. Nobody is found in other content. Raises ValueError for frames that do not
+    A person's arrays have one of the `keys`. Other content holds no person. Raises ValueError for frames that do not
     belong together.
     """
     if isinstance(content, list) and content and isinstance(content[0], Mapping):
