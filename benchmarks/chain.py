@@ -19,8 +19,9 @@ Samples: `sample_head_hf_over_codec` is the fine energy of generated heads over 
 the Lab distance of the face to bare forearms (to `hands`) within a person over that of held-out people's meshes, read
 from rendered pixels of the front view under the cells of those parts.
 
-Payloads: `payload_repeat_cosine` compares the changes of two fits whose cameras stand half a step apart,
-`payload_cpu_seconds` is the processor's time of one fit, `payload_colouring_cpu_seconds` of each further colouring,
+Fits: `fit_repeat_cosine_rest` compares what person components leave out of two fits whose cameras stand half a step
+apart, `fit_unexplained_rms` is what the model leaves of a fit when it denoises it from step 100 without noise (rms of
+latents), `fit_cpu_seconds` the processor's time of one fit, `fit_colouring_cpu_seconds` of each further colouring,
 `payload_pose_gain_db` what fitted payloads gain over from_mesh in seven other poses, and `_head_` at the head.
 """
 
@@ -40,6 +41,7 @@ from chain_sets import (
     decoded,
     denoised_once,
     draw,
+    explained,
     fit,
     generated,
     head_camera,
@@ -60,7 +62,6 @@ from numpy import ndarray
 from PIL import Image
 from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.diffusion.codec import window_weight
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.regions import region_of
 from primdiffusion.evaluation.image_metrics import overlap, ssim
@@ -71,7 +72,6 @@ from primdiffusion.people.payloads import head_centre, make_payloads, rest_frame
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.anchors import CHARTS, attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
-from primdiffusion.primitives.primitives import Payload, S
 from record import report
 from torch import Tensor
 
@@ -123,7 +123,7 @@ def main() -> None:
         figures |= sample_figures(model, assets, chain, samples, skins)
         report(figures, arguments.json)
         if held is not None:
-            figures |= payload_figures(assets, held, 1 if arguments.quick else PAYLOAD_PEOPLE)
+            figures |= payload_figures(model, assets, held, 1 if arguments.quick else PAYLOAD_PEOPLE)
     report(figures, arguments.json)
 
 
@@ -193,19 +193,24 @@ class Chain:
         return figures
 
 
-def payload_figures(assets: Assets, held: Path, count: int) -> Figures:
-    """Repeatability and cost of fits, and their gain in other poses."""
-    cosines, seconds, gains = [], [], {"front": [], "head": []}
+def payload_figures(model: DiffusionModel, assets: Assets, held: Path, count: int) -> Figures:
+    """Repeatability of fits, what they leave the model to guess, their cost, and their gain in other poses."""
+    cosines, unexplained, seconds, gains = [], [], [], {"front": [], "head": []}
+    base = load_checkpoint()  # from whose guesses the held-out fits start
     colouring = None
     for number in range(count):
         person = held_out(assets, number)
         frames = rest_frames(person.betas)
         start, fitted = start_of(person, frames), at_density(stored_fit(held, number), FULL_DENSITY)
-        (turned,), spent = fit([person], frames, turn=0.5)
-        cosines.append(change_cosine(fitted, turned, start, FULL_DENSITY))
+        (turned,), spent = fit([person], frames, base, turn=0.5)
+        samples = [latents_of(model, each) for each in (stored_fit(held, number), stored(turned, person.betas))]
+        rest = rest_of(model, samples)
+        if rest is not None:
+            cosines.append(float(torch.nn.functional.cosine_similarity(*rest.flatten(1), dim=0)))
+        unexplained.append(float((samples[0] - explained(model, samples[0])).square().mean().sqrt()))
         seconds.append(spent)
         if number == count - 1:  # the first fit may have compiled
-            _, more = fit(recoloured(person, number, COLOURINGS), frames, turn=0.5)
+            _, more = fit(recoloured(person, number, COLOURINGS), frames, base, turn=0.5)
             colouring = (more - spent) / COLOURINGS
         plain = at_density(stored(start, person.betas), FULL_DENSITY)
         for scene in posed_scenes(person):
@@ -215,10 +220,11 @@ def payload_figures(assets: Assets, held: Path, count: int) -> Figures:
                 gained.append(after - before)
         progress("repeated and posed")(number + 1, count)
     return {
-        "payload_repeat_cosine": float(np.mean(cosines)),
-        "payload_repeat_cosine_min": min(cosines),
-        "payload_cpu_seconds": float(np.median(seconds)),
-        "payload_colouring_cpu_seconds": colouring,
+        "fit_repeat_cosine_rest": float(np.mean(cosines)) if cosines else None,
+        "fit_repeat_cosine_rest_min": min(cosines, default=None),
+        "fit_unexplained_rms": float(np.mean(unexplained)),
+        "fit_cpu_seconds": float(np.median(seconds)),
+        "fit_colouring_cpu_seconds": colouring,
         "payload_pose_gain_db": float(np.mean(gains["front"])),
         "payload_pose_head_gain_db": float(np.mean(gains["head"])),
     }
@@ -279,21 +285,6 @@ def compare(drawn: Float[Tensor, "H W 4"], true: Float[Tensor, "H W 4"]) -> Meas
 def means(rows: Sequence[Measures]) -> dict[str, float]:
     """Of each measure over pictures."""
     return {name: float(np.mean([row[name] for row in rows])) for name in rows[0]}
-
-
-def change_cosine(first: Payload, second: Payload, start: Payload, full_density: float) -> float:
-    """Cosine of the changes of two fits from their start: encoded colour and relative density, weighted by the window.
-
-    1: both found the same; 0: what they changed is chance.
-    """
-    root = window_weight()[: S**3].unflatten(0, (S, S, S))
-
-    def values(payload: Payload) -> Tensor:
-        colour = encode_srgb(payload.rgb.clamp(0, 1)) * root
-        return torch.cat([colour.flatten(), (payload.density / full_density * root).flatten()]).double()
-
-    origin = values(start)
-    return float(torch.nn.functional.cosine_similarity(values(first) - origin, values(second) - origin, dim=0))
 
 
 def rest_std(rest: Float[Tensor, "n c 32 32"]) -> dict[str, float]:

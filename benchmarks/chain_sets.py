@@ -23,6 +23,7 @@ from primdiffusion.human import Human, people_of
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.payloads import (
+    GUESS_LEVEL,
     HEAD_EXTENT,
     HEAD_FOV,
     VARIANT_STRIDE,
@@ -171,6 +172,11 @@ def denoised_once(model: DiffusionModel, x0: Tensor, seed: int) -> Iterator[tupl
         yield t, model.denoise(model.schedule.q_sample(x0, torch.tensor([t]), noise), t)
 
 
+def explained(model: DiffusionModel, x0: Tensor) -> Tensor:
+    """What the model takes a clean sample for: its guess at GUESS_LEVEL without noise."""
+    return model.denoise(model.schedule.signal(GUESS_LEVEL) * x0, GUESS_LEVEL)
+
+
 def decoded(model: DiffusionModel, x0: Tensor) -> Payload:
     """The payload of one clean sample [1, *shape], fit for the marcher."""
     return model.decode(x0[0]).to("cpu").map(lambda tensor: tensor.clone())
@@ -191,10 +197,12 @@ def rest_of(model: DiffusionModel, samples: Sequence[Tensor]) -> Tensor | None:
     return model.denoiser.prior.split(torch.cat(list(samples)))[1]
 
 
-def fit(people: Sequence[Person], frames: Frames, turn: float = 0.0) -> tuple[list[Payload], float]:
+def fit(
+    people: Sequence[Person], frames: Frames, model: DiffusionModel, turn: float = 0.0
+) -> tuple[list[Payload], float]:
     """Fitted payloads of colourings of one geometry, and the processor's seconds."""
     begun = time.process_time()
-    payloads = fitted_payloads([person.mesh for person in people], frames, people[0].betas, turn=turn)
+    payloads = fitted_payloads([person.mesh for person in people], frames, people[0].betas, model, turn=turn)
     return payloads, time.process_time() - begun
 
 

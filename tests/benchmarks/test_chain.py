@@ -6,7 +6,7 @@ import pytest
 import torch
 from figure_metrics import compare_detail, detail_energy, figure_psnr
 from primdiffusion.evaluation.image_metrics import overlap
-from primdiffusion.primitives.primitives import K, Payload
+from primdiffusion.primitives.primitives import K
 from scipy import ndimage
 
 
@@ -80,18 +80,6 @@ def test_compare_of_shifted_squares_gives_the_overlap_by_hand():
     measured = chain.compare(drawn, true)
     assert measured["iou"] == pytest.approx(12 / 20)
     assert overlap(true[..., 3] > 0.5, drawn[..., 3] > 0.5) == pytest.approx(12 / 20)
-
-
-def test_change_cosine_of_equal_opposite_and_invisible_changes():
-    def payload(grey, density):
-        return Payload(torch.full((K, 3, 8, 8, 8), grey), torch.full((K, 8, 8, 8), density), torch.ones(K, 3))
-
-    start, up, down = payload(0.3, 50.0), payload(0.3, 60.0), payload(0.3, 40.0)
-    assert chain.change_cosine(up, up, start, 100.0) == pytest.approx(1)
-    assert chain.change_cosine(up, down, start, 100.0) == pytest.approx(-1)
-    edge = up.map(torch.clone)
-    edge.density[..., 0, 0, 0] = 0.0
-    assert chain.change_cosine(up, edge, start, 100.0) == pytest.approx(1, abs=1e-2)
 
 
 def test_lab_of_known_colours():

@@ -61,6 +61,7 @@ def run_payloads(command: PayloadsCommand) -> None:
             command.seed,
             command.workers,
             command.making,
+            command.checkpoint,
             report,
         )
 

@@ -8,12 +8,17 @@ those from captures have `source` (JSON: images and encoder) and may have no see
 a second run skips complete ones.
 
 `from_mesh` gives each voxel the colour of the nearest surface point, which blurs because about four boxes overlap at
-every point. Fitting optimises the sum of the overlapping boxes against renders of the mesh instead. All samples use the
-same cameras, so that similar humans get similar payloads, which a network can learn.
+every point. Fitting optimises the sum of the overlapping boxes against renders of the mesh instead.
+
+Most of what pictures leave open, numbers that cancel between overlapping boxes, would be particular to each human, and
+no network could learn it. So a fit starts from what a trained model makes of the mesh's own colours, and is pulled
+towards that: similar humans get similar payloads. The next model is trained on these (expectation maximisation). All
+samples use the same cameras, for the same reason.
 """
 
 from __future__ import annotations
 
+import functools
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -25,6 +30,8 @@ from jaxtyping import Float, UInt8
 from numpy import ndarray
 
 from primdiffusion.body.model import default_body
+from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.arrays import read_arrays, write_deflated
 from primdiffusion.formats.requests import Making
 from primdiffusion.formats.whole_files import written_whole
@@ -44,8 +51,10 @@ from primdiffusion.worker_process import each
 VARIANT_STRIDE = 1 << 32
 """Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""
 KEYS = ("voxels", "betas", "attributes", "full_density", "seed", "making")
-VERSIONS: dict[Making, str] = {"fitted": "fitted 1", "from_mesh": "from_mesh 2"}
-"""Method and version stored in files; those of other versions are made again."""
+VERSIONS: dict[Making, str] = {"fitted": "fitted 2", "from_mesh": "from_mesh 2"}
+"""Method and version stored in files, followed by the checkpoint for fits; those of others are made again."""
+GUESS_LEVEL = 100
+"""Step at which the model denoises the mesh's own colours, to make the start of a fit."""
 
 
 def make_payloads(
@@ -56,42 +65,47 @@ def make_payloads(
     seed: int,
     workers: int,
     making: Making = "fitted",
+    checkpoint: Path | None = None,
     report: Callable[[int, int], None] = lambda done, total: None,
 ) -> list[Path]:
     """Write the missing files of seeds seed ... seed + count - 1 to `out_dir`; return the paths of all.
 
-    A fitted sample takes about 30 s on one core with all its variants (`from_mesh`: 2 s). `report`
-    receives the number of finished samples and the total.
+    A fitted sample takes about 20 s on one core with all its variants (`from_mesh`: 2 s). Fits start from guesses of
+    `checkpoint` (None: the included one). `report` receives the number of finished samples and the total.
 
     Raises:
-        ValueError: a count is not positive; a worker process was killed.
+        ValueError: a count is not positive; the checkpoint is damaged; a worker process was killed.
         FileNotFoundError, FileError: asset files are missing or damaged.
     """
     for name, value in (("count", count), ("variants", variants), ("workers", workers)):
         if value < 1:
             raise ValueError(f"{name} is {value}: give 1 or more")
+    method = _method(making, checkpoint)
     out_dir.mkdir(parents=True, exist_ok=True)
     paths = [out_dir / f"person_{person_seed:06d}.npz" for person_seed in range(seed, seed + count)]
     jobs = [
         (path, person_seed)
         for path, person_seed in zip(paths, range(seed, seed + count), strict=True)
-        if not is_complete(path, variants, person_seed, making)
+        if not is_complete(path, variants, person_seed, method)
     ]
     done = count - len(jobs)
     report(done, count)
-    for _ in each(write_person, [(assets, path, variants, person_seed, making) for path, person_seed in jobs], workers):
+    work = [(assets, path, variants, person_seed, making, checkpoint) for path, person_seed in jobs]
+    for _ in each(write_person, work, workers):
         done += 1
         report(done, count)
     return paths
 
 
-def write_person(assets: Assets, path: Path, variants: int, seed: int, making: Making) -> None:
+def write_person(
+    assets: Assets, path: Path, variants: int, seed: int, making: Making, checkpoint: Path | None = None
+) -> None:
     """Generate one sample in all colourings and write its file, atomically."""
     colourings = coloured_people(assets, seed, variants)
     person = colourings[0]
     meshes, frames = [variant.mesh for variant in colourings], rest_frames(person.betas)
     if making == "fitted":
-        payloads = fitted_payloads(meshes, frames, person.betas)
+        payloads = fitted_payloads(meshes, frames, person.betas, _model(checkpoint))
     else:
         field = surface_field(person.mesh, frames)
         payloads = [colour(field, mesh) for mesh in meshes]
@@ -101,9 +115,20 @@ def write_person(assets: Assets, path: Path, variants: int, seed: int, making: M
         "betas": person.betas,
         "attributes": json.dumps(attributes),
         "seed": seed,
-        "making": VERSIONS[making],
+        "making": _method(making, checkpoint),
     }
     store_person(path, entries)
+
+
+@functools.lru_cache(maxsize=1)
+def _model(checkpoint: Path | None) -> DiffusionModel:
+    return load_checkpoint(checkpoint)
+
+
+def _method(making: Making, checkpoint: Path | None) -> str:
+    """What a file says of how it was made."""
+    of_model = f" from {_model(checkpoint).card['sha256'][:12]}" if making == "fitted" else ""
+    return VERSIONS[making] + of_model
 
 
 def coloured_people(assets: Assets, seed: int, variants: int) -> list[Person]:
@@ -134,14 +159,14 @@ def voxels_from_payload(payload: Payload) -> UInt8[np.ndarray, "K 8 8 8 4"]:
     return (torch.cat([encoded, density], dim=-1) * 255).round().to(torch.uint8).numpy()
 
 
-def is_complete(path: Path, variants: int, seed: int, making: Making) -> bool:
+def is_complete(path: Path, variants: int, seed: int, method: str) -> bool:
     """Whether a file contains this sample, made by this method; False for damaged files, which are made again."""
     try:
         arrays = read_arrays(path, KEYS)
         known = int(arrays["seed"]), str(arrays["making"])
     except (OSError, ValueError):
         return False
-    return known == (seed, VERSIONS[making]) and arrays["voxels"].shape == (variants, K, S, S, S, 4)
+    return known == (seed, method) and arrays["voxels"].shape == (variants, K, S, S, S, 4)
 
 
 BODY_VIEWS, BODY_SIZE, BODY_FOV = 28, 176, math.radians(30)
@@ -154,22 +179,26 @@ BODY_PITCHES = (0, 10, -10, 25, 5, -5, 15)
 HEAD_PITCHES = (0, 10, -10, 20, -5)
 """Camera elevations in degrees, cycled over the views."""
 SUPERSAMPLE = 3
-SETTINGS = InverseSettings()
+SETTINGS = InverseSettings(steps=2, pull=1.0, smoothness=0.3)
+"""Of fits that start from a model's guess. Stronger pulls and fewer steps than elsewhere: the start is good, and what
+pictures do not determine should stay as it is there."""
 
 
 def fitted_payloads(
     colourings: Sequence[TexturedMesh],
     frames: Frames,
     betas: Float[ndarray, "10"],
+    model: DiffusionModel | None,
     settings: InverseSettings = SETTINGS,
     turn: float = 0.0,
 ) -> list[Payload]:
     """Fit payloads to meshes that differ only in their textures, in the rest pose of the default body.
 
-    Density and the first colouring are fitted jointly, then all colours with that density fixed. `turn` (0 to 1)
-    rotates the cameras towards their neighbours, to measure how much the result depends on them.
+    Density and the first colouring are fitted jointly, then all colours with that density fixed. Each starts from the
+    guess of `model` (None: the mesh's own colours). `turn` (0 to 1) rotates the cameras towards their neighbours, to
+    measure how much the result depends on them.
 
-    Takes about 30 s on one core; further colourings add little, as they share marches and matrices.
+    Takes about 20 s on one core; further colourings add little, as they share marches and matrices.
 
     Raises:
         ValueError: as `surface_field`; no colourings are given.
@@ -178,9 +207,18 @@ def fitted_payloads(
         raise ValueError("no mesh to fit to: give at least one colouring")
     field = surface_field(colourings[0], frames)
     starts = [colour(field, mesh) for mesh in colourings]
+    if model is not None:
+        starts = [guess(model, start) for start in starts]
     targets = _targets(colourings, frames, betas, turn)
     fitted = fit_payload(starts[0], targets[0], FULL_DENSITY, settings)
     return fit_colours([fitted, *starts[1:]], fitted, targets, settings)
+
+
+def guess(model: DiffusionModel, payload: Payload) -> Payload:
+    """What a model of the default body takes a payload for: its detail as this model would draw it."""
+    x = model.schedule.signal(GUESS_LEVEL) * model.encode(payload)
+    decoded = model.decode(model.denoise(x[None], GUESS_LEVEL)[0])
+    return Payload(decoded.rgb, decoded.density.clamp(max=FULL_DENSITY), payload.delta_scale)
 
 
 def views_of(mesh: TexturedMesh, betas: Float[ndarray, "10"], turn: float = 0.0) -> list[tuple[Camera, float]]:

@@ -143,9 +143,9 @@ def test_a_mesh_without_textures_is_named():
         np.zeros((0, 0, 4), np.uint8), np.zeros((3, 1), np.int32), np.ones((3, 1)),
     )  # fmt: skip
     with refused(ValueError, "body"):
-        fitted_payloads([TexturedMesh((bare,))], FRAMES, np.zeros(10))
+        fitted_payloads([TexturedMesh((bare,))], FRAMES, np.zeros(10), None)
     with refused(ValueError, "colouring"):
-        fitted_payloads([], FRAMES, np.zeros(10))
+        fitted_payloads([], FRAMES, np.zeros(10), None)
 
 
 def test_influence_is_the_square_change_of_the_images_by_a_voxel():
