@@ -54,13 +54,13 @@ def luminance(encoded: UInt8[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
 
 # sRGB, hexadecimal. Repeats are weights.
 CLOTHES: dict[str, str] = {
-    "top": "f2f2ee f2f2ee e8e3d5 c4c6c8 8d9196 4a4d52 22242a 1f2c4d 274f8f 3f7fc1 8db6d9 2e8b8b 3f7d4e 6b7a45 "
-    "c9a13b d9c04f c8703a b23a3a 7a2637 d79aa8 6f4a86 6b4c38 b89f7d",
+    "top": "f2f2ee f2f2ee f2f2ee e8e3d5 c4c6c8 8d9196 4a4d52 4a4d52 22242a 22242a 22242a 1f2c4d 1f2c4d 3b4a6b 5f7fa8 "
+    "8db6d9 3f5a47 6b7a45 7a2637 b89f7d 6b4c38 c9a13b b23a3a d79aa8 2e8b8b",
     "denim": "2a3a55 2f4a74 47658f 47658f 6d8bb5 8ba5c4 23252a 55595f b09a73 5b4636 55583c d5d0c2",
     "trousers": "23252a 2e3138 1f2a40 4a4d52 6a6d70 5b4636 8b7a5c 3a3f33",
     "tights": "1c1d21 23252a 2a2f45 3d3f45 4a2f3f 2f4a4a 5a5d63",
-    "skirt": "22242a 3b3f46 1f2c4d 6a6d70 5b3a3a 7a2637 8b7a5c 3f4a3a b89f7d 4a3f5a",
-    "jacket": "3f4a3a 55583c 5b4636 2e3138 1f2c4d 8b7a5c 6b2f2f 6a6d70 22242a 8a6a4a",
+    "skirt": "22242a 22242a 3b3f46 1f2c4d 6a6d70 5b3a3a 7a2637 8b7a5c 3f4a3a b89f7d",
+    "jacket": "3f4a3a 55583c 5b4636 2e3138 1f2c4d 1f2c4d 8b7a5c 6b2f2f 6a6d70 22242a 22242a 8a6a4a",
     "suit": "1b1c20 26282e 1f2a40 2c3a5a 4a4d52 5b4a3e 77787a a89a80",
     "overall": "2f4a74 47658f 6d8bb5 55583c 8b7a5c 6b3f2a 2e3138 3f6a5a",
     "shoe": "1c1a19 2b2725 4a2f20 6b4328 8b5a33 a5764a d8d4cb f0eeea 5a5d63 1f2c4d 7a2a2a",
@@ -82,6 +82,10 @@ HAIR: dict[str, str] = {
     "grey": "8a8783",
     "white": "cfccc6",
 }
+VIVID = 24.0
+"""Lab chroma above which a colour is vivid."""
+GREY_SHARE = {"young": (0.0, 0.0), "middleage": (0.12, 0.02), "old": (0.7, 0.5)}
+"""Shares of grey and white hair beside all other colours together."""
 CLOTHES_SPREAD, SOBER_SPREAD, HAIR_SPREAD = (5.0, 4.0, 4.0), (4.0, 1.5, 2.0), (2.5, 0.7, 1.2)
 """Standard deviations of colours around their palette entries, Lab."""
 
@@ -93,21 +97,24 @@ def garment_colour(kind: str, draws: np.random.Generator) -> Float[np.ndarray, "
     return _near(codes[draws.integers(len(codes))], draws, spread)
 
 
+def is_vivid(colour: Float[np.ndarray, "3"]) -> bool:
+    """Whether a linear colour is one of the few of a person's clothes that catch the eye."""
+    return bool(np.hypot(*lab_from_bytes(bytes_from_linear(colour))[1:]) > VIVID)
+
+
 def contrasting(colour: Float[np.ndarray, "3"], kind: str, draws: np.random.Generator) -> Float[np.ndarray, "3"]:
     """Draw four colours for a kind of garment and return the one farthest from `colour`."""
     options = [garment_colour(kind, draws) for _ in range(4)]
     return max(options, key=lambda option: float(np.abs(np.sqrt(option) - np.sqrt(colour)).sum()))
 
 
-def hair_colour(tone: float, old: bool, draws: np.random.Generator) -> tuple[str, Float[np.ndarray, "3"]]:
-    """Draw a hair colour's name and linear value; dark skin (tone near 1) comes with dark hair, old age with grey."""
+def hair_colour(tone: float, age: str, draws: np.random.Generator) -> tuple[str, Float[np.ndarray, "3"]]:
+    """Draw a hair colour's name and linear value; dark skin (tone near 1) comes with dark hair, age with grey."""
     light = (0.16, 0.2, 0.2, 0.13, 0.06, 0.05, 0.08, 0.09, 0.02, 0.01)
     dark = (0.62, 0.22, 0.08, 0.01, 0.01, 0.0, 0.0, 0.01, 0.04, 0.01)
     darkness = min(1.0, 1.6 * tone)
     share = np.array(light) * (1 - darkness) + np.array(dark) * darkness
-    if old:
-        share *= 0.55
-        share[-2:] += 0.24
+    share[-2:] = GREY_SHARE[age]
     name = list(HAIR)[draws.choice(len(HAIR), p=share / share.sum())]
     return name, _near(HAIR[name], draws, HAIR_SPREAD)
 

@@ -21,11 +21,11 @@ from trimesh import Trimesh
 from trimesh.geometry import faces_to_edges
 from trimesh.graph import connected_component_labels
 
-from primdiffusion.geometry.textured_mesh import vertex_normals
+from primdiffusion.geometry.textured_mesh import TexturedPart, vertex_normals
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import BaseMesh
 from primdiffusion.people.mhclo import ObjMesh, Proxy
-from primdiffusion.people.wardrobe import SKIRTS
+from primdiffusion.people.wardrobe import SKIRTS, Garment
 
 JOINTS = 24
 INFLUENCES = 4
@@ -34,6 +34,8 @@ DRAPE, LOOSE = 6, 0.6
 """Smoothing iterations of a skirt's weights, and the lower fraction of the skirt that is smoothed."""
 OVERLAP = 0.012
 """Overlap of socks with trousers, metres."""
+HEM_DEPTH = 0.02
+"""How far above its hem a skirt is closed between the legs, metres."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -73,6 +75,51 @@ def fit_item(
 ) -> Float[np.ndarray, "V 3"]:
     """Fit a mesh to a body in the base's rest pose, metres."""
     return assets.proxy(path)[0].fit(base_vertices, item_skinning(assets, base, path)[2])
+
+
+def skirt_faces(garment: Garment, mesh: ObjMesh) -> Bool[np.ndarray, " F"]:
+    """Find the faces of a garment's skirt."""
+    pieces = [number for number, piece in enumerate(garment.pieces) if piece.kind == "skirt"]
+    return np.isin(connected_faces(mesh.faces, len(mesh.vertices)), pieces)
+
+
+def lengthened(
+    vertices: Float[np.ndarray, "V 3"], skirt: Int[np.ndarray, "F 3"], factor: float
+) -> Float[np.ndarray, "V 3"]:
+    """Stretch a skirt downwards from its waist."""
+    own, result = np.unique(skirt), vertices.copy()
+    waist = vertices[own, 1].max()
+    result[own, 1] = waist - factor * (waist - vertices[own, 1])
+    return result
+
+
+def with_closed_hem(part: TexturedPart, skirt: Bool[np.ndarray, " F"]) -> TexturedPart:
+    """Straighten a skirt's hem, and close it between the legs: rays that look into it would see the background."""
+    faces = part.faces[skirt]
+    sides = np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1)  # each face's three edges
+    edges = np.sort(sides.reshape(-1, 2), axis=1)
+    _, place, count = np.unique(edges, axis=0, return_inverse=True, return_counts=True)
+    height = part.vertices[sides, 1].mean(axis=-1)
+    middle = (part.vertices[faces, 1].min() + part.vertices[faces, 1].max()) / 2
+    hem = (count[place].reshape(-1, 3) == 1) & (height < middle)
+    rim = sides[hem]
+    uv = part.corner_uv[skirt][hem]
+    own = np.unique(rim)
+    dense = np.zeros(JOINTS)
+    np.add.at(dense, part.skin_index[own], part.skin_weight[own])
+    strongest = np.argsort(-dense, kind="stable")[:INFLUENCES]
+    vertices = part.vertices.copy()
+    vertices[own, 1] = np.median(vertices[own, 1])
+    centre = vertices[own].mean(axis=0) + [0, HEM_DEPTH, 0]
+    cap = np.column_stack([rim[:, ::-1], np.full(len(rim), len(part.vertices))])
+    return dataclasses.replace(
+        part,
+        vertices=np.concatenate([vertices, centre[None]]),
+        faces=np.concatenate([part.faces, cap.astype(part.faces.dtype)]),
+        corner_uv=np.concatenate([part.corner_uv, np.repeat(uv[:, None], 3, axis=1)]),
+        skin_index=np.concatenate([part.skin_index, strongest[None].astype(part.skin_index.dtype)]),
+        skin_weight=np.concatenate([part.skin_weight, (dense[strongest] / dense[strongest].sum())[None]]),
+    )
 
 
 def under_hat(

@@ -25,9 +25,9 @@ from primdiffusion.raster.uv_atlas import texel_map
 
 SIZE = 512
 """Texture size; a texel covers about 3 mm of cloth."""
-ORIGINAL_SHARE: dict[str, float] = {"denim": 0.3, "shoe": 0.5, "overall": 0.2, "top": 0.06, "sock": 1.0}
+ORIGINAL_SHARE: dict[str, float] = {"denim": 0.3, "shoe": 0.5, "overall": 0.2, "sock": 1.0}
 """Probability that a piece keeps the pack's own colours."""
-PLAIN_TRIM_SHARE = 0.5
+PLAIN_TRIM_SHARE = 0.8
 """Probability that trim takes the colour of its piece; never for the shirt and tie of a suit."""
 TRIM_DISTANCE = 24.0
 """Lab distance from a piece's main colour beyond which a texel is trim."""
@@ -35,7 +35,7 @@ TRIM_DISTANCE = 24.0
 
 RIM = 2
 """Width of the border of an island that is mixed with the background, texels."""
-CREASE_SPREADS, CREASE_DEPTHS = (14, 1), (0.06, 0.03)
+CREASE_SPREADS, CREASE_DEPTHS = (14, 1), (0.02, 0.02)
 """Size (texels) and relative depth of creases and weave for cloth without a texture."""
 SKIN_DISTANCE, TRIES = 22.0, 8
 """Smallest Lab distance between cloth and skin, and the attempts to draw such a colour."""
@@ -107,12 +107,18 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
 def paint_garment(
     garment: Garment, draws: np.random.Generator, skin: UInt8[np.ndarray, "3"] | None = None
 ) -> tuple[Paint, ...]:
-    """Draw colours for every piece; pieces of one kind share them, and none is close to `skin`."""
+    """Draw colours for every piece; pieces of one kind share them, none is close to `skin`, and at most one is vivid."""
     by_kind: dict[Kind, Paint] = {}
     for piece in garment.pieces:
+        if piece.kind in by_kind:
+            continue
+        vivid = any(colours.is_vivid(paint.main) for kind, paint in by_kind.items() if kind != "denim")
         for _ in range(TRIES):
-            if piece.kind not in by_kind or (skin is not None and _is_skin(by_kind[piece.kind].main, skin)):
-                by_kind[piece.kind] = _paint(piece, draws)
+            paint = _paint(piece, draws)
+            like_skin = skin is not None and _is_skin(paint.main, skin)
+            if not like_skin and not (vivid and piece.kind != "denim" and colours.is_vivid(paint.main)):
+                break
+        by_kind[piece.kind] = paint
     return tuple(by_kind[piece.kind] for piece in garment.pieces)
 
 
@@ -122,10 +128,9 @@ def coloured(fabric: Cloth, paints: tuple[Paint, ...]) -> UInt8[np.ndarray, "H W
     trim = np.stack([paint.trim for paint in paints]).astype(np.float64)
     target = np.where(fabric.trim[..., None], trim[fabric.piece], main[fabric.piece])
     for number, paint in enumerate(paints):
-        pattern = dict(PATTERNS).get(paint.pattern)
-        if pattern is not None:
+        if paint.pattern in PATTERNS:
             here = (fabric.piece == number) & ~fabric.trim
-            share = pattern(fabric.position[here])[:, None].astype(np.float64)
+            share = PATTERNS[paint.pattern][1](fabric.position[here])[:, None].astype(np.float64)
             target[here] += share * (paint.second - paint.main).astype(np.float64)
     texture = np.full((*fabric.piece.shape, 4), 255, np.uint8)
     texture[..., :3] = bytes_from_linear(np.clip(target * fabric.shade[..., None], 0, 1))
@@ -143,19 +148,21 @@ def _is_skin(colour: Float[np.ndarray, "3"], skin: UInt8[np.ndarray, "3"]) -> bo
 
 
 def _paint(piece: Piece, draws: np.random.Generator) -> Paint:
-    """Draw the colours of a piece; only tops may be patterned."""
+    """Draw the colours of a piece; tops may be printed, and denim worn."""
     kind = piece.kind
     main = colours.garment_colour(kind, draws)
-    partner = "shirt" if kind == "suit" else "top"
-    trim = colours.contrasting(main, partner, draws)
+    partner = "shirt" if kind in ("suit", "top") else "top"
+    trim, second = (colours.contrasting(main, partner, draws) for _ in range(2))
     if kind != "suit" and draws.random() < PLAIN_TRIM_SHARE:
         trim = main
-    second = colours.contrasting(main, "top", draws)
     pattern = "solid"
-    if kind == "top" and draws.random() > SOLID_SHARE:
-        pattern = PATTERNS[draws.integers(len(PATTERNS))][0]
     if draws.random() < ORIGINAL_SHARE.get(kind, 0.0) and not piece.smooth:
         pattern = "original"
+    elif draws.random() < PRINTED_SHARE.get(kind, 0.0):
+        prints = [name for name, (on, _) in PATTERNS.items() if on == kind]
+        pattern = prints[draws.integers(len(prints))]
+    if pattern == "fades":
+        second = main + FADING * (1 - main)
     return Paint(main, trim, second, pattern)
 
 
@@ -207,16 +214,16 @@ def hanging_height(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b
     return np.where(along_arm > 0, np.minimum(position[..., 1], SHOULDER_Y) - along_arm, position[..., 1])
 
 
-def bands(position: Float[np.ndarray, "*b 3"], period: float = 0.14) -> Float[np.ndarray, "*b"]:
+def stripes(position: Float[np.ndarray, "*b 3"], period: float) -> Float[np.ndarray, "*b"]:
     """Horizontal stripes around body and sleeves."""
     return _soft(_wave(hanging_height(position) / period) - 0.25, EDGE / period)
 
 
-def plaid(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+def check(position: Float[np.ndarray, "*b 3"], period: float) -> Float[np.ndarray, "*b"]:
     """Crossing bands: weight 1 at crossings, 0.5 elsewhere on a band."""
     across = np.where(np.abs(position[..., 0]) > SHOULDER_X, position[..., 2], position[..., 0])
-    along = _soft(_wave(across / 0.12) - 0.25, EDGE / 0.12)
-    return 0.5 * (bands(position, 0.12) + along)
+    along = _soft(_wave(across / period) - 0.25, EDGE / period)
+    return 0.5 * (stripes(position, period) + along)
 
 
 def dots(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
@@ -227,32 +234,41 @@ def dots(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
     return _soft(0.026 - distance, EDGE)
 
 
-def sleeves(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
-    """Sleeves in the second colour."""
-    # Excludes the hips, which can be as wide.
-    raised = position[..., 1] > SHOULDER_Y - 0.25
-    return np.where(raised, _soft(np.abs(position[..., 0]) - SHOULDER_X + 0.02, EDGE), 0)
-
-
-def yoke(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+def block(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
     """Shoulders and arms in the second colour, down to the chest."""
     return _soft(position[..., 1] - (SHOULDER_Y - 0.1), EDGE)
 
 
-def chest_band(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
-    """One wide band around the chest and both upper arms."""
-    return _soft(0.06 - np.abs(hanging_height(position) - (SHOULDER_Y - 0.14)), EDGE)
+def chest_print(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+    """A ring around a disc on the chest."""
+    distance = np.hypot(position[..., 0], position[..., 1] - (SHOULDER_Y - 0.15))
+    drawn = np.maximum(_soft(0.03 - distance, EDGE), _soft(0.012 - np.abs(distance - 0.06), EDGE))
+    return np.where(position[..., 2] > 0, drawn, 0)
 
 
-SOLID_SHARE = 0.7
-PATTERNS: tuple[tuple[str, Pattern], ...] = (
-    ("sleeves", sleeves),
-    ("yoke", yoke),
-    ("chest band", chest_band),
-    ("bands", bands),
-    ("plaid", plaid),
-    ("dots", dots),
-)
+def fades(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
+    """The front of thighs and knees, as denim wears off."""
+    across = (np.abs(position[..., 0]) - 0.1) / 0.05
+    along = (position[..., 1] + 0.5) / 0.2
+    return np.where(position[..., 2] > 0, np.exp(-(across**2) - along**4), 0)
+
+
+PRINTED_SHARE: dict[str, float] = {"top": 0.22, "denim": 0.15}
+"""Probability that a piece is printed: about one garment in six."""
+FADING = 0.25
+"""How far worn denim is from its colour to white."""
+PATTERNS: dict[str, tuple[Kind, Pattern]] = {
+    "narrow stripes": ("top", functools.partial(stripes, period=0.08)),
+    "wide stripes": ("top", functools.partial(stripes, period=0.14)),
+    "check": ("top", functools.partial(check, period=0.09)),
+    "large check": ("top", functools.partial(check, period=0.15)),
+    "dots": ("top", dots),
+    "block": ("top", block),
+    "chest print": ("top", chest_print),
+    "fades": ("denim", fades),
+}
+"""Prints by name: the kind of piece that has them, and where they are. The same print is at the same place of a garment
+on every human, so that a network meets it again; only its colours differ."""
 
 
 def _wave(phase: np.ndarray) -> np.ndarray:

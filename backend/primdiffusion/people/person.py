@@ -18,10 +18,13 @@ from primdiffusion.people.fitting import (
     cover,
     fit_item,
     item_skinning,
+    lengthened,
     shown_faces,
+    skirt_faces,
     sunk,
     under_hat,
     under_hem,
+    with_closed_hem,
 )
 from primdiffusion.people.wardrobe import EYES, Choice, choose, hair_path, stream
 
@@ -102,6 +105,9 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.nda
     )
     parts = [_compact(body)]
     fitted = {name: fit_item(assets, base, path, vertices) for name, path in worn.items()}
+    skirt = skirt_faces(choice.outfit, pairs["outfit"][1])
+    if choice.outfit.lengthened != 1:
+        fitted["outfit"] = lengthened(fitted["outfit"], pairs["outfit"][1].faces[skirt], choice.outfit.lengthened)
     shoes = pairs["shoes"][1].faces
     sock_pieces = [number for number, piece in enumerate(choice.shoes.pieces) if piece.kind == "sock"]
     sock = np.isin(connected_faces(shoes, len(pairs["shoes"][1].vertices)), sock_pieces)
@@ -113,6 +119,8 @@ def _geometry(assets: Assets, base: BaseMesh, choice: Choice, face: Float[np.nda
         index, weight, _ = item_skinning(assets, base, path)
         seen = shown.get(name, np.ones(len(mesh.faces), bool))
         part = TexturedPart(name, fitted[name], mesh.faces[seen], mesh.corner_uv[seen], plain, index, weight)
+        if name == "outfit" and skirt.any():
+            part = with_closed_hem(part, skirt[seen])
         parts.append(_compact(part))
     return TexturedMesh(tuple(parts))
 
@@ -132,7 +140,7 @@ def _compact(part: TexturedPart) -> TexturedPart:
 def _coloured(assets: Assets, base: BaseMesh, choice: Choice, mesh: TexturedMesh, seed: int) -> Person:
     """Draw all colours from a seed and texture the geometry."""
     complexion = appearance.draw_skin(assets, choice.sex, stream(seed, "skin"))
-    hair_name, hair_linear = colours.hair_colour(complexion.tone, complexion.age == "old", stream(seed, "hair colour"))
+    hair_name, hair_linear = colours.hair_colour(complexion.tone, complexion.age, stream(seed, "hair colour"))
     iris = appearance.draw_eyes(assets, complexion.tone, stream(seed, "eye colour"))
     skin_picture = appearance.skin_texture(assets, complexion)
     bare = np.median(skin_picture[::16, ::16, :3].reshape(-1, 3), axis=0).astype(np.uint8)

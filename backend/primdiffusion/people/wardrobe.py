@@ -39,39 +39,43 @@ class Garment:
     pieces: tuple[Piece, ...]
     by_island: bool = False
     """Pieces are UV islands instead of connected components of the mesh."""
+    mesh: str = ""
+    """Name of the mesh, if it is another garment's."""
+    lengthened: float = 1.0
+    """Factor on the length of its skirt."""
 
     @property
     def path(self) -> str:
         """Path of its files in the asset folder, without extension."""
-        return f"clothes/{self.name}/{self.name}"
+        return "clothes/{0}/{0}".format(self.mesh or self.name)
 
 
 TRIMMED_TOP, SMOOTHED_TOP, PLAIN_TOP = Piece("top", trim=True), Piece("top", smooth=True), Piece("top")
 DENIM, DETAIL = Piece("denim"), Piece("detail")
 INNER_SHIRT = Piece("shirt", smooth=True)
 
+_SKIRT = (SMOOTHED_TOP, Piece("skirt"))
 UNISEX = (
+    Garment("female_casualsuit01", (TRIMMED_TOP, DENIM)),
+    Garment("female_casualsuit02", (DENIM, PLAIN_TOP, DETAIL)),
+    Garment("male_casualsuit01", (DENIM, PLAIN_TOP, DENIM, PLAIN_TOP, PLAIN_TOP, PLAIN_TOP), by_island=True),
+    Garment("male_casualsuit02", (TRIMMED_TOP, DENIM)),
     Garment("male_casualsuit03", (SMOOTHED_TOP, DENIM)),
+    Garment("male_casualsuit04", (DENIM, TRIMMED_TOP)),
     Garment("male_casualsuit05", (Piece("jacket"), DENIM, INNER_SHIRT, INNER_SHIRT)),
     Garment("male_casualsuit06", (SMOOTHED_TOP, DENIM)),
+    Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("suit"))),
     Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
 )
-"""Made for men and used for both sexes, because the pack has few women's clothes; they fit both."""
+"""For both sexes, whichever the pack made them for: they fit both."""
 OUTFITS: dict[Sex, tuple[Garment, ...]] = {
     "female": (
-        Garment("female_casualsuit01", (TRIMMED_TOP, DENIM)),
-        Garment("female_casualsuit02", (DENIM, PLAIN_TOP, DETAIL)),
-        Garment("female_elegantsuit01", (SMOOTHED_TOP, Piece("skirt"))),
+        *UNISEX,
+        Garment("female_elegantsuit01", _SKIRT),
+        Garment("female_elegantsuit01_long", _SKIRT, mesh="female_elegantsuit01", lengthened=1.45),
         Garment("female_sportsuit01", (TRIMMED_TOP, Piece("tights", trim=True))),
-        *UNISEX,
     ),
-    "male": (
-        Garment("male_casualsuit01", (DENIM, PLAIN_TOP, DENIM, PLAIN_TOP, PLAIN_TOP, PLAIN_TOP), by_island=True),
-        Garment("male_casualsuit02", (TRIMMED_TOP, DENIM)),
-        Garment("male_casualsuit04", (DENIM, TRIMMED_TOP)),
-        Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("suit"))),
-        *UNISEX,
-    ),
+    "male": UNISEX,
 }
 SKIRTS = {
     garment.path: tuple(number for number, piece in enumerate(garment.pieces) if piece.kind == "skirt")
@@ -94,20 +98,32 @@ SHOES: tuple[Garment, ...] = (
 HATS = ("clothes/fedora01/fedora", "clothes/fedora01/fedora_cocked")
 HAIR: dict[Sex, dict[str, float]] = {
     "female": {
-        "bob01": 0.09,
-        "bob02": 0.11,
-        "long01": 0.2,
-        "ponytail01": 0.2,
-        "braid01": 0.16,
-        "short03": 0.12,
-        "afro01": 0.12,
+        "bob01": 0.05,
+        "bob02": 0.1,
+        "long01": 0.18,
+        "ponytail01": 0.18,
+        "braid01": 0.13,
+        "short01": 0.05,
+        "short02": 0.07,
+        "short03": 0.09,
+        "short04": 0.05,
+        "afro01": 0.1,
     },
-    "male": {"short01": 0.22, "short02": 0.22, "short04": 0.22, "short03": 0.17, "afro01": 0.17},
+    "male": {
+        "short01": 0.19,
+        "short02": 0.2,
+        "short04": 0.2,
+        "short03": 0.14,
+        "afro01": 0.13,
+        "long01": 0.05,
+        "ponytail01": 0.06,
+        "bob02": 0.03,
+    },
 }
-"""Probabilities; low for the bobs, which hide an eye."""
+"""Probabilities; low for the bob that hides an eye."""
 HAT_HAIR: dict[Sex, dict[str, float]] = {
-    "female": {"bob02": 0.3, "long01": 0.7},
-    "male": {"short02": 0.5, "short04": 0.5},
+    "female": {"bob02": 0.2, "long01": 0.4, "ponytail01": 0.25, "short02": 0.15},
+    "male": {"short01": 0.3, "short02": 0.3, "short04": 0.3, "ponytail01": 0.1},
 }
 EYEBROWS = tuple(f"eyebrows/eyebrow{number:03d}/eyebrow{number:03d}" for number in range(1, 13))
 EYELASHES = tuple(f"eyelashes/eyelashes{number:02d}/eyelashes{number:02d}" for number in range(1, 5))
@@ -206,6 +222,7 @@ WORDS = {
         "female_casualsuit01": "fitted tee and jeans",
         "female_casualsuit02": "tee and shorts",
         "female_elegantsuit01": "blouse and skirt",
+        "female_elegantsuit01_long": "blouse and long skirt",
         "female_sportsuit01": "crop top and leggings",
         "male_casualsuit01": "shirt and trousers",
         "male_casualsuit02": "sweater and jeans",
@@ -232,8 +249,8 @@ WORDS = {
     "hat": {"fedora": "fedora", "fedora_cocked": "cocked fedora"},
 }
 """Display names of the pack's meshes; other names are used as they are."""
-PLAIN = {"solid", "original"}
-"""Values of `pattern` without a pattern."""
+PLAIN = {"solid", "original", "fades"}
+"""Values of `pattern` without a print on the top."""
 
 
 def words_of(attributes: Mapping[str, object]) -> dict[str, str]:
