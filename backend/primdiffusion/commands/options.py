@@ -228,7 +228,7 @@ class PayloadsCommand(MadePeople):
     variants: Count = 4
     """Colourings of each human."""
     making: Making = "fitted"
-    """fitted: the primitives are fitted to renders of the mesh, about 20 s per human and core; from_mesh: each voxel
+    """fitted: the primitives are fitted to renders of the mesh, about 30 s per human and core; from_mesh: each voxel
     takes the colour of the nearest surface point, 2 s, blurred."""
     checkpoint: Path | None = None
     """Model from whose guesses fits start, so that similar humans get similar primitives; the default is the included

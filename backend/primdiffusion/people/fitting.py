@@ -109,8 +109,11 @@ def with_closed_hem(part: TexturedPart, skirt: Bool[np.ndarray, " F"]) -> Textur
     np.add.at(dense, part.skin_index[own], part.skin_weight[own])
     strongest = np.argsort(-dense, kind="stable")[:INFLUENCES]
     vertices = part.vertices.copy()
-    vertices[own, 1] = np.median(vertices[own, 1])
-    centre = vertices[own].mean(axis=0) + [0, HEM_DEPTH, 0]
+    hem_height = np.median(vertices[own, 1])
+    vertices[own, 1] = hem_height
+    below = np.unique(faces)
+    vertices[below, 1] = np.maximum(vertices[below, 1], hem_height)
+    centre = vertices[own].mean(axis=0) + np.array([0, HEM_DEPTH, 0])
     cap = np.column_stack([rim[:, ::-1], np.full(len(rim), len(part.vertices))])
     return dataclasses.replace(
         part,

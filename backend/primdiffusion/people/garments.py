@@ -107,7 +107,7 @@ def cloth(assets: Assets, base: BaseMesh, garment: Garment) -> Cloth:
 def paint_garment(
     garment: Garment, draws: np.random.Generator, skin: UInt8[np.ndarray, "3"] | None = None
 ) -> tuple[Paint, ...]:
-    """Draw colours for every piece; pieces of one kind share them, none is close to `skin`, and at most one is vivid."""
+    """Draw colours for every piece; those of a kind share them, none is close to `skin`, and at most one is vivid."""
     by_kind: dict[Kind, Paint] = {}
     for piece in garment.pieces:
         if piece.kind in by_kind:

@@ -70,7 +70,7 @@ def make_payloads(
 ) -> list[Path]:
     """Write the missing files of seeds seed ... seed + count - 1 to `out_dir`; return the paths of all.
 
-    A fitted sample takes about 20 s on one core with all its variants (`from_mesh`: 2 s). Fits start from guesses of
+    A fitted sample takes about 30 s on one core with all its variants (`from_mesh`: 2 s). Fits start from guesses of
     `checkpoint` (None: the included one). `report` receives the number of finished samples and the total.
 
     Raises:
@@ -179,9 +179,9 @@ BODY_PITCHES = (0, 10, -10, 25, 5, -5, 15)
 HEAD_PITCHES = (0, 10, -10, 20, -5)
 """Camera elevations in degrees, cycled over the views."""
 SUPERSAMPLE = 3
-SETTINGS = InverseSettings(steps=2, pull=1.0, smoothness=0.3)
-"""Of fits that start from a model's guess. Stronger pulls and fewer steps than elsewhere: the start is good, and what
-pictures do not determine should stay as it is there."""
+SETTINGS = InverseSettings(pull=0.2)
+"""Of fits that start from a model's guess. A stronger pull than usual: what pictures do not determine should stay as
+the model has it."""
 
 
 def fitted_payloads(
@@ -198,7 +198,7 @@ def fitted_payloads(
     guess of `model` (None: the mesh's own colours). `turn` (0 to 1) rotates the cameras towards their neighbours, to
     measure how much the result depends on them.
 
-    Takes about 20 s on one core; further colourings add little, as they share marches and matrices.
+    Takes about 30 s on one core; further colourings add little, as they share marches and matrices.
 
     Raises:
         ValueError: as `surface_field`; no colourings are given.

@@ -47,7 +47,7 @@ class Garment:
     @property
     def path(self) -> str:
         """Path of its files in the asset folder, without extension."""
-        return "clothes/{0}/{0}".format(self.mesh or self.name)
+        return f"clothes/{self.mesh or self.name}/{self.mesh or self.name}"
 
 
 TRIMMED_TOP, SMOOTHED_TOP, PLAIN_TOP = Piece("top", trim=True), Piece("top", smooth=True), Piece("top")

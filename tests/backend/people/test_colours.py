@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
-from primdiffusion.people.colours import bytes_from_lab, hair_colour, lab_from_bytes
+from primdiffusion.people.colours import bytes_from_lab, hair_colour, is_vivid, lab_from_bytes
 from primdiffusion.people.fitting import connected_faces, uv_islands
-from primdiffusion.people.garments import PATTERNS, SHOULDER_X, SHOULDER_Y, hanging_height
+from primdiffusion.people.garments import PATTERNS, SHOULDER_X, SHOULDER_Y, hanging_height, paint_garment
+from primdiffusion.people.wardrobe import OUTFITS, stream
 from primdiffusion.raster.uv_atlas import texel_map
 from support.errors import refused
 
@@ -55,13 +56,14 @@ def test_islands_part_where_texture_coordinates_do():
     assert uv_islands(corner_uv).tolist() == [0, 0, 1]
 
 
-@pytest.mark.parametrize(("name", "pattern"), PATTERNS)
-def test_patterns_show_both_colours_and_are_mirror_symmetric(name, pattern):
+@pytest.mark.parametrize("name", PATTERNS)
+def test_patterns_show_both_colours_and_are_mirror_symmetric(name):
+    kind, pattern = PATTERNS[name]
     draws = np.random.default_rng(1)
-    position = draws.uniform((-0.6, -0.1, -0.2), (0.6, 0.5, 0.2), (4000, 3))
+    position = draws.uniform((-0.6, -0.8 if kind == "denim" else -0.1, -0.2), (0.6, 0.5, 0.2), (8000, 3))
     share = pattern(position)
     assert share.min() == 0
-    assert share.max() == 1
+    assert share.max() == pytest.approx(1, abs=0.05)
     mirrored = pattern(position * [-1, 1, 1])
     assert np.abs(share - mirrored).max() < 1e-9, name
 
@@ -75,6 +77,24 @@ def test_bands_run_on_from_body_to_sleeve():
 @pytest.mark.parametrize("tone", [0.0, 0.3, 1.0])
 def test_hair_shares_are_those_of_the_tone(tone):
     draws = np.random.default_rng(2)
-    names = [hair_colour(tone, False, draws)[0] for _ in range(600)]
+    names = [hair_colour(tone, "young", draws)[0] for _ in range(600)]
     dark = sum(name in ("black", "darkbrown") for name in names) / 600
-    assert dark == pytest.approx({0.0: 0.36, 0.3: 0.5904, 1.0: 0.84}[tone], abs=0.06)
+    assert dark == pytest.approx({0.0: 0.371, 0.3: 0.615, 1.0: 0.884}[tone], abs=0.06)
+
+
+def test_hair_turns_grey_with_age():
+    draws = np.random.default_rng(3)
+    grey = {
+        age: sum(hair_colour(0.3, age, draws)[0] in ("grey", "white") for _ in range(600)) / 600
+        for age in ("young", "middleage", "old")
+    }
+    assert grey == {"young": 0, "middleage": pytest.approx(0.127, abs=0.05), "old": pytest.approx(0.555, abs=0.06)}
+
+
+def test_at_most_one_garment_in_six_is_printed_and_at_most_one_colour_of_an_outfit_is_vivid():
+    outfits = [*OUTFITS["female"]]
+    paints = [paint_garment(each, stream(seed, "x")) for seed in range(150) for each in outfits]
+    garments = [paint for each in paints for paint in set(each)]
+    assert sum(paint.pattern in PATTERNS for paint in garments) / len(garments) < 1 / 6
+    vivid = [sum(is_vivid(paint.main) for paint in set(each)) for each in paints]
+    assert np.mean(np.array(vivid) > 1) < 0.1  # denim may be blue beside a vivid top

@@ -6,6 +6,7 @@ import os
 import numpy as np
 import pytest
 import torch
+import trimesh
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people import assets as assets_module
@@ -14,7 +15,7 @@ from primdiffusion.people import payloads as payloads_module
 from primdiffusion.people import person as person_module
 from primdiffusion.people.appearance import SkinColours, skin_texture
 from primdiffusion.people.assets import ENVIRONMENT_VARIABLE
-from primdiffusion.people.fitting import shown_faces, under_hat, under_hem
+from primdiffusion.people.fitting import shown_faces, skirt_faces, under_hat, under_hem
 from primdiffusion.people.mhclo import parse_mhclo
 from primdiffusion.people.payloads import fitted_payloads, is_complete, make_payloads, orbit_camera, rest_frames
 from primdiffusion.people.wardrobe import HAIR, HATS, OUTFITS, choose, draw_body
@@ -120,6 +121,22 @@ def test_femininity_separates_the_bodies_the_shape_space_was_made_from(base):
         waist = body[np.abs(body[:, 1] - (crotch + 0.35)) < 0.03][:, 0]
         ratio.append(np.ptp(hips) / np.ptp(waist))
     assert ratio[0] > ratio[1] + 0.05
+
+
+def test_skirts_are_closed_between_the_legs_and_their_hem_is_straight(assets, base):
+    for outfit in OUTFITS["female"]:
+        skirt = skirt_faces(outfit, assets.proxy(outfit.path)[1])
+        if not skirt.any():
+            continue
+        seed = next(seed for seed in range(1000) if choose(seed, person_module.femininity(base)).outfit == outfit)
+        (part,) = (part for part in make_person(assets, base, seed).mesh.parts if part.name == "outfit")
+        mesh = trimesh.Trimesh(part.vertices, part.faces, process=False)
+        low = mesh.bounds[0, 1]
+        depth = mesh.bounds[:, 2].mean()
+        rays = np.array([[x, low - 0.3, depth + z] for x in (-0.03, 0, 0.03) for z in (-0.02, 0, 0.02)])
+        hits, ray, _ = mesh.ray.intersects_location(rays, np.tile([0, 1.0, 0], (len(rays), 1)))
+        first = [hits[ray == number, 1].min() for number in range(len(rays))]
+        assert np.max(first) < low + 0.06, outfit.name
 
 
 def test_outfits_are_worn_evenly_within_a_sex_and_betas_stay_in_range(base):
