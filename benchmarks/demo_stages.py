@@ -66,7 +66,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     keyframed = time.perf_counter() - start
     bpy.context.scene.frame_start, bpy.context.scene.frame_end = 1, arguments.frames
 
-    shutil.copyfile(scene_human.person_file(collection), arguments.human)
+    shutil.copyfile(import_module(f"{MODULE}.scene.payload").session_file(armature), arguments.human)
     checked = [1, 1 + arguments.frames // 3, arguments.shown + 1, arguments.frames]
     bpy.ops.primdiffusion.volumes_in_viewport()  # others are not evaluated
     error = max(lbs_error_mm(armature, arguments.human, rotations[number - 1], number) for number in checked)
@@ -103,15 +103,16 @@ def lbs_error_mm(armature: bpy.types.Object, human_file: Path, rotation: np.ndar
 
 
 def cycles(arguments: argparse.Namespace) -> dict[str, float]:
-    """Open the saved file, check that its volumes exist, and render the current frame in Cycles."""
+    """Open the saved file, write its volumes, and render the current frame in Cycles."""
     bpy.ops.wm.open_mainfile(filepath=str(arguments.blend))
     scene = bpy.context.scene
-    missing = [v.name for v in bpy.data.volumes if not Path(bpy.path.abspath(v.filepath)).is_file()]
-    if missing or not bpy.data.volumes:
-        count = len(bpy.data.volumes)
-        raise SystemExit(f"{arguments.blend} reopened with {count} volumes, {len(missing)} without a file")
     sys.path.insert(0, str(ROOT))
     from blender_primdiffusion.scene.cycles import setup_cycles_preview
+    from blender_primdiffusion.scene.pending import open_humans, write_all_pending
+
+    if (faults := open_humans()) or not bpy.data.volumes:
+        raise SystemExit(f"{arguments.blend} reopened with {len(bpy.data.volumes)} volumes; {' '.join(faults)}")
+    write_all_pending()
 
     yaw = math.radians(arguments.yaw)
     setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples, yaw=yaw, world=0.48)

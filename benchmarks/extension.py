@@ -175,6 +175,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     _enable(arguments)
     from blender_primdiffusion.jobs.queue import queue
     from blender_primdiffusion.scene.human import armature_of, humans
+    from blender_primdiffusion.scene.payload import forget_session_files
 
     context, megabytes, blender = bpy.context, [], []
     context.preferences.edit.undo_steps = UNDO_STEPS
@@ -188,7 +189,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
         context.view_layer.update()
         bpy.ops.primdiffusion.delete_human(human=collection.name)
         bpy.ops.outliner.orphans_purge(do_recursive=True)
-        bpy.ops.primdiffusion.remove_unused_files()
+        forget_session_files()
         record.trim()
         blender.append(record.resident_mb())
         megabytes.append(blender[-1] + children_mb())

@@ -15,7 +15,8 @@ from ..formats.joints import JOINT_NAMES
 from ..scene.armature import model_origin
 from ..scene.blend_values import stored_numbers
 from ..scene.convention import transforms_to_backend
-from ..scene.human import BETA_COUNT, BETAS, MARK, person_file
+from ..scene.human import BETA_COUNT, BETAS, MARK
+from ..scene.payload import session_file
 from .solids import scene_solids, stored, visible_instances
 
 SMALLEST_SCALE = 1e-4
@@ -168,7 +169,7 @@ def pose_of(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collec
     origin = np.eye(4)
     origin[:3, 3] = model_origin(armature.data)
     return PosedHuman(
-        person_file(owner),
+        session_file(armature.original),
         transforms_to_backend(matrix @ origin),
         transforms_to_backend(np.linalg.inv(origin) @ posed @ np.linalg.inv(rest) @ origin),
         _betas(armature, owner.name),

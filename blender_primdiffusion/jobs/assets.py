@@ -23,7 +23,8 @@ from ..places import own_folder
 from ..scene.armature import build_armature, keyframe_poses
 from ..scene.blend_values import as_shown
 from ..scene.convention import points_to_blender
-from ..scene.human import armature_of, person_file, provenance_of
+from ..scene.human import armature_of, provenance_of
+from ..scene.payload import session_file
 from .queue import Job
 from .target import HumanTarget
 
@@ -151,7 +152,8 @@ def mark_human(person: bpy.types.Collection, picture: Path) -> str:
 def _drawing(person: bpy.types.Collection, pose: np.ndarray, folder: Path) -> dict[str, Any]:
     """Parameters of the child's method `render`."""
     sides = {"width": SIDE, "height": SIDE}
-    return {"human": str(person_file(person)), "out": str(folder / _PICTURE), "pose": pose.ravel().tolist(), **sides}
+    human = str(session_file(armature_of(person)))
+    return {"human": human, "out": str(folder / _PICTURE), "pose": pose.ravel().tolist(), **sides}
 
 
 LIBRARY = "PrimDiffusion"

@@ -22,7 +22,7 @@ from ..motion.pose_library import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
-from ..scene.human import BODY_FILE, PERSON_FILE, armature_of, person_file
+from ..scene.human import armature_of
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
     HumanMotion,
@@ -35,6 +35,7 @@ from ..scene.human_file import (
     write_tensors,
 )
 from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
+from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
@@ -189,7 +190,7 @@ def write_human(
     The motion is that of the joints in the armature's space, constraints and layers included; the object's own
     transform is left out.
     """
-    human = read_tensors(person_file(person))
+    human = read_tensors(session_file(armature_of(person)))
     if has_custom_shape(person):
         betas = betas_of(person)
         human = reshaped(human, betas, shape_model_of(person).growth(generated_betas(person), betas))
@@ -284,6 +285,7 @@ class ImportHumanJob(Job):
     kind = "import_human"
     method = "open_human"
     undo = "Import Human"
+    new_person = True
 
     path: str
     at: tuple[float, float, float] | None = None
@@ -292,10 +294,6 @@ class ImportHumanJob(Job):
     @property
     def label(self) -> str:
         return f"Import {Path(self.path).name}"
-
-    @property
-    def new_person(self) -> str:
-        return name_of(self.path)
 
     def params(self, folder: Path) -> dict[str, Any]:
         return {"person": self.path, "out_dir": str(folder), "size": PREVIEW_PX}

@@ -23,7 +23,8 @@ from ..motion.pose_library import check_posable, take_world_posture, world_postu
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
 from ..scene.handles import handles_from_joints, joints_from_handles
-from ..scene.human import BODY_FILE, armature_of, state_folder
+from ..scene.human import armature_of
+from ..scene.payload import BODY
 from ..scene.shape import betas_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
@@ -35,7 +36,7 @@ POSTURE_FORMAT = "primdiffusion-posture"
 
 def on_own_body(person: bpy.types.Collection) -> bool:
     """Whether a human stands on a body of the user's files, whose shape and skeleton the fit does not know."""
-    return (state_folder(person) / BODY_FILE).exists()
+    return BODY in armature_of(person)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -173,7 +174,7 @@ class PictureJob(Job):
     kind = "from_picture"
     method = "reconstruct"
     undo = "Human from Picture"
-    new_person = "Human"
+    new_person = True
 
     task: PictureTask
     seed: int = -1

@@ -13,13 +13,11 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
 from ..formats.requests import ReconstructRequest
-from ..scene.build import build_prepared
+from ..scene.build import build_human
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import select_human
 from ..scene.human import armature_of, humans
 from ..scene.place import stand_at_cursor
-from ..scene.states import prepare_now
-from .follow import building
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .views import bring_into_view, eye
 
@@ -34,8 +32,8 @@ def build_person(
 
     Raises as `build_human` does, and then leaves nothing.
     """
-    prepared = building.take(result.person) or prepare_now(result.person, name)
-    collection = build_prepared(context, prepared, name)
+    began = time.monotonic()
+    collection = build_human(context, result.person, name)
     stand_at_cursor(context, collection, eye())
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, collection)
@@ -45,7 +43,7 @@ def build_person(
     warnings = list(result.warnings)
     if overlap := overlap_warning_in(context.scene, collection):
         warnings.append(overlap)
-    notice = f"{made} in {result.seconds + time.monotonic() - prepared.began:.1f} s"
+    notice = f"{made} in {result.seconds + time.monotonic() - began:.1f} s"
     return collection, " ".join([sentence(notice), *map(sentence, warnings)])
 
 
@@ -59,7 +57,7 @@ class GenerateJob(Job):
 
     kind = method = "generate"
     undo = "Generate Human"
-    new_person = "Human"
+    new_person = True
 
     seed: int
     sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -90,7 +88,7 @@ class ReconstructJob(Job):
 
     kind = method = "reconstruct"
     undo = "Human from Captures"
-    new_person = "Human"
+    new_person = True
 
     capture: str
     """Folder of a dataset of captures, or of one subject in it."""

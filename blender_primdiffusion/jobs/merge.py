@@ -67,7 +67,7 @@ class MergeJob(Job):
     def finish(self, _context: bpy.types.Context, result: MergeAnswer, folder: Path) -> str:
         person = self.target.found()
         digest = write_grid(read_grid(result.out), folder / "grid.vdb")
-        files = publish([folder / "grid.vdb"], [digest], merged_folder(person))
+        files = publish([folder / "grid.vdb"], [digest], merged_folder())
         show_merged(person, files, MergedState((self.moment.digest,), self.voxel))
         set_attachment(person, "MERGED")
         size = files[0].stat().st_size / 1e6
@@ -121,7 +121,7 @@ class MergeFramesJob(Job):
         if self._error is not None:
             raise self._error
         written = [_grid(folder, index).with_suffix(".vdb") for index in range(len(self.moments))]
-        files = publish(written, self._digests, merged_folder(person))
+        files = publish(written, self._digests, merged_folder())
         show_merged(person, files, MergedState(tuple(m.digest for m in self.moments), self.voxel, self.start))
         set_attachment(person, "MERGED")
         size = sum(path.stat().st_size for path in files) / 1e6

@@ -6,7 +6,8 @@ import dataclasses
 
 import bpy
 
-from ..scene.human import check_editable, human_of, humans, person_file, state_of
+from ..scene.human import armature_of, check_editable, human_of, humans
+from ..scene.payload import session_file, state_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -17,13 +18,13 @@ class HumanTarget:
     """The collection's identity while the file is open (`session_uid`)."""
     name: str
     state: str
-    """The human's state by `state_of`."""
+    """What the human holds, by `state_of`."""
 
     @classmethod
     def of(cls, person: bpy.types.Collection) -> HumanTarget:
         """Raises ValueError for a human that cannot be edited."""
         check_editable(person)
-        return cls(person.session_uid, person.name, state_of(person))
+        return cls(person.session_uid, person.name, state_of(armature_of(person)))
 
     def found(self) -> bpy.types.Collection:
         """The human. Raises ValueError where it is no longer in a scene, or has changed."""
@@ -34,7 +35,7 @@ class HumanTarget:
                 f"the human {self.name!r} was removed during the edit; nothing was changed. Undo the "
                 "removal and edit again"
             )
-        if state_of(person) != self.state:
+        if state_of(armature_of(person)) != self.state:
             raise ValueError(
                 f"the human {person.name!r} changed during the edit (by undo or redo); nothing was changed. Edit again"
             )
@@ -42,11 +43,8 @@ class HumanTarget:
         return person
 
     def file_now(self) -> str:
-        """Path of the human's own file at this time: the first save of the .blend moves it.
-
-        Raises as `found` does, and FileNotFoundError.
-        """
-        return str(person_file(self.found()))
+        """Path of the human's own file. Raises as `found` and `session_file` do."""
+        return str(session_file(armature_of(self.found())))
 
 
 def selected_person(context: bpy.types.Context) -> bpy.types.Collection:

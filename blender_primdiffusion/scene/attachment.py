@@ -64,11 +64,10 @@ def in_viewport(collection: bpy.types.Collection) -> bool:
     return stored_flag(collection, IN_VIEWPORT, True)
 
 
-def volumes_may_wait(collection: bpy.types.Collection | None = None) -> bool:
-    """Whether new volumes of a human, or of a new one, may be written after the scene shows it: viewports hide them,
-    and there is a window, whose timer writes them."""
-    hidden = not (VOLUMES_IN_VIEWPORT if collection is None else in_viewport(collection))
-    return hidden and not bpy.app.background
+def volumes_may_wait(collection: bpy.types.Collection) -> bool:
+    """Whether a human's volumes may be written after the scene shows it: viewports hide them, and there is a window,
+    whose timer writes them."""
+    return not in_viewport(collection) and not bpy.app.background
 
 
 def show_in_viewport(collection: bpy.types.Collection, shown: bool) -> None:

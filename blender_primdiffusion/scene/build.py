@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -15,38 +14,32 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
 from .armature import build_armature
-from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT
+from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, volumes_may_wait
 from .convention import frames_to_blender, points_to_blender
-from .human import BETAS, BODY_MARK, HOME, MARK, ORIGIN, stored_path, volume_name
+from .human import BETAS, BODY_MARK, MARK, ORIGIN, volume_name
 from .material import volume_material
+from .payload import pack, session_file
+from .pending import write_volumes
+from .rest_human import read_human
 from .stand_in import build_stand_in
-from .states import NAME_LENGTH, PreparedHuman, prepare_now
+
+NAME_LENGTH = 40
+"""Characters of a new human's name; names of its parts are longer, and Blender allows 63."""
 
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
-_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
+_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials", "images")
 
 
 def build_human(context: bpy.types.Context, person: str | Path, name: str = "Human") -> bpy.types.Collection:
-    """Build the human of a file in the scene, with its volumes where they cannot come later; see `build_prepared`.
-
-    Raises as `states.prepare`, and then leaves neither data nor files.
-    """
-    return build_prepared(context, prepare_now(Path(person), name), name)
-
-
-def build_prepared(context: bpy.types.Context, prepared: PreparedHuman, name: str = "Human") -> bpy.types.Collection:
-    """Build a human whose files are there: armature, hidden body mesh and a volume for every primitive.
+    """Build the human of a file: an armature that holds the file, a hidden body mesh and a volume for every primitive.
 
     The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
-    space, the backend's axes are turned z up and the body is raised by ORIGIN. Raises ValueError, and then leaves
-    neither data nor files. Makes no undo step.
+    space, the backend's axes are turned z up and the body is raised by ORIGIN. Without a window the volumes' files are
+    written too. Raises as `read_human`, also for what cannot be written, and then leaves no data. Makes no undo step.
     """
-    with prepared.entering():
-        return _build(context, prepared, name)
-
-
-def _build(context: bpy.types.Context, prepared: PreparedHuman, name: str) -> bpy.types.Collection:
-    human, model, rest = prepared.human, prepared.human.model, prepared.human.rest
+    person = Path(person)
+    human = read_human(person)
+    model, rest = human.model, human.rest
     if model.uv_corner is None:
         raise ValueError("the body's file is of an earlier version, without texture coordinates: import it again")
     with _no_data_left_on_failure():
@@ -55,6 +48,7 @@ def _build(context: bpy.types.Context, prepared: PreparedHuman, name: str) -> bp
         vertices = points_to_blender(rest.vertices)
         origin = floor_below(vertices)
         armature = build_armature(label, points_to_blender(rest.joints) + origin)
+        pack(armature, person, own_body=human.payload.rest_half_extent is not None)
         armature.data[ORIGIN] = origin.tolist()
         armature[BETAS] = human.payload.betas.tolist()
         armature.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
@@ -68,20 +62,22 @@ def _build(context: bpy.types.Context, prepared: PreparedHuman, name: str) -> bp
         primitives.hide_viewport = not VOLUMES_IN_VIEWPORT
         primitives.objects.link(armature)  # the Outliner then shows the volumes inside the armature's closed row
         collection.children.link(primitives)
+        folder = session_file(armature).parent
         attach_volumes(
             label,
             armature,
             primitives,
-            [prepared.folder / volume_name(k) for k in range(len(rest.position))],
+            [folder / volume_name(k) for k in range(len(rest.position))],
             points_to_blender(rest.position) + origin,
             frames_to_blender(rest.rotation),
             model.primitive_weights(),
             volume_material(),
         )
-        collection[MARK] = prepared.provenance
-        collection[HOME] = str(prepared.folder)
+        collection[MARK] = human.provenance()
         collection[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
         context.scene.collection.children.link(collection)
+        if not volumes_may_wait(collection):
+            write_volumes(collection)
     return collection
 
 
@@ -174,8 +170,6 @@ def attach_volumes(
     """
     hide_relationship_lines()
     positions, quaternions = np.asarray(position).tolist(), matrix_to_quaternion(rotation).tolist()
-    paths = [os.path.split(path) for path in files]
-    folders = {folder: stored_path(Path(folder)) for folder in {folder for folder, _ in paths}}
     targets = _targets(weights)
     labels = [f"{name}_prim_{k:04d}" for k in range(len(files))]
     volumes = _volumes(f"{name}_prim", material, len(files))
@@ -183,8 +177,7 @@ def attach_volumes(
     prototypes: dict[tuple[str, ...], bpy.types.ArmatureConstraint] = {}
     for k, primitive in enumerate(objects):  # a loop of its own: new data make these changes slow
         volume = volumes[k]
-        folder, file = paths[k]
-        volume.filepath = os.path.join(folders[folder], file)
+        volume.filepath = str(files[k])
         primitive.parent = armature
         primitive.rotation_mode = "QUATERNION"
         primitive.location = positions[k]

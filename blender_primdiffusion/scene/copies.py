@@ -14,7 +14,7 @@ from typing import Any
 import bpy
 
 from ..formats.joints import JOINT_NAMES
-from .human import BODY_MARK, MARK, armature_of, volume_path, volumes_of
+from .human import BODY_MARK, MARK, armature_of, primitive_of, volumes_of
 from .proxy import PROXY_MARK
 from .stand_in import STAND_IN
 from .surface import MARK as CARRIER_MARK
@@ -30,7 +30,7 @@ def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
     """Copy a human, in the same place and scene; posing, reshaping and editing one leaves the other unchanged.
 
     Everything in the human's collections is copied, and pointers to parts of the human become pointers to the copies.
-    Files are shared, and so is the volumes' data, which edits copy before they change it (see `human.own_data`). Raises
+    The volumes' data is shared, which edits copy before they change it (see `human.own_data`). Raises
     ValueError for a collection that is no human.
     """
     armature_of(collection)
@@ -260,8 +260,7 @@ def _follows(obj: bpy.types.Object, armature: bpy.types.Object) -> bool:
 def _kind(obj: bpy.types.Object) -> str:
     """What part of a human an object is, the same for its copies; empty for other objects."""
     if obj.type == "VOLUME":
-        path = volume_path(obj.data)
-        return path.name if path is not None else ""
+        return str(primitive_of(obj.data))
     return next((mark for mark in _MARKS if mark in obj), "") if obj.type == "MESH" else ""
 
 

@@ -4,7 +4,7 @@ region painted for an edit by the backend; and its result in place of the human 
 from __future__ import annotations
 
 import dataclasses
-import os
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -18,7 +18,6 @@ from .convention import frames_to_blender, points_to_blender
 from .human import (
     BETA_COUNT,
     BETAS,
-    HOME,
     LARGEST_BETA,
     MARK,
     ORIGIN,
@@ -26,16 +25,14 @@ from .human import (
     body_of,
     check_editable,
     own_data,
-    stored_path,
-    volume_name,
     volumes_of,
 )
+from .payload import pack, session_file
+from .pending import show_volume
 from .proxy import follow_shape, proxy_of
-from .rest_human import shape_model_of
+from .rest_human import read_human, shape_model_of
 from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
-from .states import PreparedHuman
 from .surface import scale_surface
-from .volumes import reload_volume
 
 _FLOOR_TOLERANCE = 1e-3
 """Metres the soles may be off the floor and still count as on it."""
@@ -141,21 +138,17 @@ class Replaced:
     """What could not be done, in a sentence; empty otherwise."""
 
 
-def replace_person(collection: bpy.types.Collection, prepared: PreparedHuman) -> Replaced:
-    """Show the prepared human where `collection` shows another: its next state.
+def replace_person(collection: bpy.types.Collection, person: Path) -> Replaced:
+    """Show the human of a file where `collection` shows another.
 
     Armature, pose, animation, transform, names, materials and other changes by hand stay, as do deleted volumes. Where
     the edit has changed the betas, the bones' rest, the body mesh and the volumes' places follow, unless the user has
     given the human a custom shape, which stays. Makes no undo step.
 
-    Raises ValueError or FileNotFoundError before the scene is touched, and then leaves no files.
+    Raises as `read_human` and `check_editable` before the scene is touched.
     """
-    with prepared.entering():
-        return _replace(collection, prepared)
-
-
-def _replace(collection: bpy.types.Collection, prepared: PreparedHuman) -> Replaced:
-    human, betas = prepared.human, prepared.human.payload.betas.astype(np.float64)
+    human = read_human(person)
+    betas = human.payload.betas.astype(np.float64)
     check_editable(collection)
     shown, count = volumes_of(collection), len(human.payload.density)
     if max(shown) >= count:
@@ -169,21 +162,17 @@ def _replace(collection: bpy.types.Collection, prepared: PreparedHuman) -> Repla
     if reshaped:
         check_shapeable(collection)
     growth = human.model.growth(betas, betas_of(collection)) if custom else np.ones((count, 3))
+    armature = armature_of(collection)
+    pack(armature, person, own_body=human.payload.rest_half_extent is not None)
     warning = apply_rest(collection, human.rest, betas, growth) if reshaped else ""
     if reshaped:
         follow_shape(collection, proxy_of(collection), betas)
     if new_betas and custom:
         apply_growth(collection, growth)
-    folder = stored_path(prepared.folder)
-    for k, objects in shown.items():
-        for obj in objects:
-            volume = own_data(obj, collection)
-            volume.filepath = os.path.join(folder, volume_name(k))
-            if volume.grids.error_message:  # its file was missing
-                reload_volume(volume)
-    collection[MARK] = prepared.provenance
-    collection[HOME] = str(prepared.folder)
-    armature_of(collection).update_tag()
+    for volume in {own_data(obj, collection) for objects in shown.values() for obj in objects}:
+        show_volume(volume, session_file(armature).parent)
+    collection[MARK] = human.provenance()
+    armature.update_tag()
     return Replaced(reshaped, warning)
 
 

@@ -30,7 +30,8 @@ from ..formats.poses.rotation import first_improper, improper_text
 from ..formats.regular_files import FileError, as_file_error, read_regular
 from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, check_limits, read_layout
 from ..formats.whole_files import written_whole
-from .human import BETA_COUNT, LARGEST_PERSON
+from .human import BETA_COUNT
+from .payload import LARGEST_PERSON
 
 _METADATA = "__metadata__"
 _MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite, check_shapes, read_arrays
-from ..formats.regular_files import FileError, as_file_error, remove_file
+from ..formats.regular_files import FileError, as_file_error, check_inside, real_path, remove_file
+from ..formats.whole_files import written_whole
 from .blend_values import stored_record
-from .human import armature_of, copy_file, home_of, state_of, stored_path, write_error
+from .human import armature_of, write_error
 from .material import person_material
+from .payload import session_folder, state_of
 from .volumes import write_vdb
 
 MARK = "primdiffusion_merged"
@@ -99,7 +102,7 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
     try:
         for source, target in zip(files, targets, strict=True):
             if target in new:
-                copy_file(source, target, folder.parent)
+                _copy(source, target)
     except (OSError, FileError) as error:
         for path in new:
             if path.is_file():
@@ -121,7 +124,7 @@ def show_merged(collection: bpy.types.Collection, files: Sequence[Path], state: 
         merged.data.materials.append(person_material(collection))
         collection.objects.link(merged)
     volume = merged.data
-    volume.filepath = stored_path(files[0])
+    volume.filepath = _stored(files[0])
     volume.is_sequence = len(files) > 1
     if volume.is_sequence:
         volume.frame_start, volume.frame_duration, volume.frame_offset = state.start, len(files), 0
@@ -151,15 +154,31 @@ def remove_merged(collection: bpy.types.Collection) -> None:
         bpy.data.volumes.remove(merged.data)  # removes the object too
 
 
-def merged_folder(collection: bpy.types.Collection) -> Path:
-    """Where merged files go: beside the folders of the human's states, if these are of this .blend."""
-    return home_of(collection)
+def merged_folder() -> Path:
+    """Where merged files go: `<blendname>_volumes` beside the .blend, a temporary folder while it is unsaved."""
+    blend = Path(bpy.data.filepath)
+    return real_path(blend).parent / f"{blend.stem}_volumes" if blend.name else session_folder() / "merged"
+
+
+def _stored(path: Path) -> str:
+    """A path as the .blend stores it: relative (`//`) when it is saved, else absolute."""
+    try:
+        return bpy.path.relpath(str(path)) if bpy.data.filepath else str(path)
+    except ValueError:  # another drive on Windows
+        return str(path)
+
+
+def _copy(source: Path, target: Path) -> None:
+    check_inside(target, target.parent.parent)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(target) as unfinished:
+        shutil.copyfile(source, unfinished)
 
 
 def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequence[float] | None) -> str:
     """Identifies a human in a pose: hash of its state, the shape and the joints [24, 3, 4]."""
     rounded = np.round(np.asarray(joints, np.float64), _DECIMALS) + 0.0  # no negative zeros
     shape = [] if betas is None else [round(float(value), _DECIMALS) for value in betas]
-    digest = hashlib.sha256(f"{state_of(collection)} {shape}".encode())
+    digest = hashlib.sha256(f"{state_of(armature_of(collection))} {shape}".encode())
     digest.update(rounded.tobytes())
     return digest.hexdigest()[:16]

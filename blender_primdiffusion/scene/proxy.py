@@ -27,7 +27,8 @@ from .armature import model_origin
 from .blend_values import as_numbers, stored_record
 from .build import build_body_mesh, floor_below
 from .convention import points_to_blender
-from .human import BETA_COUNT, BODY_MARK, ORIGIN, armature_of, own_data, state_of
+from .human import BETA_COUNT, BODY_MARK, ORIGIN, armature_of, own_data
+from .payload import state_of
 from .rest_human import shape_model_of
 from .shape import SAME_BETAS, ShapeModel
 
@@ -100,7 +101,7 @@ def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas
     """Whether the human was edited since, or has a shape that the proxy could not follow."""
     shown = shown_betas(proxy)
     same_shape = shown is None if betas is None else shown is not None and np.allclose(shown, betas, atol=1e-4)
-    return stored_record(proxy, PROXY_MARK).get("file") != state_of(collection) or not same_shape
+    return stored_record(proxy, PROXY_MARK).get("file") != state_of(armature_of(collection)) or not same_shape
 
 
 def shown_betas(proxy: bpy.types.Object) -> NDArray[np.float64] | None:
@@ -166,7 +167,7 @@ def _model_origin(collection: bpy.types.Collection, betas: NDArray | None) -> ND
 
 
 def _origin(collection: bpy.types.Collection, betas: NDArray | None) -> dict[str, object]:
-    return {"file": state_of(collection), "betas": None if betas is None else _rounded(betas)}
+    return {"file": state_of(armature_of(collection)), "betas": None if betas is None else _rounded(betas)}
 
 
 def _rounded(betas: NDArray) -> list[float]:

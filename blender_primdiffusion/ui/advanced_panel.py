@@ -213,12 +213,6 @@ class PRIMDIFFUSION_PT_advanced(SidebarPanel, bpy.types.Panel):
         layout = property_columns(self.layout)
         if humans(context.scene):
             _draw_person(layout, context)
-        files = draw_section(layout, "files", text="Files", page="editing", section="undo-and-files-on-disk")
-        if files is not None:
-            files.operator("primdiffusion.collect_files", icon="PACKAGE")
-            find = files.operator("primdiffusion.find_missing_volumes", text="Find Volumes in Folder", icon="VIEWZOOM")
-            find.choose = True
-            files.operator("primdiffusion.remove_unused_files", icon="TRASH")
         if not backend_is_named():
             return
         backend = draw_section(layout, "backend", text="Backend", page="troubleshooting")

@@ -20,7 +20,8 @@ from ..jobs.follow import Reporting, submit
 from ..jobs.target import selected_person
 from ..places import backend_is_named
 from ..scene.edit import end_painting, painted_weights, start_painting
-from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
+from ..scene.human import BODY_MARK, MARK, armature_of, body_of, humans
+from ..scene.payload import session_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
 from .declared import PANELS, SKIP, declared, not_given
 from .drawing import draw_job, property_columns
@@ -218,7 +219,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         return {
-            "source": str(person_file(other_human(context, person, self.source))),
+            "source": str(session_file(armature_of(other_human(context, person, self.source)))),
             "region": self.region(settings, person),
             "what": self.chosen("what", settings),
             "harmonise": self.chosen("harmonise", settings),
@@ -239,7 +240,7 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
     def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         other = other_human(context, person, self.other)
-        return {"other": str(person_file(other)), "fraction": self.chosen("fraction", settings)}
+        return {"other": str(session_file(armature_of(other))), "fraction": self.chosen("fraction", settings)}
 
 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)

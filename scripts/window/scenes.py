@@ -24,7 +24,6 @@ from start import (
     begin,
     cancel_all,
     clear_of_the_sidebar,
-    people_file,
     queue_of,
     select,
     with_people,
@@ -294,21 +293,6 @@ def cancelled(module: str, python: str) -> Steps:
     yield "cancelled"
 
 
-def missing(module: str, python: str) -> Steps:
-    """The person's files are missing."""
-    yield from with_people(module, python, FIRST_SEED)
-    folder = people_file(module).with_name(people_file(module).stem + "_humans")
-    away = folder.with_name("elsewhere")
-    folder.rename(away)
-    try:
-        bpy.ops.wm.open_mainfile(filepath=str(people_file(module)), load_ui=False)
-        yield 2.0
-        yield from show("PRIMDIFFUSION_PT_human")
-        yield "missing_files"
-    finally:
-        away.rename(folder)
-
-
 def paint(armature: bpy.types.Object) -> None:
     """Set the weights of the chest, because brush strokes need a mouse."""
     body = bpy.context.view_layer.objects.active
@@ -354,7 +338,6 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "from_picture": from_picture,
     "export": export,
     "cancelled": cancelled,
-    "missing": missing,
     "five_humans": five_humans,
     "other_files": other_files,
     "copies": copies,

@@ -14,10 +14,8 @@ from unittest import mock
 import bpy
 import numpy as np
 
-from blender_primdiffusion.scene import states
-from blender_primdiffusion.scene.build import build_prepared
-from blender_primdiffusion.scene.pending import pending_of, write_pending
-from blender_primdiffusion.scene.states import prepare_now
+from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene.rest_human import read_human
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = os.environ.get("PRIMDIFFUSION_PYTHON", sys.executable)
@@ -65,15 +63,15 @@ class Oracle:
 
 def add_human(folder: Path) -> bpy.types.Collection:
     """Build the human of `Oracle.make`, with few of its volumes, so that it is quick."""
-    with mock.patch.object(states, "volumes_may_wait", return_value=True):
-        prepared = prepare_now(folder / "person.human.safetensors")
-    whole, few = prepared.human, slice(PRIMITIVES_IN_BLENDER)
+    whole, few = read_human(folder / "person.human.safetensors"), slice(PRIMITIVES_IN_BLENDER)
     fields = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")
     model = dataclasses.replace(whole.model, **{name: getattr(whole.model, name)[few] for name in fields})
-    human = dataclasses.replace(whole, model=model, rest=model.rest(whole.payload.betas))
-    person = build_prepared(bpy.context, dataclasses.replace(prepared, human=human))
-    list(write_pending(pending_of(person)))
-    return person
+    boxes = {name: getattr(whole.payload, name)[few] for name in ("rgb", "density", "delta_scale")}
+    own = whole.payload.rest_half_extent
+    payload = dataclasses.replace(whole.payload, **boxes, rest_half_extent=None if own is None else own[few])
+    human = dataclasses.replace(whole, payload=payload, model=model, rest=model.rest(whole.payload.betas))
+    with mock.patch.object(build, "read_human", return_value=human):
+        return build.build_human(bpy.context, folder / "person.human.safetensors")
 
 
 def set_up_render(

@@ -5,14 +5,15 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import synthetic
+from human_files import person_file
 from mathutils import Matrix, Vector
 from oracle import evaluated_matrices
 
 from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.scene.armature import move_rest_joints, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import ORIGIN, armature_of, body_of, person_file
-from blender_primdiffusion.scene.missing import missing_files
+from blender_primdiffusion.scene.human import ORIGIN, armature_of, body_of
+from blender_primdiffusion.scene.pending import write_all_pending
 
 COUNT = 6
 
@@ -61,7 +62,7 @@ def whole(person, where=None) -> bool:
     """Files, grids and the engine's idea of a person; and their volumes' places, where these are given."""
     volumes = {obj.data for obj in person.all_objects if obj.type == "VOLUME"}
     assert len([obj for obj in person.all_objects if obj.type == "VOLUME"]) == COUNT
-    assert not [one.summary() for one in missing_files()]
+    write_all_pending()
     assert all(volume.grids.load() for volume in volumes)
     assert person_file(person).is_file()
     files = [one.file.resolve() for one in posed_humans(bpy.context.evaluated_depsgraph_get())]

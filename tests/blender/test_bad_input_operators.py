@@ -15,6 +15,7 @@ from unittest.mock import MagicMock
 import bpy
 import pytest
 import synthetic_shape
+from human_files import lose_data
 from jobs_driven import drive
 from scene_state import state
 from shown_words import ways
@@ -146,8 +147,8 @@ def hidden(person) -> None:
     person.hide_viewport = True
 
 
-def files_missing(_person) -> None:
-    shutil.move(Path(bpy.data.filepath).with_name("shot_humans"), Path(bpy.data.filepath).with_name("gone"))
+def data_missing(person) -> None:
+    lose_data(person)
 
 
 def never_saved(person) -> None:
@@ -182,7 +183,7 @@ def with_ik_handles(person) -> None:
 SITUATIONS: list[Callable] = [
     empty, nothing_active, armature_in_edit_mode, armature_in_pose_mode, body_in_edit_mode, body_being_painted,
     armature_deleted, armature_data_deleted, volumes_deleted, body_deleted, bones_renamed, mark_damaged, linked,
-    overridden, instanced, excluded, hidden, files_missing, never_saved, backend_missing, two_people, tiny_units,
+    overridden, instanced, excluded, hidden, data_missing, never_saved, backend_missing, two_people, tiny_units,
     with_ik_handles,
 ]  # fmt: skip
 SOURCE: dict[str, Path] = {}
@@ -200,7 +201,6 @@ def anna(addon, tmp_path, monkeypatch):
     bpy.context.scene.frame_end = 2
     bpy.ops.wm.save_mainfile()
     (tmp_path / "for the child").mkdir()
-    shutil.copytree(tmp_path / "shot_humans", tmp_path / "kept_aside")
     yield tmp_path
     shutil.rmtree(tmp_path / "for the child")  # threads wait there for the child's files
 
@@ -253,9 +253,6 @@ def test_every_operator_works_or_reports_what_is_wrong(anna, situation, monkeypa
     again = True
     for name, properties in operators():
         if again:
-            shutil.rmtree(anna / "shot_humans", ignore_errors=True)
-            shutil.rmtree(anna / "gone", ignore_errors=True)
-            shutil.copytree(anna / "kept_aside", anna / "shot_humans")
             bpy.ops.wm.open_mainfile(filepath=str(anna / "shot.blend"))
             situation(humans(bpy.context.scene)[0])
         before = state()

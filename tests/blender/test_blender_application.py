@@ -96,7 +96,7 @@ def test_blender_validates_the_zip_and_rejects_a_spoiled_one(bare, archive, tmp_
 def test_the_command_makes_people_with_pictures_and_a_blend(people):
     for name in ("person_000007", "person_000008"):
         there = {path.name for path in (people / name).iterdir()}
-        assert {"person.human.safetensors", "front.png", "person.blend", "person_humans"} <= there
+        assert {"person.human.safetensors", "front.png", "person.blend"} <= there
 
 
 def test_the_same_command_continues_with_the_python_that_preferences_name(installed, people):

@@ -79,21 +79,6 @@ def read_body_file(path: Path) -> None:
     finite_members(_read_body(file_version(path)))
 
 
-def make_earlier_body(folder: Path) -> Path:
-    import synthetic
-    from support import tensor_files
-
-    arrays, _ = tensor_files.read_tensors(synthetic.write(folder, count=6).with_name(tensor_files.BODY))
-    np.savez(folder / "body_0123456789ab.npz", **arrays)
-    return folder / "body_0123456789ab.npz"
-
-
-def read_earlier_body(path: Path) -> None:
-    from blender_primdiffusion.scene.earlier_files import read_earlier_body
-
-    finite(*read_earlier_body(path).values())
-
-
 def make_proxy(folder: Path) -> Path:
     import exporting
 
@@ -199,7 +184,6 @@ TARGETS = (
     Target("vocabulary", make_checkpoint, mutations.SAFETENSORS, read_vocabulary),
     Target("small human in Blender", make_small, mutations.SAFETENSORS, read_human),
     Target("body file", make_body_file, mutations.SAFETENSORS, read_body_file),
-    Target("earlier body file", make_earlier_body, mutations.NPZ, read_earlier_body),
     Target("proxy", make_proxy, mutations.NPZ, read_proxy),
     Target("motion .npy", as_npy, NPY, read_motion),
     Target("motion .json", as_json, mutations.JSON, read_motion),

@@ -263,7 +263,6 @@ EXTENSION = {
     "jobs/from_picture.py": OWN,
     "motion/pose_library.py": ("own pose",),
     "scene/rest_human.py": ("body file",),
-    "scene/earlier_files.py": ("earlier body file",),
     "scene/human.py": ("human in Blender",),
     "scene/human_file.py": (
         "human in Blender",

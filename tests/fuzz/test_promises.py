@@ -98,7 +98,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "AMASS", "poses .npz", "pose .npz", "MHR .npz", "parameters of a scan", "captures: poses",
             "captures: pickled poses",
             "captures: joints", "payload", "payload of a gallery", "fitted voxels", "painted weights", "solids",
-            "earlier body file", "body of captures", "proxy", "merged grid",
+            "body of captures", "proxy", "merged grid",
         ),
         (
             "tests/backend/formats/test_arrays.py::test_arrays_of_one_call_share_the_limit",

@@ -2,7 +2,7 @@
 
 OUT/settings.json, report.json
 OUT/person_000007/person.human.safetensors, front.png, side.png, depth.png
-OUT/person_000007/person.blend, person_humans/      where asked for
+OUT/person_000007/person.blend      where asked for
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ...backend.requests import Backend, ChildRequest
 from ...console import Report, Stop, duration
 from ...formats.regular_files import check_unlinked, real_path
 from ...jobs.queue import chosen_checkpoint
-from ...scene.human import PERSON_FILE
+from ...scene.payload import PERSON_FILE
 from ..attributes import Attributes, parsed
 from .arguments import DECLARED, motion_name, parse_generate
 from .people import Movement, movement_of, person_blend

@@ -55,7 +55,6 @@ def person_blend(person: Path, blend: Path, name: str, movement: Movement | None
     Raises as `build_human`, OSError.
     """
     new_file()
-    _save(blend)  # where the volumes go
     build_person(bpy.context, person, name, movement)
     _save(blend)
     remove_file(blend.with_name(f"{blend.name}1"), blend.parent)  # Blender's backup

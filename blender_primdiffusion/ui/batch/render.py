@@ -21,12 +21,13 @@ from ...console import Report, Stop, Stopped
 from ...engine import studio
 from ...engine.engine import ENGINE
 from ...formats.picture_files import is_whole_picture
-from ...formats.regular_files import check_regular, exists_in_its_folder, real_path, remove_folder
+from ...formats.regular_files import check_regular, real_path
 from ...formats.whole_files import replacing
 from ...jobs.deferred_volumes import deferred_volumes
 from ...jobs.export import opened
 from ...scene.cycles import fit_cycles_to_volumes, new_camera
-from ...scene.human import PERSON_FILE, humans, humans_folder, volume_path
+from ...scene.human import humans
+from ...scene.payload import PERSON_FILE, forget_session_files
 from .arguments import ENGINES, motion_name, parse_render
 from .people import (
     Movement,
@@ -179,7 +180,7 @@ class _Drawing:
                 self.say(f"{source.name}: picture {number + 1} of {len(shots)}")
         if not source.is_blend:
             new_file()
-            remove_folder(humans_folder(""), humans_folder("").parent)
+            forget_session_files()
         return len(shots)
 
     def _last_frame(self) -> int:
@@ -210,7 +211,7 @@ class _Drawing:
     def _build(self, source: RenderSource) -> None:
         """The human of a file, in an empty .blend; the volumes lie in a temporary folder."""
         new_file()
-        remove_folder(humans_folder(""), humans_folder("").parent)
+        forget_session_files()
         with tempfile.TemporaryDirectory(dir=bpy.app.tempdir or None) as folder:
             asked = {"person": str(source.path), "out_dir": folder, "size": 16}
             made = opened(source.path, Path(folder)) or ask(self._backend, "open_human", asked, self._stop)
@@ -231,7 +232,7 @@ class _Drawing:
         if render.engine == "CYCLES":
             if options.engine or options.samples:
                 fit_cycles_to_volumes(scene, options.samples or _SAMPLES)
-            _check_volumes(scene)
+            _check_volumes()
         elif render.engine == ENGINE and not self._checked:
             check_backend(options.python)
             self._checked = True
@@ -241,16 +242,11 @@ class _Drawing:
         render.image_settings.color_mode = "RGBA" if render.film_transparent else "RGB"
 
 
-def _check_volumes(scene: bpy.types.Scene) -> None:
+def _check_volumes() -> None:
+    """Raises OSError where volumes could not be written."""
     deferred_volumes.finish()
-    volumes = {obj.data for person in humans(scene) for obj in person.all_objects if obj.type == "VOLUME"}
-    paths = [path for path in map(volume_path, volumes) if path is not None]
-    missing = [path for path in paths if not exists_in_its_folder(path)]
-    if missing:
-        raise FileNotFoundError(
-            f"{len(missing)} of {len(volumes)} volumes have lost their files, {missing[0]} among them: put the folder "
-            "back beside the .blend, or open it and press Find Missing Volumes"
-        )
+    if deferred_volumes.error:
+        raise OSError(deferred_volumes.error)
 
 
 def draw(scene: bpy.types.Scene, path: Path, folder: Path) -> None:

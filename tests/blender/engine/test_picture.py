@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from types import SimpleNamespace
 
 import bpy
@@ -22,13 +21,14 @@ from engine_stage import (
     render_png,
     set_up_render,
 )
+from human_files import lose_data
 from human_stage import make_earlier
 from mathutils import Euler, Matrix
 from oracle import raised
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of, person_file, remove_human
+from blender_primdiffusion.scene.human import armature_of, remove_human
 from blender_primdiffusion.scene.rest_human import read_human
 
 SIZE = (120, 90)
@@ -361,15 +361,12 @@ def test_a_renamed_collection_and_a_blend_saved_elsewhere_keep_their_person(stag
     assert_same(render_png(stage.out), wanted)
 
 
-def test_a_missing_file_is_one_error_that_names_person_and_file(stage):
-    folder = person_file(stage.person).parent
-    shutil.move(folder / "person.human.safetensors", stage.out.parent)
-    with refused(RuntimeError, "Human", "person.human.safetensors") as caught:
+def test_a_human_without_data_is_one_error_that_names_it(stage):
+    lose_data(stage.person)
+    with refused(RuntimeError, "Human", "holds no data") as caught:
         render_png(stage.out)
     assert str(caught.value).count("Error:") == 1
     assert not stage.out.exists()
-    shutil.move(stage.out.parent / "person.human.safetensors", folder)
-    assert render_png(stage.out).any()
 
 
 def test_undo_and_frame_changes_do_not_disturb_the_engine(stage, backend):

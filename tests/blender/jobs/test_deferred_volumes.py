@@ -8,23 +8,17 @@ import time
 import bpy
 import pytest
 from deferred_volumes_stage import COUNT, advance, check_complete, generated, on_disk, paths_of
+from human_files import folder_of, person_file
 
 import blender_primdiffusion
 from blender_primdiffusion.engine.gpu.overlay import overlay
 from blender_primdiffusion.jobs import deferred_volumes as module
 from blender_primdiffusion.jobs import windows
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
-from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
-from blender_primdiffusion.scene.human import (
-    armature_of,
-    humans,
-    person_file,
-    state_folder,
-    volumes_of,
-)
+from blender_primdiffusion.scene.human import armature_of, humans, volumes_of
 from blender_primdiffusion.scene.pending import pending_of, pending_volumes, write_all_pending, write_pending
 from blender_primdiffusion.scene.volumes import person_memory
 
@@ -37,8 +31,6 @@ def test_the_human_stands_before_any_volume_is_written(person):
     assert len(volumes_of(person)) == COUNT
     assert person_file(person).is_file()
     assert armature_of(person).visible_get()
-    look()
-    assert state.summary == "", "what is not yet written is not missing"
 
 
 def test_the_files_written_later_are_those_that_would_be_written_at_once(person, tmp_path):
@@ -140,7 +132,7 @@ def test_both_a_render_and_the_timer_may_write_the_same(person):
     check_complete(person)
     while deferred_volumes.work(60.0):
         pass
-    assert not list(state_folder(person).glob(".*.partial*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
 
 
 def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypatch, capsys):
@@ -152,24 +144,17 @@ def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypat
         pass
     assert "No space left" in deferred_volumes.error
     assert capsys.readouterr().out.count("No space left") == 1
-    assert not list(state_folder(person).glob(".*.partial*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
     monkeypatch.undo()
     deferred_volumes.finish()
     assert deferred_volumes.error == ""
     check_complete(person)
 
 
-def test_a_damaged_file_of_the_human_is_reported(person):
-    person_file(person).write_bytes(b"no human")
-    while deferred_volumes.work(0.0):
-        pass
-    assert person_file(person).name in deferred_volumes.error
-
-
 def test_disabling_the_extension_leaves_no_unfinished_files(person):
     advance("half")
     blender_primdiffusion.unregister()
-    assert not list(state_folder(person).glob(".*.partial*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
     assert pending_of(person) is not None
     blender_primdiffusion.register()
 
@@ -196,15 +181,3 @@ def test_several_humans_are_written_one_after_another(hidden):
         assert time.monotonic() - began < 300
     for person in people:
         check_complete(person)
-
-
-def test_paths_change_after_undo_only_once_it_rests(person, monkeypatch):
-    brought = []
-    monkeypatch.setattr(deferred_volumes, "bring_here", lambda: brought.append(True))
-    monkeypatch.setattr(windows, "_last_undo", time.monotonic())
-    monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
-    assert module._bring_here_soon() == module.BLOCKED_S
-    assert not brought
-    monkeypatch.setattr(windows, "_last_undo", -math.inf)
-    assert module._bring_here_soon() is None
-    assert brought

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import bpy
 import pytest
+from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
@@ -20,7 +21,8 @@ from blender_primdiffusion.jobs import queue as queue_module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.human import armature_of, humans
+from blender_primdiffusion.scene.payload import session_folder
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 
 
@@ -90,7 +92,7 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed,
         bpy.ops.primdiffusion.generate(seed=seed, steps=1)
     assert str(caught.value).count("Error:") == 1
     assert len(bpy.data.objects) == objects
-    assert not (tmp_path / "shot_humans").exists()
+    assert not session_folder().exists()
     assert not list(Path(bpy.app.tempdir).glob("generate_*"))
     assert re.search(sentence, " ".join(panel_texts(addon)))
 

@@ -156,7 +156,7 @@ def test_a_view_that_shows_less_than_half_of_the_picture_does_without(denoising,
 
 
 def test_edits_show_no_picture_in_the_views(denoising, monkeypatch):
-    monkeypatch.setattr(GenerateJob, "new_person", "")
+    monkeypatch.setattr(GenerateJob, "new_person", False)
     follow()
     assert not shown()
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 import pytest
 from blender_primdiffusion.formats.answers import VariationFiles
+from human_files import person_file
 from jobs_driven import drive, error_of, shown, until_running
 from support.errors import refused
 from support.fake_child import FAILS, TAKES_LONG, request_of
@@ -14,7 +15,7 @@ from support.fake_child import FAILS, TAKES_LONG, request_of
 from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.variations import Sheet, VariationsJob, sheet
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.ui import variations_panel
 
 pytestmark = pytest.mark.any_blender

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from human_files import folder_of
 from human_stage import strong_pose
 from oracle import Z_UP, blended_frames, blended_vertices, evaluated_matrices, world_from_model
 from support.errors import refused
@@ -17,7 +18,7 @@ from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import ATTACHMENT, IN_VIEWPORT, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.copies import duplicate_human
-from blender_primdiffusion.scene.human import armature_of, body_of, folder_of, humans, volumes_of
+from blender_primdiffusion.scene.human import armature_of, body_of, humans, volumes_of
 from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of, primitives_of
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")

@@ -39,7 +39,7 @@ def box_grid(voxel: float, low: tuple, high: tuple, density: float, colour: tupl
 
 def show_grid(person, grid: MergedGrid, tmp_path) -> None:
     digest = write_grid(grid, tmp_path / "grid.vdb")
-    files = publish([tmp_path / "grid.vdb"], [digest], merged_folder(person))
+    files = publish([tmp_path / "grid.vdb"], [digest], merged_folder())
     show_merged(person, files, MergedState(("",), grid.voxel))
 
 

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import itertools
 import json
-import shutil
 
 import bpy
 import numpy as np
 import pytest
 import synthetic
+from human_files import folder_of
 from human_stage import strong_pose
 from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
@@ -20,18 +20,13 @@ from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
-from blender_primdiffusion.scene.human import (
-    MARK,
-    armature_of,
-    body_of,
-    folder_of,
-    humans,
-    remove_human,
-)
+from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans, remove_human
+from blender_primdiffusion.scene.payload import forget_session_files, session_folder
+from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
-KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions")
+KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions", "images")
 
 
 def datablocks() -> dict[str, list[str]]:
@@ -72,7 +67,7 @@ def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
     arrays = synthetic.arrays(1024)
     collection = build_human(saved_scene, synthetic.write(tmp_path / "human", 1024))
     assert sum(o.type == "VOLUME" for o in collection.all_objects) == 1024
-    assert len(list(folder_of(collection).glob("0001/prim_*.vdb"))) == 1024
+    assert len(list(folder_of(collection).glob("prim_*.vdb"))) == 1024
     frames = np.arange(1, 9)
     swing = np.zeros((8, 24, 3))
     swing[:, 1, 0], swing[:, 2, 0] = 0.5 * np.sin(frames), -0.5 * np.sin(frames)
@@ -130,17 +125,15 @@ def test_provenance_and_overlaps_are_stored_on_the_collection(person):
     assert "draws only 31" in overlap_warning(collection)
 
 
-def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_path):
+def test_saving_and_loading_keeps_volumes_and_pose(person, tmp_path):
     collection, arrays = person
     rotations, translation = strong_pose(1)
     pose_from_joint_rotations(armature_of(collection), rotations, translation)
-    assert all(v.filepath.startswith("//shot_humans/Human/0001/prim_") for v in bpy.data.volumes)
     bpy.ops.wm.save_mainfile()
-    moved = tmp_path / "elsewhere"
-    moved.mkdir()
-    shutil.move(tmp_path / "shot.blend", moved)
-    shutil.move(tmp_path / "shot_humans", moved)
-    bpy.ops.wm.open_mainfile(filepath=str(moved / "shot.blend"))
+    forget_session_files()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert open_humans() == []
+    write_all_pending()
     collection = humans(bpy.context.scene)[0]
     expected = expected_matrices(collection, arrays, rotations, translation)
     np.testing.assert_allclose(evaluated_matrices(collection), expected, atol=1e-5)
@@ -149,15 +142,13 @@ def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_pa
         assert {grid.name for grid in volume.grids} == {"density", "Cd"}
 
 
-def test_removal_takes_everything_but_the_files(person):
+def test_removal_takes_everything(person):
     collection, _ = person
     keyframe_poses(armature_of(collection), np.array([1]), np.tile(np.eye(3), (1, 24, 1, 1)), np.zeros((1, 3)))
-    files = volume_files()
     remove_human(collection)
     left = datablocks()
     assert left.pop("materials") == ["PrimDiffusion Volume"]
     assert not any(left.values())
-    assert all(shutil.os.path.exists(path) for path in files)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "NaN"])
@@ -174,9 +165,7 @@ def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_pa
     assert sorted(tmp_path.rglob("*")) == files
 
 
-def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(
-    person, saved_scene, tmp_path, monkeypatch
-):
+def test_a_failure_in_the_middle_of_building_leaves_the_scene_as_it_was(person, saved_scene, tmp_path, monkeypatch):
     before, files = datablocks(), volume_files()
 
     def failing(*given):
@@ -187,8 +176,7 @@ def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(
     with pytest.raises(MemoryError):
         build_human(saved_scene, synthetic.write(tmp_path / "second", 8, seed=3))
     assert datablocks() == before
-    assert sorted(str(path) for path in tmp_path.rglob("*.vdb")) == files
-    assert [path.name for path in (tmp_path / "shot_humans").iterdir()] == ["Human"]
+    assert sorted(map(str, session_folder().rglob("*.vdb"))) == files
 
 
 def test_building_from_edit_mode_works(saved_scene, tmp_path):

@@ -10,25 +10,15 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from human_files import folder_of, person_file
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
 from scene_stage import replace
 from support import tensor_files
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.collect import collect_before_saving, unused
-from blender_primdiffusion.scene.human import (
-    BETAS,
-    MARK,
-    armature_of,
-    body_of,
-    folder_of,
-    human_of,
-    humans,
-    person_file,
-    state_folder,
-    state_of,
-)
+from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, human_of, humans
+from blender_primdiffusion.scene.payload import state_of
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
@@ -78,27 +68,28 @@ def person(saved_scene, tmp_path):
     return collection
 
 
-def test_an_edit_is_a_new_folder_and_leaves_the_files_of_the_state_before(person, saved_scene, tmp_path):
+def test_an_edit_has_files_of_its_own_and_leaves_those_before(person, saved_scene, tmp_path):
     places = transforms(person)
-    files = {path: path.stat().st_mtime_ns for path in state_folder(person).iterdir()}
+    files = {path: path.stat().st_mtime_ns for path in folder_of(person).iterdir()}
+    before = folder_of(person)
     done = replace(person, redyed(tmp_path, 3, 7))
-    assert state_folder(person) == folder_of(person) / "0002"
+    assert folder_of(person) != before
     assert (done.reshaped, done.warning) == (False, "")
     assert transforms(person) == places
     assert {path: path.stat().st_mtime_ns for path in files} == files
-    assert {path.name for path in files} == {path.name for path in state_folder(person).iterdir()}
+    assert {path.name for path in files} == {path.name for path in folder_of(person).iterdir()}
     assert all(volume.grids.load() for volume in bpy.data.volumes)
     assert not first(person)
     assert json.loads(person[MARK])["edited"] == [3, 7]
 
 
-def test_the_state_is_told_apart_by_what_it_holds_not_by_its_folder(person, saved_scene, tmp_path):
-    before = state_of(person)
+def test_the_state_is_told_apart_by_what_it_holds(person, saved_scene, tmp_path):
+    before = state_of(armature_of(person))
     replace(person, redyed(tmp_path, 3))
-    edited = state_of(person)
+    edited = state_of(armature_of(person))
     assert edited != before
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
-    assert state_of(person) == edited
+    assert state_of(armature_of(person)) == edited
 
 
 def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_scene, tmp_path):
@@ -186,42 +177,6 @@ def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person,
     assert {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"} == before
     assert [list(bone.head_local) for bone in armature_of(twin).data.bones] == bones
     assert first(twin)
-
-
-def test_after_saving_under_another_name_an_edit_goes_to_the_new_folder(person, saved_scene, tmp_path):
-    before = state_folder(person)
-    files = sorted(before.parent.rglob("*"))
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
-    replace(person, redyed(tmp_path, 3))
-    assert sorted(before.parent.rglob("*")) == files
-    assert all(path.startswith("//second_humans/Human/") for path in paths(person).values())
-    assert person_file(person).is_relative_to(tmp_path / "second_humans" / "Human")
-    assert all(volume.grids.load() for volume in bpy.data.volumes)
-
-
-def test_an_edit_before_the_first_save_is_collected_without_the_states_before_it(empty_scene, tmp_path):
-    person = build_human(empty_scene, synthetic_shape.write(tmp_path / "human", COUNT))
-    replace(person, redyed(tmp_path, 3))
-    bpy.app.handlers.save_pre.append(collect_before_saving)
-    try:
-        bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
-    finally:
-        bpy.app.handlers.save_pre.remove(collect_before_saving)
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
-    (person,) = humans(bpy.context.scene)
-    assert not first(person)
-    assert list((tmp_path / "shot_humans" / "Human").iterdir()) == [state_folder(person)]
-    assert len(list(state_folder(person).iterdir())) == COUNT + 2
-    assert all(volume.grids.load() for volume in bpy.data.volumes)
-
-
-def test_files_of_earlier_states_are_unused_and_those_shown_are_not(person, saved_scene, tmp_path):
-    humans_folder, before = tmp_path / "shot_humans", state_folder(person)
-    assert unused(humans_folder) == []
-    (before / "notes.txt").write_text("mine")
-    replace(person, redyed(tmp_path, 3))
-    assert unused(humans_folder) == sorted(path for path in before.iterdir() if path.name != "notes.txt")
-    assert unused(tmp_path / "nowhere") == []
 
 
 def test_every_part_of_a_human_leads_to_it_and_other_objects_do_not(person, saved_scene):

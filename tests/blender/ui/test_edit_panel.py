@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
@@ -19,7 +20,7 @@ from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import painted_weights
-from blender_primdiffusion.scene.human import armature_of, body_of, humans, humans_folder, person_file, remove_human
+from blender_primdiffusion.scene.human import armature_of, body_of, humans, remove_human
 from blender_primdiffusion.ui import edit_panel
 
 FINE = 8
@@ -230,8 +231,6 @@ def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(add
     person.name = "Anna"
     drive()
     assert error_of("vary") == ""
-    assert all(path.startswith("//late_humans/Human/") for path in paths(person))
-    assert person_file(person).parent == tmp_path / "late_humans" / "Human" / "0002"
     assert sent(person)["seed"] == FINE
 
 
@@ -301,12 +300,3 @@ def test_the_panel_offers_the_chosen_edit_alone(person):
         assert [other for other, name in offered.items() if f"primdiffusion.{name}" in shown] == [kind]
     bpy.context.scene.primdiffusion_edit.region = "PAINTED"
     assert "primdiffusion.paint_region" in drawn("REDRESS")
-
-
-def test_unused_files_are_removed_and_those_in_use_stay(person):
-    ops.vary(seed=FINE, steps=1)
-    shown = {bpy.path.abspath(path) for human in humans(bpy.context.scene) for path in paths(human)}
-    assert ops.remove_unused_files() == {"FINISHED"}
-    left = {str(path) for path in humans_folder().rglob("*.vdb")}
-    assert left == shown
-    assert person_file(person).is_file()

@@ -9,8 +9,9 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from human_files import person_file
 
-from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans, person_file
+from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 ops = bpy.ops.primdiffusion

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 import synthetic
 from backend_python import use_this_python
+from human_files import lose_data
 from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
@@ -110,12 +110,10 @@ def test_an_impossible_export_is_reported_in_a_sentence(anna, out, operator, pro
     assert not list(out.iterdir())
 
 
-def test_a_missing_persons_file_is_named(anna, out):
-    for path in Path(bpy.data.filepath).parent.rglob("person.human.safetensors"):
-        if "store" not in path.parts:
-            path.unlink()
+def test_a_person_without_data_is_named(anna, out):
+    lose_data(anna)
     for file in ("a.glb", "a.human"):
-        assert_rejected("is missing", OPERATORS.export, filepath=str(out / file))
+        assert_rejected("holds no data", OPERATORS.export, filepath=str(out / file))
 
 
 def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):

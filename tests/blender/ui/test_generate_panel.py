@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
+from human_files import person_file
 from jobs_driven import Layout, drive, notice_of, shown
 from support.errors import refused
 from support.fake_child import FAILS, request_of
@@ -19,7 +20,7 @@ from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene import cycles
 from blender_primdiffusion.scene.cycles import posed_extent
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.scene.place import GAP_M
 from blender_primdiffusion.ui import generate_panel
 

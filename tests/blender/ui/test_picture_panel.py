@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.picture_files import write_png
+from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import request_of
@@ -20,7 +21,7 @@ from blender_primdiffusion.jobs.from_picture import PictureJob, PictureTask
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.motion.pose_library import take_world_posture, world_posture
 from blender_primdiffusion.scene.convention import points_to_backend
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.human import armature_of, humans
 from blender_primdiffusion.scene.shape import betas_of
 from blender_primdiffusion.ui.picture_panel import PRIMDIFFUSION_OT_choose_picture, PRIMDIFFUSION_PT_human_from_picture
 

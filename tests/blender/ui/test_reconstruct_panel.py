@@ -9,13 +9,15 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
+from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import request_of
 
 from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import humans, person_file
+from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.payload import session_folder
 from blender_primdiffusion.ui import reconstruct_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
@@ -79,7 +81,7 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, captures, tmp_p
         bpy.ops.primdiffusion.human_from_captures(directory=str(captures))
     assert str(caught.value).count("Error:") == 1
     assert not bpy.data.objects
-    assert not (tmp_path / "shot_humans").exists()
+    assert not session_folder().exists()
     assert not list(Path(bpy.app.tempdir).glob("reconstruct_*"))
     assert sentence in " ".join(shown(PRIMDIFFUSION_PT_human_from_captures, addon))
     assert sentence not in " ".join(shown(PRIMDIFFUSION_PT_generate, addon))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic_shape
 from engine_stage import cube
+from human_files import lose_data
 from mathutils import Matrix
 
 from blender_primdiffusion.engine.boxes import Boxes
@@ -21,7 +22,7 @@ from blender_primdiffusion.engine.gpu.start import GpuStart
 from blender_primdiffusion.engine.view import NO_SURFACE_M
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
-from blender_primdiffusion.scene.human import armature_of, body_of, person_file
+from blender_primdiffusion.scene.human import armature_of, body_of
 from blender_primdiffusion.ui import viewport_humans
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
@@ -137,8 +138,8 @@ def test_an_instance_is_drawn_and_stands_for_its_human(people):
     np.testing.assert_allclose(pelvis["Instance"] - pelvis["Anna"], [3, 0, 0], atol=1e-5)
 
 
-def test_a_human_without_its_file_is_named_and_the_others_are_drawn(people):
-    person_file(people.anna).unlink()
+def test_a_human_without_data_is_named_and_the_others_are_drawn(people):
+    lose_data(people.anna)
     assert names(read(people.overlay)) == ["Bert"]
     assert "Anna" in people.overlay.error
     volumes_of(people.anna).hide_viewport = False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import shutil
 from pathlib import Path
 
 import bpy
@@ -18,7 +17,6 @@ from support.errors import refused
 from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
 from blender_primdiffusion.scene.cycles import new_camera
-from blender_primdiffusion.scene.human import humans_folder
 from blender_primdiffusion.ui.batch import execute
 from blender_primdiffusion.ui.batch.people import go_round, moving_extent
 from blender_primdiffusion.ui.batch.render import draw
@@ -151,21 +149,6 @@ def test_one_who_fails_is_named_and_does_not_stop_the_others(people, out, capfd)
     assert not list(out.rglob(".*"))
 
 
-def test_volumes_that_are_gone_are_written_before_cycles_renders(people, out):
-    folder = people / "person_000007"
-    gone = next((folder / "person_humans").rglob("*.vdb"))
-    gone.unlink()
-    assert render(folder / "person.blend", out, *SMALL, "--engine", "cycles") == DONE
-    assert gone.is_file()
-
-
-def test_missing_humans_are_reported_before_cycles_renders(people, out):
-    folder = people / "person_000007"
-    shutil.rmtree(folder / "person_humans")
-    assert render(folder / "person.blend", out, *SMALL, "--engine", "cycles") == FAILED
-    assert "8 of 8 volumes have lost their files" in report(out)["failed"][0]["why"]
-
-
 def test_a_missing_backend_is_reported_at_once(people, out, monkeypatch, capfd):
     def nowhere(*_, **__):
         raise BackendNotFound("No Python for the backend: /nowhere does not exist")
@@ -203,7 +186,7 @@ def test_what_is_no_source_is_named(addon, tmp_path, out, capfd):
         assert sentence in capfd.readouterr().err
 
 
-def test_links_where_pictures_and_temporary_humans_go_lose_nothing_outside(people, out, tmp_path):
+def test_links_where_pictures_go_lose_nothing_outside(people, out, tmp_path):
     mine = tmp_path / "outside" / "mine.png"
     mine.parent.mkdir()
     mine.write_text("mine")
@@ -211,7 +194,6 @@ def test_links_where_pictures_and_temporary_humans_go_lose_nothing_outside(peopl
     (out / "person_000007.png").symlink_to(mine.with_name("nothing"))
     (out / "person_000008.png").symlink_to(mine.parent)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    humans_folder("").symlink_to(mine.parent)
     assert render(people, out, *SMALL) == FAILED
     assert (out / "person_000007.png").stat().st_size > 0
     assert not (out / "person_000007.png").is_symlink()
