@@ -54,8 +54,7 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     pressed = time.perf_counter() - start
 
     scene_human = import_module(f"{MODULE}.scene.human")
-    collection = scene_human.humans(bpy.context.scene)[0]
-    armature = scene_human.armature_of(collection)
+    armature = scene_human.humans(bpy.context.scene)[0]
     spent = import_module(f"{MODULE}.jobs.queue").queue.last.seconds
     rotations = walk_and_wave(arguments.frames)
     numbers = np.arange(1, arguments.frames + 1)

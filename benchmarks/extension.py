@@ -106,16 +106,14 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     """One person: building, frames with both attachments, motion."""
     _enable(arguments)
     from blender_primdiffusion.scene.build import build_human
-    from blender_primdiffusion.scene.human import armature_of
 
     context = bpy.context
     start = time.perf_counter()
     folder = arguments.folder / "person"
-    collection = build_human(context, folder / "person.human.safetensors")
+    armature = build_human(context, folder / "person.human.safetensors")
     bpy.ops.primdiffusion.volumes_in_viewport()
     context.view_layer.update()
     built = time.perf_counter() - start
-    armature = armature_of(collection)
     context.view_layer.objects.active = armature
 
     motion = _amass_file(arguments.folder / "amass.npz")
@@ -174,7 +172,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     """Generate, pose and delete repeatedly; measures memory growth, stray files and stray processes."""
     _enable(arguments)
     from blender_primdiffusion.jobs.queue import queue
-    from blender_primdiffusion.scene.human import armature_of, humans
+    from blender_primdiffusion.scene.human import humans, parts_of
     from blender_primdiffusion.scene.payload import forget_session_files
 
     context, megabytes, blender = bpy.context, [], []
@@ -182,12 +180,11 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     rng = np.random.default_rng(SEED)
     for number in range(arguments.rounds):
         bpy.ops.primdiffusion.generate(seed=SEED + number, steps=arguments.steps)
-        collection = humans(context.scene)[0]
-        armature = armature_of(collection)
+        armature = humans(context.scene)[0]
         for bone in armature.pose.bones:
             bone.rotation_quaternion = (1.0, *rng.normal(0, 0.1, 3))
         context.view_layer.update()
-        bpy.ops.primdiffusion.delete_human(human=collection.name)
+        bpy.data.batch_remove(parts_of(armature))
         bpy.ops.outliner.orphans_purge(do_recursive=True)
         forget_session_files()
         record.trim()

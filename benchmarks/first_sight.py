@@ -56,7 +56,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.edit import select_human
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.pending import write_all_pending
 from blender_primdiffusion.scene.place import stand_at_cursor
 
@@ -155,7 +154,7 @@ def one_human(person: Path) -> dict[str, float]:
     figures["longest_step_seconds"] = figures["stand_seconds"]
     trim()
     figures["person_memory_mb"] = resident_mb() - memory
-    figures["person_frame_ms"] = frame_ms(armature_of(found[0]))
+    figures["person_frame_ms"] = frame_ms(found[0])
     figures["outliner_rows"] = outliner_rows(found[0])
     figures["volumes_seconds"] = seconds(write_all_pending)
     return figures

@@ -15,7 +15,6 @@ from ..formats.answers import HumanAnswer
 from ..scene.attachment import volumes_may_wait
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import Replaced, replace_person
-from ..scene.human import armature_of
 from ..scene.payload import session_file
 from ..scene.volumes import free_unused_grids
 from .deferred_volumes import deferred_volumes
@@ -26,7 +25,7 @@ _STEP_PICTURE_PX = 256
 """Of the picture after each step, for the panel."""
 
 
-def show_in_place(context: bpy.types.Context, person: bpy.types.Collection, result: HumanAnswer) -> Replaced:
+def show_in_place(context: bpy.types.Context, person: bpy.types.Object, result: HumanAnswer) -> Replaced:
     """Show the human of the child's `result` in place of `person`. Raises as `replace_person` does."""
     done = replace_person(person, result.person)
     if not volumes_may_wait(person):
@@ -49,9 +48,9 @@ class EditJob(Job):
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
 
     @classmethod
-    def of(cls, person: bpy.types.Collection, asked: Mapping[str, Any]) -> EditJob:
+    def of(cls, person: bpy.types.Object, asked: Mapping[str, Any]) -> EditJob:
         """Raises ValueError for a human that cannot be edited."""
-        session_file(armature_of(person))
+        session_file(person)
         return cls(HumanTarget.of(person), asked)
 
     @property

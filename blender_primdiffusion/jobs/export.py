@@ -22,7 +22,7 @@ from ..motion.pose_library import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.attachment import attachment_of, set_attachment
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
-from ..scene.human import armature_of
+from ..scene.human import link_part
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
     HumanMotion,
@@ -45,7 +45,7 @@ from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
 
 
-def show(person: bpy.types.Collection, what: str) -> None:
+def show(person: bpy.types.Object, what: str) -> None:
     """Switch to `what`: VOLUMES, VIEWPORT or MESH. Raises ValueError where there is no proxy; makes no undo step."""
     proxy = proxy_of(person)
     if proxy is None:
@@ -58,7 +58,7 @@ def show(person: bpy.types.Collection, what: str) -> None:
             part.hide_render = part.hide_render or what == "MESH"
 
 
-def shown(person: bpy.types.Collection) -> str:
+def shown(person: bpy.types.Object) -> str:
     """What is shown now: VOLUMES, VIEWPORT or MESH."""
     proxy = proxy_of(person)
     if proxy is None or proxy.hide_viewport:
@@ -85,7 +85,7 @@ class ProxyJob(Job):
             "triangles": self.triangles,
         }
 
-    def built(self, person: bpy.types.Collection, result: ProxyAnswer) -> bpy.types.Object:
+    def built(self, person: bpy.types.Object, result: ProxyAnswer) -> bpy.types.Object:
         """The proxy as an object, in no collection, with the current shape of the body."""
         made = np.array(result.betas, np.float64)
         proxy = build_proxy(person, read_proxy(result.proxy), result.texture, made)
@@ -109,11 +109,10 @@ class ExportMeshJob(ProxyJob):
 
     def finish(self, context: bpy.types.Context, result: ProxyAnswer, _folder: Path) -> str:
         person = self.target.found()
-        armature = armature_of(person)
-        check_ready(armature)
+        check_ready(person)
         proxy = self.built(person, result)
         try:
-            write_model(context, armature, proxy, self.path, self.format, self.frames)
+            write_model(context, person, proxy, self.path, self.format, self.frames)
         finally:
             remove_proxy(proxy)
         size = self.path.stat().st_size / 1e6
@@ -138,7 +137,7 @@ class AddProxyJob(ProxyJob):
         earlier = proxy_of(person)
         if earlier is not None:
             remove_proxy(earlier)
-        person.objects.link(proxy)
+        link_part(person, proxy)
         show(person, "VIEWPORT")
         show_textures_in_solid()
         return f"Mesh proxy of {result.triangles} triangles for {person.name} in {result.seconds:.1f} s"
@@ -151,33 +150,30 @@ def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
     return FrameRange(scene.frame_current, scene.frame_current)
 
 
-def posed_now(context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+def posed_now(context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
     """The human at the current frame: see `posed_frames`."""
     return posed_frames(context, person, [context.scene.frame_current])[0]
 
 
-def posed_frames(
-    context: bpy.types.Context, person: bpy.types.Collection, frames: Iterable[int]
-) -> list[dict[str, Any]]:
+def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: Iterable[int]) -> list[dict[str, Any]]:
     """The human at these frames: file, object matrix, joints and shape, as parameters of the child's `draw`.
 
     Raises ValueError for an armature in Edit Mode or without SMPL's bones, FileNotFoundError where the file is missing.
     """
-    armature = armature_of(person)
-    check_ready(armature)
+    check_ready(person)
     found = []
-    with scene_with_only(context, armature) as scene:
+    with scene_with_only(context, person) as scene:
         for frame in frames:
             if frame != scene.frame_current:
                 scene.frame_set(frame)
-            evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
-            found.append(pose_of(evaluated, np.array(evaluated.matrix_world, np.float64), person).params())
+            evaluated = person.evaluated_get(scene.view_layers[0].depsgraph)
+            found.append(pose_of(evaluated, np.array(evaluated.matrix_world, np.float64)).params())
     return found
 
 
 def write_human(
     context: bpy.types.Context,
-    person: bpy.types.Collection,
+    person: bpy.types.Object,
     path: Path,
     frames: FrameRange | None,
     *,
@@ -190,7 +186,7 @@ def write_human(
     The motion is that of the joints in the armature's space, constraints and layers included; the object's own
     transform is left out.
     """
-    human = read_tensors(session_file(armature_of(person)))
+    human = read_tensors(session_file(person))
     if has_custom_shape(person):
         betas = betas_of(person)
         human = reshaped(human, betas, shape_model_of(person).growth(generated_betas(person), betas))
@@ -198,10 +194,10 @@ def write_human(
     write_tensors(path, with_motion(compacted(human) if compact else expanded(human), motion))
 
 
-def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: FrameRange) -> HumanMotion:
+def _motion(context: bpy.types.Context, person: bpy.types.Object, frames: FrameRange) -> HumanMotion:
     numbers = range(frames.first, frames.last + 1)
     joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)
-    pelvis = rest_joints(armature_of(person))[0]
+    pelvis = rest_joints(person)[0]
     rotations = nearest(joints[..., :3])  # bones may be scaled and mirrored
     translations = joints[:, 0, :, :3] @ pelvis + joints[:, 0, :, 3] - pelvis
     render = context.scene.render
@@ -304,12 +300,11 @@ class ImportHumanJob(Job):
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         motion = motion_in(read_tensors(Path(self.path), CHOOSE_ANOTHER), Path(self.path).name)
         person, notice = build_person(context, result, "Imported", name_of(self.path))
-        armature = armature_of(person)
         if motion is not None:
-            _move(armature, motion)
+            _move(person, motion)
         if self.at is not None:
-            armature.location.xy = self.at[:2]
-            armature.location.z += self.at[2]
+            person.location.xy = self.at[:2]
+            person.location.z += self.at[2]
         return notice
 
 

@@ -16,7 +16,7 @@ from ..formats.requests import ReconstructRequest
 from ..scene.build import build_human
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import select_human
-from ..scene.human import armature_of, humans
+from ..scene.human import humans
 from ..scene.place import stand_at_cursor
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .views import bring_into_view, eye
@@ -27,24 +27,23 @@ FIRST_HUMAN_SHARE = 0.25
 
 def build_person(
     context: bpy.types.Context, result: HumanAnswer, made: str, name: str = "Human"
-) -> tuple[bpy.types.Collection, str]:
-    """Build the human of the child's `result`; returns the collection and the message ("Generated in 1.2 s.").
+) -> tuple[bpy.types.Object, str]:
+    """Build the human of the child's `result`; returns them and the message ("Generated in 1.2 s.").
 
     Raises as `build_human` does, and then leaves nothing.
     """
     began = time.monotonic()
-    collection = build_human(context, result.person, name)
-    stand_at_cursor(context, collection, eye())
+    person = build_human(context, result.person, name)
+    stand_at_cursor(context, person, eye())
     if context.mode == "OBJECT":  # else the user is posing or painting
-        select_human(context, collection)
-        others = [human for human in humans(context.scene) if human != collection]
-        bones = [obj for human in others for obj in human.objects if obj.type == "ARMATURE"]
-        bring_into_view(armature_of(collection), 0.0 if others else FIRST_HUMAN_SHARE, bones)
+        select_human(context, person)
+        others = [human for human in humans(context.scene) if human != person]
+        bring_into_view(person, 0.0 if others else FIRST_HUMAN_SHARE, others)
     warnings = list(result.warnings)
-    if overlap := overlap_warning_in(context.scene, collection):
+    if overlap := overlap_warning_in(context.scene, person):
         warnings.append(overlap)
     notice = f"{made} in {result.seconds + time.monotonic() - began:.1f} s"
-    return collection, " ".join([sentence(notice), *map(sentence, warnings)])
+    return person, " ".join([sentence(notice), *map(sentence, warnings)])
 
 
 _STEP_PICTURE_PX = 256

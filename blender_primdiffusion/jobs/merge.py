@@ -14,7 +14,6 @@ from ..formats.answers import MergeAnswer, MergeFramesAnswer
 from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import remove_file
 from ..scene.attachment import set_attachment
-from ..scene.human import armature_of
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from .queue import Job
 from .target import HumanTarget
@@ -30,17 +29,17 @@ class Moment:
     """See `pose_digest`."""
 
     @classmethod
-    def now(cls, person: bpy.types.Collection, armature: bpy.types.Object | None = None) -> Moment:
+    def now(cls, person: bpy.types.Object, armature: bpy.types.Object | None = None) -> Moment:
         """The current pose of the human, or of the evaluated `armature` if given.
 
         Raises ValueError for a renamed bone or a pose that holds NaN, FileNotFoundError where the human's file is
         missing.
         """
-        armature = armature_of(person) if armature is None else armature
+        armature = person if armature is None else armature
         missing = [name for name in JOINT_NAMES if name not in armature.pose.bones]
         if missing:
             raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}: give it this name again")
-        pose = pose_of(armature, np.eye(4), person)
+        pose = pose_of(armature, np.eye(4))
         return cls(pose.params(), pose_digest(person, pose.joints, pose.betas))
 
 

@@ -1,4 +1,4 @@
-"""Build a human in the scene: one collection with armature, body mesh and volumes."""
+"""Build a human in the scene: an armature with body mesh and volumes as its children."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
 from .armature import build_armature
-from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, volumes_may_wait
+from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, in_viewport, volumes_may_wait
 from .convention import frames_to_blender, points_to_blender
-from .human import BETAS, BODY_MARK, MARK, ORIGIN, volume_name
+from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, volume_name, volumes_of
 from .material import volume_material
 from .payload import pack, session_file
 from .pending import write_volumes
-from .rest_human import read_human
+from .rest_human import read_human, shape_model_of
+from .shape import Rest, ShapeModel, betas_of, generated_betas
 from .stand_in import build_stand_in
 
 NAME_LENGTH = 40
@@ -30,55 +31,82 @@ _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and d
 _KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials", "images")
 
 
-def build_human(context: bpy.types.Context, person: str | Path, name: str = "Human") -> bpy.types.Collection:
-    """Build the human of a file: an armature that holds the file, a hidden body mesh and a volume for every primitive.
+def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human") -> bpy.types.Object:
+    """Build the human of a file in a collection of their own: an armature that holds the file, and its parts.
 
     The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
     space, the backend's axes are turned z up and the body is raised by ORIGIN. Without a window the volumes' files are
     written too. Raises as `read_human`, also for what cannot be written, and then leaves no data. Makes no undo step.
     """
-    person = Path(person)
-    human = read_human(person)
-    model, rest = human.model, human.rest
-    if model.uv_corner is None:
+    file = Path(file)
+    human = read_human(file)
+    if human.model.uv_corner is None:
         raise ValueError("the body's file is of an earlier version, without texture coordinates: import it again")
     with _no_data_left_on_failure():
         collection = bpy.data.collections.new(name[:NAME_LENGTH])
-        label = collection.name
-        vertices = points_to_blender(rest.vertices)
-        origin = floor_below(vertices)
-        armature = build_armature(label, points_to_blender(rest.joints) + origin)
-        pack(armature, person, own_body=human.payload.rest_half_extent is not None)
-        armature.data[ORIGIN] = origin.tolist()
-        armature[BETAS] = human.payload.betas.tolist()
-        armature.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
-        collection.objects.link(armature)
-        body = build_body_mesh(
-            f"{label}_body", armature, vertices + origin, model.faces, model.uv_corner, model.skin_weights
-        )
-        collection.objects.link(body)
-        collection.objects.link(build_stand_in(label, armature, body))
-        primitives = bpy.data.collections.new(f"{label}_primitives")
-        primitives.hide_viewport = not VOLUMES_IN_VIEWPORT
-        primitives.objects.link(armature)  # the Outliner then shows the volumes inside the armature's closed row
-        collection.children.link(primitives)
-        folder = session_file(armature).parent
-        attach_volumes(
-            label,
-            armature,
-            primitives,
-            [folder / volume_name(k) for k in range(len(rest.position))],
-            points_to_blender(rest.position) + origin,
-            frames_to_blender(rest.rotation),
-            model.primitive_weights(),
-            volume_material(),
-        )
-        collection[MARK] = human.provenance()
-        collection[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
+        origin = floor_below(points_to_blender(human.rest.vertices))
+        person = build_armature(collection.name, points_to_blender(human.rest.joints) + origin)
+        pack(person, file, own_body=human.payload.rest_half_extent is not None)
+        person.data[ORIGIN] = origin.tolist()
+        person[BETAS] = human.payload.betas.tolist()
+        person.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
+        person[MARK] = human.provenance()
+        person[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
+        collection.objects.link(person)
+        _build_body(person, collection, human.model, human.rest)
+        _build_volumes(person, collection, human.model, human.rest)
         context.scene.collection.children.link(collection)
-        if not volumes_may_wait(collection):
-            write_volumes(collection)
-    return collection
+        if not volumes_may_wait(person):
+            write_volumes(person)
+    return person
+
+
+def build_missing_parts(person: bpy.types.Object) -> None:
+    """Give a human without volumes, such as a copy of the armature alone, all parts that it lacks.
+
+    Raises as `shape_model_of` does, and then leaves no data. Makes no undo step.
+    """
+    model, betas = shape_model_of(person), betas_of(person)
+    rest = model.rest(betas)
+    with _no_data_left_on_failure():
+        collection = min(person.users_collection, key=lambda collection: collection.hide_viewport)
+        if body_of(person) is None:
+            _build_body(person, collection, model, rest)
+        _build_volumes(person, collection, model, rest)
+        growth = model.growth(generated_betas(person), betas)
+        for k, (volume,) in volumes_of(person).items():
+            volume.scale = growth[k]
+        if not volumes_may_wait(person):
+            write_volumes(person)
+
+
+def _build_body(person: bpy.types.Object, collection: bpy.types.Collection, model: ShapeModel, rest: Rest) -> None:
+    """The hidden body mesh, and what stands in for the human in a Blender without the extension."""
+    vertices = points_to_blender(rest.vertices)
+    vertices += floor_below(vertices)
+    label = f"{person.name}_body"
+    body = build_body_mesh(label, person, vertices, model.faces, model.uv_corner, model.skin_weights)
+    collection.objects.link(body)
+    collection.objects.link(build_stand_in(person.name, person, body))
+
+
+def _build_volumes(person: bpy.types.Object, collection: bpy.types.Collection, model: ShapeModel, rest: Rest) -> None:
+    """A volume for every primitive, in a collection of their own."""
+    primitives = bpy.data.collections.new(f"{person.name}_primitives")
+    primitives.hide_viewport = not in_viewport(person)
+    primitives.objects.link(person)  # the Outliner then shows the volumes inside the armature's closed row
+    collection.children.link(primitives)
+    folder, origin = session_file(person).parent, floor_below(points_to_blender(rest.vertices))
+    attach_volumes(
+        person.name,
+        person,
+        primitives,
+        [folder / volume_name(k) for k in range(len(rest.position))],
+        points_to_blender(rest.position) + origin,
+        frames_to_blender(rest.rotation),
+        model.primitive_weights(),
+        volume_material(),
+    )
 
 
 def floor_below(vertices: NDArray) -> NDArray[np.float64]:

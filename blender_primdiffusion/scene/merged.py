@@ -17,7 +17,7 @@ from ..formats.arrays import all_finite, check_shapes, read_arrays
 from ..formats.regular_files import FileError, as_file_error, check_inside, real_path, remove_file
 from ..formats.whole_files import written_whole
 from .blend_values import stored_record
-from .human import armature_of, write_error
+from .human import link_part, parts_of, write_error
 from .material import person_material
 from .payload import session_folder, state_of
 from .volumes import write_vdb
@@ -113,16 +113,16 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
     return targets
 
 
-def show_merged(collection: bpy.types.Collection, files: Sequence[Path], state: MergedState) -> bpy.types.Object:
+def show_merged(person: bpy.types.Object, files: Sequence[Path], state: MergedState) -> bpy.types.Object:
     """Show these files in the human's merged object, made if there is none; it moves with the armature object."""
-    merged = merged_of(collection)
+    merged = merged_of(person)
     if merged is None:
-        label = f"{collection.name}_merged"
+        label = f"{person.name}_merged"
         merged = bpy.data.objects.new(label, bpy.data.volumes.new(label))
-        merged.parent = armature_of(collection)
+        merged.parent = person
         merged.data.render.space = "WORLD"
-        merged.data.materials.append(person_material(collection))
-        collection.objects.link(merged)
+        merged.data.materials.append(person_material(person))
+        link_part(person, merged)
     volume = merged.data
     volume.filepath = _stored(files[0])
     volume.is_sequence = len(files) > 1
@@ -133,9 +133,9 @@ def show_merged(collection: bpy.types.Collection, files: Sequence[Path], state: 
     return merged
 
 
-def merged_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
+def merged_of(person: bpy.types.Object) -> bpy.types.Object | None:
     """The human's merged object, if any."""
-    return next((obj for obj in collection.all_objects if obj.type == "VOLUME" and MARK in obj), None)
+    return next((obj for obj in parts_of(person) if obj.type == "VOLUME" and MARK in obj), None)
 
 
 def merged_state(merged: bpy.types.Object) -> MergedState:
@@ -147,9 +147,9 @@ def merged_state(merged: bpy.types.Object) -> MergedState:
     return MergedState(tuple(map(str, poses)), float(voxel), start)
 
 
-def remove_merged(collection: bpy.types.Collection) -> None:
+def remove_merged(person: bpy.types.Object) -> None:
     """Remove the merged object from the .blend; its files stay for undo."""
-    merged = merged_of(collection)
+    merged = merged_of(person)
     if merged is not None:
         bpy.data.volumes.remove(merged.data)  # removes the object too
 
@@ -175,10 +175,10 @@ def _copy(source: Path, target: Path) -> None:
         shutil.copyfile(source, unfinished)
 
 
-def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequence[float] | None) -> str:
+def pose_digest(person: bpy.types.Object, joints: NDArray, betas: Sequence[float] | None) -> str:
     """Identifies a human in a pose: hash of its state, the shape and the joints [24, 3, 4]."""
     rounded = np.round(np.asarray(joints, np.float64), _DECIMALS) + 0.0  # no negative zeros
     shape = [] if betas is None else [round(float(value), _DECIMALS) for value in betas]
-    digest = hashlib.sha256(f"{state_of(armature_of(collection))} {shape}".encode())
+    digest = hashlib.sha256(f"{state_of(person)} {shape}".encode())
     digest.update(rounded.tobytes())
     return digest.hexdigest()[:16]

@@ -14,7 +14,7 @@ from pathlib import Path
 import bpy
 
 from ..formats.whole_files import remove_abandoned
-from .human import MARK, armature_of, body_of, primitive_of, volume_name, volumes_of, write_error
+from .human import all_humans, body_of, primitive_of, volume_name, volumes_of, write_error
 from .payload import session_file, state_of
 from .rest_human import read_human, shape_model_of
 from .volumes import reload_volume, write_volume
@@ -25,7 +25,7 @@ class PendingVolumes:
     """Volumes of one human. Holds no Blender objects, since undo may replace them."""
 
     human: str
-    """Name of the human's collection."""
+    """The human's name."""
     file: Path
     """The human's own file."""
     primitives: tuple[int, ...]
@@ -39,11 +39,9 @@ def open_humans() -> list[str]:
     data are missing or damaged shows its body mesh.
     """
     faults = []
-    for person in bpy.data.collections:
-        if MARK not in person:
-            continue
+    for person in all_humans():
         try:
-            folder = session_file(armature_of(person)).parent
+            folder = session_file(person).parent
             shape_model_of(person)
         except (ValueError, OSError) as error:
             faults.append(f"the human {person.name!r} cannot be drawn: {error}")
@@ -64,14 +62,14 @@ def show_volume(volume: bpy.types.Volume, folder: Path) -> None:
 
 def pending_volumes() -> list[PendingVolumes]:
     """What all humans of the .blend have of such volumes; without humans that cannot be read."""
-    every = (pending_of(person) for person in bpy.data.collections if MARK in person)
+    every = map(pending_of, all_humans())
     return [one for one in every if one is not None]
 
 
-def pending_of(person: bpy.types.Collection) -> PendingVolumes | None:
+def pending_of(person: bpy.types.Object) -> PendingVolumes | None:
     """What one human has of such volumes; None for nothing, and for a human that cannot be read."""
     try:
-        file = session_file(armature_of(person))
+        file = session_file(person)
     except (ValueError, OSError):
         return None
     there = {path.name for path in file.parent.glob("prim_*.vdb")}
@@ -82,8 +80,7 @@ def pending_of(person: bpy.types.Collection) -> PendingVolumes | None:
 
 def is_wanted(pending: PendingVolumes) -> bool:
     """Whether a human of the .blend is still in this state."""
-    holders = (obj for person in bpy.data.collections if MARK in person for obj in person.objects)
-    return any(state_of(obj) == pending.file.parent.name for obj in holders if obj.type == "ARMATURE")
+    return any(state_of(person) == pending.file.parent.name for person in all_humans())
 
 
 def write_pending(pending: PendingVolumes) -> Generator[None, None, None]:
@@ -110,7 +107,7 @@ def write_pending(pending: PendingVolumes) -> Generator[None, None, None]:
         yield
 
 
-def write_volumes(person: bpy.types.Collection) -> None:
+def write_volumes(person: bpy.types.Object) -> None:
     """Write those of one human, which takes seconds. Raises as `write_pending`."""
     pending = pending_of(person)
     for _ in write_pending(pending) if pending is not None else ():

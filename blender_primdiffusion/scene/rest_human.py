@@ -18,7 +18,7 @@ from ..formats.body_layout import body_data, half_extents, read_layout, stencils
 from ..formats.human_layout import provenance_of
 from ..formats.regular_files import FileError, as_file_error, exists_in_its_folder
 from .cycles import max_overlap
-from .human import LARGEST_BETA, armature_of
+from .human import LARGEST_BETA
 from .human_file import (
     GENERATE_AGAIN,
     FileVersion,
@@ -34,9 +34,9 @@ from .shape import FIELDS, OPTIONAL_FIELDS, Rest, ShapeModel, faulty_field
 from .volumes import Grids, bake
 
 
-def shape_model_of(collection: bpy.types.Collection) -> ShapeModel:
+def shape_model_of(person: bpy.types.Object) -> ShapeModel:
     """The model by which the human's body follows its shape. Raises as `session_file` and `body_of_file`."""
-    return body_of_file(session_file(armature_of(collection)))
+    return body_of_file(session_file(person))
 
 
 def body_of_file(person: Path) -> ShapeModel:

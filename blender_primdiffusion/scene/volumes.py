@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.whole_files import temporary_folder
-from .human import armature_of, volume_name, volumes_of
+from .human import volume_name, volumes_of
 from .payload import session_file
 
 bpy.utils.expose_bundled_modules()
@@ -207,14 +207,14 @@ class Memory:
     renders."""
 
 
-def person_memory(collection: bpy.types.Collection) -> Memory:
+def person_memory(person: bpy.types.Object) -> Memory:
     """Memory of the volumes of a human's primitives, shown or hidden; zero until all are written.
 
     Reads the files' headers once, about .2 s for 1024 of them, and caches the result by their names. Raises as
     `session_file`.
     """
-    folder = session_file(armature_of(collection)).parent
-    paths = [folder / volume_name(k) for k in sorted(volumes_of(collection))]
+    folder = session_file(person).parent
+    paths = [folder / volume_name(k) for k in sorted(volumes_of(person))]
     return _memory_of(tuple(paths)) if all(path.is_file() for path in paths) else Memory(0, 0)
 
 

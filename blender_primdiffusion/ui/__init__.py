@@ -12,7 +12,7 @@ from types import ModuleType
 
 import bpy
 
-from ..jobs import copies, deferred_volumes, follow, picture_in_view, windows
+from ..jobs import deferred_volumes, follow, parts, picture_in_view, windows
 from ..scene import stand_in
 from . import (
     advanced_panel,
@@ -42,7 +42,7 @@ from . import (
 
 MODULES = (
     *backend_state.MODULES, windows, follow, jobs_panel, attributes,
-    generate_panel, variations_panel, human_panel, shape_panel, edit_panel, copies,
+    generate_panel, variations_panel, human_panel, shape_panel, edit_panel, parts,
     deferred_volumes, import_motion, motion_panel, pose_panel, picture_panel,
     render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
     captures_panel, reconstruct_panel, viewport_humans, picture_in_view, batch, manual, stand_in,

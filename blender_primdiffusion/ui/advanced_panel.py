@@ -23,7 +23,7 @@ from ..scene.attachment import (
 )
 from ..scene.blend_values import as_shown
 from ..scene.cycles import current_overlap, overlap_warning_in
-from ..scene.human import armature_of, humans, provenance_of
+from ..scene.human import humans, parts_of, provenance_of
 from ..scene.material import density_gain, set_density_gain
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import proxy_of
@@ -53,7 +53,7 @@ class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
         name="Attachment", description="How volumes follow the body", items=ATTACHMENT_ITEMS, default="ARMATURE"
     )
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         set_attachment(person, self.mode)
         return {"FINISHED"}
 
@@ -67,7 +67,7 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
 
     everyone: bpy.props.BoolProperty(name="All Humans", description="Do it for all humans of the scene", options=SKIP)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         visible = not in_viewport(person)
         if visible:
             deferred_volumes.finish()
@@ -112,7 +112,7 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
     frame_start: bpy.props.IntProperty(name="Start", description="Not given: the scene's", options=SKIP)
     frame_end: bpy.props.IntProperty(name="End", description="Not given: the scene's", options=SKIP)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         if self.what == "NOTHING":
             _unmerge(person)
             bpy.ops.ed.undo_push(message="Unmerge")
@@ -130,7 +130,7 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
         return submit(self, context, MergeFramesJob(target, moments, start, voxel))
 
 
-def _unmerge(person: bpy.types.Collection) -> None:
+def _unmerge(person: bpy.types.Object) -> None:
     """Raises ValueError where there is no merged volume."""
     if merged_of(person) is None:
         raise ValueError(f"{person.name!r} has no merged volume")
@@ -139,11 +139,11 @@ def _unmerge(person: bpy.types.Collection) -> None:
     remove_merged(person)
 
 
-def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
-    return Moment.now(person, armature_of(person).evaluated_get(graph))
+def _moment(person: bpy.types.Object, graph: bpy.types.Depsgraph) -> Moment:
+    return Moment.now(person, person.evaluated_get(graph))
 
 
-def _moments(context: bpy.types.Context, person: bpy.types.Collection, frames: range) -> list[Moment]:
+def _moments(context: bpy.types.Context, person: bpy.types.Object, frames: range) -> list[Moment]:
     """The human in each frame; the scene is at its own frame again afterwards."""
     scene, now = context.scene, context.scene.frame_current
     moments = []
@@ -174,12 +174,12 @@ class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
     )
 
 
-def _gain(person: bpy.types.Collection) -> float:
+def _gain(person: bpy.types.Object) -> float:
     gain = density_gain(person)
     return DENSITY_GAIN if gain is None else gain
 
 
-def _set_gain(person: bpy.types.Collection, gain: float) -> None:
+def _set_gain(person: bpy.types.Object, gain: float) -> None:
     try:
         set_density_gain(person, gain)
     except ValueError as error:  # a property has no report
@@ -187,7 +187,7 @@ def _set_gain(person: bpy.types.Collection, gain: float) -> None:
 
 
 def gain_property() -> bpy.props.FloatProperty:
-    """`collection.primdiffusion_density_gain` of a human's collection."""
+    """`armature.primdiffusion_density_gain` of a human."""
     return bpy.props.FloatProperty(
         name="Density Gain",
         description="Factor on the density in Cycles, which absorbs exponentially while the PrimDiffusion "
@@ -241,7 +241,7 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
             content(body, context, person)
 
 
-def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Collection) -> None:
+def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
     """How volumes follow the body."""
     now = attachment_of(person)
     row = layout.row(align=True)
@@ -252,7 +252,7 @@ def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, pe
     layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)
 
 
-def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Collection) -> None:
+def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
     """One volume for Cycles."""
     layout.prop(context.scene.primdiffusion_merging, "voxel")
     draw_job(layout, "merge", "primdiffusion.merge", "VOLUME_DATA", text="Merge Pose")
@@ -264,7 +264,7 @@ def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: 
         layout.operator("primdiffusion.merge", text="Unmerge", icon="X").what = "NOTHING"
 
 
-def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Collection) -> None:
+def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
     """What brings Cycles near the exact picture."""
     if density_gain(person) is None:
         draw_lines(layout, "The human's material has no node Density Gain", "INFO")
@@ -275,14 +275,14 @@ def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, pe
         draw_lines(layout, sentence(f"{warning}, or merge the human"), "ERROR")
 
 
-def _draw_memory(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Collection) -> None:
+def _draw_memory(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
     """How the human was made, and what it takes."""
     column = layout.column(align=True)
     for name, value in details(person):
         column.label(text=f"{name}: {value}", translate=False)
 
 
-def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
+def outdated(person: bpy.types.Object, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or human than the armature as it is now."""
     try:
         return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)
@@ -296,7 +296,7 @@ _MOST_LINES = 60
 """Lines about the provenance."""
 
 
-def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
+def details(person: bpy.types.Object) -> list[tuple[str, str]]:
     """Names and values: how the human was made, what its files and volumes take."""
     provenance = provenance_of(person)
     attributes, edits = provenance.get("attributes"), provenance.get("edits")
@@ -312,7 +312,7 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
             rest = [f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)]
             lines.append((f"Edit: {as_shown(edit.get('edit', '?'))}", as_shown(", ".join(rest))))
     del lines[_MOST_LINES:]
-    volumes = [obj for obj in person.all_objects if obj.type == "VOLUME"]
+    volumes = [obj for obj in parts_of(person) if obj.type == "VOLUME"]
     memory = person_memory(person)
     try:
         most = str(current_overlap(person))
@@ -326,5 +326,5 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
 
 PROPERTIES = (
     (bpy.types.Scene, "primdiffusion_merging", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_merging)),
-    (bpy.types.Collection, "primdiffusion_density_gain", gain_property()),
+    (bpy.types.Object, "primdiffusion_density_gain", gain_property()),
 )

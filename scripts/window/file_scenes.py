@@ -37,13 +37,15 @@ def five_humans(module: str, python: str) -> Steps:
     yield "five_camera"
     select(armatures()[2])
     bpy.ops.ed.undo_push(message="Before")
-    press("primdiffusion.delete_human", "EXEC_DEFAULT")
-    bpy.ops.ed.undo_push(message="Delete Human")
+    press("object.delete", "EXEC_DEFAULT")
+    yield 1.0
     expect(module, len(_FIVE) - 1)
     yield from at_rest(module)
     yield "five_deleted"
     window, area = view()
     yield {"point": [area.x + area.width // 2, window.height - area.y - area.height // 2]}
+    yield {"key": "ctrl+z"}
+    yield 0.5
     yield {"key": "ctrl+z"}
     yield from wait(lambda: len(armatures()) == len(_FIVE), 20)
     expect(module, len(_FIVE))

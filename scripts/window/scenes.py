@@ -161,7 +161,7 @@ def edits(module: str, python: str) -> Steps:
     select(first)
     clear_of_the_sidebar()
     settings = bpy.context.scene.primdiffusion_edit
-    settings.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
+    settings.other = second
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit")
     settings.kind = "TRANSFER"
     yield 0.5

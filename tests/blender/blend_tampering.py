@@ -29,7 +29,7 @@ from blender_primdiffusion.places import EXTENSION
 from blender_primdiffusion.scene import attachment, merged, proxy, stand_in, surface
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import replace_person
-from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, armature_of, body_of
+from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, is_human, link_part, parts_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD
 from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 from blender_primdiffusion.ui.drawing import DATA
@@ -94,16 +94,16 @@ def build(stage: Stage) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(stage.blend))
     person = build_human(bpy.context, first / "person.human.safetensors", "Anna")
     attachment.set_attachment(person, "SURFACE")
-    armature = armature_of(person)
+    armature = person
     bpy.context.view_layer.objects.active = armature
     armature.animation_data_create().action = bpy.data.actions.new("Walk")
     mesh = bpy.data.objects.new("Anna_proxy", body_of(person).data.copy())
     mesh[proxy.PROXY_MARK] = json.dumps({"file": "person.human.safetensors", "betas": [0.0] * 10})
-    person.objects.link(mesh)
+    link_part(person, mesh)
     whole = bpy.data.objects.new("Anna_merged", bpy.data.volumes.new("Anna_merged"))
     whole[merged.MARK] = json.dumps({"poses": ["0"], "voxel": 0.01, "start": 0})
     whole.data.filepath = str(stage.shipped / "merged_0123456789ab.vdb")
-    person.objects.link(whole)
+    link_part(person, whole)
     (stage.shipped / "merged_0123456789ab.vdb").write_bytes(b"merged")
     (stage.shipped / LINK).symlink_to(os.path.relpath(stage.users, stage.shipped))
     (stage.shipped / DEVICE).symlink_to("/dev/zero")
@@ -113,19 +113,19 @@ def build(stage: Stage) -> None:
     shutil.copy(stage.blend, stage.blend.with_name("other.blend"))
 
 
-def person() -> bpy.types.Collection:
-    return next(collection for collection in bpy.data.collections if MARK in collection)
+def person() -> bpy.types.Object:
+    return next(filter(is_human, bpy.data.objects))
 
 
 def _with(mark: str) -> Callable[[], bpy.types.Object]:
-    return lambda: next(obj for obj in person().all_objects if mark in obj)
+    return lambda: next(obj for obj in parts_of(person()) if mark in obj)
 
 
 HOLDERS: dict[str, Callable[[], Any]] = {
     **dict.fromkeys((MARK, attachment.ATTACHMENT, attachment._BEFORE), person),
     attachment.IN_VIEWPORT: person,
-    **dict.fromkeys((BETAS, PAYLOAD, BODY), lambda: armature_of(person())),
-    ORIGIN: lambda: armature_of(person()).data,
+    **dict.fromkeys((BETAS, PAYLOAD, BODY), person),
+    ORIGIN: lambda: person().data,
     BODY_MARK: lambda: body_of(person()),
     proxy.PROXY_MARK: _with(proxy.PROXY_MARK),
     merged.MARK: _with(merged.MARK),
@@ -201,13 +201,13 @@ PROPERTIES: dict[str, Callable[[object], None]] = {
     "volume.filepath": _set_volume,
     "merged.filepath": _set_merged,
     "library.filepath": _set_library,
-    "collection.name": _set_name,
+    "armature.name": _set_name,
     **{f"{group}.{name}": _set_setting(group, name) for group, names in SETTINGS.items() for name in names},
     **{f"{group}.{name}": _set_setting(group, name) for group, names in TEXTS.items() for name in names},
     **{f"preferences.{name}": _set_preference(name) for name in PREFERENCES},
 }
 """How each is set, as a stranger would."""
-TEXT_ONLY = {"volume.filepath", "merged.filepath", "library.filepath", "collection.name"} | {
+TEXT_ONLY = {"volume.filepath", "merged.filepath", "library.filepath", "armature.name"} | {
     f"preferences.{name}" for name in PREFERENCES
 }
 """Blender itself stores these as text."""

@@ -25,7 +25,7 @@ from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import Job, queue
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.handles import add_handles
-from blender_primdiffusion.scene.human import armature_of, body_of, humans
+from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.ui.drawing import DATA
 
 ELSEWHERE = {"test_backend", "set_up_backend", "make_pose_assets", "copy_diagnostics"}
@@ -76,11 +76,11 @@ def _enter(obj: bpy.types.Object, mode: str) -> None:
 
 
 def armature_in_edit_mode(person) -> None:
-    _enter(armature_of(person), "EDIT")
+    _enter(person, "EDIT")
 
 
 def armature_in_pose_mode(person) -> None:
-    _enter(armature_of(person), "POSE")
+    _enter(person, "POSE")
 
 
 def body_in_edit_mode(person) -> None:
@@ -92,11 +92,11 @@ def body_being_painted(person) -> None:
 
 
 def armature_deleted(person) -> None:
-    bpy.data.objects.remove(armature_of(person))
+    bpy.data.objects.remove(person)
 
 
 def armature_data_deleted(person) -> None:
-    bpy.data.armatures.remove(armature_of(person).data)
+    bpy.data.armatures.remove(person.data)
 
 
 def volumes_deleted(_person) -> None:
@@ -108,7 +108,7 @@ def body_deleted(person) -> None:
 
 
 def bones_renamed(person) -> None:
-    armature_of(person).data.bones["spine2"].name = "Wirbelsäule"
+    person.data.bones["spine2"].name = "Wirbelsäule"
 
 
 def mark_damaged(person) -> None:
@@ -144,7 +144,7 @@ def excluded(person) -> None:
 
 def hidden(person) -> None:
     bpy.context.view_layer.layer_collection.children[person.name].hide_viewport = True
-    person.hide_viewport = True
+    bpy.data.collections[person.name].hide_viewport = True
 
 
 def data_missing(person) -> None:
@@ -173,11 +173,11 @@ def two_people(_person) -> None:
 
 def tiny_units(person) -> None:
     bpy.context.scene.unit_settings.scale_length = 0.01
-    armature_of(person).scale = (100, 100, 100)
+    person.scale = (100, 100, 100)
 
 
 def with_ik_handles(person) -> None:
-    add_handles(bpy.context, armature_of(person))
+    add_handles(bpy.context, person)
 
 
 SITUATIONS: list[Callable] = [
@@ -197,7 +197,7 @@ def anna(addon, tmp_path, monkeypatch):
     SOURCE.update(file=synthetic_shape.write(tmp_path / "human", 8))
     monkeypatch.setenv("FAKE_HUMAN", str(SOURCE["file"]))
     person = build_human(addon, SOURCE["file"], "Anna")
-    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.context.view_layer.objects.active = person
     bpy.context.scene.frame_end = 2
     bpy.ops.wm.save_mainfile()
     (tmp_path / "for the child").mkdir()

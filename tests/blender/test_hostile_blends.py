@@ -18,7 +18,7 @@ from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_
 from blender_primdiffusion.jobs.queue import chosen_checkpoint, queue
 from blender_primdiffusion.places import EXTENSION, preference
 from blender_primdiffusion.scene import payload
-from blender_primdiffusion.scene.human import armature_of, body_of
+from blender_primdiffusion.scene.human import body_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_folder
 from blender_primdiffusion.scene.pending import pending_of
 from blender_primdiffusion.ui.setup import known
@@ -60,7 +60,7 @@ def test_no_volume_is_read_or_written_in_a_folder_that_a_blend_names(pristine, w
     before = pristine.before()
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
-    bpy.context.view_layer.objects.active = armature_of(person())
+    bpy.context.view_layer.objects.active = person()
     WRITERS[writer]()
     assert len(paths_of(person())) == COUNT
     assert all(path.is_file() and path.is_relative_to(session_folder()) for path in paths_of(person()))
@@ -90,7 +90,7 @@ def another(data: bytes) -> bpy.types.Image:
 
 def damage(kind: str) -> None:
     """As a stranger's file has it."""
-    armature = armature_of(person())
+    armature = person()
     whole = armature[PAYLOAD].packed_file.data
     if kind in ("missing", "old"):
         del armature[PAYLOAD]
@@ -136,9 +136,9 @@ def test_a_packed_file_above_the_limit_is_not_read(pristine, monkeypatch):
 def test_a_whole_file_in_place_of_the_damaged_one_is_drawn_again(pristine):
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     whole = person_file(person()).read_bytes()
-    armature_of(person())[PAYLOAD] = another(b"noise")
+    person()[PAYLOAD] = another(b"noise")
     assert person_file(person()).read_bytes() == b"noise"
-    armature_of(person())[PAYLOAD] = another(whole)
+    person()[PAYLOAD] = another(whole)
     assert person_file(person()).read_bytes() == whole
     assert folder_of(person()).is_relative_to(session_folder())
 

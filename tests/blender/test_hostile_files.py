@@ -15,7 +15,6 @@ from exporting import write_person
 from scene_state import state
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of
 
 LONGEST_SENTENCE = 300
 READS = {
@@ -122,7 +121,7 @@ def fault(name: str, folder: Path, **properties: str) -> str:
 def anna(addon, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     person = build_human(addon, synthetic_shape.write(tmp_path / "human", 8), "Anna")
-    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.context.view_layer.objects.active = person
     bpy.context.scene.frame_end = 2
     bpy.ops.wm.save_mainfile()
     return tmp_path

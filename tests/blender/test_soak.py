@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 import psutil
 import pytest
+from human_files import remove_human
 from jobs_driven import drive
 
 import blender_primdiffusion
@@ -13,7 +14,7 @@ from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.picture_in_view import picture_in_view
 from blender_primdiffusion.jobs.pictures import so_far
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import humans, remove_human
+from blender_primdiffusion.scene.human import humans
 
 pytestmark = [pytest.mark.slow, pytest.mark.any_blender, pytest.mark.timeout(1800)]
 HUMANS, WARM_UP = 50, 10

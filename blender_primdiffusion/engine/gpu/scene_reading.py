@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.human import BODY_MARK
+from ...scene.human import BODY_MARK, human_of
 from ...scene.human_file import FileVersion, file_version, read_payload
 from ...scene.proxy import PROXY_MARK
 from ..boxes import Boxes, boxes_of
@@ -128,18 +128,18 @@ class SceneReader:
     def read(self, content: ViewContent, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> SceneReading:
         """What the space shows, whose content this is."""
         humans: dict[object, ShownHuman] = {}
-        candidates: list[tuple[bpy.types.Object, bpy.types.Collection, PosedHuman | Exception]] = []
-        bones, noted = [np.zeros((0, 2, 3))], {kind: set[bpy.types.Object]() for kind in content.types}
+        candidates: list[tuple[bpy.types.Object, bpy.types.Object, PosedHuman | Exception]] = []
+        bones, noted = [np.zeros((0, 2, 3))], {kind: set[bpy.types.Object | None]() for kind in content.types}
         errors, complete, end = [""], True, time.monotonic() + READING_S
-        for obj, armature, matrix, owner in human_armatures(_noting(visible_instances(depsgraph, space), noted)):
+        for obj, armature, matrix in human_armatures(_noting(visible_instances(depsgraph, space), noted)):
             if armature.show_in_front or armature.original.mode != "OBJECT":
                 bones.append(_bones(armature, matrix))
             try:
-                candidates.append((obj, owner, pose_of(armature, matrix, owner)))
+                candidates.append((obj, armature.original, pose_of(armature, matrix)))
             except (ValueError, OSError) as error:
-                candidates.append((obj, owner, error))
-        for number, (obj, owner, pose) in enumerate(candidates, 1):
-            shown = {kind for kind, found in noted.items() if found and not found.isdisjoint(owner.all_objects)}
+                candidates.append((obj, armature.original, error))
+        for number, (obj, person, pose) in enumerate(candidates, 1):
+            shown = {kind for kind, found in noted.items() if person in found}
             if "mesh" in shown or (content.by_volumes and "volume" in shown):
                 continue
             try:
@@ -173,15 +173,15 @@ def _key(pose: PosedHuman) -> object:
 
 
 def _noting(
-    instances: Iterable[bpy.types.DepsgraphObjectInstance], noted: dict[str, set[bpy.types.Object]]
+    instances: Iterable[bpy.types.DepsgraphObjectInstance], noted: dict[str, set[bpy.types.Object | None]]
 ) -> Iterator[bpy.types.DepsgraphObjectInstance]:
-    """The same instances; `noted`, by kind, gets what Blender may draw of humans: volumes, and as "mesh" their mesh
-    proxies and body meshes."""
+    """The same instances; `noted`, by kind, gets what Blender may draw of humans, by its volumes, or as
+    "mesh" by their mesh proxies and body meshes."""
     for instance in instances:
         obj = instance.object
         kind = "volume" if obj.type == "VOLUME" else "mesh" if PROXY_MARK in obj or BODY_MARK in obj else ""
         if kind in noted:
-            noted[kind].add(obj.original)
+            noted[kind].add(human_of(obj.original))
         yield instance
 
 

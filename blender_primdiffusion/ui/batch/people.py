@@ -17,7 +17,7 @@ from ...formats.regular_files import remove_file
 from ...scene.armature import keyframe_poses, pose_from_joint_rotations
 from ...scene.build import build_human
 from ...scene.cycles import frame_box, framing_distance, humans_extent, setup_cycles_preview
-from ...scene.human import armature_of, humans
+from ...scene.human import humans
 
 _SAMPLED = 24
 """Frames of a motion that determine the distance of the camera."""
@@ -30,13 +30,13 @@ class Movement:
     motion: Motion
     still: bool
 
-    def apply(self, context: bpy.types.Context, person: bpy.types.Collection) -> None:
+    def apply(self, context: bpy.types.Context, person: bpy.types.Object) -> None:
         """Pose the human, or key a motion from frame 1 on and set the scene to its length and rate."""
-        armature, motion = armature_of(person), self.motion
+        motion = self.motion
         if self.still:
-            pose_from_joint_rotations(armature, motion.rotations[0], np.zeros(3))
+            pose_from_joint_rotations(person, motion.rotations[0], np.zeros(3))
             return
-        keyframe_poses(armature, 1 + np.arange(len(motion)), motion.rotations, motion.translations, motion.name)
+        keyframe_poses(person, 1 + np.arange(len(motion)), motion.rotations, motion.translations, motion.name)
         scene = context.scene
         scene.frame_start, scene.frame_end = 1, len(motion)
         scene.render.fps, scene.render.fps_base = max(1, round(motion.fps)), max(1, round(motion.fps)) / motion.fps
@@ -65,23 +65,21 @@ def new_file() -> None:
     bpy.ops.wm.read_homefile(use_empty=True, use_factory_startup=True)
 
 
-def build_person(
-    context: bpy.types.Context, person: Path, name: str, movement: Movement | None
-) -> bpy.types.Collection:
+def build_person(context: bpy.types.Context, person: Path, name: str, movement: Movement | None) -> bpy.types.Object:
     """Build the human of a file in the open file, moved, with a camera and a transparent background."""
-    collection = build_human(context, person, name)
+    person = build_human(context, person, name)
     if movement is not None:
-        movement.apply(context, collection)
+        movement.apply(context, person)
     scene = context.scene
     setup_cycles_preview(scene, size=512, samples=4)
     scene.render.engine = ENGINE
     frame_box(scene.camera, moving_extent(scene), 0.0)
-    return collection
+    return person
 
 
 def moving_extent(scene: bpy.types.Scene) -> tuple[np.ndarray, np.ndarray]:
     """Corners of the box that contains all humans over the scene's frames, of which some are sampled."""
-    if not any(armature_of(person).animation_data for person in humans(scene)):
+    if not any(person.animation_data for person in humans(scene)):
         return humans_extent(scene)
     before, lows, highs = scene.frame_current, [], []
     for frame in np.unique(np.linspace(scene.frame_start, scene.frame_end, _SAMPLED).round().astype(int)):

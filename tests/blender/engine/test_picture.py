@@ -21,14 +21,13 @@ from engine_stage import (
     render_png,
     set_up_render,
 )
-from human_files import lose_data
+from human_files import lose_data, remove_human
 from human_stage import make_earlier
 from mathutils import Euler, Matrix
 from oracle import raised
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of, remove_human
 from blender_primdiffusion.scene.rest_human import read_human
 
 SIZE = (120, 90)
@@ -49,9 +48,7 @@ def stage(extension, saved_scene, backend, tmp_path):
     camera = set_up_render(scene, SIZE, (0.5, -3.0, 1.2), (math.radians(84), 0, math.radians(9)))
     scene.primdiffusion_render.step = STEP
     person = add_human(backend.folders[0])
-    return SimpleNamespace(
-        scene=scene, camera=camera, person=person, armature=armature_of(person), out=tmp_path / "picture.png"
-    )
+    return SimpleNamespace(scene=scene, camera=camera, person=person, armature=person, out=tmp_path / "picture.png")
 
 
 def placed(matrix, folder) -> np.ndarray:
@@ -220,11 +217,11 @@ def test_every_frame_of_an_animation_has_its_own_pose(stage, backend, tmp_path):
 
 def test_two_people_share_one_picture_and_the_hidden_are_left_out(stage, backend):
     second = add_human(backend.folders[1])
-    armature_of(second).location.x += 0.35
-    armature_of(second).location.y += 0.3
+    second.location.x += 0.35
+    second.location.y += 0.3
     bpy.context.view_layer.update()
     first = as_asked(backend.folders[0], stage.armature)
-    other = as_asked(backend.folders[1], armature_of(second))
+    other = as_asked(backend.folders[1], second)
     both = eight_bit(expected(stage, backend, [first, other])[0])
     assert_same(render_png(stage.out), both)
     layer = bpy.context.view_layer.layer_collection.children[second.name]
@@ -232,14 +229,14 @@ def test_two_people_share_one_picture_and_the_hidden_are_left_out(stage, backend
     alone = eight_bit(expected(stage, backend, [first])[0])
     assert_same(render_png(stage.out), alone)
     layer.exclude = False
-    armature_of(second).hide_render = True
+    second.hide_render = True
     assert_same(render_png(stage.out), alone)
 
 
 def test_an_instanced_human_renders_at_the_instance(stage, backend):
     instance = bpy.data.objects.new("again", None)
     stage.scene.collection.objects.link(instance)
-    instance.instance_type, instance.instance_collection = "COLLECTION", stage.person
+    instance.instance_type, instance.instance_collection = "COLLECTION", bpy.data.collections[stage.person.name]
     instance.location = (0.6, 0.2, 0.0)
     bpy.context.view_layer.update()
     here = as_asked(backend.folders[0], stage.armature)

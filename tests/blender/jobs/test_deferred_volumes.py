@@ -18,8 +18,9 @@ from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
-from blender_primdiffusion.scene.human import armature_of, humans, volumes_of
+from blender_primdiffusion.scene.human import humans, volumes_of
 from blender_primdiffusion.scene.pending import pending_of, pending_volumes, write_all_pending, write_pending
+from blender_primdiffusion.scene.surface import primitives_of
 from blender_primdiffusion.scene.volumes import person_memory
 
 ops = bpy.ops.primdiffusion
@@ -30,7 +31,7 @@ def test_the_human_stands_before_any_volume_is_written(person):
     assert pending_of(person).primitives == tuple(range(COUNT))
     assert len(volumes_of(person)) == COUNT
     assert person_file(person).is_file()
-    assert armature_of(person).visible_get()
+    assert person.visible_get()
 
 
 def test_the_files_written_later_are_those_that_would_be_written_at_once(person, tmp_path):
@@ -47,10 +48,10 @@ def test_hidden_volumes_cost_the_viewport_nothing_and_renders_have_them(person):
     graph = bpy.context.evaluated_depsgraph_get()
     assert not [instance for instance in graph.object_instances if instance.object.type == "VOLUME"]
     assert not any(isinstance(block, bpy.types.Volume) for block in graph.ids)
-    primitives = next(child for child in person.children if child.name.endswith("_primitives"))
+    primitives = primitives_of(person)
     assert primitives.hide_viewport
     assert not primitives.hide_render
-    assert armature_of(person).name in primitives.objects
+    assert person.name in primitives.objects
 
 
 def test_a_slice_is_as_long_as_the_drawing_before_it_within_limits(person, monkeypatch):
@@ -163,7 +164,7 @@ def test_background_mode_writes_at_once(addon):
     assert ops.generate(seed=5) == {"FINISHED"}
     (person,) = humans(bpy.context.scene)
     assert all(path.is_file() for path in paths_of(person))
-    assert person.children[0].hide_viewport
+    assert primitives_of(person).hide_viewport
 
 
 def test_the_memory_of_volumes_is_told_when_they_are_written(in_each_state):

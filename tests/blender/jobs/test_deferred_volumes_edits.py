@@ -7,12 +7,12 @@ import shutil
 import bpy
 import pytest
 from deferred_volumes_stage import advance, check_complete, on_disk, paths_of
+from human_files import copy_of, press_x
 from jobs_driven import drive
 
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.copies import duplicate_human
-from blender_primdiffusion.scene.human import armature_of, humans, volumes_of
+from blender_primdiffusion.scene.human import humans, volumes_of
 
 ops = bpy.ops.primdiffusion
 
@@ -30,7 +30,7 @@ def test_undo_redo_and_work_again(in_each_state):
 def test_a_deleted_human_is_not_written_on_and_comes_back_with_undo(in_each_state):
     before = on_disk()
     bpy.ops.ed.undo_push(message="stands")
-    ops.delete_human(human=in_each_state.name)
+    press_x(in_each_state)
     bpy.ops.ed.undo_push(message="deleted")
     assert not deferred_volumes.work(0.0)
     assert on_disk() == before
@@ -101,12 +101,11 @@ def test_an_edit_in_each_state_ends_with_the_volumes_of_the_edit(in_each_state):
 
 
 def test_a_duplicate_shares_what_is_still_to_be_written(in_each_state):
-    twin = duplicate_human(in_each_state)
-    assert armature_of(twin).name in twin.children[0].objects
+    twin = copy_of(in_each_state)
     advance("written")
     for person in (in_each_state, twin):
         check_complete(person)
-    assert all(obj.parent == armature_of(twin) for objects in volumes_of(twin).values() for obj in objects)
+    assert all(obj.parent == twin for objects in volumes_of(twin).values() for obj in objects)
 
 
 def test_what_failed_is_tried_again_when_the_file_is_opened(person, monkeypatch):

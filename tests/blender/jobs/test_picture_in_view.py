@@ -84,7 +84,7 @@ def test_the_picture_goes_when_the_human_stands(addon, redraws):
     queue.add(addon, GenerateJob(7, {"steps": 3}))
     drive()
     assert redraws == [True, False]
-    assert bpy.data.collections["Human"]
+    assert bpy.data.objects["Human"]
 
 
 def test_loading_a_file_and_unregistering_remove_the_picture(denoising):

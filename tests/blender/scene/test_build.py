@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
-from human_files import folder_of
+from human_files import folder_of, remove_human
 from human_stage import strong_pose
 from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
@@ -20,7 +20,7 @@ from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
-from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans, remove_human
+from blender_primdiffusion.scene.human import MARK, body_of, humans
 from blender_primdiffusion.scene.payload import forget_session_files, session_folder
 from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 
@@ -45,16 +45,14 @@ def person(saved_scene, tmp_path):
 
 def expected_matrices(collection, arrays, rotations, translation) -> np.ndarray:
     bpy.context.view_layer.update()
-    return world_from_model(armature_of(collection), arrays["vertices"]) @ blended_frames(
-        arrays, rotations, translation
-    )
+    return world_from_model(collection, arrays["vertices"]) @ blended_frames(arrays, rotations, translation)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_volumes_follow_linear_blend_skinning_to_a_hundredth_of_a_millimetre(person, seed):
     collection, arrays = person
     rotations, translation = strong_pose(seed)
-    armature = armature_of(collection)
+    armature = collection
     pose_from_joint_rotations(armature, rotations, translation)
     armature.location, armature.rotation_euler, armature.scale = (1, -2, 0.5), (0.4, -0.3, 2.0), (1.2, 1.2, 1.2)
     expected = expected_matrices(collection, arrays, rotations, translation)
@@ -73,7 +71,7 @@ def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
     swing[:, 1, 0], swing[:, 2, 0] = 0.5 * np.sin(frames), -0.5 * np.sin(frames)
     swing[:, 18, 1], swing[:, 16, 2] = 0.8 * np.cos(frames), -1.0
     rotations, translations = synthetic.axis_angle(swing), np.stack([0 * frames, 0 * frames, 0.1 * frames], -1)
-    keyframe_poses(armature_of(collection), frames, rotations, translations)
+    keyframe_poses(collection, frames, rotations, translations)
     for index in (0, 3, 7):
         bpy.context.scene.frame_set(int(frames[index]))
         expected = expected_matrices(collection, arrays, rotations[index], translations[index])
@@ -83,7 +81,7 @@ def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
 
 def test_soles_stand_on_the_floor_and_the_person_faces_minus_y(person):
     collection, arrays = person
-    armature = armature_of(collection)
+    armature = collection
     assert armature.matrix_world.translation.length == 0, "the origin is on the floor"
     feet = [vertex.co for vertex in body_of(collection).data.vertices]
     assert min(point.z for point in feet) == pytest.approx(0, abs=1e-6)
@@ -128,7 +126,7 @@ def test_provenance_and_overlaps_are_stored_on_the_collection(person):
 def test_saving_and_loading_keeps_volumes_and_pose(person, tmp_path):
     collection, arrays = person
     rotations, translation = strong_pose(1)
-    pose_from_joint_rotations(armature_of(collection), rotations, translation)
+    pose_from_joint_rotations(collection, rotations, translation)
     bpy.ops.wm.save_mainfile()
     forget_session_files()
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
@@ -144,7 +142,7 @@ def test_saving_and_loading_keeps_volumes_and_pose(person, tmp_path):
 
 def test_removal_takes_everything(person):
     collection, _ = person
-    keyframe_poses(armature_of(collection), np.array([1]), np.tile(np.eye(3), (1, 24, 1, 1)), np.zeros((1, 3)))
+    keyframe_poses(collection, np.array([1]), np.tile(np.eye(3), (1, 24, 1, 1)), np.zeros((1, 3)))
     remove_human(collection)
     left = datablocks()
     assert left.pop("materials") == ["PrimDiffusion Volume"]
@@ -185,4 +183,4 @@ def test_building_from_edit_mode_works(saved_scene, tmp_path):
     saved_scene.view_layer.objects.active = mesh
     bpy.ops.object.mode_set(mode="EDIT")
     collection = build_human(saved_scene, synthetic.write(tmp_path / "human", 8))
-    assert armature_of(collection).mode == "OBJECT"
+    assert collection.mode == "OBJECT"

@@ -17,7 +17,7 @@ from support import tensor_files
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import BETAS, MARK, armature_of, body_of, human_of, humans
+from blender_primdiffusion.scene.human import BETAS, MARK, body_of, human_of, humans, parts_of
 from blender_primdiffusion.scene.payload import state_of
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
@@ -61,10 +61,8 @@ def transforms(collection) -> dict[str, list]:
 @pytest.fixture
 def person(saved_scene, tmp_path):
     collection = build_human(saved_scene, synthetic_shape.write(tmp_path / "human", COUNT))
-    pose_from_joint_rotations(
-        armature_of(collection), synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3)))
-    )
-    armature_of(collection).location.x = 2.0
+    pose_from_joint_rotations(collection, synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3))))
+    collection.location.x = 2.0
     return collection
 
 
@@ -84,12 +82,12 @@ def test_an_edit_has_files_of_its_own_and_leaves_those_before(person, saved_scen
 
 
 def test_the_state_is_told_apart_by_what_it_holds(person, saved_scene, tmp_path):
-    before = state_of(armature_of(person))
+    before = state_of(person)
     replace(person, redyed(tmp_path, 3))
-    edited = state_of(armature_of(person))
+    edited = state_of(person)
     assert edited != before
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "second.blend"))
-    assert state_of(armature_of(person)) == edited
+    assert state_of(person) == edited
 
 
 def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_scene, tmp_path):
@@ -111,14 +109,14 @@ def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_sce
 
 def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved_scene, tmp_path):
     rotations = synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.5, (24, 3)))
-    before = [list(bone.rotation_quaternion) for bone in armature_of(person).pose.bones]
+    before = [list(bone.rotation_quaternion) for bone in person.pose.bones]
     objects = {o.name for o in bpy.data.objects}
     saved_scene.view_layer.objects.active = body_of(person)
     done = replace(person, reshaped(tmp_path, 3))
     assert done.reshaped
     assert {o.name for o in bpy.data.objects} == objects
     assert saved_scene.view_layer.objects.active == body_of(person)
-    armature = armature_of(person)
+    armature = person
     np.testing.assert_allclose([list(bone.rotation_quaternion) for bone in armature.pose.bones], before, atol=1e-6)
     arrays = edited_shape()
     body_of(person).hide_viewport = False  # hidden things are not evaluated
@@ -143,9 +141,9 @@ def test_undo_takes_another_shape_back(person, saved_scene, tmp_path):
 
 
 def test_a_shape_the_user_chose_stays_while_the_betas_do(person, saved_scene, tmp_path):
-    armature_of(person)[BETAS] = [2.0] * 10
+    person[BETAS] = [2.0] * 10
     replace(person, redyed(tmp_path, 3))
-    assert list(armature_of(person)[BETAS]) == [2.0] * 10
+    assert list(person[BETAS]) == [2.0] * 10
 
 
 def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person, saved_scene, tmp_path):
@@ -154,37 +152,38 @@ def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person, saved_scene
 
 
 def test_what_was_renamed_moved_or_deleted_by_hand_stays_so(person, saved_scene, tmp_path):
-    objects = sorted((o for o in person.all_objects if o.type == "VOLUME"), key=lambda o: o.name)
+    objects = sorted((o for o in parts_of(person) if o.type == "VOLUME"), key=lambda o: o.name)
     objects[3].name = "brooch"
     objects[4].location.z += 1
     height = objects[4].location.z
     bpy.data.objects.remove(objects[5])
     replace(person, redyed(tmp_path, 3, 4, 5))
-    assert sum(obj.type == "VOLUME" for obj in person.all_objects) == COUNT - 1
+    assert sum(obj.type == "VOLUME" for obj in parts_of(person)) == COUNT - 1
     assert bpy.data.objects["Human_prim_0004"].location.z == height
     assert "Human_prim_0005" not in bpy.data.objects
 
 
 def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person, saved_scene, tmp_path):
-    twin = bpy.data.collections.new("Twin")
-    saved_scene.scene.collection.children.link(twin)
-    twin[MARK] = person[MARK]
-    for obj in list(person.all_objects):
-        twin.objects.link(obj.copy())
-    before = {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"}
-    bones = [list(bone.head_local) for bone in armature_of(twin).data.bones]
+    twin = person.copy()
+    saved_scene.scene.collection.objects.link(twin)
+    for obj in person.children:
+        copy = obj.copy()
+        copy.parent = twin
+        saved_scene.scene.collection.objects.link(copy)
+    before = {o.name: o.data.filepath for o in twin.children if o.type == "VOLUME"}
+    bones = [list(bone.head_local) for bone in twin.data.bones]
     replace(person, reshaped(tmp_path, 3))
-    assert {o.name: o.data.filepath for o in twin.objects if o.type == "VOLUME"} == before
-    assert [list(bone.head_local) for bone in armature_of(twin).data.bones] == bones
+    assert {o.name: o.data.filepath for o in twin.children if o.type == "VOLUME"} == before
+    assert [list(bone.head_local) for bone in twin.data.bones] == bones
     assert first(twin)
 
 
 def test_every_part_of_a_human_leads_to_it_and_other_objects_do_not(person, saved_scene):
     hat = bpy.data.objects.new("hat", None)
-    hat.parent = armature_of(person)
+    hat.parent = person
     cube = bpy.data.objects.new("cube", None)
     for obj in (hat, cube):
         saved_scene.scene.collection.objects.link(obj)
-    assert {human_of(obj, saved_scene.scene) for obj in [*person.all_objects, hat]} == {person}
+    assert {human_of(obj, saved_scene.scene) for obj in [*parts_of(person), hat]} == {person}
     assert human_of(cube, saved_scene.scene) is None
     assert human_of(None, saved_scene.scene) is None

@@ -11,12 +11,12 @@ import pytest
 import synthetic
 from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.formats.requests import DENSITY_GAIN
-from human_files import folder_of, sequence_files, volume_path
+from human_files import copy_of, folder_of, sequence_files, volume_path
 from support.errors import refused
 
 from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.copies import duplicate_human
+from blender_primdiffusion.scene.human import parts_of
 from blender_primdiffusion.scene.material import (
     density_gain,
     person_material,
@@ -197,7 +197,7 @@ def test_a_gain_of_one_s_own_is_a_material_of_one_s_own(person, tmp_path):
 
 
 def test_a_duplicate_s_gain_is_its_own(person):
-    twin = duplicate_human(person)
+    twin = copy_of(person)
     set_density_gain(person, 2.0)
     set_density_gain(twin, 1.9)
     assert density_gain(person) == pytest.approx(2.0)
@@ -207,7 +207,7 @@ def test_a_duplicate_s_gain_is_its_own(person):
 
 def test_a_material_without_the_factor_is_rejected(person):
     other = bpy.data.materials.new("Smoke")
-    for obj in person.all_objects:
+    for obj in parts_of(person):
         if obj.type == "VOLUME":
             obj.data.materials[0] = other
     assert density_gain(person) is None

@@ -12,7 +12,7 @@ from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
-from blender_primdiffusion.scene.human import BODY_MARK, MARK, armature_of, body_of
+from blender_primdiffusion.scene.human import BODY_MARK, body_of, humans, is_human, parts_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD, forget_session_files, session_file, session_folder
 
 ops = bpy.ops.primdiffusion
@@ -26,11 +26,11 @@ def content(source):
 
 
 def held(person) -> tuple[bytes, bytes]:
-    armature = armature_of(person)
+    armature = person
     return tuple(armature[name].packed_file.data for name in (PAYLOAD, BODY))
 
 
-def reopened(path=None) -> bpy.types.Collection:
+def reopened(path=None) -> bpy.types.Object:
     """Anna, from the .blend alone."""
     path = path or bpy.data.filepath
     forget_session_files()
@@ -107,19 +107,20 @@ def test_a_library_override(person, content, tmp_path):
     with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
         wanted.collections = ["Anna"]
     bpy.context.scene.collection.children.link(wanted.collections[0])
-    override = wanted.collections[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    made = wanted.collections[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    override = next(filter(is_human, made.all_objects))
     assert held(override) == content
     bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
     reopened(tmp_path / "film.blend")
-    assert held(next(c for c in bpy.data.collections if MARK in c and c.library is None)) == content
+    assert held(next(one for one in humans(bpy.context.scene) if one.library is None)) == content
 
 
 @pytest.mark.parametrize("linked", [False, True], ids=["Shift-D", "Alt-D"])
 def test_blenders_duplicate_of_the_armature_shares_the_file_until_an_edit(person, content, linked):
-    armature_of(person).select_set(True)
+    person.select_set(True)
     bpy.ops.object.duplicate(linked=linked)
     twin = bpy.context.view_layer.objects.active
-    assert twin[PAYLOAD] == armature_of(person)[PAYLOAD]
+    assert twin[PAYLOAD] == person[PAYLOAD]
     assert session_file(twin) == person_file(person)
     ops.vary(human="Anna", seed=12)
     assert held(named())[0] != content[0]
@@ -128,12 +129,12 @@ def test_blenders_duplicate_of_the_armature_shares_the_file_until_an_edit(person
 
 def test_two_humans_of_the_same_body_hold_it_once(person, source):
     berta = build_posed(source, "Berta")
-    assert armature_of(berta)[BODY] == armature_of(person)[BODY]
+    assert berta[BODY] == person[BODY]
 
 
 def test_x_on_the_armature_and_undo(person, content):
     bpy.ops.ed.undo_push(message="before")
-    armature_of(person).select_set(True)
+    person.select_set(True)
     bpy.ops.object.delete()
     bpy.ops.ed.undo_push(message="deleted")
     assert not [obj for obj in bpy.data.objects if obj.type == "ARMATURE"]
@@ -143,7 +144,7 @@ def test_x_on_the_armature_and_undo(person, content):
 
 
 def test_unpacked_by_blender_the_file_is_the_same(person, content, tmp_path):
-    armature_of(person)[PAYLOAD].unpack(method="WRITE_LOCAL")
+    person[PAYLOAD].unpack(method="WRITE_LOCAL")
     (written,) = [path for path in tmp_path.rglob("*") if path.is_file() and path.parent.name == "textures"]
     assert written.read_bytes() == content[0]
 
@@ -158,7 +159,7 @@ def test_files_of_the_session_are_written_again_where_they_are_removed(person, c
 
 def test_a_human_of_an_earlier_version_is_named_in_one_sentence(person, capsys):
     lose_data(person)
-    for obj in person.all_objects:
+    for obj in parts_of(person):
         if obj.type == "VOLUME":
             obj.data.filepath = f"//shot_humans/Anna/0001/{obj.data.filepath[-13:]}"
     bpy.ops.wm.save_mainfile()

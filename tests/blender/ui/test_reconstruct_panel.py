@@ -16,7 +16,7 @@ from support.fake_child import request_of
 
 from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.human import humans, parts_of
 from blender_primdiffusion.scene.payload import session_folder
 from blender_primdiffusion.ui import reconstruct_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
@@ -39,7 +39,7 @@ def test_the_operator_builds_a_human_from_the_chosen_captures(addon, captures):
     asked = {"directory": f"{captures}/", "subject": "anna", "frame": 2, "views": 5, "by": "prior"}
     assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
     (person,) = humans(addon.scene)
-    assert sum(obj.type == "VOLUME" for obj in person.all_objects) == 8
+    assert sum(obj.type == "VOLUME" for obj in parts_of(person)) == 8
     sent = asked_of_the_child(person)
     assert Path(sent.pop("capture")) == captures
     assert Path(sent.pop("out_dir")).name.startswith("reconstruct_")
@@ -142,4 +142,4 @@ def test_the_real_child_makes_a_person_of_real_captures(real_child, tmp_path, mo
     about = json.loads(person["primdiffusion_human"])
     assert (about["reconstructed_from"], about["checkpoint"]) == ("person_000001", "tiny encoder")
     assert len(about["views"]) == 3
-    assert sum(obj.type == "VOLUME" for obj in person.all_objects) > 500
+    assert sum(obj.type == "VOLUME" for obj in parts_of(person)) > 500

@@ -17,7 +17,7 @@ from support.fake_child import FAILS, TAKES_LONG, request_of
 
 from blender_primdiffusion.backend.environment import BackendNotFound
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, NO_BACKEND, UNUSABLE
-from blender_primdiffusion.scene.human import armature_of, humans
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.batch import execute
 from blender_primdiffusion.ui.batch.running import ask
 
@@ -108,7 +108,7 @@ def test_a_blend_holds_the_person_wherever_it_is_moved(out, tmp_path):
     assert person.name == "person_000007"
     assert person_file(person).read_bytes() == (moved / "person.human.safetensors").read_bytes()
     assert (scene.frame_start, scene.frame_end, scene.render.engine) == (1, 3, "PRIMDIFFUSION")
-    bone = armature_of(person).pose.bones["left_shoulder"]
+    bone = person.pose.bones["left_shoulder"]
     scene.frame_set(3)
     assert bone.rotation_quaternion.angle == pytest.approx(0.5, abs=1e-3)
 
