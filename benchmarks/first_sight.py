@@ -149,26 +149,26 @@ def children_seconds() -> float:
 def one_human(person: Path) -> dict[str, float]:
     trim()
     memory = resident_mb()
-    found: list[bpy.types.Collection] = []
+    found: list[bpy.types.Object] = []
     figures = {"stand_seconds": seconds(lambda: found.append(enter(person)))}
     figures["longest_step_seconds"] = figures["stand_seconds"]
     trim()
     figures["person_memory_mb"] = resident_mb() - memory
     figures["person_frame_ms"] = frame_ms(found[0])
-    figures["outliner_rows"] = outliner_rows(found[0])
+    figures["outliner_rows"] = outliner_rows(found[0].users_collection[0])
     figures["volumes_seconds"] = seconds(write_all_pending)
     return figures
 
 
-def enter(person: Path) -> bpy.types.Collection:
+def enter(person: Path) -> bpy.types.Object:
     """What blocks the window."""
     with mock.patch.object(build, "volumes_may_wait", return_value=True):
-        collection = build.build_human(bpy.context, person)
-    stand_at_cursor(bpy.context, collection)
+        human = build.build_human(bpy.context, person)
+    stand_at_cursor(bpy.context, human)
     bpy.context.view_layer.update()
-    select_human(bpy.context, collection)
+    select_human(bpy.context, human)
     bpy.ops.ed.undo_push(message="Generate Human")
-    return collection
+    return human
 
 
 def seconds(call: Callable[[], object]) -> float:

@@ -20,7 +20,7 @@ COUNT = 12
 STATES = ("absent", "half", "written")
 
 
-def generated(seed: int = 7) -> bpy.types.Collection:
+def generated(seed: int = 7) -> bpy.types.Object:
     queue.add(bpy.context, GenerateJob(seed, {"steps": 1}))
     drive()
     return humans(bpy.context.scene)[-1]
@@ -40,7 +40,7 @@ def on_disk() -> list[Path]:
     return sorted(session_folder().rglob("prim_*.vdb"))
 
 
-def check_complete(person: bpy.types.Collection) -> None:
+def check_complete(person: bpy.types.Object) -> None:
     """Every volume of the human has its file, and nothing is left to write."""
     paths = paths_of(person)
     assert len(paths) == COUNT

@@ -61,7 +61,7 @@ class Oracle:
         self._process.wait()
 
 
-def add_human(folder: Path) -> bpy.types.Collection:
+def add_human(folder: Path) -> bpy.types.Object:
     """Build the human of `Oracle.make`, with few of its volumes, so that it is quick."""
     whole, few = read_human(folder / "person.human.safetensors"), slice(PRIMITIVES_IN_BLENDER)
     fields = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")

@@ -33,7 +33,7 @@ def person(addon, tmp_path):
     return build_human(addon, synthetic_shape.write(tmp_path / "human", 6), "Änne")
 
 
-def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Job]:
+def jobs_about(person: bpy.types.Object, folder: Path) -> list[Job]:
     target, moment, context = HumanTarget.of(person), Moment.now(person), bpy.context
     return [
         VaryJob.of(person, {"steps": 3, "amount": 0.5, "seed": 3}),

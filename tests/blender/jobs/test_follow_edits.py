@@ -75,7 +75,7 @@ def check_whole(person, count: int = COUNT) -> None:
     assert not list(folder_of(person).glob(".*.partial*"))
 
 
-def current() -> bpy.types.Collection:
+def current() -> bpy.types.Object:
     return humans(bpy.context.scene)[0]
 
 

@@ -20,7 +20,7 @@ from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint
 from blender_primdiffusion.scene.build import attach_volumes, build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
-from blender_primdiffusion.scene.human import MARK, body_of, humans
+from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
 from blender_primdiffusion.scene.payload import forget_session_files, session_folder
 from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 
@@ -64,7 +64,7 @@ def test_volumes_follow_linear_blend_skinning_to_a_hundredth_of_a_millimetre(per
 def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
     arrays = synthetic.arrays(1024)
     collection = build_human(saved_scene, synthetic.write(tmp_path / "human", 1024))
-    assert sum(o.type == "VOLUME" for o in collection.all_objects) == 1024
+    assert sum(o.type == "VOLUME" for o in parts_of(collection)) == 1024
     assert len(list(folder_of(collection).glob("prim_*.vdb"))) == 1024
     frames = np.arange(1, 9)
     swing = np.zeros((8, 24, 3))
@@ -95,7 +95,7 @@ def test_soles_stand_on_the_floor_and_the_person_faces_minus_y(person):
 def test_a_volume_covers_its_box_in_the_world(person):
     collection, arrays = person
     bpy.context.view_layer.update()
-    volume = next(o for o in collection.all_objects if o.type == "VOLUME" and o.name.endswith("prim_0007"))
+    volume = next(o for o in parts_of(collection) if o.type == "VOLUME" and o.name.endswith("prim_0007"))
     corners = np.array([volume.matrix_world @ Vector(corner) for corner in volume.bound_box])
     half = arrays["half_extent"][7]
     edge = half * 8 / 7  # half a voxel beyond the centres of the outermost

@@ -50,12 +50,12 @@ def first(person) -> bool:
 
 
 def paths(collection) -> dict[str, str]:
-    return {o.name: o.data.filepath for o in collection.all_objects if o.type == "VOLUME"}
+    return {o.name: o.data.filepath for o in parts_of(collection) if o.type == "VOLUME"}
 
 
 def transforms(collection) -> dict[str, list]:
     bpy.context.view_layer.update()
-    return {o.name: [list(row) for row in o.matrix_world] for o in collection.all_objects}
+    return {o.name: [list(row) for row in o.matrix_world] for o in parts_of(collection)}
 
 
 @pytest.fixture
@@ -184,6 +184,6 @@ def test_every_part_of_a_human_leads_to_it_and_other_objects_do_not(person, save
     cube = bpy.data.objects.new("cube", None)
     for obj in (hat, cube):
         saved_scene.scene.collection.objects.link(obj)
-    assert {human_of(obj, saved_scene.scene) for obj in [*parts_of(person), hat]} == {person}
-    assert human_of(cube, saved_scene.scene) is None
-    assert human_of(None, saved_scene.scene) is None
+    assert {human_of(obj) for obj in [*parts_of(person), hat]} == {person}
+    assert human_of(cube) is None
+    assert human_of(None) is None

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
+from human_files import copy_of
 from mathutils import Matrix, Vector
 from oracle import Z_UP
 

@@ -58,7 +58,7 @@ def test_grids_of_people_who_are_shown_are_given_back_and_read_again(saved_scene
     assert _boxes(person) == boxes
 
 
-def _boxes(person: bpy.types.Collection) -> dict[str, list[tuple[float, ...]]]:
+def _boxes(person: bpy.types.Object) -> dict[str, list[tuple[float, ...]]]:
     graph = bpy.context.evaluated_depsgraph_get()
     volumes = [obj for obj in parts_of(person) if obj.type == "VOLUME"]
     return {obj.name: [tuple(corner) for corner in obj.evaluated_get(graph).bound_box] for obj in volumes}

@@ -46,7 +46,7 @@ def chosen(addon, picture, monkeypatch):
     return addon
 
 
-def a_human() -> bpy.types.Collection:
+def a_human() -> bpy.types.Object:
     bpy.ops.primdiffusion.generate(seed=100)
     return humans(bpy.context.scene)[0]
 

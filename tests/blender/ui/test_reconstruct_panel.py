@@ -31,7 +31,7 @@ def captures(tmp_path) -> Path:
     return tmp_path / "captures"
 
 
-def asked_of_the_child(person: bpy.types.Collection) -> dict:
+def asked_of_the_child(person: bpy.types.Object) -> dict:
     return request_of(person_file(person))
 
 
