@@ -162,7 +162,7 @@ def _too_close(extent: NDArray, others: NDArray) -> bool:
 
 def _others(scene: bpy.types.Scene, but: bpy.types.Object | None = None) -> NDArray[np.float64]:
     """`_extent` [N, 2, 3] of the scene's humans except `but`, where they have bones."""
-    found = [obj for human in humans(scene) if human != but for obj in human.objects if obj.type == "ARMATURE"]
+    found = [person for person in humans(scene) if person != but]
     return np.array([_extent(armature) for armature in found if armature.data.bones]).reshape(-1, 2, 3)
 
 

@@ -142,7 +142,7 @@ def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
     assert drawn() == {"primdiffusion.show_proxy": "Show Mesh in Viewport"}
     OPERATORS.show_proxy(shown="REMOVED")
     assert drawn() == {"primdiffusion.add_proxy": "As Mesh"}
-    bpy.context.scene.collection.children.unlink(anna)
+    bpy.context.scene.collection.children.unlink(bpy.data.collections[anna.name])
     assert drawn() == {}
 
 
