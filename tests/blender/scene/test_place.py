@@ -18,7 +18,6 @@ from blender_primdiffusion.scene.place import (
     _thinned,
     next_place,
     stand_at_cursor,
-    stand_beside_others,
 )
 
 FRONT, BACK = Vector((8.0, -16.0, 9.0)), Vector((8.0, 16.0, 9.0))
@@ -160,15 +159,6 @@ def test_a_human_within_a_closed_solid_is_moved_out_if_the_eye_is_outside(empty_
 def test_where_nothing_within_reach_is_free_a_human_stands_at_the_cursor(empty_scene):
     bpy.ops.mesh.primitive_plane_add(size=10 * REACH_M, location=(0, 0, 1))
     assert place() == [0, 0, 0]
-
-
-def test_a_duplicate_is_clear_of_solid_objects_along_the_row(saved_scene, source):
-    collection = build_human(saved_scene, source)
-    bpy.ops.mesh.primitive_cube_add(size=0.3, location=(0, 0, 1))
-    stand_beside_others(saved_scene, collection)
-    bpy.context.view_layer.update()
-    extent = _extent(collection)
-    assert apart(extent, ((-0.15, -0.15), (0.15, 0.15))) >= GAP_M - 1e-5
 
 
 def test_a_box_meets_a_triangle_where_no_plane_is_between_them():
