@@ -133,8 +133,8 @@ class AddProxyJob(ProxyJob):
 
     def finish(self, _context: bpy.types.Context, result: ProxyAnswer, _folder: Path) -> str:
         person = self.target.found()
-        proxy = self.built(person, result)
         earlier = proxy_of(person)
+        proxy = self.built(person, result)
         if earlier is not None:
             remove_proxy(earlier)
         link_part(person, proxy)

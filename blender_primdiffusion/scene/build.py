@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
 from .armature import build_armature
-from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, in_viewport, volumes_may_wait
+from .attachment import ATTACHMENT, IN_VIEWPORT, MODES, VOLUMES_IN_VIEWPORT, in_viewport, volumes_may_wait
 from .convention import frames_to_blender, points_to_blender
 from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, volume_name, volumes_of
 from .material import volume_material
@@ -68,6 +68,7 @@ def build_missing_parts(person: bpy.types.Object) -> None:
     """
     model, betas = shape_model_of(person), betas_of(person)
     rest = model.rest(betas)
+    person[ATTACHMENT] = MODES[0]
     with _no_data_left_on_failure():
         collection = min(person.users_collection, key=lambda collection: collection.hide_viewport)
         if body_of(person) is None:

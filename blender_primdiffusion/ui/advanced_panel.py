@@ -27,7 +27,7 @@ from ..scene.human import humans, parts_of, provenance_of
 from ..scene.material import density_gain, set_density_gain
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import proxy_of
-from ..scene.volumes import person_memory
+from ..scene.volumes import Memory, person_memory
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend
@@ -313,7 +313,10 @@ def details(person: bpy.types.Object) -> list[tuple[str, str]]:
             lines.append((f"Edit: {as_shown(edit.get('edit', '?'))}", as_shown(", ".join(rest))))
     del lines[_MOST_LINES:]
     volumes = [obj for obj in parts_of(person) if obj.type == "VOLUME"]
-    memory = person_memory(person)
+    try:
+        memory = person_memory(person)
+    except (ValueError, OSError):  # the panel Human says why
+        memory = Memory(0, 0)
     try:
         most = str(current_overlap(person))
     except ValueError:  # changed by hand

@@ -99,10 +99,12 @@ def build(stage: Stage) -> None:
     armature.animation_data_create().action = bpy.data.actions.new("Walk")
     mesh = bpy.data.objects.new("Anna_proxy", body_of(person).data.copy())
     mesh[proxy.PROXY_MARK] = json.dumps({"file": "person.human.safetensors", "betas": [0.0] * 10})
+    mesh.parent = person
     link_part(person, mesh)
     whole = bpy.data.objects.new("Anna_merged", bpy.data.volumes.new("Anna_merged"))
     whole[merged.MARK] = json.dumps({"poses": ["0"], "voxel": 0.01, "start": 0})
     whole.data.filepath = str(stage.shipped / "merged_0123456789ab.vdb")
+    whole.parent = person
     link_part(person, whole)
     (stage.shipped / "merged_0123456789ab.vdb").write_bytes(b"merged")
     (stage.shipped / LINK).symlink_to(os.path.relpath(stage.users, stage.shipped))

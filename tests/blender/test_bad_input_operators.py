@@ -22,6 +22,7 @@ from shown_words import ways
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.parts import complete
 from blender_primdiffusion.jobs.queue import Job, queue
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.handles import add_handles
@@ -255,6 +256,7 @@ def test_every_operator_works_or_reports_what_is_wrong(anna, situation, monkeypa
         if again:
             bpy.ops.wm.open_mainfile(filepath=str(anna / "shot.blend"))
             situation(humans(bpy.context.scene)[0])
+            complete()  # operators do it first
         before = state()
         wrong = fault(name, properties)
         again = before != state()

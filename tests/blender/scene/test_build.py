@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
-from human_files import folder_of, remove_human
+from human_files import folder_of
 from human_stage import strong_pose
 from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
@@ -138,15 +138,6 @@ def test_saving_and_loading_keeps_volumes_and_pose(person, tmp_path):
     for volume in bpy.data.volumes:
         assert volume.grids.load(), volume.grids.error_message
         assert {grid.name for grid in volume.grids} == {"density", "Cd"}
-
-
-def test_removal_takes_everything(person):
-    collection, _ = person
-    keyframe_poses(collection, np.array([1]), np.tile(np.eye(3), (1, 24, 1, 1)), np.zeros((1, 3)))
-    remove_human(collection)
-    left = datablocks()
-    assert left.pop("materials") == ["PrimDiffusion Volume"]
-    assert not any(left.values())
 
 
 @pytest.mark.parametrize("damage", ["truncated", "NaN"])

@@ -131,7 +131,8 @@ def test_hidden_humans_are_not_drawn(people):
 
 def test_an_instance_is_drawn_and_stands_for_its_human(people):
     empty = bpy.data.objects.new("Instance", None)
-    empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", people.anna, (3, 0, 0)
+    empty.instance_type, empty.instance_collection = "COLLECTION", bpy.data.collections["Anna"]
+    empty.location = (3, 0, 0)
     bpy.context.scene.collection.objects.link(empty)
     reading = read(people.overlay)
     assert names(reading) == ["Anna", "Bert", "Instance"]
