@@ -70,6 +70,8 @@ def build_missing_parts(person: bpy.types.Object) -> None:
     rest = model.rest(betas)
     person[ATTACHMENT] = MODES[0]
     with _no_data_left_on_failure():
+        for collection in _with_volumes_of_others(person):
+            collection.objects.unlink(person)
         collection = min(person.users_collection, key=lambda collection: collection.hide_viewport)
         if body_of(person) is None:
             _build_body(person, collection, model, rest)
@@ -108,6 +110,12 @@ def _build_volumes(person: bpy.types.Object, collection: bpy.types.Collection, m
         model.primitive_weights(),
         volume_material(),
     )
+
+
+def _with_volumes_of_others(person: bpy.types.Object) -> list[bpy.types.Collection]:
+    """The collections in which Blender has put a copy because the copied human was there, beside its volumes."""
+    found = [one for one in person.users_collection if any(obj.type == "VOLUME" for obj in one.objects)]
+    return found if len(found) < len(person.users_collection) else []
 
 
 def floor_below(vertices: NDArray) -> NDArray[np.float64]:
