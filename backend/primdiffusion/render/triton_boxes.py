@@ -211,6 +211,9 @@ def place_boxes(
     shear_off = tl.maximum(shear_off, tl.abs(_dot(xx, xy, xz, zx, zy, zz)))
     shear_off = tl.maximum(shear_off, tl.abs(_dot(yx, yy, yz, zx, zy, zz)))
     size_sum = tl.abs(px) + tl.abs(py) + tl.abs(pz) + tl.abs(h0_single) + tl.abs(h1_single) + tl.abs(h2_single)
+    # `maximum` of a device drops NaN, sums keep it.
+    size_sum += tl.abs(xx) + tl.abs(xy) + tl.abs(xz) + tl.abs(yx) + tl.abs(yy) + tl.abs(yz)
+    size_sum += tl.abs(zx) + tl.abs(zy) + tl.abs(zz)
     sound = (shear_off <= ORTHOGONAL) & (size_sum < float("inf"))
     if tl.min((sound | (here == 0)).to(tl.int32), 0) == 0:
         tl.atomic_or(totals, 2)
