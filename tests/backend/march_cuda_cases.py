@@ -398,22 +398,24 @@ def test_a_scene_that_grows_tenfold_between_two_calls_is_drawn_as_if_it_were_the
     first = bits(grown(small))
     needed = dict(cuda_scene._plans)
     monkeypatch.setattr(cuda_scene, "_plans", {})
-    before = bits(small)
+    before = draw(small, camera, settings, shapes=SMALL_TILES)
     ((kind, plan),) = cuda_scene._plans.items()
     assert needed[kind].tiles >= 6 * plan.tiles
     assert all(torch.equal(a, b) for a, b in zip(first, bits(grown(small)), strict=True))
     assert cuda_scene._plans == needed
-    assert all(torch.equal(a, b) for a, b in zip(before, bits(small), strict=True))
+    assert torch.equal(draw(small, camera, settings, shapes=SMALL_TILES).rgb, before.rgb)
 
 
 @pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
 def test_a_prepared_scene_draws_the_bits_of_the_marcher_for_every_camera_size_and_change(settings, no_plans):
-    boxes = single(batch(mixed_sizes(6, 41, 60.0)))
+    boxes = single(batch(mixed_sizes(6 // BOXES, 41, 60.0)))
     boxes = dataclasses.replace(boxes, half_extent=boxes.half_extent * 0.5)
     marcher = Marcher(boxes, settings, SMALL_TILES)
     views = [camera_at((x, 0.1, 0.6), fov=0.5, width=16, height=12) for x in (0.2, -0.3, 0.1, 0.0, 0.3)]
     views += [camera_at((0.2, 0.1, 0.6), fov=0.5, width=11, height=7)] * 3 + views[:2]
     for number, view in enumerate(views):
+        if INTERPRETED and number not in (0, 1, 3, 5):
+            continue  # nothing is recorded
         if number in (3, 8):
             boxes.half_extent.mul_(3.0)
             boxes.rgb.mul_(0.9)
@@ -469,6 +471,7 @@ def step_of(settings: MarchSettings, target: Tensor):
     return step
 
 
+@pytest.mark.skipif(INTERPRETED, reason="nothing is recorded on processors")
 @pytest.mark.parametrize("settings", [ROUGH, IN_ORDER])
 def test_gradients_are_the_same_bits_when_recorded_and_again_when_the_scene_outgrows_the_recording(settings, no_plans):
     boxes, camera = single(batch(mixed_sizes(6, 43, 60.0))), camera_at((0.2, 0.1, 0.9), fov=0.6, width=16, height=12)
@@ -482,7 +485,7 @@ def test_gradients_are_the_same_bits_when_recorded_and_again_when_the_scene_outg
 
 def test_what_is_recorded_uses_the_last_plan_and_says_whether_it_fitted(no_plans):
     """Without a graph: what a recording would launch, with room left over, and with too little of it."""
-    boxes, camera = single(batch(mixed_sizes(6, 43, 60.0))), camera_at((0.2, 0.1, 0.9), fov=0.6, width=16, height=12)
+    boxes, camera = single(batch(mixed_sizes(3, 43, 60.0))), camera_at((0.2, 0.1, 0.9), fov=0.6, width=16, height=12)
     step = step_of(ROUGH, torch.full((1, 12, 16, 3), 0.3, device=DEVICE))
     small, large = ([*vars(grown(boxes, f)).values(), *vars(single(batch(camera))).values()][:7] for f in (0.2, 1.5))
     results, found = [], []
