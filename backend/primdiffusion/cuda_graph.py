@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Sequence
 from contextvars import ContextVar
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -35,6 +35,11 @@ def expect(numbers: Tensor, fits: Fits) -> None:
     expected = _expected.get()
     assert expected is not None
     expected.append((numbers, fits))
+
+
+def copy_all(targets: Sequence[Tensor], sources: Sequence[Tensor]) -> None:
+    """Copy tensors of the same shapes, in one launch if they are of one dtype."""
+    torch._foreach_copy_(list(targets), list(sources))  # pyright: ignore[reportPrivateImportUsage]
 
 
 def record(function: Callable[[], Result]) -> tuple[torch.cuda.CUDAGraph, Result]:
@@ -71,7 +76,7 @@ class Reading:
                 self._host.copy_(numbers, non_blocking=True)
                 self._done = stream.record_event()
 
-    def wait(self) -> list[int]:
+    def wait(self) -> list[Any]:
         """Return the numbers."""
         if self._done is not None:
             self._done.synchronize()
@@ -139,7 +144,7 @@ class _Recording:
     @torch.no_grad()
     def replay(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...] | None:
         """Repeat for these inputs; None if that is not what the function expects."""
-        torch._foreach_copy_(self._inputs, list(inputs))
+        copy_all(self._inputs, inputs)
         self._graph.replay()
         if self._numbers is not None:
             found = Reading(self._numbers).wait()

@@ -41,7 +41,8 @@ class Marcher:
         self.settings, self.shapes, self.device = settings, shapes, position.device
         with torch.inference_mode(False):
             self.geometry = [torch.empty_like(getattr(primitives, name)).contiguous() for name in GEOMETRY]
-            self.packed = Packed.room(*position.shape[:2], self.device)
+            people, boxes = position.shape[:2]
+            self.packed = Packed.room(people, boxes, self.device)
         self._sizes: dict[tuple, _Size] = {}
         self.show(primitives)
 
@@ -51,7 +52,7 @@ class Marcher:
         self.primitives = primitives
         self._versions = _versions(primitives)
         with cuda_scene.on_device(self.device):
-            torch._foreach_copy_(self.geometry, [getattr(primitives, name) for name in GEOMETRY])
+            cuda_graph.copy_all(self.geometry, [getattr(primitives, name) for name in GEOMETRY])
             self.packed.pack(primitives.rgb.contiguous(), primitives.density.contiguous())
 
     @torch.no_grad()
@@ -99,13 +100,14 @@ class _Size:
         views, height, width = self._flat
         rays = views * height * width
         rgb = planes[:3].view(-1)[: 3 * rays].view(*self._flat, 3)
-        return rgb, *(plane[:rays].view(self._flat) for plane in planes[3:])
+        alpha, depth, first_hit = (plane[:rays].view(self._flat) for plane in planes[3:])
+        return rgb, alpha, depth, first_hit
 
     def draw(self, camera: Camera) -> Rendering:
         """Draw what the marcher shows."""
         marcher, record = self._marcher, cuda_graph.usable(self._marcher.device)
         inputs = [camera.intrinsics, camera.world_to_camera]
-        torch._foreach_copy_([self._camera.intrinsics, self._camera.world_to_camera], inputs)
+        cuda_graph.copy_all([self._camera.intrinsics, self._camera.world_to_camera], inputs)
         scene = Scene(marcher.primitives, self._camera, marcher.settings, None, marcher.shapes, keep=False)
 
         def place() -> Placed:
