@@ -34,7 +34,7 @@ from ..scene.human_file import (
     with_motion,
     write_tensors,
 )
-from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
+from ..scene.merged import merged_of, read_grid, write_grid
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
@@ -268,7 +268,7 @@ class ExportVdbSequenceJob(Job):
         written = []
         for index, grid in enumerate(result.files):
             name = f"{self.stem}_{self.first + index:04d}.vdb"
-            write_grid(_for_other_programs(read_grid(grid)), folder / name)
+            write_grid(read_grid(grid), folder / name)
             remove_file(grid, grid.parent)
             written.append(folder / name)
         size = sum(path.stat().st_size for path in written) / 1e6
@@ -348,12 +348,6 @@ def put(source: Path, target: Path) -> None:
     """Copy a finished file to its destination, where it appears whole. Raises OSError."""
     with written_whole(target) as unfinished:
         shutil.copyfile(source, unfinished)
-
-
-def _for_other_programs(grid: MergedGrid) -> MergedGrid:
-    """Undo the half voxel by which `write_grid` moves grids for old versions of Cycles."""
-    shift = 0.5 * grid.voxel if bpy.app.version < (5, 0) else 0.0
-    return dataclasses.replace(grid, origin=grid.origin + shift)
 
 
 def _move(armature: bpy.types.Object, motion: HumanMotion) -> None:

@@ -1,7 +1,7 @@
 """SMPL's skeleton as a Blender armature; poses given as SMPL joint rotations, and keyframes of many; and the limbs that
 IK handles move, with the bones that `handles` adds for them.
 
-Actions have one layer, strip and slot, the same in Blender 4.5 to 5.2.
+Actions have one layer, strip and slot, the same in Blender 5.0 to 5.3.
 """
 
 from __future__ import annotations

@@ -21,7 +21,6 @@ from .human import MARK, PERSON_FILE, PRIMITIVE_VDB, is_own, state_folder, volum
 from .rest_human import read_human
 from .volumes import format_of, is_readable, readable_format, reload_volume, write_volume
 
-_WRITTEN_AS = (5, 0, 0)
 """The version of Blender by which grids of a newer format are placed: what older ones cannot read came later."""
 
 
@@ -96,12 +95,11 @@ def write_pending(pending: PendingVolumes) -> Generator[None, None, None]:
     grids = human.grids()
     yield
     remove_abandoned(folder)
-    version = bpy.app.version if pending.newer is None else _WRITTEN_AS
     for k in pending.primitives:
         path = folder / volume_name(k)
         try:
             if not is_readable(path):
-                write_volume(grids, k, version, path)
+                write_volume(grids, k, path)
         except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
             raise write_error(folder, error) from error
         yield

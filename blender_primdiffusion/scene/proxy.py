@@ -182,8 +182,6 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
         image.pack()
     image.filepath_raw = f"//{file}"  # `filepath` would look for the file at once
     material = bpy.data.materials.new(name)
-    if bpy.app.version < (5, 0):
-        material.use_nodes = True  # always true, and deprecated, since 5.0
     nodes = material.node_tree.nodes
     shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
     picture = nodes.new("ShaderNodeTexImage")

@@ -96,7 +96,7 @@ def prepare(
                 copy_file(person.with_name(BODY_FILE), folder / BODY_FILE, folder)
             for number, k in enumerate(which):
                 yield number / len(which)
-                write_volume(grids, k, bpy.app.version, folder / volume_name(k))
+                write_volume(grids, k, folder / volume_name(k))
         except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
             raise write_error(home, error) from error
         undone.pop_all()

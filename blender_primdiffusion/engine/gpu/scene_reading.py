@@ -187,7 +187,6 @@ def _noting(
 
 def _bones(armature: bpy.types.Object, matrix: NDArray) -> NDArray[np.float64]:
     """Ends [N, 2, 3] of the bones that are not hidden, in Blender's world."""
-    hidden = "hide" if bpy.app.version >= (5, 0) else "bone.hide"
-    shown = [bone for bone in armature.pose.bones if not bone.path_resolve(hidden)]
+    shown = [bone for bone in armature.pose.bones if not bone.hide]
     ends = np.array([(bone.head, bone.tail) for bone in shown], np.float64).reshape(-1, 2, 3)
     return ends @ matrix[:3, :3].T + matrix[:3, 3]

@@ -220,7 +220,7 @@ def test_bones_in_front_stay_visible_unless_hidden(people):
     bones = read(people.overlay).bones
     assert bones.shape == (24, 2, 3)
     assert np.abs(bones[:, 0] - head).sum(1).min() < 1e-5
-    (bone if bpy.app.version >= (5, 0) else bone.bone).hide = True
+    bone.hide = True
     bones = read(people.overlay).bones
     assert bones.shape == (23, 2, 3)
 
