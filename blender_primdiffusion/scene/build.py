@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
 from .armature import build_armature
-from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT
+from .attachment import ATTACHMENT, IN_VIEWPORT, VOLUMES_IN_VIEWPORT
 from .convention import frames_to_blender, points_to_blender
 from .human import BETAS, BODY_MARK, HOME, MARK, ORIGIN, stored_path, volume_name
 from .material import volume_material
+from .splats import SPLATS_AVAILABLE, build_splats
 from .stand_in import build_stand_in
 from .states import NAME_LENGTH, PreparedHuman, prepare_now
 
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
-_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
+_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials", "pointclouds")
 
 
 def build_human(context: bpy.types.Context, person: str | Path, name: str = "Human") -> bpy.types.Collection:
@@ -35,7 +36,8 @@ def build_human(context: bpy.types.Context, person: str | Path, name: str = "Hum
 
 
 def build_prepared(context: bpy.types.Context, prepared: PreparedHuman, name: str = "Human") -> bpy.types.Collection:
-    """Build a human whose files are there: armature, hidden body mesh and a volume for every primitive.
+    """Build a human whose files are there: armature, hidden body mesh, a volume for every primitive and, in
+    Blender 5.3 and newer, splats, which then show it.
 
     The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
     space, the backend's axes are turned z up and the body is raised by ORIGIN. Raises ValueError, and then leaves
@@ -78,6 +80,11 @@ def _build(context: bpy.types.Context, prepared: PreparedHuman, name: str) -> bp
             model.primitive_weights(),
             volume_material(),
         )
+        if SPLATS_AVAILABLE:
+            for part in build_splats(label, armature, body, human):
+                collection.objects.link(part)
+            collection[ATTACHMENT] = "SPLATS"
+            primitives.hide_viewport = primitives.hide_render = True
         collection[MARK] = prepared.provenance
         collection[HOME] = str(prepared.folder)
         collection[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT

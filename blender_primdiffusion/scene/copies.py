@@ -16,25 +16,27 @@ import bpy
 from ..formats.joints import JOINT_NAMES
 from .human import BODY_MARK, MARK, armature_of, volume_path, volumes_of
 from .proxy import PROXY_MARK
+from .splats import CELLS_MARK, SPLATS_MARK
 from .stand_in import STAND_IN
 from .surface import MARK as CARRIER_MARK
 from .surface import build_surface, carrier_of, node_inputs, set_node_input
 
 LONGEST_NAME = 40
 """Characters of a human's name; names of its parts are longer, and Blender allows 63."""
-_MARKS = (BODY_MARK, PROXY_MARK, CARRIER_MARK, STAND_IN)
-"""Custom properties by which parts that are meshes are recognised."""
+_MARKS = (BODY_MARK, PROXY_MARK, CARRIER_MARK, STAND_IN, SPLATS_MARK, CELLS_MARK)
+"""Custom properties by which parts that are no volumes are recognised."""
 
 
 def duplicate_human(collection: bpy.types.Collection) -> bpy.types.Collection:
     """Copy a human, in the same place and scene; posing, reshaping and editing one leaves the other unchanged.
 
     Everything in the human's collections is copied, and pointers to parts of the human become pointers to the copies.
-    Files are shared, and so is the volumes' data, which edits copy before they change it (see `human.own_data`). Raises
-    ValueError for a collection that is no human.
+    Files are shared, and so is the data of volumes and splats, which edits copy before they change it (see
+    `human.own_data`). Raises ValueError for a collection that is no human.
     """
     armature_of(collection)
     shared = {obj for objects in volumes_of(collection).values() for obj in objects}
+    shared |= {obj for obj in collection.all_objects if obj.type == "POINTCLOUD"}
     duplicate = collection.copy()
     copies: dict[Any, Any] = {collection: duplicate}
     _copy_children(duplicate, copies)
@@ -230,7 +232,7 @@ def _human_of(
     pairs = [(source, copy) for source, copy in copies.items() if isinstance(source, bpy.types.Collection)]
     for _, copy in pairs:
         _replace_objects(copy, copies, copied)
-    _copy_data([part for part in new if part.type != "VOLUME"], copies)
+    _copy_data([part for part in new if part.type not in ("VOLUME", "POINTCLOUD")], copies)
     for obj in {*copied, *(copies[part] for part in new)}:
         _redirect(obj, copies)
     _enter_scenes(person, twin, copies)
@@ -262,7 +264,7 @@ def _kind(obj: bpy.types.Object) -> str:
     if obj.type == "VOLUME":
         path = volume_path(obj.data)
         return path.name if path is not None else ""
-    return next((mark for mark in _MARKS if mark in obj), "") if obj.type == "MESH" else ""
+    return next((mark for mark in _MARKS if mark in obj), "") if obj.type in ("MESH", "POINTCLOUD") else ""
 
 
 def _lost_armature(person: bpy.types.Collection) -> bool:

@@ -33,6 +33,7 @@ from .human import (
 from .proxy import follow_shape, proxy_of
 from .rest_human import shape_model_of
 from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
+from .splats import replace_splats, scale_splats
 from .states import PreparedHuman
 from .surface import scale_surface
 from .volumes import reload_volume
@@ -72,7 +73,9 @@ def reshape(collection: bpy.types.Collection, betas: NDArray) -> str:
         raise ValueError(f"a shape is {BETA_COUNT} numbers from -{limit} to {limit}, not {betas.tolist()}")
     check_shapeable(collection)
     model, generated = shape_model_of(collection), generated_betas(collection)
-    notice = apply_rest(collection, model.rest(betas), betas, model.growth(generated, betas))
+    growth = model.growth(generated, betas)
+    notice = apply_rest(collection, model.rest(betas), betas, growth)
+    scale_splats(collection, model, betas, growth)
     follow_shape(collection, proxy_of(collection), betas)
     return notice
 
@@ -174,6 +177,8 @@ def _replace(collection: bpy.types.Collection, prepared: PreparedHuman) -> Repla
         follow_shape(collection, proxy_of(collection), betas)
     if new_betas and custom:
         apply_growth(collection, growth)
+    replace_splats(collection, human)
+    scale_splats(collection, human.model, betas_of(collection), growth)
     folder = stored_path(prepared.folder)
     for k, objects in shown.items():
         for obj in objects:

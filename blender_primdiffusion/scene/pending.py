@@ -16,12 +16,10 @@ import bpy
 
 from ..formats.regular_files import exists_in_its_folder
 from ..formats.whole_files import remove_abandoned
-from .attachment import in_viewport
+from .attachment import attachment_of, in_viewport
 from .human import MARK, PERSON_FILE, PRIMITIVE_VDB, is_own, state_folder, volume_name, volume_path, write_error
 from .rest_human import read_human
 from .volumes import format_of, is_readable, readable_format, reload_volume, write_volume
-
-"""The version of Blender by which grids of a newer format are placed: what older ones cannot read came later."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -50,7 +48,10 @@ def pending_volumes() -> list[PendingVolumes]:
 
 
 def pending_of(person: bpy.types.Collection) -> PendingVolumes | None:
-    """What one human has of such volumes, wherever it is; None where that is nothing or its own file is missing."""
+    """What one human has of such volumes, wherever it is; None where that is nothing, its own file is missing, or
+    splats show it."""
+    if attachment_of(person) == "SPLATS":
+        return None
     folder = state_folder(person)
     if not exists_in_its_folder(folder / PERSON_FILE):
         return None

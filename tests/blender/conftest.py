@@ -59,11 +59,12 @@ def saved_scene(empty_scene, tmp_path):
 
 @pytest.fixture
 def volumes_shown(monkeypatch):
-    """New humans have volumes that viewports show, as they had in earlier versions."""
+    """New humans have volumes that viewports show, and no splats, as in earlier versions."""
     from blender_primdiffusion.scene import attachment, build
 
     for module in (attachment, build):
         monkeypatch.setattr(module, "VOLUMES_IN_VIEWPORT", True)
+        monkeypatch.setattr(module, "SPLATS_AVAILABLE", False)
 
 
 @pytest.fixture
