@@ -24,15 +24,20 @@ SPLATS_MARK, CELLS_MARK = "primdiffusion_splats", "primdiffusion_cells"
 
 SPLATS_AVAILABLE = bpy.app.version >= (5, 3)
 """Whether this Blender has Gaussian splats."""
-WIDTH = 1 / 6**0.5
-"""Standard deviation of a voxel's trilinear kernel, in voxel spacings: the splat has the kernel's own variance."""
-GAIN = 2.0
-"""Optical depth of a splat relative to its voxel's opacity. Splats composite as 1 - product(1 - a), while the marcher
-adds opacities until 1 and so occludes sooner."""
-HIDDEN = 3.0
-"""Optical depth of the splats further out along the normal from which on one is invisible."""
-FAINTEST = 1 / 255
+WIDTH = (0.465, 0.465, 0.367)
+"""Standard deviations along T, B, N, in voxel spacings; the trilinear kernel's own is .408."""
+OPACITY_OF_VOXEL = np.geomspace(0.004, 6, 14)[2:-2]
+GAIN = np.array([0.3, 3.7, 5.0, 2.7, 1.8, 1.7, 1.8, 2.0, 3.0, 5.5])
+"""Optical depth of a splat relative to its voxel's opacity, of voxels of the opacities above. Splats composite as
+1 - product(1 - a), while the marcher adds opacities until 1 and so occludes sooner; and what is faint along the normal
+is seen along the skin at the silhouette. These and WIDTH are the least squares of pictures of splats and the marcher."""
+COVERED = (0.0, 0.75, 1.5, 2.25)
+SHARE_IF_COVERED = (1.0, 0.8, 0.5, 0.0)
+"""What is left of it below voxels whose opacities add up to COVERED: what no picture shows is left out."""
+FAINTEST = 0.02
 """Opacity below which a splat is left out."""
+LEAST = 0.004
+"""Opacity of a voxel along the normal below which it makes none."""
 MOST_OPAQUE = 0.995
 _NEVER_STRETCHED = 1e3
 """Side of a cell, metres, that no skin reaches."""
@@ -57,25 +62,31 @@ class Splats:
 
 
 def splats_of(human: RestHuman) -> Splats:
-    """The voxels that show, as splats. A voxel's opacity is that along the box's normal."""
+    """The voxels that show, as splats; coarser lattices first (see `_lattice`)."""
     payload = human.payload
     half_extent = human.rest_half_extent * payload.delta_scale
     size = payload.density.shape[-1]
     share, centre = _kernel(size)
     window = share[:, None, None] * share[:, None] * share
     spacing = half_extent * 2 / (size - 1)
-    depth = GAIN * payload.density * window * spacing[:, 2, None, None, None]
-    opacity = 1 - np.exp(-depth)
-    above = np.cumsum(depth[:, ::-1], 1)[:, ::-1] - depth  # of the voxels further out along the normal
-    cell, d, h, w = np.nonzero((opacity >= FAINTEST) & (above < HIDDEN))
+    along_normal = payload.density * window * spacing[:, 2, None, None, None]
+    covered = np.cumsum(along_normal[:, ::-1], 1)[:, ::-1] - along_normal  # by the voxels further out
+    cell, d, h, w = np.nonzero((along_normal >= LEAST) & (covered < COVERED[-1]))
+    raw = along_normal[cell, d, h, w]
+    gain = np.exp(np.interp(np.log(raw), np.log(OPACITY_OF_VOXEL), np.log(GAIN)))
+    gain *= np.interp(covered[cell, d, h, w], COVERED, SHARE_IF_COVERED)
+    in_plane = np.sqrt(spacing[:, 0] * spacing[:, 1]) / spacing[:, 2]
+    opacity = 1 - np.exp(-gain * raw * in_plane[cell])
+    shown = opacity >= FAINTEST
+    cell, d, h, w, opacity = (values[shown] for values in (cell, d, h, w, opacity))
     order = np.argsort(_lattice(d, h, w), kind="stable")
-    cell, d, h, w = (index[order] for index in (cell, d, h, w))
+    cell, d, h, w, opacity = (values[order] for values in (cell, d, h, w, opacity))
     local = np.stack([centre[w], centre[h], centre[d]], -1) * half_extent[cell]
     return Splats(
         cell.astype(np.int32),
         local.astype(np.float32),
         (spacing[cell] * WIDTH).astype(np.float32),
-        np.minimum(opacity[cell, d, h, w], MOST_OPAQUE).astype(np.float32),
+        np.minimum(opacity, MOST_OPAQUE).astype(np.float32),
         payload.rgb[cell, :, d, h, w].clip(0, 1).astype(np.float32),
     )
 

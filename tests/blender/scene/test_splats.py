@@ -98,7 +98,7 @@ def test_splats_of_the_sample_stretch_with_the_skin_as_the_engines_boxes_do(save
     cloud = splats_in(collection).data
     scale, cell = drawn(collection, "scale"), read(cloud, "cell")[:, 0]
     boxes = boxes_of(posed_humans(bpy.context.evaluated_depsgraph_get())[0])
-    np.testing.assert_allclose(scale, boxes.half_extent[cell] * 2 / 7 * WIDTH, rtol=2e-3)
+    np.testing.assert_allclose(scale, boxes.half_extent[cell] * 2 / 7 * np.array(WIDTH), rtol=2e-3)
     assert (scale / read(cloud, "scale")).max() > 1.3
     stretch = scale / read(cloud, "scale")
     places = np.einsum("nij,nj->ni", boxes.rotation[cell], read(cloud, "position") * stretch) + boxes.position[cell]
