@@ -65,7 +65,6 @@ def _build(context: bpy.types.Context, prepared: PreparedHuman, name: str) -> bp
             f"{label}_body", armature, vertices + origin, model.faces, model.uv_corner, model.skin_weights
         )
         collection.objects.link(body)
-        collection.objects.link(build_stand_in(label, armature, body))
         primitives = bpy.data.collections.new(f"{label}_primitives")
         primitives.hide_viewport = not VOLUMES_IN_VIEWPORT
         primitives.objects.link(armature)  # the Outliner then shows the volumes inside the armature's closed row
@@ -85,6 +84,8 @@ def _build(context: bpy.types.Context, prepared: PreparedHuman, name: str) -> bp
                 collection.objects.link(part)
             collection[ATTACHMENT] = "SPLATS"
             primitives.hide_viewport = primitives.hide_render = True
+        else:  # splats show without the extension
+            collection.objects.link(build_stand_in(label, armature, body))
         collection[MARK] = prepared.provenance
         collection[HOME] = str(prepared.folder)
         collection[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT

@@ -30,7 +30,7 @@ OPACITY_OF_VOXEL = np.geomspace(0.004, 6, 14)[2:-2]
 GAIN = np.array([0.3, 3.7, 5.0, 2.7, 1.8, 1.7, 1.8, 2.0, 3.0, 5.5])
 """Optical depth of a splat relative to its voxel's opacity, of voxels of the opacities above. Splats composite as
 1 - product(1 - a), while the marcher adds opacities until 1 and so occludes sooner; and what is faint along the normal
-is seen along the skin at the silhouette. These and WIDTH are the least squares of pictures of splats and the marcher."""
+is seen along the skin at the silhouette. These and WIDTH are least squares of pictures of splats and the marcher."""
 COVERED = (0.0, 0.75, 1.5, 2.25)
 SHARE_IF_COVERED = (1.0, 0.8, 0.5, 0.0)
 """What is left of it below voxels whose opacities add up to COVERED: what no picture shows is left out."""

@@ -59,12 +59,26 @@ def saved_scene(empty_scene, tmp_path):
 
 @pytest.fixture
 def volumes_shown(monkeypatch):
-    """New humans have volumes that viewports show, and no splats, as in earlier versions."""
+    """New humans have volumes that viewports show, as they had in earlier versions."""
     from blender_primdiffusion.scene import attachment, build
 
     for module in (attachment, build):
         monkeypatch.setattr(module, "VOLUMES_IN_VIEWPORT", True)
-        monkeypatch.setattr(module, "SPLATS_AVAILABLE", False)
+
+
+@pytest.fixture
+def splats():
+    """New humans are shown by splats, if this Blender has them."""
+
+
+@pytest.fixture(autouse=True)
+def only_volumes(request, monkeypatch):
+    """New humans are shown by volumes on every Blender, unless a test asks for `splats`."""
+    if "splats" not in request.fixturenames:
+        from blender_primdiffusion.scene import attachment, build
+
+        for module in (attachment, build):
+            monkeypatch.setattr(module, "SPLATS_AVAILABLE", False)
 
 
 @pytest.fixture

@@ -27,7 +27,10 @@ from blender_primdiffusion.scene.splat_nodes import GROUP_NAME
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE, WIDTH, cells_in, splats_in
 from blender_primdiffusion.scene.surface import set_node_input
 
-pytestmark = pytest.mark.skipif(not SPLATS_AVAILABLE, reason="Gaussian splats came with Blender 5.3")
+pytestmark = [
+    pytest.mark.usefixtures("splats"),
+    pytest.mark.skipif(not SPLATS_AVAILABLE, reason="Gaussian splats came with Blender 5.3"),
+]
 COUNT = 12
 FIELDS = {"position": ("vector", 3), "scale": ("vector", 3), "rotation": ("value", 4), "cell": ("value", 1)}
 

@@ -73,7 +73,7 @@ def context(matrix=PERSPECTIVE, shading="SOLID", volumes=True) -> SimpleNamespac
     region = SimpleNamespace(width=SIZE[0], height=SIZE[1], as_pointer=lambda: 1)
     space = SimpleNamespace(
         local_view=None, shading=SimpleNamespace(show_xray=False, type=shading), as_pointer=lambda: 2,
-        show_object_viewport_mesh=True, show_object_viewport_volume=volumes,
+        show_object_viewport_mesh=True, show_object_viewport_volume=volumes, show_object_viewport_pointcloud=True,
     )  # fmt: skip
     around = SimpleNamespace(window_matrix=matrix, view_matrix=LOOK_ALONG_Y)
     return SimpleNamespace(
