@@ -36,7 +36,9 @@ from walk import walk_and_wave
 ROOT = Path(__file__).resolve().parents[1]
 
 MODULE = "bl_ext.user_default.primdiffusion"
-SEED = 7
+SEED = 10
+"""A human of the included checkpoint with a clear face, even cloth and a clean collar: the seventh of seeds 0 to 63 by
+how close its pictures are to those of meshes (`evaluation.attribute_network`)."""
 BACKGROUND = (0.72, 0.72, 0.72)
 
 

@@ -25,7 +25,8 @@ from pathlib import Path
 import numba
 import numpy as np
 import torch
-from march_people import Scene, checkered_human, contorted, in_fewer_boxes, portrait, scenes, standing_person
+from march_people import Scene, checkered_human, contorted, in_fewer_boxes, scenes, standing_person
+from marching import OPERATIONS_PER_SAMPLE, leaves, portrait
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.human import framing, place
 from primdiffusion.primitives.primitives import Primitives
@@ -36,7 +37,6 @@ from primdiffusion.render.reference import march_reference
 from record import command_line, report
 from torch import Tensor
 
-OPERATIONS_PER_SAMPLE = 136
 DEGREE = 32
 ARGUMENTS = 2048
 """8 KB: they stay in the first-level cache."""
@@ -107,11 +107,6 @@ def best_ms(call: Callable[[], object], repeats: int, clock: Callable[[], float]
         call()
         fastest = min(fastest, clock() - began)
     return 1e3 * fastest
-
-
-def leaves(record: Primitives | Camera) -> Primitives | Camera:
-    """The same values as tensors that collect gradients."""
-    return record.map(lambda tensor: tensor.detach().clone().requires_grad_())
 
 
 def backward_ms(person: Primitives, camera: Camera, repeats: int) -> tuple[float, float]:

@@ -1,31 +1,46 @@
 """Speed and exactness of the marcher on a CUDA device, for one person of 1024 boxes that fills the frame.
 
 `python benchmarks/march_cuda.py --json march_cuda.json` prints and writes one flat object. Milliseconds are medians
-between CUDA events around whole calls, including launches and the one synchronisation with the device. The ceilings are
-measured on the same device in the same run; a sample costs `OPERATIONS_PER_SAMPLE` (SPEC 4) and, without reuse, 128
-bytes of voxels. `--kernels` adds a table of the time of each kernel, `--sweep` one of different program shapes.
+between CUDA events around whole calls, including launches and the wait for checks: cuda_forward of a prepared scene
+(`Marcher`), cuda_march of `march_cuda` called again and again, cuda_eager of `march_cuda` without graphs, cuda_training
+of a forward and a backward pass in one graph. cuda_pipelined is the time of a picture out of many in a row, and
+cuda_launch_share the part of cuda_forward in which no kernel runs. The ceilings are measured on the same device in the
+same run; a sample costs `OPERATIONS_PER_SAMPLE` (SPEC 4) and, without reuse, 128 bytes of voxels.
+
+`--cases` also runs the tests of the marcher on the device, `--train` times training steps (`train_cuda.py`),
+`--kernels` prints the time of each kernel, `--sweep` that of different program shapes. A part that fails prints its
+traceback, and the others go on.
 
 It needs a CUDA device, torch for CUDA, the triton that this torch requires, and the package's own requirements; nothing
-is downloaded. From a checkout: `PYTHONPATH=backend python benchmarks/march_cuda.py`.
+is downloaded. From a checkout: `PYTHONPATH=backend python benchmarks/march_cuda.py`. `--write-person FILE` on any
+machine, and `--person FILE` on the one with the device, spare the latter the packages that make people.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
+import importlib.util
+import os
 import statistics
+import subprocess
 import sys
+import time
+import traceback
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import torch
-from march import OPERATIONS_PER_SAMPLE, leaves
-from march_people import portrait, standing_person
+from marching import OPERATIONS_PER_SAMPLE, leaves, portrait
+from primdiffusion import cuda_graph
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import count_samples
 from primdiffusion.render.cuda import Shapes, available, march_cuda
-from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings
+from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings
+from primdiffusion.render.marcher import Marcher
 from primdiffusion.render.reference import march_reference
 from record import command_line, report
 from torch import Tensor
@@ -35,6 +50,7 @@ if not available("cuda"):
 import triton
 import triton.language as tl
 
+ROOT = Path(__file__).resolve().parents[1]
 FINE, DEFAULT = UNIFORM_MILLIMETRE, MarchSettings()
 SIZES = (256, 512, 1024, 2048)
 BATCHES = (4, 16)
@@ -51,9 +67,34 @@ RESIDENT_BYTES = 16 << 20
 COPIED_BYTES = 4 << 30
 
 
+made: dict[str, Any] = {}
+"""What `write_person` wrote, if --person was given."""
+
+
+def person(seed: int) -> Primitives:
+    """A standing person. From a file there is one, whose colours are dealt anew to the boxes for each seed."""
+    if made:
+        first = Primitives(**made["person"])
+        return dataclasses.replace(first, rgb=first.rgb.roll(97 * seed, 0))
+    # packages that make people
+    from march_people import standing_person
+
+    return standing_person(seed)
+
+
+def samples_of(settings: MarchSettings) -> int:
+    """Samples in boxes of a picture of 512 x 512."""
+    return made["samples"][settings.step] if made else count_samples(person(0), portrait(512), settings).inside_boxes
+
+
+def write_person(path: Path) -> None:
+    samples = {settings.step: samples_of(settings) for settings in (DEFAULT, FINE)}
+    torch.save({"person": dict(vars(person(0))), "samples": samples}, path)
+
+
 def scene(size: int, views: int = 1, people: int = 1) -> tuple[Primitives, Camera]:
     """A person, or several different ones, and equal views, on the device."""
-    boxes = [standing_person(seed) for seed in range(people)]
+    boxes = [person(seed) for seed in range(people)]
     names = [field.name for field in dataclasses.fields(Primitives)]
     batch = Primitives(**{name: torch.stack([getattr(person, name) for person in boxes]) for name in names})
     camera = portrait(size).map(lambda tensor: tensor.expand(views, *tensor.shape).clone())
@@ -61,8 +102,100 @@ def scene(size: int, views: int = 1, people: int = 1) -> tuple[Primitives, Camer
 
 
 def forward_ms(boxes: Primitives, camera: Camera, settings: MarchSettings, shapes: Shapes = Shapes()) -> float:  # noqa: B008
+    marcher = Marcher(boxes, settings, shapes)
+    return median_ms(lambda: marcher(camera))
+
+
+def march_ms(boxes: Primitives, camera: Camera, settings: MarchSettings) -> float:
     with torch.no_grad():
-        return median_ms(lambda: march_cuda(boxes, camera, settings, None, shapes))
+        return median_ms(lambda: march_cuda(boxes, camera, settings))
+
+
+def pipelined_ms(boxes: Primitives, camera: Camera, settings: MarchSettings, pictures: int = 50) -> float:
+    """Milliseconds of each of many pictures in a row."""
+    marcher = Marcher(boxes, settings)
+
+    def draw() -> None:
+        for _ in range(pictures):
+            marcher(camera)
+
+    return median_ms(draw, 5, 1) / pictures
+
+
+def kernels_ms(call: Callable[[], object], repeats: int = 20) -> tuple[float, str]:
+    """Milliseconds of all kernels of a call, and a table of them."""
+    from torch.profiler import ProfilerActivity, profile
+
+    for _ in range(3):
+        call()
+    torch.cuda.synchronize()
+    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
+        for _ in range(repeats):
+            call()
+        torch.cuda.synchronize()
+    events = profiled.key_averages()
+    total = sum(event.self_device_time_total for event in events) / repeats / 1e3
+    return total, events.table(sort_by="self_cuda_time_total", row_limit=25, max_name_column_width=60)
+
+
+def step_of(settings: MarchSettings, camera: Camera) -> Callable[..., tuple[Tensor, ...]]:
+    """A loss of every output, and the gradients of the boxes."""
+
+    def step(*fields: Tensor) -> tuple[Tensor, ...]:
+        own = [field.detach().requires_grad_() for field in fields]
+        picture = march_cuda(Primitives(*own), camera, settings)
+        depth = torch.where(torch.isfinite(picture.depth), picture.depth, 0)
+        loss = picture.rgb.square().mean() + picture.alpha.square().mean() + depth.square().mean()
+        return loss.detach(), *torch.autograd.grad(loss, own)
+
+    return step
+
+
+def graphs() -> Figures:
+    """Whether graphs draw the same bits as launches from Python, and the time of a training step as one graph."""
+    figures: Figures = {}
+    boxes, camera = scene(512)
+    fields = tuple(vars(boxes).values())
+    for name, settings in (
+        ("", DEFAULT),
+        ("_1mm", FINE),
+        ("_released", dataclasses.replace(RELEASED, pixel_centre=0.5)),
+    ):
+        step = step_of(settings, camera)
+        recorded = cuda_graph.Recorded(step)
+        marcher = Marcher(boxes, settings)
+        alone = step(*fields)
+        same = [all(map(torch.equal, alone, recorded(*fields))) for _ in range(4)]
+        eager = march_cuda(leaves(boxes), camera, settings)
+        for _ in range(4):
+            drawn = (marcher(camera), march_cuda(boxes, camera, settings))
+            same += [torch.equal(one.rgb, eager.rgb) and torch.equal(one.depth, eager.depth) for one in drawn]
+        figures[f"cuda_graph_same_bits{name}"] = all(same)
+        print(f"same bits{name}: {same}", flush=True)
+        figures[f"cuda_training{name}_ms"] = median_ms(functools.partial(recorded, *fields), 30)
+        figures[f"cuda_training_eager{name}_ms"] = median_ms(functools.partial(step, *fields), 30)
+        print({key: value for key, value in figures.items() if name in key}, flush=True)
+    return figures
+
+
+def launches() -> Figures:
+    """The calls that do without a prepared scene, and the share of a picture's time in which no kernel runs."""
+    figures: Figures = {}
+    for size in (256, 512):
+        boxes, camera = scene(size)
+        marcher = Marcher(boxes, DEFAULT)
+        busy, _ = kernels_ms(lambda marcher=marcher, camera=camera: marcher(camera))
+        whole = median_ms(lambda marcher=marcher, camera=camera: marcher(camera))
+        figures[f"cuda_kernels_{size}_ms"] = busy
+        figures["cuda_launch_share" if size == 512 else f"cuda_launch_share_{size}"] = max(0.0, 1 - busy / whole)
+        figures[f"cuda_pipelined_{size}_ms"] = pipelined_ms(boxes, camera, DEFAULT)
+        figures[f"cuda_march_{size}_ms"] = march_ms(boxes, camera, DEFAULT)
+        cuda_graph.ENABLED = False
+        try:
+            figures[f"cuda_eager_{size}_ms"] = march_ms(boxes, camera, DEFAULT)
+        finally:
+            cuda_graph.ENABLED = True
+    return figures
 
 
 def training_ms(
@@ -92,11 +225,12 @@ def speed() -> Figures:
     }
     for size in SIZES:
         figures[f"cuda_forward_{size}_ms"] = forward_ms(*scene(size), DEFAULT)
+        print(size, figures[f"cuda_forward_{size}_ms"], "ms", flush=True)
     boxes, camera = scene(512)
     figures["cuda_forward_4mm_ms"] = figures["cuda_forward_512_ms"]
     figures["cuda_forward_1mm_ms"] = forward_ms(boxes, camera, FINE)
     for name, settings in (("4mm", DEFAULT), ("1mm", FINE)):
-        samples = count_samples(standing_person(), portrait(512), settings).inside_boxes
+        samples = samples_of(settings)
         seconds = float(figures[f"cuda_forward_{name}_ms"] or 0) / 1e3
         figures[f"samples_{name}"] = samples
         figures[f"cuda_share_of_tflops_{name}"] = samples * OPERATIONS_PER_SAMPLE / operations / seconds
@@ -146,16 +280,32 @@ def gradients(draw: Callable[..., Rendering], boxes: Primitives, camera: Camera)
 
 
 def print_kernels() -> None:
-    """Print the time of each kernel in a forward and a backward pass, from the profiler."""
-    from torch.profiler import ProfilerActivity, profile
+    """Print the time of each kernel in a picture, and in a step of forward and backward pass, from the profiler."""
+    boxes, camera = scene(512)
+    marcher, recorded = Marcher(boxes, DEFAULT), cuda_graph.Recorded(step_of(DEFAULT, camera))
+    fields = tuple(vars(boxes).values())
+    for name, call in (("forward", lambda: marcher(camera)), ("training", lambda: recorded(*fields))):
+        total, table = kernels_ms(call)
+        print(f"{name}: {total:.4f} ms of kernels\n{table}", flush=True)
 
-    boxes, camera = (leaves(record) for record in scene(512))
-    march_cuda(boxes, camera).rgb.sum().backward()
-    torch.cuda.synchronize()
-    with profile(activities=[ProfilerActivity.CUDA]) as profiled:
-        march_cuda(boxes, camera).rgb.sum().backward()
-        torch.cuda.synchronize()
-    print(profiled.key_averages().table(row_limit=40, max_name_column_width=60))
+
+def cases() -> Figures:
+    """Run the tests of the marcher on the device, in as many processes as compile kernels at the same time."""
+    spread = ["-n", "8"] if importlib.util.find_spec("xdist") else []
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "-c", os.devnull, "--noconftest"]
+    command += ["--rootdir", str(ROOT), *spread, str(ROOT / "tests/backend/march_cuda_cases.py")]
+    paths = [str(ROOT / folder) for folder in ("backend", "tests", "tests/backend")]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "TRITON_INTERPRET": "0"}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=200)
+    print(done.stdout[-6000:], done.stderr[-2000:], flush=True)
+    return {"cuda_cases_pass": done.returncode == 0}
+
+
+def training() -> Figures:
+    """Milliseconds of training steps."""
+    from train_cuda import training_figures
+
+    return training_figures()
 
 
 def variants() -> Iterator[Shapes]:
@@ -185,16 +335,36 @@ def print_sweep() -> None:
 
 def main() -> None:
     parser = command_line(__doc__)
+    parser.add_argument("--cases", action="store_true", help="also run the tests of the marcher on the device")
+    parser.add_argument("--train", action="store_true", help="also time training steps")
     parser.add_argument("--kernels", action="store_true", help="also print the time of each kernel")
     parser.add_argument("--sweep", action="store_true", help="also print the times of other program shapes")
+    parser.add_argument("--write-person", type=Path, help="only write the person of the scene there")
+    parser.add_argument("--person", type=Path, help="read the person of the scene from there")
     arguments = parser.parse_args()
+    if arguments.write_person:
+        write_person(arguments.write_person)
+        return
     if not torch.cuda.is_available():
         sys.exit("no CUDA device: torch sees none on this machine, so there is nothing to measure")
-    report(exactness() | speed(), arguments.json)
-    if arguments.kernels:
-        print_kernels()
-    if arguments.sweep:
-        print_sweep()
+    if arguments.person:
+        made.update(torch.load(arguments.person, weights_only=True))
+    figures: Figures = {}
+    parts = [exactness, graphs, speed, launches]
+    parts += [part for part, wanted in ((cases, arguments.cases), (training, arguments.train)) if wanted]
+    parts += [part for part, wanted in ((print_kernels, arguments.kernels), (print_sweep, arguments.sweep)) if wanted]
+    failed = []
+    for part in parts:
+        began = time.perf_counter()
+        try:
+            figures |= part() or {}
+        except Exception:
+            traceback.print_exc()
+            failed.append(part.__name__)
+        print(f"-- {part.__name__}: {time.perf_counter() - began:.1f} s", flush=True)
+        report(figures, arguments.json)
+    if failed:
+        sys.exit(f"these parts failed: {', '.join(failed)}")
 
 
 def median_ms(call: Callable[[], object], repeats: int = 50, warm_up: int = 5) -> float:

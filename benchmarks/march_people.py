@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import math
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import torch
+from marching import portrait
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.export.surface import OuterSurface
-from primdiffusion.geometry.camera import Camera, look_at
+from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
 from primdiffusion.human import Human, framing, generate, place
@@ -70,12 +70,6 @@ def checkered_human(seed: int = 0, betas: Tensor | None = None, off_the_skin: fl
     )
     frames = attach(default_anchors(), vertices, body.faces)
     return Human(from_mesh(TexturedMesh((skin,)), frames), betas, {})
-
-
-def portrait(size: int) -> Camera:
-    """A camera that sees the whole person in a square picture; the body's origin is near its pelvis."""
-    position, target = torch.tensor([0.6, 0.1, 3.2]), torch.tensor([0.0, -0.3, 0.0])
-    return look_at(position, target, vertical_fov=math.radians(32), width=size, height=size)
 
 
 def walking() -> BodyPose:

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from primdiffusion.render import cuda
+from primdiffusion.render import cuda, cuda_scene
 
 HOPPER = 90
 POINTER = {"f": "*fp32", "i": "*i32", "l": "*i64", "d": "*fp64"}
@@ -28,9 +28,9 @@ def forward(sets: int, gap: int, *, index_order: bool = False) -> Launch:
     """The marcher's forward kernel, for this many sets of boxes and this gap."""
     from primdiffusion.render import triton_march
 
-    shapes = cuda.Shapes()
+    shapes = cuda_scene.Shapes()
     more = {"TILES_OF_LIST": 1, "HAS_SPAN": False, "KEEP": True, "WHOLE": True, "INDEX_ORDER": index_order}
-    constants = cuda.march_constants(shapes, sets, gap) | more
+    constants = cuda_scene.march_constants(shapes, sets, gap) | more
     options = {"num_warps": shapes.march_warps, "maxnreg": shapes.march_registers}
     return Launch(triton_march.march_tiles, "fifiliifffffi", ("i32",) * 7 + ("fp32",), constants, options)
 
@@ -39,7 +39,7 @@ def backward(*, index_order: bool = False) -> Launch:
     """The marcher's backward kernel."""
     from primdiffusion.render import triton_adjoint
 
-    shapes = cuda.Shapes()
+    shapes = cuda_scene.Shapes()
     constants = {"HAS_SPAN": False, "INDEX_ORDER": index_order}
     constants |= {"BLOCK_WIDTH": shapes.block[0], "BLOCK_HEIGHT": shapes.block[1]}
     options = {"num_warps": shapes.adjoint_warps}
@@ -51,14 +51,15 @@ def small() -> Iterator[Launch]:
     from primdiffusion.render import triton_adjoint, triton_boxes, triton_lists, triton_march
 
     place = {"STRIDES": (4, 2, 1), "TILE_WIDTH": 8, "TILE_HEIGHT": 4, "BIN": 8}
-    place |= {"BLOCK_WIDTH": 8, "BLOCK_HEIGHT": 4, "LANES": cuda.LANES}
+    place |= {"BLOCK_WIDTH": 8, "BLOCK_HEIGHT": 4, "LANES": cuda_scene.LANES}
     one = {"boxes": 1, "own_boxes": 1}
-    lists = {"BIN": 8, "LANES": cuda.LANES_OF_TILE}
+    lists = {"BIN": 8, "LANES": cuda_scene.LANES_OF_TILE}
     for kernel, pointers, scalars, constants, warps in (
-        (triton_boxes.pack_boxes, "fffil", 0, {}, 4),
+        (triton_boxes.pack_boxes, "fffi", 0, {}, 4),
         (triton_boxes.place_boxes, "fffiffdfiil", 5, place, 1),
-        (triton_lists.list_bins, "liilil", 2, lists, 4),
-        (triton_lists.list_bins, "liilil", 0, lists | {"boxes": 1, "across": 1}, 4),
+        (triton_lists.order_boxes, "ii", 1, {"LANES": cuda_scene.LANES, "CHUNK": cuda_scene.LANES_OF_ORDER}, 4),
+        (triton_lists.list_bins, "iiilil", 3, lists, 4),
+        (triton_lists.list_bins, "iiilil", 1, lists | {"boxes": 1, "across": 1}, 4),
         (triton_adjoint.finish_boxes, "lffffffffff", 3, {}, 4),
         (triton_adjoint.finish_boxes, "lffffffffff", 0, one | {"views": 1}, 4),
     ):
@@ -68,7 +69,7 @@ def small() -> Iterator[Launch]:
     yield Launch(end, "fifiliffi", ("i32",) * 7 + ("fp32",), end_of, {"num_warps": 1})
     yield Launch(end, "fifiliffi", ("i32",) * 5 + ("fp32",), end_of | one, {"num_warps": 1})
     tiles |= lists
-    yield Launch(triton_lists.list_tiles, "ilifiilil", ("i32",) * 4 + ("fp32",), tiles, {"num_warps": 1})
+    yield Launch(triton_lists.list_tiles, "ilifiilil", ("i32",) * 5 + ("fp32",), tiles, {"num_warps": 1})
     for index_order in (False, True):
         constants = {"INDEX_ORDER": index_order, "LANES": cuda.LANES_OF_SEEDS}
         yield Launch(triton_adjoint.seed_rays, "ffffif", ("i32", "fp32"), constants, {"num_warps": 4})

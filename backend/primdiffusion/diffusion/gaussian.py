@@ -27,8 +27,8 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.kinds import Block, expected, posterior
-from primdiffusion.geometry.records import TensorRecord
 
 IMPOSSIBLE = -1e4
 """Log weight of a kind that contradicts the condition, or is padding."""
@@ -39,18 +39,9 @@ TOGETHER = 32
 
 
 @dataclasses.dataclass(frozen=True)
-class PersonPrior(TensorRecord):
-    """Distribution of latents [C, H, W] on K = H*W cells, with P parts of N components (R = P*N), and G groups of at
-    most M kinds."""
+class PersonPrior(PersonComponents):
+    """Distribution of latents, with G groups of at most M kinds."""
 
-    mean: Float[Tensor, "c h w"]
-    basis: Float[Tensor, "k d n"]
-    """Components, orthonormal in each part, in the order of their variance: [i, :, j] is what component j of a cell's
-    part adds to its d leading channels. Cells are in the order of their parts, `part.argsort(stable=True)`."""
-    part: Int[Tensor, "k"]
-    """Part of each cell, equal to its own mirror image; the last one is the head."""
-    parity: Float[Tensor, "r"]
-    """Sign of each coefficient in the mirror image of a person."""
     rest_variance: Float[Tensor, "c h w"]
     """Variance of the entries of r."""
     log_weight: Float[Tensor, "g m"]
@@ -97,44 +88,6 @@ class PersonPrior(TensorRecord):
             head_variance=axes.new_zeros(1, 0), head_left=axes.new_zeros(1),
             shared=axes.new_zeros(groups, 0, len(parity)), kind=kind,
         )  # fmt: skip
-
-    def split(self, z: Float[Tensor, "b c h w"], signal: Tensor | float = 1.0) -> tuple[Tensor, Tensor]:
-        """Person coefficients [b, R] and rest [b, C, H, W] of latents whose mean is scaled by `signal` [b, 1, 1, 1]."""
-        centred = z - signal * self.mean
-        coefficients = self._along(centred)
-        return coefficients, centred - self.picture(coefficients)
-
-    def join(self, coefficients: Float[Tensor, "b r"], rest: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """Latents of person coefficients and rest; the rest's share along the components is removed."""
-        return self.mean + rest + self.picture(coefficients - self._along(rest))
-
-    def outside(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b c h w"]:
-        """The part orthogonal to the person components of latents without the mean."""
-        return z - self.picture(self._along(z))
-
-    def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
-        """Return the contribution of person coefficients to latents, without the mean."""
-        own = coefficients.unflatten(1, (-1, self.basis.shape[2])).unbind(1)
-        drawn = torch.cat([part @ basis.flatten(0, 1).T for part, basis in zip(own, self._bases(), strict=True)], dim=1)
-        channels = self.basis.shape[1]
-        picture = coefficients.new_zeros((len(coefficients), *self.mean.flatten(1).shape))
-        picture[:, :channels, self._order] = drawn.unflatten(1, (-1, channels)).mT
-        return picture.unflatten(2, self.mean.shape[1:])
-
-    def _along(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b r"]:
-        cells = z.flatten(2)[:, : self.basis.shape[1], self._order].mT
-        own = cells.split([len(basis) for basis in self._bases()], dim=1)
-        return torch.cat(
-            [part.flatten(1) @ basis.flatten(0, 1) for part, basis in zip(own, self._bases(), strict=True)], dim=1
-        )
-
-    @property
-    def _order(self) -> Int[Tensor, "k"]:
-        return self.part.argsort(stable=True)
-
-    def _bases(self) -> tuple[Tensor, ...]:
-        """The components of each part [cells, d, n]."""
-        return self.basis.split(self.part.bincount().tolist())
 
     def log_weights(self, condition: Float[Tensor, "b x"] | None) -> Float[Tensor, "b g m"] | Float[Tensor, "1 g m"]:
         """Return the log weights of the kinds, lowered by IMPOSSIBLE where a kind contradicts the condition.
@@ -211,14 +164,6 @@ class PersonPrior(TensorRecord):
         clothes = torch.einsum("g,gi->i", weight.sum(1), _diagonal(self.axes, self.variance, self.left))
         head = torch.einsum("f,fi->i", heads, _diagonal(self.head_axes, self.head_variance, self.head_left))
         return torch.cat([clothes, head]) + torch.einsum("g,gqr->r", weight.sum(1), self.shared.square()) + between
-
-    def picture_variance(self, variance: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
-        """Variance of `picture` for independent coefficients of these variances."""
-        own = variance.unflatten(0, (-1, self.basis.shape[2]))
-        drawn = torch.cat([basis.square() @ part for part, basis in zip(own, self._bases(), strict=True)])
-        picture = torch.zeros_like(self.mean).flatten(1)
-        picture[: drawn.shape[1], self._order] = drawn.T
-        return picture.view_as(self.mean)
 
     def sample(
         self, count: int, generator: torch.Generator, condition: Float[Tensor, "1 x"] | None = None

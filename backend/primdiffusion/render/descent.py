@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from primdiffusion.cuda_graph import Recorded
 from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.formats.requests import Count, NotNegative, RayStep
 from primdiffusion.formats.schema import Checked, Range
@@ -114,24 +115,32 @@ def descend(
     fall = torch.optim.lr_scheduler.LambdaLR(adam, lambda done: _share_of_rate(done, settings))
     chosen = _chosen(views, settings)
     covered = sum(float(view.target[..., 3].sum()) for view in views) / 255 / len(views) / settings.stride**2
+
+    def gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
+        own = _Leaves(*(leaf.detach().requires_grad_() for leaf in tensors[:3]))
+        shown = [_view(*tensors[first : first + 6]) for first in range(3, len(tensors), 6)]
+        with torch.enable_grad():
+            payload = own.payload(start)
+            loss = torch.stack([_loss(view, payload, settings) for view in shown]).mean() / covered
+        return loss.detach(), *torch.autograd.grad(loss, own)
+
+    recorded = Recorded(gradients)
     began, number = time.perf_counter(), 0
-    with torch.enable_grad():
-        for number in range(1, settings.steps + 1):
-            adam.zero_grad()
-            payload = leaves.payload(start)
-            losses = [_loss(view, payload, settings) for view in itertools.islice(chosen, settings.views)]
-            loss = torch.stack(losses).mean() / covered
-            value = float(loss.detach())
-            if not math.isfinite(value):
-                raise ValueError(f"refinement diverged at step {number} (loss {value}): use smaller rates")
-            loss.backward()
-            adam.step()
-            fall.step()
-            leaves.clamp_(settings.largest_density)
-            if on_step is not None:
-                on_step(DescentStep(number, value))
-            if time.perf_counter() - began > settings.seconds:
-                break
+    for number in range(1, settings.steps + 1):
+        shown = itertools.islice(chosen, settings.views)
+        loss, *found = recorded(*leaves, *itertools.chain.from_iterable(map(_tensors, shown)))
+        value = float(loss)
+        if not math.isfinite(value):
+            raise ValueError(f"refinement diverged at step {number} (loss {value}): use smaller rates")
+        for leaf, gradient in zip(leaves, found, strict=True):
+            leaf.grad = gradient
+        adam.step()
+        fall.step()
+        leaves.clamp_(settings.largest_density)
+        if on_step is not None:
+            on_step(DescentStep(number, value))
+        if time.perf_counter() - began > settings.seconds:
+            break
     return Descent(leaves.result(start), number, time.perf_counter() - began)
 
 
@@ -181,6 +190,19 @@ def _chosen(views: Sequence[PosedView], settings: DescentSettings) -> Iterator[P
             view = views[number]
             left, top = draws.integers(stride, size=2).tolist()
             yield PosedView(view.frames, view.camera.every(stride, left, top), view.target[top::stride, left::stride])
+
+
+def _tensors(view: PosedView) -> tuple[Tensor, ...]:
+    return *vars(view.frames).values(), view.camera.intrinsics, view.camera.world_to_camera, view.target
+
+
+def _view(
+    position: Tensor, rotation: Tensor, half_extent: Tensor, intrinsics: Tensor, world_to_camera: Tensor, target: Tensor
+) -> PosedView:
+    """The view of these `_tensors`."""
+    height, width = target.shape[:2]
+    camera = Camera(intrinsics, world_to_camera, width, height)
+    return PosedView(Frames(position, rotation, half_extent), camera, target)
 
 
 def _share_of_rate(done: int, settings: DescentSettings) -> float:

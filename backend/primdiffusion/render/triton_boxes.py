@@ -27,9 +27,9 @@ columns and rows that its content touches 4-7, pixel columns and rows that all o
 ORTHOGONAL = tl.constexpr(1e-2)
 NEARLY_ORTHOGONAL = tl.constexpr(0.045)  # of a camera, the rows of whose matrix are compared here, not its columns
 # Totals: 0 errors, as bits (content 1, place 2, camera 4; `check_scene` produces the message), 1 pairs of boxes and
-# bins, 2 pairs of boxes and tiles, 3 units of the adjoint, 4-5 written so far, 6 spans with NaN, 7 whether a stride is
-# odd (1), or even and no multiple of 4 (2).
-TOTALS = 8
+# bins, 2 pairs of boxes and tiles, 3 units of the adjoint, 4 spans with NaN, 5 whether a stride is odd (1), or even and
+# no multiple of 4 (2).
+TOTALS = 6
 
 OPTICAL = tl.constexpr(1e-2)  # a centre further off the optical axis than arccos of this has no pixel to refer to
 MARGIN = tl.constexpr(0.01)  # pixels added around a rectangle against rounding
@@ -38,8 +38,8 @@ LAST_POINT = tl.constexpr(1 << 30)
 
 
 @triton.jit
-def pack_boxes(rgb, density, voxels, bounds, totals):
-    """One box: [3, 512] and [512] to [512, 4], the range of visible voxel indices, and errors."""
+def pack_boxes(rgb, density, voxels, bounds):
+    """One box: [3, 512] and [512] to [512, 4], and to `bounds` the range of visible voxel indices, and 1 for errors."""
     box = tl.program_id(0).to(tl.int64)
     i = tl.arange(0, 512)
     red = tl.load(rgb + box * 1536 + i)
@@ -51,8 +51,7 @@ def pack_boxes(rgb, density, voxels, bounds, totals):
 
     sound = (tl.abs(red) < float("inf")) & (tl.abs(green) < float("inf")) & (tl.abs(blue) < float("inf"))
     sound = sound & (opacity >= 0) & (opacity < float("inf"))
-    if tl.min(sound.to(tl.int32), 0) == 0:
-        tl.atomic_or(totals, 1)
+    tl.store(bounds + box * 8 + 6, 1 - tl.min(sound.to(tl.int32), 0))
 
     # A cell next to a voxel with density may have density; the others are empty.
     seen = opacity > 0
@@ -191,10 +190,6 @@ def place_boxes(
     h1_single = tl.load(half_extent + source * 3 + 1, here, 0.0)
     h2_single = tl.load(half_extent + source * 3 + 2, here, 0.0)
     shortest = tl.minimum(tl.minimum(h0_single, h1_single), h2_single)
-    solid = here & (shortest > 0)
-    h0 = tl.where(solid, h0_single, 1.0).to(tl.float64)
-    h1 = tl.where(solid, h1_single, 1.0).to(tl.float64)
-    h2 = tl.where(solid, h2_single, 1.0).to(tl.float64)
     xx = tl.load(rotation + source * 9, here, 1.0).to(tl.float64)
     yx = tl.load(rotation + source * 9 + 1, here, 0.0).to(tl.float64)
     zx = tl.load(rotation + source * 9 + 2, here, 0.0).to(tl.float64)
@@ -211,6 +206,9 @@ def place_boxes(
     shear_off = tl.maximum(shear_off, tl.abs(_dot(xx, xy, xz, zx, zy, zz)))
     shear_off = tl.maximum(shear_off, tl.abs(_dot(yx, yy, yz, zx, zy, zz)))
     size_sum = tl.abs(px) + tl.abs(py) + tl.abs(pz) + tl.abs(h0_single) + tl.abs(h1_single) + tl.abs(h2_single)
+    # `maximum` of a device drops NaN, sums keep it.
+    size_sum += tl.abs(xx) + tl.abs(xy) + tl.abs(xz) + tl.abs(yx) + tl.abs(yy) + tl.abs(yz)
+    size_sum += tl.abs(zx) + tl.abs(zy) + tl.abs(zz)
     sound = (shear_off <= ORTHOGONAL) & (size_sum < float("inf"))
     if tl.min((sound | (here == 0)).to(tl.int32), 0) == 0:
         tl.atomic_or(totals, 2)
@@ -219,8 +217,16 @@ def place_boxes(
     bent = tl.maximum(bent, tl.abs(_dot(r0x, r0y, r0z, r1x, r1y, r1z)))
     bent = tl.maximum(bent, tl.abs(_dot(r0x, r0y, r0z, r2x, r2y, r2z)))
     bent = tl.maximum(bent, tl.abs(_dot(r1x, r1y, r1z, r2x, r2y, r2z)))
-    if ((sum_camera < float("inf")) & (bent <= NEARLY_ORTHOGONAL)) == 0:
+    rigid = (k * 0 + sum_camera < float("inf")) & (k * 0 + bent <= NEARLY_ORTHOGONAL)
+    if tl.min(rigid.to(tl.int32), 0) == 0:
         tl.atomic_or(totals, 4)
+    if tl.max(tl.load(bounds + source * 8 + 6, here, 0), 0) > 0:
+        tl.atomic_or(totals, 1)
+    # The host looks at errors when the picture is under way: boxes with errors could take billions of samples.
+    solid = here & (shortest > 0) & sound & rigid
+    h0 = tl.where(solid, h0_single, 1.0).to(tl.float64)
+    h1 = tl.where(solid, h1_single, 1.0).to(tl.float64)
+    h2 = tl.where(solid, h2_single, 1.0).to(tl.float64)
 
     # The reference: direction D through pixel (u0, v0), lattice point n0.
     wx, wy, wz = px - ox, py - oy, pz - oz
@@ -326,7 +332,7 @@ def place_boxes(
     tl.store(line + 7, bottom, here)
     low_bits = tl.sum(tl.where(shown & (stride % 2 != 0), 1, 0), 0)
     next_bits = tl.sum(tl.where(shown & (stride % 4 == 2), 1, 0), 0)
-    tl.atomic_or(totals + 7, tl.where(low_bits > 0, 1, 0).to(tl.int64) + tl.where(next_bits > 0, 2, 0))
+    tl.atomic_or(totals + 5, tl.where(low_bits > 0, 1, 0).to(tl.int64) + tl.where(next_bits > 0, 2, 0))
     tl.store(first_point + target, tl.where(shown, first, 2147483647), here)
     tiles = (right - left + 1).to(tl.int64) * (bottom - top + 1)
     bins = (right // BIN - left // BIN + 1).to(tl.int64) * (bottom // BIN - top // BIN + 1)

@@ -8,6 +8,8 @@ import triton.language as tl
 SHARPNESS = tl.constexpr(8.0)
 NEVER = tl.constexpr(1 << 30)
 """Lattice index behind all others."""
+LAST = tl.constexpr(2147483647)
+"""First point of boxes that are not drawn."""
 
 
 @triton.jit
@@ -65,8 +67,33 @@ BLUR = tl.constexpr(1e-4)  # relative margin of a box for rounding
 
 
 @triton.jit
+def order_boxes(first_point, order, boxes, LANES: tl.constexpr, CHUNK: tl.constexpr):
+    """LANES boxes of one view: their places in the order of their first points, equal ones in that of their index."""
+    view = tl.program_id(1).to(tl.int64) * boxes
+    k = tl.program_id(0) * LANES + tl.arange(0, LANES)
+    own = tl.load(first_point + view + k, k < boxes, 0)[:, None]
+    place = tl.zeros((LANES,), tl.int32)
+    for start in range(0, boxes, CHUNK):
+        i = start + tl.arange(0, CHUNK)
+        other = tl.load(first_point + view + i, i < boxes, LAST)[None, :]
+        before = (other < own) | ((other == own) & (i[None, :] < k[:, None]))
+        place += tl.sum(before.to(tl.int32), 1)
+    tl.store(order + view + place, k, k < boxes)
+
+
+@triton.jit
+def _place(written, found, capacity):
+    """Reserve room for `found` entries, or for what is left of it: where they begin, and their number.
+
+    The host knows from the totals of `place_boxes` that something was left out, and draws again.
+    """
+    place = tl.atomic_add(written, found.to(tl.int64))
+    return place, tl.minimum(found.to(tl.int64), tl.maximum(capacity - place, 0)).to(tl.int32)
+
+
+@triton.jit
 def list_bins(
-    order, indices, entries, begin, count, totals, boxes, across,
+    order, indices, entries, begin, count, written, capacity, boxes, across,
     BIN: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
     """One bin of one view: all boxes whose tiles meet it, in `order`."""
@@ -78,7 +105,8 @@ def list_bins(
         i = start + tl.arange(0, LANES)
         k = tl.load(order + first_box + i, i < boxes, 0).to(tl.int32)
         found += tl.sum(_meets(indices, first_box, k, i < boxes, column, row, BIN).to(tl.int32), 0)
-    place = tl.atomic_add(totals + 4, found.to(tl.int64))
+    place, found = _place(written, found, capacity)
+    stop = place + found
     tl.store(begin + view * tl.num_programs(0) + bin_, place)
     tl.store(count + view * tl.num_programs(0) + bin_, found)
     if found > 0:
@@ -88,12 +116,12 @@ def list_bins(
             here = _meets(indices, first_box, k, i < boxes, column, row, BIN)
             line = indices + (first_box + k) * 16
             first, last = tl.load(line + 1, here, 0), tl.load(line + 2, here, 0)
-            place = _write(entries, place, here, k, first, first, last)
+            place = _write(entries, place, stop, here, k, first, first, last)
 
 
 @triton.jit
 def list_tiles(
-    bin_entries, bin_begin, bin_count, record, indices, entries, begin, count, totals,
+    bin_entries, bin_begin, bin_count, record, indices, entries, begin, count, written, capacity,
     boxes, across, bins_across, bins, spacing,
     BIN: tl.constexpr, TILE_WIDTH: tl.constexpr, TILE_HEIGHT: tl.constexpr, LANES: tl.constexpr,
 ):  # fmt: skip
@@ -112,11 +140,13 @@ def list_tiles(
         here = _meets(indices, first_box, k, i < number, column, row, 1)
         first, last = _reached(record, indices, first_box + k, column, row, spacing, TILE_WIDTH, TILE_HEIGHT)
         found += tl.sum((here & (first <= last)).to(tl.int32), 0)
-    tl.store(count + list_, found)
     if found == 0:
+        tl.store(count + list_, found)
         tl.store(begin + list_, found.to(tl.int64))
     else:
-        place = tl.atomic_add(totals + 5, found.to(tl.int64))
+        place, found = _place(written + 1, found, capacity)
+        stop = place + found
+        tl.store(count + list_, found)
         tl.store(begin + list_, place)
         for start in range(0, number, LANES):
             i = start + tl.arange(0, LANES)
@@ -124,17 +154,18 @@ def list_tiles(
             here = _meets(indices, first_box, k, i < number, column, row, 1)
             first, last = _reached(record, indices, first_box + k, column, row, spacing, TILE_WIDTH, TILE_HEIGHT)
             sorted_by = tl.load(candidates + i * 4 + 1, i < number, 0)
-            place = _write(entries, place, here & (first <= last), k, sorted_by, first, last)
+            place = _write(entries, place, stop, here & (first <= last), k, sorted_by, first, last)
 
 
 @triton.jit
-def _write(entries, place, here, k, sorted_by, first, last):
-    """Append entries for those `here`, from `place` on; return the next free place."""
-    at = entries + (place + tl.cumsum(here.to(tl.int32), 0) - 1) * 4
-    tl.store(at, k, here)
-    tl.store(at + 1, sorted_by, here)
-    tl.store(at + 2, first, here)
-    tl.store(at + 3, last, here)
+def _write(entries, place, stop, here, k, sorted_by, first, last):
+    """Append entries for those `here`, from `place` on, none from `stop` on; return the next free place."""
+    index = place + tl.cumsum(here.to(tl.int32), 0) - 1
+    at, fits = entries + index * 4, here & (index < stop)
+    tl.store(at, k, fits)
+    tl.store(at + 1, sorted_by, fits)
+    tl.store(at + 2, first, fits)
+    tl.store(at + 3, last, fits)
     return place + tl.sum(here.to(tl.int64), 0)
 
 

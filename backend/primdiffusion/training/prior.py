@@ -8,7 +8,6 @@ groups lean on their like, and a mean that is a sum of effects: of the group, of
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import Counter
 from collections.abc import Sequence
@@ -19,6 +18,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.diffusion.codec import LinearCodec
+from primdiffusion.diffusion.components import PersonComponents
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.gaussian import IMPOSSIBLE, PersonPrior
 from primdiffusion.diffusion.model import ShapePrior
@@ -33,30 +33,15 @@ Values = tuple[int, ...]
 """The value of each of some attributes, as its number in the vocabulary; -1 where unknown."""
 
 
-class Mixture(NamedTuple):
-    """Fields of `PersonPrior`."""
-
-    log_weight: Float[Tensor, "g m"]
-    centre: Float[Tensor, "g m r"]
-    axes: Float[Tensor, "g a o"]
-    variance: Float[Tensor, "g a"]
-    left: Float[Tensor, "g"]
-    head: Int[Tensor, "g m"]
-    head_axes: Float[Tensor, "f e s"]
-    head_variance: Float[Tensor, "f e"]
-    head_left: Float[Tensor, "f"]
-    shared: Float[Tensor, "g q r"]
-    kind: Float[Tensor, "g m x"]
-
-
 def fit_mixture(
     c: Float[Tensor, "n r"],
     clothes: int,
     condition: Float[Tensor, "n x"],
     vocabulary: AttributeVocabulary,
     config: PriorConfig,
-) -> Mixture:
-    """Kinds for all that can be put together of the people's attributes; a single one if they have none.
+) -> dict[str, Tensor]:
+    """Kinds, as fields of `PersonPrior`, for all that can be put together of the people's attributes; a single one if
+    they have none.
 
     The leading `clothes` coefficients are those of the clothes, the others the head's.
     """
@@ -84,7 +69,11 @@ def fit_mixture(
             head[g, m] = choices[1].index(chosen[1])
             kind[g, m] = _condition(chosen, keys, vocabulary)
     log_weight = log_weight - log_weight.flatten().logsumexp(0)
-    return Mixture(log_weight, centre, *axes, head, *head_axes, shared, kind)
+    return {
+        "log_weight": log_weight, "centre": centre, "axes": axes[0], "variance": axes[1], "left": axes[2],
+        "head": head, "head_axes": head_axes[0], "head_variance": head_axes[1], "head_left": head_axes[2],
+        "shared": shared, "kind": kind,
+    }  # fmt: skip
 
 
 def _shared(
@@ -216,8 +205,7 @@ def fit_prior(
     basis = torch.cat([one.basis[..., :count] for one in fitted])
     signs = torch.cat([one.signs[:count] for one in fitted])
     kept = torch.cat([one.kept[:count] for one in fitted])
-    nothing = torch.zeros(0)
-    inside = PersonPrior(mean, basis, part, signs, *[nothing] * 12)  # splits latents; its distribution follows
+    inside = PersonComponents(mean, basis, part, signs)
     coefficients, rest_energy = [], torch.zeros_like(mean)
     for first in range(0, len(people), CHUNK):
         c, rest = inside.split(people.latents[first : first + CHUNK].float())
@@ -228,8 +216,8 @@ def fit_prior(
     rest = (rest + codec.mirror(rest).abs()) / 2 * rest_ratio
     c = torch.cat(coefficients) * kept.sqrt()
     clothes = max(count, len(signs) - 2 * count)  # the others are hands and head; a single part is all
-    mixture = fit_mixture(c, clothes, people.condition, vocabulary, config)
-    return dataclasses.replace(inside, rest_variance=rest.clamp_min(1e-6), **mixture._asdict())
+    kinds = fit_mixture(c, clothes, people.condition, vocabulary, config)
+    return PersonPrior(**vars(inside), rest_variance=rest.clamp_min(1e-6), **kinds)
 
 
 def body_parts() -> Int[Tensor, "k"]:

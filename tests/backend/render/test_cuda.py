@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 from march_scenes import camera_at, random_boxes
-from primdiffusion.render import cuda
+from primdiffusion.render import cuda, cuda_scene
 from support import hopper
 
 CASES = Path(__file__).parents[1] / "march_cuda_cases.py"
@@ -81,7 +81,7 @@ def used(launch: hopper.Launch, folder: Path):
 def test_the_forward_kernel_fits_into_registers(sets, gap, index_order, tmp_path):
     kernel, found = used(hopper.forward(sets, gap, index_order=index_order), tmp_path)
     assert found["STACK"] == 0
-    assert found["REG"] <= cuda.Shapes().march_registers
+    assert found["REG"] <= cuda_scene.Shapes().march_registers
     assert "ld.global.v4" in kernel.asm["ptx"]
 
 

@@ -1,5 +1,7 @@
 """The mixture over person components: which kinds of people it knows, and where it puts them."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 from primdiffusion.diffusion.conditioning import NOTHING, AttributeVocabulary
@@ -47,7 +49,7 @@ def components(spread=0.1):
 @pytest.fixture(scope="module")
 def mixture():
     condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in PEOPLE])
-    return fit_mixture(components(), CLOTHES, condition, WORDS, CONFIG)
+    return SimpleNamespace(**fit_mixture(components(), CLOTHES, condition, WORDS, CONFIG))
 
 
 def part(mixture, **asked):
@@ -123,6 +125,6 @@ def test_skin_is_shared_by_hands_and_head_and_by_clothes_that_show_it(mixture):
 
 
 def test_people_of_whom_nothing_is_known_are_one_gaussian():
-    mixture = fit_mixture(components(), CLOTHES, torch.zeros(len(PEOPLE), 0), NOTHING, CONFIG)
+    mixture = SimpleNamespace(**fit_mixture(components(), CLOTHES, torch.zeros(len(PEOPLE), 0), NOTHING, CONFIG))
     assert mixture.log_weight.shape == (1, 1)
     assert torch.allclose(mixture.centre[0, 0], components().mean(0), atol=0.1)

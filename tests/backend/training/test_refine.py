@@ -169,7 +169,10 @@ def test_impossible_settings_are_rejected(wrong):
 
 
 def test_rates_that_lead_nowhere_end_in_a_sentence(views, monkeypatch):
-    monkeypatch.setattr("primdiffusion.render.descent._loss", lambda *_: torch.tensor(torch.nan))
+    def lost(_view, payload, _settings):
+        return torch.nan * sum(values.sum() for values in vars(payload).values())
+
+    monkeypatch.setattr("primdiffusion.render.descent._loss", lost)
     with refused(ValueError, "step 1"):
         refine(person(2), views, QUICK)
 
