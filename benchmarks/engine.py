@@ -218,8 +218,6 @@ def picture_stage(folder: Path, seed: int) -> bpy.types.Collection:
     scene.view_settings.view_transform = "Standard"
     scene.render.dither_intensity = 0
     scene.world = bpy.data.worlds.new("Sky")
-    if bpy.app.version < (5, 0):
-        scene.world.use_nodes = True
     scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (*SKY, 1)
     return person
 
@@ -227,8 +225,6 @@ def picture_stage(folder: Path, seed: int) -> bpy.types.Collection:
 def paint(colour: tuple[float, float, float]) -> None:
     """Give the active object a material of this linear colour."""
     material = bpy.data.materials.new("paint")
-    if bpy.app.version < (5, 0):
-        material.use_nodes = True
     material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (*colour, 1)
     bpy.context.object.data.materials.append(material)
 

@@ -1,7 +1,7 @@
 """Figures of the extension: registration, building, frames, motion, memory, Cycles, a soak test.
 
     python benchmarks/extension.py --json docs/results/extension.json
-    python benchmarks/extension.py --also 4_5=.venv45/bin/python --json ...     # the same on another bpy: names + _4_5
+    python benchmarks/extension.py --also 5_3=.venv53/bin/python --json ...     # the same on another bpy: names + _5_3
 
 Each part runs in its own process (`extension.py part PART FOLDER`, where FOLDER has the `person/` that `primdiffusion
 generate` wrote); the real child generates. `--quick` renders smaller pictures and soaks for five rounds.
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument(
         "--also",
         nargs="*",
-        default=[f"4_5={ROOT / '.venv45/bin/python'}"] if (ROOT / ".venv45/bin/python").exists() else [],
+        default=[f"5_3={ROOT / '.venv53/bin/python'}"] if (ROOT / ".venv53/bin/python").exists() else [],
         help="NAME=PYTHON of other versions of bpy",
     )
     arguments = parser.parse_args()

@@ -43,9 +43,8 @@ def register() -> None:
 def unregister() -> None:
     """Called by Blender when the extension is disabled, and at its exit; ends the child processes.
 
-    As a Python module, Blender 4.5 does not call this at exit and hangs while the engine is active: hence `atexit`.
-    Newer ones call it too, after `atexit`; a second call does nothing. In the application `atexit` would be too late:
-    Blender's data are freed before.
+    As a Python module, Blender may not call this at exit: hence `atexit`. A second call does nothing.
+    In the application `atexit` would be too late: Blender's data are freed before.
     """
     atexit.unregister(unregister)
     while _registered:

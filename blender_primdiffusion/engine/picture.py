@@ -110,7 +110,7 @@ def world_colour(depsgraph: bpy.types.Depsgraph) -> tuple[float, float, float]:
     world = getattr(depsgraph.view_layer_eval, "world_override", None) or depsgraph.scene.world
     if world is None:
         return (0.0, 0.0, 0.0)
-    if world.node_tree is not None and (bpy.app.version >= (5, 0) or world.use_nodes):
+    if world.node_tree is not None:
         output = world.node_tree.get_output_node("ALL")
         links = output.inputs["Surface"].links if output is not None else ()
         shader = links[0].from_node if links else None

@@ -20,7 +20,7 @@ from ..formats.regular_files import exists_in_its_folder, remove_file
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
-from ..scene.attachment import attachment_of, set_attachment
+from ..scene.attachment import attachment_of, set_attachment, showing
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import link_part
 from ..scene.human_file import (
@@ -34,12 +34,11 @@ from ..scene.human_file import (
     with_motion,
     write_tensors,
 )
-from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
+from ..scene.merged import read_grid, write_grid
 from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
-from ..scene.surface import carrier_of, primitives_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
@@ -52,7 +51,7 @@ def show(person: bpy.types.Object, what: str) -> None:
         raise ValueError(f"{person.name!r} has no mesh proxy yet: press Add Mesh Proxy")
     set_attachment(person, attachment_of(person))  # shows the parts of the current attachment
     proxy.hide_viewport, proxy.hide_render = what == "VOLUMES", what != "MESH"
-    for part in (primitives_of(person), carrier_of(person), merged_of(person)):
+    for part in showing(person).values():
         if part is not None:
             part.hide_viewport = part.hide_viewport or what != "VOLUMES"
             part.hide_render = part.hide_render or what == "MESH"
@@ -265,7 +264,7 @@ class ExportVdbSequenceJob(Job):
         written = []
         for index, grid in enumerate(result.files):
             name = f"{self.stem}_{self.first + index:04d}.vdb"
-            write_grid(_for_other_programs(read_grid(grid)), folder / name)
+            write_grid(read_grid(grid), folder / name)
             remove_file(grid, grid.parent)
             written.append(folder / name)
         size = sum(path.stat().st_size for path in written) / 1e6
@@ -341,12 +340,6 @@ def put(source: Path, target: Path) -> None:
     """Copy a finished file to its destination, where it appears whole. Raises OSError."""
     with written_whole(target) as unfinished:
         shutil.copyfile(source, unfinished)
-
-
-def _for_other_programs(grid: MergedGrid) -> MergedGrid:
-    """Undo the half voxel by which `write_grid` moves grids for old versions of Cycles."""
-    shift = 0.5 * grid.voxel if bpy.app.version < (5, 0) else 0.0
-    return dataclasses.replace(grid, origin=grid.origin + shift)
 
 
 def _move(armature: bpy.types.Object, motion: HumanMotion) -> None:

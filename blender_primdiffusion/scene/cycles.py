@@ -59,8 +59,7 @@ def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
     cycles.volume_bounces = 0
     cycles.transparent_max_bounces = 1024  # every box in a row costs two
     cycles.volume_step_rate = 1.0
-    if bpy.app.version >= (5, 0):
-        cycles.volume_biased = True  # unbiased tracking takes seconds per volume object, an hour a frame
+    cycles.volume_biased = True  # unbiased tracking takes seconds per volume object, an hour a frame
 
 
 def humans_extent(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -82,8 +81,6 @@ def posed_extent(person: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray
 
 def _flat_world(grey: float) -> bpy.types.World:
     world = bpy.data.worlds.new("PrimDiffusion Preview")
-    if bpy.app.version < (5, 0):
-        world.use_nodes = True
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
     background.inputs["Color"].default_value = (grey, grey, grey, 1.0)
     return world

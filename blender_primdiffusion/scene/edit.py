@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
-from .armature import move_rest_joints
-from .build import floor_below
+from .armature import floor_below, move_rest_joints
 from .convention import frames_to_blender, points_to_blender
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data, volumes_of
 from .payload import pack, session_file
@@ -21,6 +20,7 @@ from .pending import show_volume
 from .proxy import follow_shape, proxy_of
 from .rest_human import read_human, shape_model_of
 from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
+from .splats import replace_splats, scale_splats
 from .surface import scale_surface
 
 _FLOOR_TOLERANCE = 1e-3
@@ -58,7 +58,9 @@ def reshape(person: bpy.types.Object, betas: NDArray) -> str:
         raise ValueError(f"a shape is {BETA_COUNT} numbers from -{limit} to {limit}, not {betas.tolist()}")
     check_shapeable(person)
     model, generated = shape_model_of(person), generated_betas(person)
-    notice = apply_rest(person, model.rest(betas), betas, model.growth(generated, betas))
+    growth = model.growth(generated, betas)
+    notice = apply_rest(person, model.rest(betas), betas, growth)
+    scale_splats(person, model, betas, growth)
     follow_shape(person, proxy_of(person), betas)
     return notice
 
@@ -157,6 +159,8 @@ def replace_person(person: bpy.types.Object, file: Path) -> Replaced:
         follow_shape(person, proxy_of(person), betas)
     if new_betas and custom:
         apply_growth(person, growth)
+    replace_splats(person, human)
+    scale_splats(person, human.model, betas_of(person), growth)
     for volume in {own_data(obj, person) for objects in shown.values() for obj in objects}:
         show_volume(volume, session_file(person).parent)
     person[MARK] = human.provenance()

@@ -112,7 +112,12 @@ def human_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
 
 def link_part(person: bpy.types.Object, part: bpy.types.Object) -> None:
     """Put a part, which is in no collection, into the one that the human is in."""
-    min(person.users_collection, key=lambda collection: collection.hide_viewport).objects.link(part)
+    home_of(person).objects.link(part)
+
+
+def home_of(person: bpy.types.Object) -> bpy.types.Collection:
+    """The collection that the human is in, beside the hidden one of its volumes."""
+    return min(person.users_collection, key=lambda collection: collection.hide_viewport)
 
 
 def own_data(obj: bpy.types.Object, person: bpy.types.Object) -> bpy.types.ID:

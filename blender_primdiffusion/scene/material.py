@@ -21,8 +21,6 @@ def volume_material() -> bpy.types.Material:
     if existing is not None and existing.node_tree is not None and GAIN_NODE in existing.node_tree.nodes:
         return existing
     material = bpy.data.materials.new(MATERIAL_NAME)
-    if bpy.app.version < (5, 0):
-        material.use_nodes = True  # always true, and deprecated, since 5.0
     tree = material.node_tree
     tree.nodes.clear()
 

@@ -70,16 +70,10 @@ def read_grid(path: Path) -> MergedGrid:
     return MergedGrid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
 
 
-def index_to_local(grid: MergedGrid, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
-    """VDB's row-vector transform [4, 4]; Cycles before 5.0 draws half a voxel too high on each axis (see `volumes`)."""
-    transform = np.diag([grid.voxel] * 3 + [1.0])
-    transform[3, :3] = grid.origin - (0.5 * grid.voxel if blender_version < (5, 0) else 0.0)
-    return transform
-
-
 def write_grid(grid: MergedGrid, path: Path) -> str:
     """Write a grid as a VDB file; returns a digest of its content. Raises FileError."""
-    transform = index_to_local(grid, bpy.app.version)
+    transform = np.diag([grid.voxel] * 3 + [1.0])  # VDB's are of row vectors
+    transform[3, :3] = grid.origin
     try:
         write_vdb(path, grid.density, grid.colour, transform)
     except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError

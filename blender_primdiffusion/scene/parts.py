@@ -9,10 +9,11 @@ from .build import build_missing_parts
 from .human import BODY_MARK, all_humans, primitive_of, volumes_of
 from .merged import MARK as MERGED_MARK
 from .proxy import PROXY_MARK
+from .splats import CELLS_MARK, SPLATS_AVAILABLE, SPLATS_MARK, cloud_of
 from .stand_in import STAND_IN
 from .surface import MARK as CARRIER_MARK
 
-_MARKS = (BODY_MARK, PROXY_MARK, CARRIER_MARK, STAND_IN, MERGED_MARK)
+_MARKS = (BODY_MARK, PROXY_MARK, CARRIER_MARK, STAND_IN, MERGED_MARK, SPLATS_MARK, CELLS_MARK)
 """Custom properties of parts; volumes of primitives have none."""
 
 
@@ -22,8 +23,9 @@ def orphans() -> list[bpy.types.Object]:
 
 
 def without_parts() -> list[bpy.types.Object]:
-    """Humans of this .blend that lack volumes: copies of an armature alone."""
-    return [person for person in all_humans() if _is_local(person) and person.users_scene and not volumes_of(person)]
+    """Humans of this .blend that lack splats and volumes: copies of an armature alone."""
+    here = (person for person in all_humans() if _is_local(person) and person.users_scene)
+    return [one for one in here if not volumes_of(one) and not (SPLATS_AVAILABLE and cloud_of(one))]
 
 
 def complete_humans() -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 import bpy
 
 from ..formats.whole_files import remove_abandoned
+from .attachment import attachment_of
 from .human import all_humans, body_of, primitive_of, volume_name, volumes_of, write_error
 from .payload import session_file, state_of
 from .rest_human import read_human, shape_model_of
@@ -67,7 +68,9 @@ def pending_volumes() -> list[PendingVolumes]:
 
 
 def pending_of(person: bpy.types.Object) -> PendingVolumes | None:
-    """What one human has of such volumes; None for nothing, and for a human that cannot be read."""
+    """What one human has of such volumes; None for nothing, and for a human that cannot be read or that splats show."""
+    if attachment_of(person) == "SPLATS":
+        return None
     try:
         file = session_file(person)
     except (ValueError, OSError):
@@ -101,7 +104,7 @@ def write_pending(pending: PendingVolumes) -> Generator[None, None, None]:
         path = folder / volume_name(k)
         try:
             if not path.is_file():
-                write_volume(grids, k, bpy.app.version, path)
+                write_volume(grids, k, path)
         except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
             raise write_error(folder, error) from error
         yield

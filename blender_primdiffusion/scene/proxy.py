@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 from ..formats.arrays import all_finite, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import FileError, as_file_error, portable_name
-from .armature import model_origin
+from .armature import floor_below, model_origin
 from .blend_values import as_numbers, stored_record
-from .build import build_body_mesh, floor_below
+from .build import build_body_mesh
 from .convention import points_to_blender
 from .human import BETA_COUNT, BODY_MARK, ORIGIN, own_data, parts_of
 from .payload import state_of
@@ -181,8 +181,6 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
         image.pack()
     image.filepath_raw = f"//{file}"  # `filepath` would look for the file at once
     material = bpy.data.materials.new(name)
-    if bpy.app.version < (5, 0):
-        material.use_nodes = True  # always true, and deprecated, since 5.0
     nodes = material.node_tree.nodes
     shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
     picture = nodes.new("ShaderNodeTexImage")

@@ -112,6 +112,10 @@ class ShapeModel:
         rotation = tangent_frames(*self._planes(vertices))
         return np.einsum("kc,kcx->kx", self.barycentric, vertices[self.faces[self.face]]), rotation
 
+    def rest_sides(self, betas: NDArray) -> NDArray[np.float64]:
+        """Lengths along T and widths along B [K, 2] of the primitives' cells at these betas [10] at rest, metres."""
+        return _sides(*self._planes(self.surface(betas)))
+
     def growth(self, before: NDArray, after: NDArray) -> NDArray[np.float64]:
         """Scale factors [K, 3] of boxes along T, B, N when the betas [10] change from `before` to `after`.
 

@@ -37,9 +37,12 @@ def carrier_of(person: bpy.types.Object) -> bpy.types.Object | None:
     return next((obj for obj in parts_of(person) if MARK in obj), None)
 
 
-def primitives_of(person: bpy.types.Object) -> bpy.types.Collection:
-    """The collection of the human's volumes. Raises ValueError where they have none to themselves."""
+def primitives_of(person: bpy.types.Object) -> bpy.types.Collection | None:
+    """The collection of the human's volumes; None for a human without. Raises ValueError where they have none to
+    themselves."""
     body, volumes = body_of(person), [obj for objects in volumes_of(person).values() for obj in objects]
+    if not volumes:
+        return None
     inside = Counter(collection for obj in volumes for collection in obj.users_collection)
     own = [collection for collection, _ in inside.most_common() if body is None or body.name not in collection.objects]
     if not own:
@@ -88,11 +91,15 @@ def scale_surface(person: bpy.types.Object, growth: NDArray) -> None:
     carrier = carrier_of(person)
     if carrier is None:
         return
-    mesh = own_data(carrier, person)
+    set_of_primitives(own_data(carrier, person), GROWTH, growth)
+
+
+def set_of_primitives(mesh: bpy.types.Mesh, name: str, values: NDArray) -> None:
+    """Set a vector attribute of a `carrier_mesh` from the values of the primitives [K, 3]."""
     primitive = np.empty(len(mesh.vertices), np.int32)
     mesh.attributes[PRIMITIVE].data.foreach_get("value", primitive)
-    attribute = mesh.attributes.get(GROWTH) or mesh.attributes.new(GROWTH, "FLOAT_VECTOR", "POINT")
-    attribute.data.foreach_set("vector", growth[primitive].astype(np.float32).ravel())
+    attribute = mesh.attributes.get(name) or mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
+    attribute.data.foreach_set("vector", values[primitive].astype(np.float32).ravel())
     mesh.update_tag()
 
 
@@ -112,7 +119,10 @@ def picks(person: bpy.types.Object, primitives: bpy.types.Collection, count: int
 
 
 def carrier_mesh(name: str, model: ShapeModel, pick: NDArray) -> bpy.types.Mesh:
-    """A vertex, with its weights, for each body vertex in the sums of each primitive's centre and tangent plane."""
+    """A vertex, with its weights, for each body vertex in the sums of each primitive's centre and tangent plane.
+
+    Vertex k is the first of primitive k.
+    """
     count, width = model.stencil_vertex.shape
     vertex = np.concatenate([model.faces[model.face], model.stencil_vertex], 1)
     no_corners, no_stencil = np.zeros((count, 3)), np.zeros((count, width))
@@ -122,18 +132,19 @@ def carrier_mesh(name: str, model: ShapeModel, pick: NDArray) -> bpy.types.Mesh:
         np.concatenate([no_corners, model.stencil_dv], 1),
     )
     used = np.any([weight != 0 for weight in weights], 0)
-    used[:, 0] = True  # the point that becomes the instance
-    primitive = np.broadcast_to(np.arange(count)[:, None], used.shape)[used]
-    first = np.concatenate([[True], primitive[1:] != primitive[:-1]]) & (pick[primitive] != _DELETED)
+    used[:, 0] = False
+    others, columns = np.nonzero(used)
+    primitive = np.concatenate([np.arange(count), others])
+    column = np.concatenate([np.zeros(count, np.int64), columns])
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(primitive))
     for attribute, kind, values in (
-        (VERTEX, "INT", vertex[used].astype(np.int32)),
+        (VERTEX, "INT", vertex[primitive, column].astype(np.int32)),
         (PRIMITIVE, "INT", primitive.astype(np.int32)),
         (PICK, "INT", np.maximum(pick, 0)[primitive].astype(np.int32)),
-        (FIRST, "BOOLEAN", first),
+        (FIRST, "BOOLEAN", (np.arange(len(primitive)) < count) & (pick[primitive] != _DELETED)),
         *(
-            (weight_name, "FLOAT", values[used].astype(np.float32))
+            (weight_name, "FLOAT", values[primitive, column].astype(np.float32))
             for weight_name, values in zip(WEIGHTS, weights, strict=True)
         ),
     ):

@@ -118,20 +118,18 @@ def bake(density: NDArray, rgb: NDArray, half_extent: NDArray) -> Grids:
     )
 
 
-def index_to_local(half_extent: NDArray, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
+def index_to_local(half_extent: NDArray) -> NDArray[np.float64]:
     """VDB's row-vector index-to-object transform [4, 4] of a box with half sides [3] in metres.
 
-    Voxel i of the eight (the padding has -1 and 8) has its centre at half_extent * (-1 + 2 i / 7). Cycles before 5.0
-    draws every voxel half a voxel too high on each axis, so its files are shifted down.
+    Voxel i of the eight (the padding has -1 and 8) has its centre at half_extent * (-1 + 2 i / 7).
     """
     step = 2.0 * np.asarray(half_extent) / (VOXELS - 1)
-    shift = -0.5 * step if blender_version < (5, 0) else 0.0
     transform = np.diag([*step, 1.0])
-    transform[3, :3] = -half_extent + shift
+    transform[3, :3] = -half_extent
     return transform
 
 
-def write_volume(grids: Grids, k: int, blender_version: tuple[int, ...], path: Path) -> None:
+def write_volume(grids: Grids, k: int, path: Path) -> None:
     """Write a primitive's volume to `path`, where it appears whole or not at all.
 
     Raises OSError, and RuntimeError when the disk is full.
@@ -142,7 +140,7 @@ def write_volume(grids: Grids, k: int, blender_version: tuple[int, ...], path: P
             hidden / path.name,
             grids.density[k][part],
             grids.colour[k][part],
-            index_to_local(grids.half_extent[k], blender_version),
+            index_to_local(grids.half_extent[k]),
             tuple((grids.first[k] - PAD).tolist()),
             _ALL_ACTIVE,
         )

@@ -7,14 +7,13 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.regular_files import printable
 from ..formats.requests import DENSITY_GAIN, VOXEL
-from ..jobs.deferred_volumes import deferred_volumes
+from ..jobs.deferred_volumes import deferred_volumes, keep_writing
 from ..jobs.export import show, shown
 from ..jobs.follow import submit
 from ..jobs.merge import MergeFramesJob, MergeJob, Moment
 from ..jobs.target import HumanTarget, selected_person
 from ..places import backend_is_named
 from ..scene.attachment import (
-    MODES,
     attachment_before_merge,
     attachment_of,
     in_viewport,
@@ -27,6 +26,7 @@ from ..scene.human import humans, parts_of, provenance_of
 from ..scene.material import density_gain, set_density_gain
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import proxy_of
+from ..scene.splats import cloud_of
 from ..scene.volumes import Memory, person_memory
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
@@ -37,6 +37,12 @@ ATTACHMENT_ITEMS = (
     ("ARMATURE", "Armature", "Each volume is an object that follows the bones; fast, and the default"),
     ("SURFACE", "Surface", "Volumes are placed on the posed skin in each pose, as in the PrimDiffusion engine"),
     ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
+    (
+        "SPLATS",
+        "Splats",
+        "Gaussian splats, which every view and engine draws: they cast shadows, but keep the light of their colors "
+        "(Blender 5.3)",
+    ),
 )
 _MOST_FRAMES = 3_000
 
@@ -55,6 +61,7 @@ class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         set_attachment(person, self.mode)
+        keep_writing()  # volumes that splats had made unnecessary
         return {"FINISHED"}
 
 
@@ -244,9 +251,10 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
 def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
     """How volumes follow the body."""
     now = attachment_of(person)
+    absent = {"MERGED": merged_of(person) is None, "SPLATS": cloud_of(person) is None}
     row = layout.row(align=True)
     for mode, label, _ in ATTACHMENT_ITEMS:
-        if mode != MODES[2] or merged_of(person) is not None:
+        if not absent.get(mode):
             row.operator("primdiffusion.set_attachment", text=label, depress=mode == now).mode = mode
     icon = "RESTRICT_VIEW_OFF" if in_viewport(person) else "RESTRICT_VIEW_ON"
     layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)

@@ -70,6 +70,21 @@ def volumes_shown(monkeypatch):
 
 
 @pytest.fixture
+def splats():
+    """New humans are shown by splats, if this Blender has them."""
+
+
+@pytest.fixture(autouse=True)
+def only_volumes(request, monkeypatch):
+    """New humans are shown by volumes on every Blender, unless a test asks for `splats`."""
+    if "splats" not in request.fixturenames:
+        from blender_primdiffusion.scene import attachment, build, parts
+
+        for module in (attachment, build, parts):
+            monkeypatch.setattr(module, "SPLATS_AVAILABLE", False)
+
+
+@pytest.fixture
 def addon(saved_scene, tmp_path, monkeypatch):
     """The add-on registered from the checkout, on an interpreter that runs the fake child."""
     import synthetic

@@ -104,8 +104,6 @@ def cube(name="cube", centre=(0.0, 0.0, 1.0), half=0.2) -> bpy.types.Object:
 def material(colour, name="paint") -> bpy.types.Material:
     """A Principled shader of this linear colour."""
     made = bpy.data.materials.new(name)
-    if bpy.app.version < (5, 0):
-        made.use_nodes = True
     shader = next(node for node in made.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Base Color"].default_value = (*colour, 1)
     return made
@@ -161,8 +159,7 @@ def render_exr(path: Path) -> tuple[np.ndarray, np.ndarray]:
     for layer in scene.view_layers:
         layer.use_pass_z = True
     settings = scene.render.image_settings
-    if bpy.app.version >= (5, 0):
-        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.media_type = "MULTI_LAYER_IMAGE"
     settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
     scene.render.filepath = str(path)
     assert bpy.ops.render.render(write_still=True) == {"FINISHED"}

@@ -236,8 +236,7 @@ class _Drawing:
         elif render.engine == ENGINE and not self._checked:
             check_backend(options.python)
             self._checked = True
-        if bpy.app.version >= (5, 0):
-            render.image_settings.media_type = "IMAGE"
+        render.image_settings.media_type = "IMAGE"
         render.image_settings.file_format = "PNG"
         render.image_settings.color_mode = "RGBA" if render.film_transparent else "RGB"
 

@@ -271,8 +271,6 @@ def test_each_view_layer_has_its_own_people(stage, backend):
 
 def test_an_opaque_film_shows_the_worlds_colour_behind_people(stage, backend):
     world = bpy.data.worlds.new("World")
-    if bpy.app.version < (5, 0):
-        world.use_nodes = True
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
     background.inputs["Color"].default_value, background.inputs["Strength"].default_value = (0.1, 0.2, 0.4, 1), 1.5
     stage.scene.world = world

@@ -30,8 +30,7 @@ def filled_box(path: Path) -> np.ndarray:
 
     grid = openvdb.read(str(path), "density")
     low, high = grid.evalActiveVoxelBoundingBox()
-    shift = 0.5 * grid.transform.voxelSize()[0] if bpy.app.version < (5, 0) else 0.0
-    return np.array([grid.transform.indexToWorld(corner) for corner in (low, high)]) + shift
+    return np.array([grid.transform.indexToWorld(corner) for corner in (low, high)])
 
 
 def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):

@@ -57,7 +57,7 @@ def test_the_count_is_that_of_the_shape_of_now(person, source):
     bpy.context.view_layer.update()
     expected = counted(source, small(person))
     assert expected > noted
-    assert abs(current_overlap(person) - expected) <= (0 if bpy.app.version >= (5, 0) else 1)
+    assert current_overlap(person) == expected
     assert ("Volumes", f"{COUNT}, up to {current_overlap(person)} overlap") in details(person)
     reshape(person, generated_betas(person))
     assert current_overlap(person) == noted

@@ -205,7 +205,7 @@ def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(perso
     assert (scene.render.engine, scene.camera, scene.world, scene.cycles.max_bounces) == ("CYCLES", camera, world, 7)
     assert scene.cycles.transparent_max_bounces == 1024
     assert scene.view_settings.view_transform == "Standard"
-    assert bpy.app.version < (5, 0) or scene.cycles.volume_biased
+    assert scene.cycles.volume_biased
     assert ops.set_up_engine() == {"FINISHED"}
     assert (scene.render.engine, scene.camera) == ("PRIMDIFFUSION", camera)
     scene.render.engine = "CYCLES"

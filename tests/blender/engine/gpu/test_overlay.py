@@ -75,7 +75,7 @@ def context(matrix=PERSPECTIVE, shading="SOLID", volumes=True) -> SimpleNamespac
     region = SimpleNamespace(width=SIZE[0], height=SIZE[1], as_pointer=lambda: 1)
     space = SimpleNamespace(
         local_view=None, shading=SimpleNamespace(show_xray=False, type=shading), as_pointer=lambda: 2,
-        show_object_viewport_mesh=True, show_object_viewport_volume=volumes,
+        show_object_viewport_mesh=True, show_object_viewport_volume=volumes, show_object_viewport_pointcloud=True,
     )  # fmt: skip
     around = SimpleNamespace(window_matrix=matrix, view_matrix=LOOK_ALONG_Y)
     return SimpleNamespace(
@@ -223,7 +223,7 @@ def test_bones_in_front_stay_visible_unless_hidden(people):
     bones = read(people.overlay).bones
     assert bones.shape == (24, 2, 3)
     assert np.abs(bones[:, 0] - head).sum(1).min() < 1e-5
-    (bone if bpy.app.version >= (5, 0) else bone.bone).hide = True
+    bone.hide = True
     bones = read(people.overlay).bones
     assert bones.shape == (23, 2, 3)
 
