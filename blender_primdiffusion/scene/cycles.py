@@ -156,8 +156,8 @@ def overlap_warning(person: bpy.types.Object) -> str | None:
 
 
 def overlap_warning_in(scene: bpy.types.Scene, person: bpy.types.Object) -> str | None:
-    """`overlap_warning` where Cycles is the scene's engine: no other engine drops volumes."""
-    return overlap_warning(person) if scene.render.engine == "CYCLES" else None
+    """`overlap_warning` for a human with volumes where Cycles is the scene's engine: no other engine drops any."""
+    return overlap_warning(person) if scene.render.engine == "CYCLES" and volumes_of(person) else None
 
 
 def current_overlap(person: bpy.types.Object) -> int:

@@ -26,7 +26,7 @@ from ..scene.human import humans, parts_of, provenance_of
 from ..scene.material import density_gain, set_density_gain
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import proxy_of
-from ..scene.splats import cloud_of
+from ..scene.splats import SPLATS_AVAILABLE, cloud_of
 from ..scene.volumes import Memory, person_memory
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
@@ -251,13 +251,14 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
 def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
     """How volumes follow the body."""
     now = attachment_of(person)
-    absent = {"MERGED": merged_of(person) is None, "SPLATS": cloud_of(person) is None}
+    absent = {"MERGED": merged_of(person) is None, "SPLATS": not SPLATS_AVAILABLE}
     row = layout.row(align=True)
     for mode, label, _ in ATTACHMENT_ITEMS:
         if not absent.get(mode):
             row.operator("primdiffusion.set_attachment", text=label, depress=mode == now).mode = mode
-    icon = "RESTRICT_VIEW_OFF" if in_viewport(person) else "RESTRICT_VIEW_ON"
-    layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)
+    if now != "SPLATS":
+        icon = "RESTRICT_VIEW_OFF" if in_viewport(person) else "RESTRICT_VIEW_ON"
+        layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)
 
 
 def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
@@ -274,6 +275,9 @@ def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: 
 
 def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
     """What brings Cycles near the exact picture."""
+    if attachment_of(person) == "SPLATS":
+        draw_lines(layout, "Splats look the same in every engine", "INFO")
+        return
     if density_gain(person) is None:
         draw_lines(layout, "The human's material has no node Density Gain", "INFO")
     else:
@@ -320,7 +324,12 @@ def details(person: bpy.types.Object) -> list[tuple[str, str]]:
             rest = [f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)]
             lines.append((f"Edit: {as_shown(edit.get('edit', '?'))}", as_shown(", ".join(rest))))
     del lines[_MOST_LINES:]
+    cloud = cloud_of(person)
+    if cloud is not None:
+        lines.append(("Splats", f"{len(cloud.data.points):,}"))
     volumes = [obj for obj in parts_of(person) if obj.type == "VOLUME"]
+    if not volumes:
+        return lines
     try:
         memory = person_memory(person)
     except (ValueError, OSError):  # the panel Human says why

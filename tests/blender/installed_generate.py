@@ -44,6 +44,7 @@ report = {
     "outcome": sorted(outcome),
     "module": module,
     "volumes": len(volumes),
+    "splats": sum(len(o.data.points) for o in bpy.context.scene.objects if o.type == "POINTCLOUD"),
     "loaded": sum(o.data.grids.load() for o in volumes),
     "bones": len(armature.data.bones),
     "files": len(list(Path(blend).parent.rglob("*.vdb"))),
