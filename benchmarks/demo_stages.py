@@ -2,8 +2,8 @@
 
 `person` installs the extension in Blender, presses the button, walks, measures the volumes' motion and saves; it
 generates through the extension's own operator and the real child process. `cycles` opens the saved file, merges the
-human and renders one frame. `march` draws the generated human: rest, walking, side view, depth, primitives as boxes. Blender's settings
-are in a temporary folder, so those of an installed Blender do not change.
+human and renders one frame. `march` draws the generated human: rest, walking, side view, depth, primitives as boxes.
+Blender's settings are in a temporary folder, so those of an installed Blender do not change.
 """
 
 from __future__ import annotations

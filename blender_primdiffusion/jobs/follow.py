@@ -14,7 +14,6 @@ from ..formats.regular_files import printable
 from ..places import backend_is_named
 from .deferred_volumes import keep_writing
 from .memory import release_when_idle
-from .picture_in_view import follow_picture
 from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
 from .remedies import error_before_the_scene
@@ -159,7 +158,6 @@ def follow() -> float | None:
         enter()
         changed = True
     changed |= so_far.show(queue.request.picture if queue.request is not None else None)
-    follow_picture()
     if changed:
         redraw()
     return TICK_S if queue.busy else None

@@ -17,7 +17,6 @@ from ..backend.requests import error_text
 from ..jobs import follow, memory
 from ..jobs.follow import Reporting, redraw, submit
 from ..jobs.memory import device_line
-from ..jobs.picture_in_view import follow_picture
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
@@ -258,7 +257,6 @@ def drop_before_loading(*_: object) -> None:
     """Handler of load_pre: the results of jobs belong into the file that is being closed."""
     queue.drop()
     so_far.show(None)
-    follow_picture()
 
 
 @persistent

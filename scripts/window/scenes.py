@@ -28,7 +28,7 @@ from start import (
     select,
     with_people,
 )
-from view_scenes import denoising_in_view, dragging, redraw, rendered, rendered_view, shadings, stalls
+from view_scenes import dragging, redraw, rendered, rendered_view, shadings, stalls
 from visible_scene import at_rest, visible_humans
 
 
@@ -333,7 +333,6 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "shadings": shadings,
     "dragging": dragging,
     "rendered": rendered,
-    "denoising_in_view": denoising_in_view,
     "captures": captures,
     "from_picture": from_picture,
     "export": export,

@@ -166,17 +166,6 @@ def read_scan_shape(path: Path) -> None:
         finite(found[0])
 
 
-def make_batch(folder: Path) -> Path:
-    (folder / "batch.json").write_text(json.dumps({"seeds": [1, 2], "steps": 30, "size": [64, 64]}), encoding="utf-8")
-    return folder / "batch.json"
-
-
-def read_batch(path: Path) -> None:
-    from blender_primdiffusion.ui.batch.running import claim
-
-    claim(path, {"seeds": [1, 2], "steps": 30, "size": [64, 64]}, whatever_is_there=False)
-
-
 TARGETS = (
     Target("human in Blender", make_human, mutations.SAFETENSORS, read_human),
     Target("moving human in Blender", make_moving, mutations.SAFETENSORS, read_human),
@@ -192,5 +181,4 @@ TARGETS = (
     Target("body of captures", make_body, mutations.NPZ, read_body),
     Target("parameters of a scan", make_parameters, mutations.NPZ, read_parameters),
     Target("shape of a scan", make_scan, mutations.PLAIN, read_scan_shape),
-    Target("batch settings", make_batch, mutations.JSON, read_batch),
 )

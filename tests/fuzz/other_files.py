@@ -311,23 +311,6 @@ def import_scan(path: Path) -> None:
     import_file(path)
 
 
-def make_blend(folder: Path) -> Path:
-    import bpy
-
-    bpy.ops.wm.save_as_mainfile(filepath=str(folder / "a.blend"), copy=True)
-    return folder / "a.blend"
-
-
-def render_blend(path: Path) -> None:
-    from blender_primdiffusion.ui.batch.render import RenderSource, _Drawing
-
-    drawing = object.__new__(_Drawing)
-    try:
-        drawing.draw(RenderSource("a", path))
-    except RuntimeError as error:  # the batch tells these by themselves
-        raise ValueError(str(error).strip()) from error
-
-
 DAMAGED: dict[str, Sequence[Mutation]] = {
     "captures: settings": mutations.JSON, "captures: cameras": mutations.JSON,
     "captures: completion mark": mutations.JSON, "captures: poses": mutations.NPZ,
@@ -367,6 +350,5 @@ TARGETS = tuple(
         ("posture", make_posture, read_posture),
         ("Blender: picture of a scan", make_scan_picture, find_scan_picture),
         ("Blender: scan", make_mesh, import_scan),
-        ("Blender: .blend", make_blend, render_blend),
     )
 )

@@ -91,13 +91,13 @@ OPTIONAL = {
 }  # fmt: skip
 """Files that may be missing: what is no file counts as that."""
 AS_MISSING = {
-    ("captures: settings", "circle"), ("batch settings", "circle"), ("run: settings", "circle"),
+    ("captures: settings", "circle"), ("run: settings", "circle"),
     ("run: starts", "circle"), ("run: metrics", "circle"), ("run: metrics", "endless"), ("Blender: scan", "endless"),
     ("Blender: HDRI", "endless"),
 }  # fmt: skip
 """A link that leads nowhere is replaced where the program writes such a file; a file of /proc counts as empty."""
 NOT_THERE_YET = {
-    "batch settings", "run: settings", "run: starts", "run: metrics", "captures: settings", "captures: joints",
+    "run: settings", "run: starts", "run: metrics", "captures: settings", "captures: joints",
     "captures: picture",
 }  # fmt: skip
 """Files that the program writes where they are absent, or reads no more than it needs of."""
@@ -275,8 +275,6 @@ EXTENSION = {
     "scene/proxy.py": ("proxy",),
     "scene/volumes.py": "it reads the header of a regular file; any other has no format",
     "ui/attributes.py": ("vocabulary",),
-    "ui/batch/render.py": ("Blender: .blend",),
-    "ui/batch/running.py": ("batch settings",),
 }
 MODULES: dict[str, tuple[str, ...] | str] = {
     **{f"backend/primdiffusion/{name}": tried for name, tried in BACKEND.items()},

@@ -112,7 +112,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "JSON: poses, cameras, captures, sets of humans": (
         (
-            "pose", "own pose", "poses .json", "motion .json", "MHR .json", "cameras", "batch settings", "human's card",
+            "pose", "own pose", "poses .json", "motion .json", "MHR .json", "cameras", "human's card",
             "manifest", "packed index", "joints of shots", "captures: settings", "captures: cameras",
             "captures: completion mark", "captures: about a pack", "posture",
         ),
@@ -183,7 +183,7 @@ ROWS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 """Kinds of files of the table in SECURITY.md: what tries each in `test_not_files`, and tests of what it says."""
 TRUSTED = {
     "ONNX network", "Blender: preview", "Blender: HDRI", "Blender: picture of a scan", "Blender: plain picture",
-    "Blender: scan", "Blender: .blend", "shape of a scan", "picture of Cycles", "frame", "captures: pack",
+    "Blender: scan", "shape of a scan", "picture of Cycles", "frame", "captures: pack",
     "material of an asset",
 }  # fmt: skip
 """Files without a largest size: what Blender and onnxruntime read by themselves, what this program has just written,
@@ -286,7 +286,7 @@ def hook() -> None:
 
 
 WRITERS = {
-    "batch settings", "run: settings", "run: starts", "run: metrics", "frame", "Blender: preview", "Blender: .blend",
+    "run: settings", "run: starts", "run: metrics", "frame", "Blender: preview",
     "packed shard",
 }  # fmt: skip
 """What is read by commands that write as well, a file that is shared with Blender, and what Blender reads. The reading
