@@ -280,7 +280,6 @@ class ImportHumanJob(Job):
     kind = "import_human"
     method = "open_human"
     undo = "Import Human"
-    new_person = True
 
     path: str
     at: tuple[float, float, float] | None = None

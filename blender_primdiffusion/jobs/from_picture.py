@@ -171,7 +171,6 @@ class PictureJob(Job):
     kind = "from_picture"
     method = "reconstruct"
     undo = "Human from Picture"
-    new_person = True
 
     task: PictureTask
     seed: int = -1

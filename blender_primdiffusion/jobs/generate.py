@@ -56,7 +56,6 @@ class GenerateJob(Job):
 
     kind = method = "generate"
     undo = "Generate Human"
-    new_person = True
 
     seed: int
     sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -87,7 +86,6 @@ class ReconstructJob(Job):
 
     kind = method = "reconstruct"
     undo = "Human from Captures"
-    new_person = True
 
     capture: str
     """Folder of a dataset of captures, or of one subject in it."""

@@ -35,9 +35,6 @@ class Job(abc.ABC):
     undo: ClassVar[str] = ""
     """Name of the undo step that `finish` makes; empty when it leaves the scene as it is."""
 
-    new_person: ClassVar[bool] = False
-    """Whether `finish` adds a human, whose picture views show meanwhile."""
-
     @property
     @abc.abstractmethod
     def label(self) -> str:
