@@ -30,6 +30,7 @@ from . import (
     import_motion,
     jobs_panel,
     manual,
+    menus,
     motion_panel,
     picture_panel,
     pose_panel,
@@ -45,7 +46,7 @@ MODULES = (
     generate_panel, variations_panel, human_panel, shape_panel, edit_panel, parts,
     deferred_volumes, import_motion, motion_panel, pose_panel, picture_panel,
     render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
-    captures_panel, reconstruct_panel, viewport_humans, captures_command, manual, stand_in,
+    captures_panel, reconstruct_panel, viewport_humans, captures_command, manual, menus, stand_in,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 
