@@ -26,7 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
 
 from blender_primdiffusion.places import EXTENSION
-from blender_primdiffusion.scene import attachment, merged, proxy, stand_in, surface
+from blender_primdiffusion.scene import attachment, merged, proxy, splats, stand_in, surface
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, is_human, link_part, parts_of
@@ -106,6 +106,12 @@ def build(stage: Stage) -> None:
     whole.data.filepath = str(stage.shipped / "merged_0123456789ab.vdb")
     whole.parent = person
     link_part(person, whole)
+    cloud = bpy.data.objects.new("Anna_splats", bpy.data.pointclouds.new("Anna_splats"))
+    cells = bpy.data.objects.new("Anna_cells", body_of(person).data.copy())
+    cloud[splats.SPLATS_MARK] = cells[splats.CELLS_MARK] = True
+    for part in (cloud, cells):
+        part.parent = person
+        link_part(person, part)
     (stage.shipped / "merged_0123456789ab.vdb").write_bytes(b"merged")
     (stage.shipped / LINK).symlink_to(os.path.relpath(stage.users, stage.shipped))
     (stage.shipped / DEVICE).symlink_to("/dev/zero")
@@ -132,6 +138,8 @@ HOLDERS: dict[str, Callable[[], Any]] = {
     proxy.PROXY_MARK: _with(proxy.PROXY_MARK),
     merged.MARK: _with(merged.MARK),
     surface.MARK: _with(surface.MARK),
+    splats.SPLATS_MARK: _with(splats.SPLATS_MARK),
+    splats.CELLS_MARK: _with(splats.CELLS_MARK),
     stand_in.STAND_IN: _with(stand_in.STAND_IN),
     FACTS: lambda: bpy.data.actions["Walk"],
 }

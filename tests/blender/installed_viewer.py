@@ -16,8 +16,6 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from blender_primdiffusion.scene.human import parts_of
-
 archive, folder = sys.argv[1], Path(sys.argv[2])
 program = Path(sys.argv[3]) if len(sys.argv) > 3 else None
 sys.modules["primdiffusion"] = None  # as in a Blender whose Python has no backend
@@ -61,7 +59,7 @@ report["exported"] = sorted(press.export(filepath=str(file), compact=True))
 report["bytes"] = file.stat().st_size
 report["imported"] = sorted(press.import_human(filepath=str(file)))
 report["humans"] = len(human.humans(bpy.context.scene))
-report["volumes"] = len(list(folder.rglob("*.vdb")))
+report["volumes"] = len(list(Path(bpy.app.tempdir).rglob("*.vdb")))
 try:
     press.generate(seed=7)
 except RuntimeError as error:
@@ -85,7 +83,7 @@ if program is not None:
     bpy.context.preferences.addons[module].preferences.backend_python = str(program)
     report["generated"].append(sorted(press.generate(seed=8, steps=2)))
     made = human.humans(bpy.context.scene)[2:]
-    report["boxes"] = [sum(obj.type == "VOLUME" for obj in parts_of(one)) for one in made]
+    report["boxes"] = [sum(obj.type == "VOLUME" for obj in human.parts_of(one)) for one in made]
     report["provenance"] = [json.loads(one[human.MARK])["seed"] for one in made]
     report["standing"] = [one.name in bpy.context.view_layer.objects for one in made]
 bpy.ops.preferences.addon_disable(module=module)

@@ -15,7 +15,7 @@ from oracle import Z_UP, blended_frames, blended_vertices, evaluated_matrices, w
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import ATTACHMENT, IN_VIEWPORT, attachment_of, set_attachment
+from blender_primdiffusion.scene.attachment import IN_VIEWPORT, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import body_of, humans, volumes_of
 from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of, primitives_of
@@ -206,7 +206,7 @@ def test_unknown_modes_and_what_is_not_merged_are_rejected(person):
         set_attachment(person[0], "BONES")
     with refused(ValueError, "Merge"):
         set_attachment(person[0], "MERGED")
-    assert ATTACHMENT not in person[0]
+    assert attachment_of(person[0]) == "ARMATURE"
 
 
 def test_a_human_of_an_earlier_version_stays_shown_in_viewports(person):

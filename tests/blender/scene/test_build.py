@@ -15,9 +15,9 @@ from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
 from support.errors import refused
 
-from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene import volume_objects
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.build import attach_volumes, build_human
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
 from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
@@ -156,11 +156,13 @@ def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_pa
 def test_a_failure_in_the_middle_of_building_leaves_the_scene_as_it_was(person, saved_scene, tmp_path, monkeypatch):
     before, files = datablocks(), volume_files()
 
+    attach_volumes = volume_objects.attach_volumes
+
     def failing(*given):
         attach_volumes(*given)
         raise MemoryError("no memory for the volumes")
 
-    monkeypatch.setattr(build, "attach_volumes", failing)
+    monkeypatch.setattr(volume_objects, "attach_volumes", failing)
     with pytest.raises(MemoryError):
         build_human(saved_scene, synthetic.write(tmp_path / "second", 8, seed=3))
     assert datablocks() == before
