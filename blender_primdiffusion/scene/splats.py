@@ -17,7 +17,7 @@ from .payload import session_file
 from .rest_human import RestHuman, default_body, read_human
 from .shape import ShapeModel, betas_of, generated_betas
 from .splat_nodes import CELL, REST_SIDES, follow_body
-from .surface import GROWTH, carrier_mesh, set_of_primitives
+from .surface import GROWTH, PRIMITIVE, carrier_mesh, set_of_primitives
 from .volumes import WINDOW_EXPONENT
 
 SPLATS_MARK, CELLS_MARK = "primdiffusion_splats", "primdiffusion_cells"
@@ -160,8 +160,9 @@ def cloud_of(person: bpy.types.Object) -> bpy.types.Object | None:
 
 
 def cells_of(person: bpy.types.Object) -> bpy.types.Object | None:
-    """The cells on which they lie; None where there are none, or they were deleted."""
-    return next((obj for obj in parts_of(person) if obj.type == "MESH" and CELLS_MARK in obj), None)
+    """The cells on which they lie; None where there are none, or they were deleted or changed by hand."""
+    marked = (obj for obj in parts_of(person) if obj.type == "MESH" and CELLS_MARK in obj)
+    return next((obj for obj in marked if PRIMITIVE in obj.data.attributes), None)
 
 
 def scale_splats(person: bpy.types.Object, model: ShapeModel, betas: NDArray, growth: NDArray) -> None:
@@ -172,10 +173,13 @@ def scale_splats(person: bpy.types.Object, model: ShapeModel, betas: NDArray, gr
 
 
 def replace_splats(person: bpy.types.Object, human: RestHuman) -> None:
-    """Show another human's voxels by the splats of this one, if it has any."""
-    splats = cloud_of(person)
-    if splats is not None:
+    """Show another human's voxels by the splats of this one, if it has any. Earlier Blenders, which cannot write them,
+    remove them instead: *Attachment* makes them again."""
+    splats, cells = cloud_of(person), cells_of(person)
+    if splats is not None and SPLATS_AVAILABLE:
         fill(own_data(splats, person), splats_of(human))
+    else:
+        bpy.data.batch_remove([part for part in (splats, cells) if part is not None])
 
 
 def _scale_cells(mesh: bpy.types.Mesh, model: ShapeModel, betas: NDArray, growth: NDArray) -> None:
