@@ -36,10 +36,18 @@ from primdiffusion.render.cpu_sampling import (
     tabulate,
     tile_rays,
 )
+from primdiffusion.render.cpu_segments import (
+    WIDTH,
+    add_four_columns,
+    add_four_transposed,
+    add_product,
+    add_transposed_product,
+    merge_sample,
+)
 from primdiffusion.render.lattice import MarchSettings
 
-COLOUR, DENSITY, OPACITY = 0, 1, 4
-"""Columns of `PictureJacobian.weight`: of a voxel's colour, of its density for red, green and blue, and for alpha."""
+DENSITY, OPACITY, COLOUR = 0, 3, 4
+"""Columns of `PictureJacobian.weight`: of a voxel's density for red, green and blue, and for alpha; of its colour."""
 WEIGHTS = 5
 SHORTEST = 4e-5
 """Entries with less than this length of ray (metres) are dropped: 0.8 % of opacity at a density of 200 per metre."""
@@ -80,15 +88,13 @@ def linearise(primitives: Primitives, camera: Camera, background: float) -> tupl
 
     `background` is linear. Raises ValueError as `march_reference` does, and for boxes of other than 8^3 voxels.
     """
-    boxes, size = primitives.density.shape[0], primitives.density.shape[-1]
+    size = primitives.density.shape[-1]
     if size**3 != VOXELS:
         raise ValueError(f"boxes of {size}^3 voxels cannot be linearised: give boxes of 8^3")
     rendering, view, scene, ends = draw_with_ends(primitives, camera, MarchSettings())
     saturates = ends.index != NEVER
     share = np.where(saturates, ends.share, np.float32(1))
     behind = np.where(saturates[:, None], ends.rgb, np.float32(background)).astype(np.float32)
-    density = primitives.density.detach().float().contiguous().numpy().reshape(boxes, VOXELS)
-    rgb = primitives.rgb.detach().float().contiguous().numpy().reshape(boxes, 3, VOXELS)
     room = max(FIRST_ROOM, ROOM_PER_PIXEL * len(behind)) // PARTS
 
     def entries_of(first: int, last: int) -> tuple[ndarray, ...]:
@@ -99,7 +105,7 @@ def linearise(primitives: Primitives, camera: Camera, background: float) -> tupl
             ray, start = np.empty(capacity // 8, np.int32), np.empty(capacity // 8 + 1, np.int64)
             voxel, weight = np.empty(capacity, np.int16), np.empty((capacity, WEIGHTS), np.float32)
             segments, entries = _linearise(
-                first, last, box_start, ray, start, voxel, weight, density, rgb, ends.index, share, ends.box, behind,
+                first, last, box_start, ray, start, voxel, weight, ends.index, share, ends.box, behind,
                 scene.boxes, scene.size, scene.rectangle, view.limits, scene.pixel_to_world, view.width, view.height,
                 view.spacing,
             )  # fmt: skip
@@ -244,7 +250,7 @@ class ColourMatrix(NamedTuple):
 
 @kernel
 def _linearise(
-    begin_box, end_box, box_start, ray_of, start, voxel, weight, density, rgb, ends, shares, last_box, behind, boxes,
+    begin_box, end_box, box_start, ray_of, start, voxel, weight, ends, shares, last_box, behind, boxes,
     size, rectangle, limits, pixel_to_world, width, height, spacing,
 ):  # fmt: skip
     """Fill the matrix; return the numbers of segments and entries, or -1 if they exceed its capacity."""
@@ -252,7 +258,7 @@ def _linearise(
     table = np.empty(LANES * TABLE_ROWS, np.float32)
     hits = np.empty(HIT_ROWS * LANES, np.float32)
     block = np.empty(8 * SAMPLES, np.float32)
-    sums = np.zeros((VOXELS, WEIGHTS), np.float32)
+    sums = np.zeros((VOXELS, WIDTH), np.float32)
     touched = np.empty(VOXELS, np.int64)
     seen = np.zeros(VOXELS, np.bool_)
     segments, entries = 0, 0
@@ -285,8 +291,8 @@ def _linearise(
                             continue
                         share = shares[ray] if reference + leave * stride == ends[ray] else np.float32(1)
                         count = _merge_segment(
-                            sums, touched, seen, density[k], rgb[k], behind[ray], block, hits, j, enter, leave, size,
-                            length, share,
+                            sums, touched, seen, boxes.voxels, 4 * k * VOXELS, behind[ray, 0], behind[ray, 1],
+                            behind[ray, 2], block, hits, j, enter, leave, size, length, share,
                         )  # fmt: skip
                         if entries + count > len(voxel) or segments + 1 >= len(ray_of):
                             return -1, -1
@@ -299,8 +305,7 @@ def _linearise(
                                 for column_of_weight in range(WEIGHTS):
                                     weight[entries, column_of_weight] = sums[v, column_of_weight]
                                 entries += 1
-                            for column_of_weight in range(WEIGHTS):
-                                sums[v, column_of_weight] = 0
+                            sums[v] = 0
                         if entries > first:
                             ray_of[segments], start[segments] = ray, first
                             segments += 1
@@ -309,9 +314,11 @@ def _linearise(
 
 
 @part()
-def _merge_segment(sums, touched, seen, density, rgb, behind, block, hits, lane, enter, leave, size, length, share):
+def _merge_segment(
+    sums, touched, seen, voxels, base, red, green, blue, block, hits, lane, enter, leave, size, length, share
+):  # fmt: skip
     """Add the samples of a ray in a box to `sums`; return the number of voxels touched, listed in `touched`."""
-    count, slab = 0, size * size
+    count, slab, before = 0, size * size, -1
     for begin in range(enter, leave + 1, SAMPLES):
         place_samples(block, hits, lane, np.float32(begin), size, length)
         samples = min(SAMPLES, leave + 1 - begin)
@@ -322,30 +329,21 @@ def _merge_segment(sums, touched, seen, density, rgb, behind, block, hits, lane,
             if opacity < np.float32(2e-5):
                 continue
             corner = np.int64(block[7 * SAMPLES + s])
-            near, far = block[4 * SAMPLES + s], block[5 * SAMPLES + s]
-            d, r, g, b = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-            for edge in range(4):
-                v = corner + (edge & 1) * size + (edge >> 1) * slab
-                w0, w1 = block[edge * SAMPLES + s] * near, block[edge * SAMPLES + s] * far
-                d += w0 * density[v] + w1 * density[v + 1]
-                r += w0 * rgb[0, v] + w1 * rgb[0, v + 1]
-                g += w0 * rgb[1, v] + w1 * rgb[1, v + 1]
-                b += w0 * rgb[2, v] + w1 * rgb[2, v + 1]
-            r, g, b = r - behind[0], g - behind[1], b - behind[2]
+            merge_sample(
+                sums, voxels, base, corner, size, slab,
+                block[s], block[SAMPLES + s], block[2 * SAMPLES + s], block[3 * SAMPLES + s],
+                block[4 * SAMPLES + s], block[5 * SAMPLES + s], opacity, red, green, blue,
+            )  # fmt: skip
+            if corner == before:
+                continue
+            before = corner
             for edge in range(4):
                 first = corner + (edge & 1) * size + (edge >> 1) * slab
-                for end in range(2):
-                    v = first + end
-                    w = block[edge * SAMPLES + s] * (far if end else near) * opacity
+                for v in range(first, first + 2):
                     if not seen[v]:
                         seen[v] = True
                         touched[count] = v
                         count += 1
-                    sums[v, 0] += w * d
-                    sums[v, 1] += w * r
-                    sums[v, 2] += w * g
-                    sums[v, 3] += w * b
-                    sums[v, 4] += w
     return count
 
 
@@ -354,19 +352,8 @@ def _apply(begin_box, end_box, box_start, ray, start, voxel, weight, x, out):
     for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
-            r, g, b, a = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-            for entry in range(start[segment], start[segment + 1]):
-                v = base + np.int64(voxel[entry])
-                w, d = weight[entry, 0], x[v, 3]
-                r += w * x[v, 0] + weight[entry, 1] * d
-                g += w * x[v, 1] + weight[entry, 2] * d
-                b += w * x[v, 2] + weight[entry, 3] * d
-                a += weight[entry, 4] * d
-            i = ray[segment]
-            out[i, 0] += r
-            out[i, 1] += g
-            out[i, 2] += b
-            out[i, 3] += a
+            first, last = start[segment], start[segment + 1]
+            add_product(out, np.int64(ray[segment]), x, base, voxel, weight, first, last)
 
 
 @kernel
@@ -377,15 +364,8 @@ def _add_transposed(taken, box_start, ray, start, voxel, weight, y, out):
             break
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
-            i = ray[segment]
-            r, g, b, a = y[i, 0], y[i, 1], y[i, 2], y[i, 3]
-            for entry in range(start[segment], start[segment + 1]):
-                v = base + np.int64(voxel[entry])
-                w = weight[entry, 0]
-                out[v, 0] += w * r
-                out[v, 1] += w * g
-                out[v, 2] += w * b
-                out[v, 3] += weight[entry, 1] * r + weight[entry, 2] * g + weight[entry, 3] * b + weight[entry, 4] * a
+            first, last = start[segment], start[segment + 1]
+            add_transposed_product(out, base, y, np.int64(ray[segment]), voxel, weight, first, last)
 
 
 @kernel
@@ -399,11 +379,11 @@ def _add_diagonal(taken, box_start, ray, start, voxel, weight, y, out):
             i = ray[segment]
             for entry in range(start[segment], start[segment + 1]):
                 v = base + np.int64(voxel[entry])
-                w = weight[entry, 0] * weight[entry, 0]
+                w = weight[entry, COLOUR] * weight[entry, COLOUR]
                 for channel in range(3):
                     out[v, channel] += w * y[i, channel]
-                    out[v, 3] += weight[entry, 1 + channel] * weight[entry, 1 + channel] * y[i, channel]
-                out[v, 3] += weight[entry, 4] * weight[entry, 4] * y[i, 3]
+                for channel in range(4):
+                    out[v, 3] += weight[entry, channel] * weight[entry, channel] * y[i, channel]
 
 
 @kernel
@@ -412,11 +392,12 @@ def _apply_colours(box_start, ray, start, voxel, weight, x, out):
     for k in range(len(box_start) - 1):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
-            row = out[ray[segment]]
-            for entry in range(start[segment], start[segment + 1]):
-                w, colours = weight[entry], x[base + np.int64(voxel[entry])]
-                for column in range(columns):
-                    row[column] += w * colours[column]
+            i, first, last = np.int64(ray[segment]), start[segment], start[segment + 1]
+            for column in range(0, columns - 3, 4):
+                add_four_columns(out, i * columns + column, x, base, columns, column, voxel, weight, first, last)
+            for column in range(columns // 4 * 4, columns):
+                for entry in range(first, last):
+                    out[i, column] += weight[entry] * x[base + np.int64(voxel[entry]), column]
 
 
 @kernel
@@ -425,11 +406,12 @@ def _add_colours_transposed(box_start, ray, start, voxel, weight, y, out):
     for k in range(len(box_start) - 1):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
-            pixel = y[ray[segment]]
-            for entry in range(start[segment], start[segment + 1]):
-                w, colours = weight[entry], out[base + np.int64(voxel[entry])]
-                for column in range(columns):
-                    colours[column] += w * pixel[column]
+            i, first, last = np.int64(ray[segment]), start[segment], start[segment + 1]
+            for column in range(0, columns - 3, 4):
+                add_four_transposed(out, base, columns, column, y, i * columns + column, voxel, weight, first, last)
+            for column in range(columns // 4 * 4, columns):
+                for entry in range(first, last):
+                    out[base + np.int64(voxel[entry]), column] += weight[entry] * y[i, column]
 
 
 @kernel
@@ -438,10 +420,10 @@ def _add_in_basis(start, voxel, weight, slope, basis, out):
         for entry in range(start[segment], start[segment + 1]):
             v = np.int64(voxel[entry])
             for channel in range(3):
-                a = weight[entry, 0] * slope[v, channel]
+                a = weight[entry, COLOUR] * slope[v, channel]
                 for c in range(basis.shape[2]):
                     out[segment, channel, c] += a * basis[v, channel, c]
             for channel in range(4):
-                a = weight[entry, 1 + channel] * slope[v, 3]
+                a = weight[entry, channel] * slope[v, 3]
                 for c in range(basis.shape[2]):
                     out[segment, channel, c] += a * basis[v, 3, c]
