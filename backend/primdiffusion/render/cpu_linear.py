@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int16, Int32, Int64
@@ -21,7 +21,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import draw_with_ends
 from primdiffusion.render.cpu_adjoint import counted_steps
-from primdiffusion.render.cpu_compiled import TILE, at_once, index, kernel, on_all_threads, part, take
+from primdiffusion.render.cpu_compiled import THREADS, TILE, at_once, index, kernel, on_all_threads, part, take
 from primdiffusion.render.cpu_forward import NEVER
 from primdiffusion.render.cpu_sampling import (
     HIT_ROWS,
@@ -54,7 +54,9 @@ SHORTEST = 4e-5
 FIRST_ROOM, ROOM_PER_PIXEL = 2_000_000, 16
 """Initial capacity in entries; an image of a human has 1.5 million with 176 x 176 pixels, 3 million with 512 x 512."""
 PARTS = 4
-"""Ranges of boxes computed at once. Constant, so that sums over rays are the same on every machine."""
+"""Ranges of boxes, or images, computed at once."""
+BOXES_AT_ONCE = 64
+"""Boxes that all images multiply in turn; their voxels fit a processor's cache."""
 
 
 class PictureJacobian(NamedTuple):
@@ -95,7 +97,7 @@ def linearise(primitives: Primitives, camera: Camera, background: float) -> tupl
     saturates = ends.index != NEVER
     share = np.where(saturates, ends.share, np.float32(1))
     behind = np.where(saturates[:, None], ends.rgb, np.float32(background)).astype(np.float32)
-    room = max(FIRST_ROOM, ROOM_PER_PIXEL * len(behind)) // PARTS
+    room = max(FIRST_ROOM, ROOM_PER_PIXEL * len(behind)) // (PARTS if THREADS > 1 else 1)
 
     def entries_of(first: int, last: int) -> tuple[ndarray, ...]:
         """The arrays of PictureJacobian for a range of boxes."""
@@ -113,17 +115,21 @@ def linearise(primitives: Primitives, camera: Camera, background: float) -> tupl
                 return box_start[:-1], ray[:segments], start[:segments], voxel[:entries], weight[:entries]
             capacity *= 2
 
-    ranges = _ranges(_tiles(scene.rectangle))
+    ranges = _ranges(_tiles(scene.rectangle)) if THREADS > 1 else [(0, len(scene.rectangle))]
     parts = list(zip(*at_once([functools.partial(entries_of, *one) for one in ranges]), strict=True))
     jacobian = PictureJacobian(
         _joined(parts[0], parts[1]),
-        np.concatenate(parts[1]),
+        _whole(parts[1]),
         _joined(parts[2], parts[3]),
-        np.concatenate(parts[3]),
-        np.concatenate(parts[4]),
+        _whole(parts[3]),
+        _whole(parts[4]),
         len(behind),
     )
     return rendering, jacobian
+
+
+def _whole(parts: Sequence[ndarray]) -> ndarray:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _tiles(rectangle: Int32[ndarray, "k 4"]) -> Int64[ndarray, "k"]:
@@ -146,36 +152,60 @@ def _joined(starts: Sequence[Int64[ndarray, "n"]], items: Sequence[ndarray]) -> 
 
 
 def apply(
-    jacobian: PictureJacobian, change: Float32[ndarray, "v 4"], alpha_free: Float32[ndarray, "r"]
-) -> Float32[ndarray, "r 4"]:
-    """J x: the change of rgb and alpha of every pixel with the voxels' colours and densities (1/m).
+    jacobians: Sequence[PictureJacobian],
+    change: Float32[ndarray, "v 4"],
+    alpha_free: Sequence[Float32[ndarray, "r"]],
+) -> list[Float32[ndarray, "r 4"]]:
+    """J x of each image: the change of rgb and alpha of every pixel with the voxels' colours and densities (1/m).
 
     `alpha_free` is 1 where alpha follows density and 0 where the ray is opaque.
     """
-
-    def part(first: int, last: int) -> ndarray:
-        out = np.zeros((jacobian.rays, 4), np.float32)
-        arrays = jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight
-        _apply(first, last, jacobian.box_start, *arrays, change, out)
-        return out
-
-    parts = at_once([functools.partial(part, *one) for one in _ranges(np.diff(jacobian.box_start))])
-    out = functools.reduce(np.add, parts)
-    out[:, 3] *= alpha_free
+    out = _applied(_apply, [jacobian[:-1] for jacobian in jacobians], change, [one.rays for one in jacobians])
+    for pixels, free in zip(out, alpha_free, strict=True):
+        pixels[:, 3] *= free
     return out
 
 
 def add_transposed(
-    jacobian: PictureJacobian,
-    pixels: Float32[ndarray, "r 4"],
-    alpha_free: Float32[ndarray, "r"],
+    jacobians: Sequence[PictureJacobian],
+    pixels: Sequence[Float32[ndarray, "r 4"]],
+    alpha_free: Sequence[Float32[ndarray, "r"]],
     out: Float32[ndarray, "v 4"],
 ) -> None:
-    """out += J^T y."""
-    freed = pixels.copy()
-    freed[:, 3] *= alpha_free
-    arrays = jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight
-    on_all_threads(_add_transposed, *arrays, freed, out)
+    """out += J^T y, summed over images."""
+    freed = [
+        y * np.stack([*np.ones((3, len(y)), np.float32), free], 1) for y, free in zip(pixels, alpha_free, strict=True)
+    ]
+    _transposed_onto(_add_transposed, [jacobian[:-1] for jacobian in jacobians], freed, out)
+
+
+Arrays = tuple[ndarray, ...]
+"""Of a matrix, as its kernels take them; the first are the first segments of boxes."""
+
+
+def _applied(kernel: Any, matrices: Sequence[Arrays], x: ndarray, rays: Sequence[int]) -> list[ndarray]:
+    """The product of each matrix with x. All matrices multiply some boxes before the next, whose voxels stay cached."""
+    out = [np.zeros((count, x.shape[1]), np.float32) for count in rays]
+
+    def part(number: int) -> None:
+        for first in range(0, len(x) // VOXELS, BOXES_AT_ONCE):
+            for arrays, pixels in zip(matrices[number::PARTS], out[number::PARTS], strict=True):
+                kernel(first, min(first + BOXES_AT_ONCE, len(arrays[0]) - 1), *arrays, x, pixels)
+
+    at_once([functools.partial(part, number) for number in range(min(PARTS, len(matrices)))])
+    return out
+
+
+def _transposed_onto(kernel: Any, matrices: Sequence[Arrays], pixels: Sequence[ndarray], out: ndarray) -> None:
+    """Add the product of each transposed matrix with its pixels; likewise."""
+
+    def part(begin: int, end: int) -> None:
+        for first in range(begin, end, BOXES_AT_ONCE):
+            for arrays, y in zip(matrices, pixels, strict=True):
+                kernel(first, min(first + BOXES_AT_ONCE, end), *arrays, y, out)
+
+    work = np.sum([np.diff(arrays[0]) for arrays in matrices], axis=0)
+    at_once([functools.partial(part, *one) for one in _ranges(work)])
 
 
 def add_diagonal(
@@ -232,20 +262,21 @@ class ColourMatrix(NamedTuple):
         weight = np.ascontiguousarray(jacobian.weight[:, COLOUR])
         return cls(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, weight, jacobian.rays)
 
-    def apply(self, colours: Float32[ndarray, "v c"]) -> Float32[ndarray, "r c"]:
-        """A x for any number of columns, such as red, green and blue of several colourings."""
-        out = np.zeros((self.rays, colours.shape[1]), np.float32)
-        _apply_colours(self.box_start, self.ray, self.start, self.voxel, self.weight, colours, out)
-        return out
-
-    def add_transposed(self, pixels: Float32[ndarray, "r c"], out: Float32[ndarray, "v c"]) -> None:
-        """out += A^T y."""
-        _add_colours_transposed(self.box_start, self.ray, self.start, self.voxel, self.weight, pixels, out)
-
     def add_diagonal(self, weight: Float32[ndarray, "r c"], out: Float32[ndarray, "v c"]) -> None:
         """out += diag(A^T W A)."""
-        squared = self.weight * self.weight
-        _add_colours_transposed(self.box_start, self.ray, self.start, self.voxel, squared, weight, out)
+        add_colours_transposed([self._replace(weight=self.weight * self.weight)], [weight], out)
+
+
+def apply_colours(matrices: Sequence[ColourMatrix], colours: Float32[ndarray, "v c"]) -> list[Float32[ndarray, "r c"]]:
+    """A x of each image for any number of columns, such as red, green and blue of several colourings."""
+    return _applied(_apply_colours, [matrix[:-1] for matrix in matrices], colours, [one.rays for one in matrices])
+
+
+def add_colours_transposed(
+    matrices: Sequence[ColourMatrix], pixels: Sequence[Float32[ndarray, "r c"]], out: Float32[ndarray, "v c"]
+) -> None:
+    """out += A^T y, summed over images."""
+    _transposed_onto(_add_colours_transposed, [matrix[:-1] for matrix in matrices], pixels, out)
 
 
 @kernel
@@ -357,11 +388,8 @@ def _apply(begin_box, end_box, box_start, ray, start, voxel, weight, x, out):
 
 
 @kernel
-def _add_transposed(taken, box_start, ray, start, voxel, weight, y, out):
-    while True:
-        k = take(taken)
-        if k >= len(box_start) - 1:
-            break
+def _add_transposed(begin_box, end_box, box_start, ray, start, voxel, weight, y, out):
+    for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
             first, last = start[segment], start[segment + 1]
@@ -387,9 +415,9 @@ def _add_diagonal(taken, box_start, ray, start, voxel, weight, y, out):
 
 
 @kernel
-def _apply_colours(box_start, ray, start, voxel, weight, x, out):
+def _apply_colours(begin_box, end_box, box_start, ray, start, voxel, weight, x, out):
     columns = x.shape[1]
-    for k in range(len(box_start) - 1):
+    for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
             i, first, last = np.int64(ray[segment]), start[segment], start[segment + 1]
@@ -401,9 +429,9 @@ def _apply_colours(box_start, ray, start, voxel, weight, x, out):
 
 
 @kernel
-def _add_colours_transposed(box_start, ray, start, voxel, weight, y, out):
+def _add_colours_transposed(begin_box, end_box, box_start, ray, start, voxel, weight, y, out):
     columns = y.shape[1]
-    for k in range(len(box_start) - 1):
+    for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
             i, first, last = np.int64(ray[segment]), start[segment], start[segment + 1]
