@@ -12,7 +12,7 @@ import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, BinaryIO
 
@@ -32,8 +32,6 @@ LARGEST_NUMBER = 1e9
 LARGEST_FILE = 2**31
 _LARGEST_DIRECTORY = 4 * 2**20
 """Of a zip archive's list of names, bytes; also of a single read."""
-_LOCAL_HEADER = struct.Struct("<26xHH")
-"""A member's header in a zip archive; its last fields are the lengths of the name and of an extra field behind it."""
 _LONGEST_HEADER = 10_000
 """Of an array, bytes, as in numpy."""
 _CHUNK = 2**20
@@ -178,51 +176,6 @@ def read_pickled_bytes(path: str | Path, name: str) -> bytes:
             if not dtype.hasobject:
                 raise place.error(f"is {dtype}, not a dictionary of arrays", "download it again")
             return b"".join(iter(lambda: stream.read(_CHUNK), b""))
-
-
-@dataclasses.dataclass(frozen=True)
-class StoredMember:
-    """A member of an archive without compression."""
-
-    begin: int
-    """Offset of its first byte in the file."""
-    size: int
-    """Bytes."""
-    checksum: int
-    """CRC-32 of its bytes, as the archive states it."""
-
-
-def stored_members(file: BinaryIO, path: str | Path) -> dict[str, StoredMember]:
-    """Return the members of an archive without compression, as torch.save writes it, from the open file at `path`.
-
-    Names that differ in upper and lower case, or in slashes and backslashes, count as equal: torch's own reader does
-    not tell them apart. Raises FileError, also where two names are equal.
-    """
-    with _archive_in(file, path) as archive:
-        members: dict[str, StoredMember] = {}
-        end = file.seek(0, io.SEEK_END)
-        for info in archive.infolist():
-            if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
-                raise FileError(path, "is compressed, which torch.save never does", "save it again")
-            archive.open(info).close()  # compares its two headers; encrypted members are errors
-            file.seek(info.header_offset)
-            name_bytes, extra_bytes = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
-            begin = info.header_offset + _LOCAL_HEADER.size + name_bytes + extra_bytes
-            if begin + info.file_size > end:
-                raise FileError(path, f"holds only a part of {info.filename!r:.60}", "download it, or make it again")
-            members[info.filename] = StoredMember(begin, info.file_size, info.CRC)
-        _check_names(path, [name.replace("\\", "/").lower() for name in archive.namelist()])
-        return members
-
-
-def stored_archive(members: Iterable[tuple[str, bytes | memoryview]]) -> io.BytesIO:
-    """An archive without compression in memory, of names and contents."""
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w", zipfile.ZIP_STORED) as archive:
-        for name, content in members:
-            archive.writestr(name, content)  # type: ignore[arg-type]
-    made.seek(0)
-    return made
 
 
 def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
