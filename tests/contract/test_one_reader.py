@@ -13,7 +13,7 @@ ROOT = Path(__file__).parents[2]
 BACKEND, EXTENSION = ROOT / "backend" / "primdiffusion", ROOT / "blender_primdiffusion"
 ALLOWED = {
     "zipfile": {"formats/arrays.py", "torch_file.py", "export/usd.py"},
-    "numpy.load": set(),
+    "numpy.load": {"formats/arrays.py"},
     "numpy.lib.format.read_array": set(),
     "json.load": set(),
     "json.loads": {"formats/json_files.py"},
