@@ -114,12 +114,6 @@ def test_all(arguments: Sequence[str]) -> None:
     run([program(VENV), "-m", "pytest", "-m", "not gpu", *TEST_ARGS, *arguments])
 
 
-def fuzz(arguments: Sequence[str]) -> None:
-    """feed damaged files and messages to every reader for MINUTES=30; see tests/fuzz"""
-    ready_to_test()
-    run([program(VENV), "-m", "tests.fuzz", "--minutes", MINUTES, *arguments], **ONE_THREAD)
-
-
 def chaos(arguments: Sequence[str]) -> None:
     """kill programs, fill disks, break environments for MINUTES=30; see tests/chaos"""
     ready_to_test()
@@ -161,7 +155,6 @@ TARGETS: dict[str, Callable[[Sequence[str]], None]] = {
     "test-5.2": test_52,
     "test-5.3": test_53,
     "test-all": test_all,
-    "fuzz": fuzz,
     "chaos": chaos,
     "lint": lint,
     "types": types,

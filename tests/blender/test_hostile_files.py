@@ -30,7 +30,7 @@ WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb",
 FOLDERS = {"human_from_captures", "make_pose_assets", "set_up_backend"}
 """Operators on the folder of their `directory`."""
 SENT = {"human_from_picture": {"mask"}}
-"""Files that the backend alone reads: tests/fuzz/test_not_files.py tries its reader."""
+"""Files that the backend alone reads: tests/contract/test_bad_files.py tries its reader."""
 PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
 
 
