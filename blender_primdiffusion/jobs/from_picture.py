@@ -163,7 +163,7 @@ class FitPictureJob(Job):
         handles_from_joints(context, armature)
         if (camera := self.task.camera_now()) is not None:
             aim_at_picture(camera, fitted.view)
-        return " ".join([f"Fitted in {result.seconds:.1f} s.", *map(sentence, result.warnings)])
+        return " ".join([f"Fitted in {result.seconds:.1f} s.", *_fit(result.fit), *map(sentence, result.warnings)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -205,7 +205,11 @@ class PictureJob(Job):
         for other in context.scene.collection.children_recursive:
             if other.session_uid == self.posed_over:
                 other.hide_viewport = other.hide_render = True
-        return notice
+        return " ".join([*_fit(result.fit), notice])
+
+
+def _fit(fit: float | None) -> list[str]:
+    return [] if fit is None else [f"Fit {100 * fit:.0f} %."]
 
 
 def _stand_at_origin(context: bpy.types.Context, armature: bpy.types.Object, camera: bpy.types.Object | None) -> None:
