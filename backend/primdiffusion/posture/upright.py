@@ -20,9 +20,9 @@ PITCH_STD, ROLL_STD = math.radians(12), math.radians(2.5)
 """Standard deviations of a held camera's tilt."""
 HEIGHT_M, HEIGHT_STD_M = 1.5, 0.3
 """Height of a held camera above the floor."""
-LEAN_STD = math.sin(math.radians(6))
+LEAN_STD = math.sin(math.radians(3))
 """Standard deviation of a standing torso from the vertical, to each side."""
-BALANCE_STD_M = 0.04
+BALANCE_STD_M = 0.03
 """Standard deviation of the centre of mass from above the line between the feet."""
 SOLE_STD_M = 0.015
 """Standard deviation of the height of one sole above the other."""
