@@ -34,6 +34,10 @@ def complete_humans() -> bool:
     Makes no undo step. Raises as `build_missing_parts`.
     """
     lost, bare = orphans(), without_parts()
+    if not (
+        lost or bare
+    ):  # even of nothing, batch_remove remakes view layers, which crashes a render that begins (5.3)
+        return False
     data = {obj.data for obj in lost if obj.data is not None}
     around = {
         collection for obj in lost for collection in obj.users_collection if collection in set(bpy.data.collections)
@@ -45,7 +49,7 @@ def complete_humans() -> bool:
         bpy.data.batch_remove(empty)
     for person in bare:
         build_missing_parts(person)
-    return bool(lost or bare)
+    return True
 
 
 def _is_local(obj: bpy.types.Object) -> bool:

@@ -178,8 +178,9 @@ def replace_splats(person: bpy.types.Object, human: RestHuman) -> None:
     splats, cells = cloud_of(person), cells_of(person)
     if splats is not None and SPLATS_AVAILABLE:
         fill(own_data(splats, person), splats_of(human))
-    else:
-        bpy.data.batch_remove([part for part in (splats, cells) if part is not None])
+        return
+    for part in filter(None, (splats, cells)):
+        bpy.data.objects.remove(part)
 
 
 def _scale_cells(mesh: bpy.types.Mesh, model: ShapeModel, betas: NDArray, growth: NDArray) -> None:

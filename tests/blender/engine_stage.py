@@ -14,7 +14,7 @@ from unittest import mock
 import bpy
 import numpy as np
 
-from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene import build, volume_objects
 from blender_primdiffusion.scene.rest_human import read_human
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -66,11 +66,7 @@ def add_human(folder: Path) -> bpy.types.Object:
     whole, few = read_human(folder / "person.human.safetensors"), slice(PRIMITIVES_IN_BLENDER)
     fields = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")
     model = dataclasses.replace(whole.model, **{name: getattr(whole.model, name)[few] for name in fields})
-    boxes = {name: getattr(whole.payload, name)[few] for name in ("rgb", "density", "delta_scale")}
-    own = whole.payload.rest_half_extent
-    payload = dataclasses.replace(whole.payload, **boxes, rest_half_extent=None if own is None else own[few])
-    human = dataclasses.replace(whole, payload=payload, model=model, rest=model.rest(whole.payload.betas))
-    with mock.patch.object(build, "read_human", return_value=human):
+    with mock.patch.object(volume_objects, "shape_model_of", return_value=model):
         return build.build_human(bpy.context, folder / "person.human.safetensors")
 
 
