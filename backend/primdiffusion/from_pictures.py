@@ -47,8 +47,8 @@ ROUNDS = (Round(96, Stage(60, 0.04), 2), Round(96, Stage(80, 0.02), 2), Round(19
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
-EXIF_LENS_STD, CAMERA_LENS_STD, UNKNOWN_LENS_STD = 0.03, 0.1, 0.25
-"""Standard deviations of the logarithm of a focal length: of EXIF data, of a given camera, and assumed."""
+KNOWN_LENS_STD, UNKNOWN_LENS_STD = 0.03, 0.25
+"""Standard deviations of the logarithm of a focal length."""
 POSE_FILE_TIGHTNESS = 2.0
 """Poses of files are known twice as well as a standing body."""
 
@@ -95,8 +95,8 @@ def start_of(
 def _prior(photographs: Sequence[Photograph], views: Sequence[View] | None) -> CameraPrior:
     """One picture's camera may be tilted otherwise than stated; those of several pictures belong together."""
     if views is not None:
-        return CameraPrior(CAMERA_LENS_STD, (PITCH_STD, ROLL_STD) if len(views) == 1 else (0.0, 0.0), held=False)
-    stated = [EXIF_LENS_STD if photograph.focal else UNKNOWN_LENS_STD for photograph in photographs]
+        return CameraPrior(KNOWN_LENS_STD, (PITCH_STD, ROLL_STD) if len(views) == 1 else (0.0, 0.0), held=False)
+    stated = [KNOWN_LENS_STD if photograph.focal else UNKNOWN_LENS_STD for photograph in photographs]
     return CameraPrior(torch.tensor(stated))
 
 
