@@ -44,14 +44,13 @@ from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.from_pictures import POSE_FILE_TIGHTNESS, UNKNOWN_LENS_STD, Start, fit_posture_in, human_in, start_of
+from primdiffusion.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, human_in, start_of
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place, pose_body
 from primdiffusion.posture.fit import Posture
 from primdiffusion.posture.start import framed, views_of
-from primdiffusion.posture.upright import CameraPrior
 from primdiffusion.reconstruction import reconstruct_by_prior
 from primdiffusion.render.march import march
 from record import command_line, report
@@ -165,7 +164,7 @@ def given(case: Case, photograph: Photograph, model: DiffusionModel, fault: Faul
     rotation = torch.cat([turn @ rotation[:1], rotation[1:]])
     pose, betas = BodyPose(rotation[None], torch.zeros(1, 3)), model.shapes.bias.clone()
     camera = framed([photograph], pose, betas, [photograph.lens()])
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, False, CameraPrior(UNKNOWN_LENS_STD))
+    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=False)
 
 
 def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, seed: int) -> tuple[float, float]:

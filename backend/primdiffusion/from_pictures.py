@@ -19,8 +19,7 @@ from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.human import Human, made_by
 from primdiffusion.posture.file import read_cameras, read_posture
-from primdiffusion.posture.fit import Posture, PostureFit, Stage, outline_error
-from primdiffusion.posture.quality import Quality, quality_of
+from primdiffusion.posture.fit import Posture, PostureFit, Stage, outline_error, overlap
 from primdiffusion.posture.start import (
     STANDING_ARMS,
     before_cameras,
@@ -30,7 +29,6 @@ from primdiffusion.posture.start import (
     standing,
     turned_to_camera,
 )
-from primdiffusion.posture.upright import PITCH_STD, ROLL_STD, CameraPrior
 from primdiffusion.reconstruction import FIT_STEPS, PersonComponents, targets_of
 from primdiffusion.render.inverse import TargetImage
 
@@ -47,8 +45,6 @@ ROUNDS = (Round(96, Stage(60, 0.04), 2), Round(96, Stage(80, 0.02), 2), Round(19
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
-KNOWN_LENS_STD, UNKNOWN_LENS_STD = 0.03, 0.25
-"""Standard deviations of the logarithm of a focal length."""
 POSE_FILE_TIGHTNESS = 2.0
 """Poses of files are known twice as well as a standing body."""
 
@@ -63,7 +59,6 @@ class Start:
     """See `PostureFit`."""
     complete: bool
     """Pose and cameras are those of files."""
-    cameras: CameraPrior
 
 
 def start_of(
@@ -79,7 +74,7 @@ def start_of(
     sizes = [(photograph.width, photograph.height) for photograph in photographs]
     views = None if cameras_path is None else read_cameras(cameras_path, sizes)
     if pose_path is None:
-        return Start(_standing(photographs, model, views), 1.0, False, _prior(photographs, views))
+        return Start(_standing(photographs, model, views), 1.0, complete=False)
     known = read_posture(pose_path, sizes)
     pose = repeated(known.pose, len(photographs))
     betas = model.shapes.bias.clone() if known.betas is None else known.betas
@@ -89,15 +84,7 @@ def start_of(
         camera = framed(photographs, pose, betas, [photograph.lens() for photograph in photographs])
     else:
         camera = cameras_of(photographs, views)
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, views is not None, _prior(photographs, views))
-
-
-def _prior(photographs: Sequence[Photograph], views: Sequence[View] | None) -> CameraPrior:
-    """One picture's camera may be tilted otherwise than stated; those of several pictures belong together."""
-    if views is not None:
-        return CameraPrior(KNOWN_LENS_STD, (PITCH_STD, ROLL_STD) if len(views) == 1 else (0.0, 0.0), held=False)
-    stated = [KNOWN_LENS_STD if photograph.focal else UNKNOWN_LENS_STD for photograph in photographs]
-    return CameraPrior(torch.tensor(stated))
+    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=views is not None)
 
 
 def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: Sequence[View] | None) -> Posture:
@@ -121,7 +108,7 @@ def fit_posture_in(
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
     """
     components = PersonComponents.of(model)
-    fit, people = PostureFit(start.posture, model.shapes, start.cameras, start.tightness), components.everyone()
+    fit, people = PostureFit(start.posture, model.shapes, start.tightness), components.everyone()
     for side, stage, coefficient_steps in ROUNDS:
         payload = components.payload(components.coefficients(people))
         fit.refine(payload, _targets(photographs, fit.posture(), side), stage, on_step)
@@ -158,16 +145,11 @@ def human_in(
     return Human(payload, posture.betas, {**origin, **made_by(model)}).validate()
 
 
-def quality_in(model: DiffusionModel, photographs: Sequence[Photograph], start: Start, posture: Posture) -> Quality:
-    """How well the posture, found from this start, explains the pictures: by the human of the coefficients alone, as
-    voxels could explain any outline.
-    """
-    components, targets = PersonComponents.of(model), _targets(photographs, posture, ROUNDS[-1].side)
-    people = components.everyone()
-    for _ in range(ROUNDS[0].coefficient_steps):
-        people = components.closer(people, _targets(photographs, posture, ROUNDS[0].side))
-    payload = components.payload(components.coefficients(people))
-    return quality_of(posture, start.posture, start.tightness, payload, targets)
+def outline_overlap(model: DiffusionModel, photographs: Sequence[Photograph], posture: Posture) -> float:
+    """Intersection over union of the mean human in the posture and the masks."""
+    components = PersonComponents.of(model)
+    targets = _targets(photographs, posture, ROUNDS[0].side)
+    return overlap(components.payload(components.coefficients(components.everyone())), targets)
 
 
 def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:

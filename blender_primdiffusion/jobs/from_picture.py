@@ -161,7 +161,7 @@ class FitPictureJob(Job):
         handles_from_joints(context, person)
         if (camera := self.task.camera_now()) is not None:
             aim_at_picture(camera, fitted.view)
-        return " ".join([f"Fitted in {result.seconds:.1f} s.", *_fit(result.fit), *map(sentence, result.warnings)])
+        return " ".join([f"Fitted in {result.seconds:.1f} s.", *map(sentence, result.warnings)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -202,11 +202,7 @@ class PictureJob(Job):
             if other.session_uid == self.posed_over:
                 for hidden in (other, *filter(None, showing(other).values())):
                     hidden.hide_viewport = hidden.hide_render = True
-        return " ".join([*_fit(result.fit), notice])
-
-
-def _fit(fit: float | None) -> list[str]:
-    return [] if fit is None else [f"Fit {100 * fit:.0f} %."]
+        return notice
 
 
 def _stand_at_origin(context: bpy.types.Context, armature: bpy.types.Object, camera: bpy.types.Object | None) -> None:

@@ -40,7 +40,7 @@ from primdiffusion.from_pictures import (
     fit_posture_in,
     human_in,
     human_steps,
-    quality_in,
+    outline_overlap,
     start_of,
 )
 from primdiffusion.human import Human
@@ -48,7 +48,6 @@ from primdiffusion.human_file import load_human
 from primdiffusion.machine import peak_memory_gb
 from primdiffusion.posture.file import write_posture
 from primdiffusion.posture.fit import Posture
-from primdiffusion.posture.quality import Quality
 from primdiffusion.posture.start import views_of
 from primdiffusion.reconstruction import reconstruct as reconstruct_human
 from primdiffusion.reconstruction import reconstruct_by_prior
@@ -60,6 +59,8 @@ STAGES = 4
 ENCODER_VIEWS = 8
 """Images to encode for a start from the encoder."""
 POSTURE_FILE = "posture.json"
+LEAST_OVERLAP = 0.8
+"""Intersection over union of the human and the mask; of fits that look right it is above 0.9."""
 
 
 def reconstruct(request: ReconstructRequest, session: Session, report: ReportProgress) -> ReconstructAnswer:
@@ -106,9 +107,7 @@ def run(request: ReconstructRequest) -> None:
         answer = reconstruct(request, Session(), report)
     print_warnings(answer.warnings)
     if request.pictures:
-        assert answer.fit is not None, "of pictures"
-        fit = f"fit {100 * answer.fit:.0f} %"
-        print(f"{request.out_dir}  {len(request.pictures)} pictures, {fit}, {answer.seconds:.1f} s")
+        print(f"{request.out_dir}  {len(request.pictures)} pictures, {answer.seconds:.1f} s")
         return
     seconds = f"{answer.seconds:.1f} s, of which the {request.by} {answer.seconds_encoding:.1f} s"
     print(f"{request.out_dir}  {answer.subject}, frame {answer.frame}, {len(answer.views or ())} views, {seconds}")
@@ -196,17 +195,16 @@ def reconstruct_pictures(request: ReconstructRequest, session: Session, report: 
         elif not start.complete:
             raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
         human = human_in(model, photographs, posture, request.seed, on_step)
-        quality = quality_in(model, photographs, start, posture)
+        warnings += _doubts(model, photographs, posture)
         report("write", 0, 1, None)
         write_human(folder, human, request.size)
-        _write_posture(folder / POSTURE_FILE, photographs, posture, quality)
+        _write_posture(folder / POSTURE_FILE, photographs, posture)
         report("write", 1, 1, 0.0)  # the last chance to cancel
     return ReconstructAnswer(
         **FILES.in_folder(request.out_dir),
         posture=request.out_dir / POSTURE_FILE,
         seed=request.seed,
-        fit=quality.fit,
-        warnings=[*warnings, *quality.doubts()],
+        warnings=warnings,
         seconds=round(time.perf_counter() - began, 3),
         peak_gb=round(peak_memory_gb(), 3),
     )
@@ -218,14 +216,10 @@ def fit_posture(request: FitPostureRequest, session: Session, report: ReportProg
     with staged(request.out_dir) as folder:
         model, photographs, start, warnings = _read(request, session, report)
         posture = fit_posture_in(model, photographs, start, _steps(report, POSTURE_STEPS))
-        quality = quality_in(model, photographs, start, posture)
-        _write_posture(folder / POSTURE_FILE, photographs, posture, quality)
-    return FitPostureAnswer(
-        posture=request.out_dir / POSTURE_FILE,
-        fit=quality.fit,
-        seconds=round(time.perf_counter() - began, 3),
-        warnings=[*warnings, *quality.doubts()],
-    )
+        warnings += _doubts(model, photographs, posture)
+        _write_posture(folder / POSTURE_FILE, photographs, posture)
+    seconds = round(time.perf_counter() - began, 3)
+    return FitPostureAnswer(posture=request.out_dir / POSTURE_FILE, seconds=seconds, warnings=warnings)
 
 
 def _read(
@@ -249,5 +243,15 @@ def _steps(report: ReportProgress, total: int) -> Callable[[], None]:
     return lambda: report("fit", next(done), total, None)
 
 
-def _write_posture(path: Path, photographs: list[Photograph], posture: Posture, quality: Quality) -> None:
-    write_posture(path, posture.pose, posture.betas, views_of(photographs, posture.camera), quality.fit)
+def _doubts(model: DiffusionModel, photographs: list[Photograph], posture: Posture) -> list[str]:
+    overlap = outline_overlap(model, photographs, posture)
+    if overlap >= LEAST_OVERLAP:
+        return []
+    return [
+        f"the fitted body and the masks overlap by {100 * overlap:.0f} %: the pose was probably not found; give a pose "
+        "file that is nearer"
+    ]
+
+
+def _write_posture(path: Path, photographs: list[Photograph], posture: Posture) -> None:
+    write_posture(path, posture.pose, posture.betas, views_of(photographs, posture.camera))

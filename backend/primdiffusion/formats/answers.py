@@ -47,8 +47,6 @@ class ReconstructAnswer(HumanAnswer):
     seconds_encoding: Seconds | None = None
     posture: Path | None = None
     """posture.json: pose, shape and cameras in pictures; None for captures."""
-    fit: Annotated[float, Range(0, 1)] | None = None
-    """How well the posture explains the pictures."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -60,8 +58,6 @@ class FitPostureAnswer(Open):
     seconds: Seconds
     warnings: list[str]
     """Sentences."""
-    fit: Annotated[float, Range(0, 1)] | None = None
-    """How well the posture explains the pictures."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,8 +1,8 @@
 """Files of postures: what a fit found, to start from again or to keep; and pose files of others to start from.
 
 posture.json: {"format": "primdiffusion-posture", "pose": [v][72], "translation": [v][3], "betas": [10],
-"fit": 0 to 1, "cameras": {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}}: axis-angle numbers in radians, metres,
-y up; betas of the default body; cameras of the whole upright pictures, OpenCV.
+"cameras": {"camera0000": {"K": 3x3, "R": 3x3, "T": [3]}, ...}}: axis-angle numbers in radians, metres, y up; betas of
+the default body; cameras of the whole upright pictures, OpenCV.
 """
 
 from __future__ import annotations
@@ -73,15 +73,14 @@ def read_cameras(path: Path, sizes: Sequence[tuple[int, int]]) -> list[View]:
     return _views(content.get("cameras", content) if isinstance(content, dict) else content, path, sizes)
 
 
-def write_posture(path: Path, pose: BodyPose, betas: Float[Tensor, "10"], views: Sequence[View], fit: float) -> None:
-    """Write a posture, whole or not at all; `fit` is that of `quality.Quality`. Raises OSError."""
+def write_posture(path: Path, pose: BodyPose, betas: Float[Tensor, "10"], views: Sequence[View]) -> None:
+    """Write a posture, whole or not at all. Raises OSError."""
     theta = matrix_to_axis_angle(pose.joint_rotation).flatten(1)
     content = {
         "format": FORMAT,
         "pose": _rounded(theta),
         "translation": _rounded(pose.translation),
         "betas": _rounded(betas),
-        "fit": round(fit, 3),
         "cameras": {
             f"camera{number:04d}": {
                 "K": view.intrinsics.tolist(),
