@@ -91,7 +91,7 @@ def viewer_manifest(manifest: str) -> str:
         if key in VIEWER:
             line = f'{key} = "{VIEWER[key]}"\n'
         if key == "files":
-            line = 'files = "Write volumes beside the .blend, run a generator you installed"\n'
+            line = 'files = "Write temporary volumes, run a generator you installed"\n'
         if key != "network":
             lines.append(line)
     return "".join(lines)

@@ -22,6 +22,9 @@ from primdiffusion.machine import share_processors
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent
 FRAMES, SHOWN = 48, 31
+SEED = 10
+"""A human of the included checkpoint with a clear face, even cloth and a clean collar: the seventh of seeds 0 to 63 by
+how close its pictures are to those of meshes (`evaluation.attribute_network`)."""
 PRINT_S = 5.0
 """Seconds between lines of progress."""
 LINE = 100
@@ -33,7 +36,7 @@ def main() -> None:
     parser = record.command_line(__doc__)
     parser.add_argument("--out", type=Path, default=ROOT / "demo_out")
     parser.add_argument("--quick", action="store_true", help="no Cycles frame, a small contact sheet")
-    parser.add_argument("--seed", type=int, default=7)
+    parser.add_argument("--seed", type=int, default=SEED)
     parser.add_argument(
         "--assets",
         type=Path,
@@ -68,7 +71,7 @@ def main() -> None:
         stage("Cycles, 384 x 384", "benchmarks/demo_stages.py", "cycles", "--blend", blend, "--out", frame)
     walk = ("--frames", str(FRAMES), "--frame", str(SHOWN))
     stage("march five pictures", "benchmarks/demo_stages.py", "march", "--human", human, *walk, "--out", out)
-    count = "4" if arguments.quick else "12"
+    count = "4" if arguments.quick else "6"
     stage("contact sheet", "benchmarks/contact_sheet.py", "--count", count, "--out", out / "contact_sheet.png")
     if arguments.json is not None and arguments.assets is not None:
         options = ["--quick"] if arguments.quick else []

@@ -45,7 +45,6 @@ import blender_primdiffusion
 from blender_primdiffusion.engine import engine
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of
 
 SIZE = 512
 WARM_UP, FRAMES = 3, 15
@@ -76,7 +75,7 @@ def stage(human: Human, folder: Path) -> bpy.types.Object:
     scene.camera.rotation_euler = (np.pi / 2, 0, 0)
     scene.collection.objects.link(scene.camera)
     scene.camera.location = (0.0, -DISTANCE_M, 1.0)
-    return armature_of(person)
+    return person
 
 
 def pose(seed: int) -> np.ndarray:
@@ -201,7 +200,7 @@ def picture_stage(folder: Path, seed: int) -> bpy.types.Collection:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(folder / "shot.blend"))
     person = build_human(bpy.context, folder / "person.human.safetensors")
-    pose_from_joint_rotations(armature_of(person), walk_and_wave(WALK_FRAMES)[SHOWN])
+    pose_from_joint_rotations(person, walk_and_wave(WALK_FRAMES)[SHOWN])
     bpy.ops.mesh.primitive_plane_add(size=40)
     paint((0.5, 0.48, 0.45))
     bpy.ops.mesh.primitive_cube_add(size=0.35, location=(0.42, -0.5, 0.175), rotation=(0, 0, 0.4))
@@ -219,8 +218,6 @@ def picture_stage(folder: Path, seed: int) -> bpy.types.Collection:
     scene.view_settings.view_transform = "Standard"
     scene.render.dither_intensity = 0
     scene.world = bpy.data.worlds.new("Sky")
-    if bpy.app.version < (5, 0):
-        scene.world.use_nodes = True
     scene.world.node_tree.nodes["Background"].inputs["Color"].default_value = (*SKY, 1)
     return person
 
@@ -228,8 +225,6 @@ def picture_stage(folder: Path, seed: int) -> bpy.types.Collection:
 def paint(colour: tuple[float, float, float]) -> None:
     """Give the active object a material of this linear colour."""
     material = bpy.data.materials.new("paint")
-    if bpy.app.version < (5, 0):
-        material.use_nodes = True
     material.node_tree.nodes["Principled BSDF"].inputs["Base Color"].default_value = (*colour, 1)
     bpy.context.object.data.materials.append(material)
 
@@ -245,7 +240,7 @@ def picture(folder: Path) -> np.ndarray:
         bpy.data.images.remove(image)
 
 
-def over_cycles(person: bpy.types.Collection, folder: Path) -> np.ndarray:
+def over_cycles(person: bpy.types.Object, folder: Path) -> np.ndarray:
     """The engine's people over Cycles' solids; the hidden body mesh casts its shadow on them."""
     scene = bpy.context.scene
     scene.render.film_transparent = True
@@ -256,7 +251,7 @@ def over_cycles(person: bpy.types.Collection, folder: Path) -> np.ndarray:
     scene.cycles.samples, scene.cycles.device = CYCLES_SAMPLES, "CPU"
     layer = bpy.context.view_layer.layer_collection.children[person.name]
     next(child for child in layer.children if child.name.endswith("_primitives")).exclude = True
-    body = next(obj for obj in person.objects if obj.type == "MESH")
+    body = next(obj for obj in person.children if obj.type == "MESH")
     body.hide_render = body.visible_camera = False
     below = picture(folder)
     return above + (1 - above[..., 3:]) * below

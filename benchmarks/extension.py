@@ -1,7 +1,7 @@
 """Figures of the extension: registration, building, frames, motion, memory, Cycles, a soak test.
 
     python benchmarks/extension.py --json docs/results/extension.json
-    python benchmarks/extension.py --also 4_5=.venv45/bin/python --json ...     # the same on another bpy: names + _4_5
+    python benchmarks/extension.py --also 5_3=.venv53/bin/python --json ...     # the same on another bpy: names + _5_3
 
 Each part runs in its own process (`extension.py part PART FOLDER`, where FOLDER has the `person/` that `primdiffusion
 generate` wrote); the real child generates. `--quick` renders smaller pictures and soaks for five rounds.
@@ -42,7 +42,7 @@ def main() -> None:
     parser.add_argument(
         "--also",
         nargs="*",
-        default=[f"4_5={ROOT / '.venv45/bin/python'}"] if (ROOT / ".venv45/bin/python").exists() else [],
+        default=[f"5_3={ROOT / '.venv53/bin/python'}"] if (ROOT / ".venv53/bin/python").exists() else [],
         help="NAME=PYTHON of other versions of bpy",
     )
     arguments = parser.parse_args()
@@ -106,16 +106,14 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
     """One person: building, frames with both attachments, motion."""
     _enable(arguments)
     from blender_primdiffusion.scene.build import build_human
-    from blender_primdiffusion.scene.human import armature_of
 
     context = bpy.context
     start = time.perf_counter()
     folder = arguments.folder / "person"
-    collection = build_human(context, folder / "person.human.safetensors")
+    armature = build_human(context, folder / "person.human.safetensors")
     bpy.ops.primdiffusion.volumes_in_viewport()
     context.view_layer.update()
     built = time.perf_counter() - start
-    armature = armature_of(collection)
     context.view_layer.objects.active = armature
 
     motion = _amass_file(arguments.folder / "amass.npz")
@@ -174,21 +172,21 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     """Generate, pose and delete repeatedly; measures memory growth, stray files and stray processes."""
     _enable(arguments)
     from blender_primdiffusion.jobs.queue import queue
-    from blender_primdiffusion.scene.human import armature_of, humans
+    from blender_primdiffusion.scene.human import humans, parts_of
+    from blender_primdiffusion.scene.payload import forget_session_files
 
     context, megabytes, blender = bpy.context, [], []
     context.preferences.edit.undo_steps = UNDO_STEPS
     rng = np.random.default_rng(SEED)
     for number in range(arguments.rounds):
         bpy.ops.primdiffusion.generate(seed=SEED + number, steps=arguments.steps)
-        collection = humans(context.scene)[0]
-        armature = armature_of(collection)
+        armature = humans(context.scene)[0]
         for bone in armature.pose.bones:
             bone.rotation_quaternion = (1.0, *rng.normal(0, 0.1, 3))
         context.view_layer.update()
-        bpy.ops.primdiffusion.delete_human(human=collection.name)
+        bpy.data.batch_remove(parts_of(armature))
         bpy.ops.outliner.orphans_purge(do_recursive=True)
-        bpy.ops.primdiffusion.remove_unused_files()
+        forget_session_files()
         record.trim()
         blender.append(record.resident_mb())
         megabytes.append(blender[-1] + children_mb())

@@ -9,10 +9,6 @@ Each part is written as soon as it is measured, with `PART_recorded`: version, c
 - seed: one seed is generated on 1, 2 and 4 threads, alone and in a batch of 8: the largest difference of any number of
   the human, relative to the range of its kind; threads: of how many numbers of threads (1, 2, 3) the files of a
   generated human and a variant have the same bytes (`tests/backend/thread_bytes.py`)
-- small: small files that claim much are read one by one (`tests/fuzz/small_inputs.py`): the largest peak of memory and
-  the longest time
-- fuzz: damaged files for every reader; verdicts: damaged safetensors files, of which the library and the programs'
-  readers must think the same (`tests/fuzz`)
 - blends: a stranger's names and paths in a .blend: how many properties were tried, and how many files they changed
   outside of the folder beside it (`tests/blender/blend_tampering.py`)
 - attacks: a stranger's lists of packages, links, texts, terminal escapes and requests, which are the inputs of the
@@ -94,7 +90,6 @@ def main() -> None:
     parser.add_argument("--parts", nargs="+", choices=PARTS, help="measure only these anew; all by default")
     parser.add_argument("--kills", type=int, default=300)
     parser.add_argument("--deaths", type=int, default=1000, help="of the child")
-    parser.add_argument("--fuzz-inputs", type=int, default=20_000)
     parser.add_argument("--steps", type=int, default=30, help="of the sampler")
     parser.add_argument("--window", type=Path, help="figures.json of scripts/window/look.py")
     arguments = parser.parse_args()
@@ -233,17 +228,6 @@ PARTS: dict[str, Part] = {
     "seed": Part(("threads_person_error_max",), lambda given: {"threads_person_error_max": person_error(given.steps)}),
     "threads": Part(
         ("same_bytes_threads",), lambda given: tool("tests/backend/thread_bytes.py", "--steps", str(given.steps))
-    ),
-    "small": Part(
-        ("small_inputs", "small_input_peak_mb", "small_input_seconds"), lambda _: tool("-m", "tests.fuzz", "--small")
-    ),
-    "fuzz": Part(
-        ("fuzz_inputs", "fuzz_tracebacks", "fuzz_garbage", "fuzz_hangs", "fuzz_over_500mb", "executions"),
-        lambda given: tool("-m", "tests.fuzz", "--inputs", str(given.fuzz_inputs)),
-    ),
-    "verdicts": Part(
-        ("reader_verdicts_compared", "reader_verdicts_accepted", "reader_verdicts_differ"),
-        lambda _: tool("-m", "tests.fuzz", "--verdicts"),
     ),
     "blends": Part(
         ("blend_properties_tried", "files_written_outside"),

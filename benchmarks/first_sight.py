@@ -8,7 +8,7 @@
         --window one/figures.json two/figures.json three/figures.json undo/figures.json viewport.json
 
 Measured without a window, which adds its redraws: the seconds from the child's answer until the human stands
-(stand_seconds) and the longest step of these without a pause; the seconds in which its volumes are written afterwards;
+(stand_seconds), in one step (longest_step_seconds); the seconds in which its volumes are written afterwards;
 memory with undo, milliseconds of a frame change, and rows of the Outliner as Blender opens them (collections open,
 objects closed). second_* are the same with another human in the scene. panels_open, sidebar_px, panel_classes and
 operators are of `sidebar.py`.
@@ -53,14 +53,11 @@ from record import command_line, report, resident_mb, trim
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from blender_primdiffusion.scene import states
+from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.build import build_prepared
 from blender_primdiffusion.scene.edit import select_human
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.pending import write_all_pending
 from blender_primdiffusion.scene.place import stand_at_cursor
-from blender_primdiffusion.scene.states import PreparedHuman
 
 FRAMES = 60
 _ENTERING = (
@@ -152,41 +149,26 @@ def children_seconds() -> float:
 def one_human(person: Path) -> dict[str, float]:
     trim()
     memory = resident_mb()
-    steps: list[float] = []
-    prepared = [prepared_in_slices(person, steps)]
-    found: list[bpy.types.Collection] = []
-    steps.append(seconds(lambda: found.append(enter(prepared.pop()))))
-    figures = {"stand_seconds": sum(steps), "longest_step_seconds": max(steps)}
+    found: list[bpy.types.Object] = []
+    figures = {"stand_seconds": seconds(lambda: found.append(enter(person)))}
+    figures["longest_step_seconds"] = figures["stand_seconds"]
     trim()
     figures["person_memory_mb"] = resident_mb() - memory
-    figures["person_frame_ms"] = frame_ms(armature_of(found[0]))
-    figures["outliner_rows"] = outliner_rows(found[0])
+    figures["person_frame_ms"] = frame_ms(found[0])
+    figures["outliner_rows"] = outliner_rows(found[0].users_collection[0])
     figures["volumes_seconds"] = seconds(write_all_pending)
     return figures
 
 
-def prepared_in_slices(person: Path, steps: list[float]) -> PreparedHuman:
-    """The slices before the human enters, as with a window; their durations are appended to `steps`."""
-    preparing = states.prepare(person)
-    while True:
-        began = time.perf_counter()
-        try:
-            with mock.patch.object(states, "volumes_may_wait", return_value=True):
-                next(preparing)
-        except StopIteration as done:
-            return done.value
-        finally:
-            steps.append(time.perf_counter() - began)
-
-
-def enter(prepared: PreparedHuman) -> bpy.types.Collection:
+def enter(person: Path) -> bpy.types.Object:
     """What blocks the window."""
-    collection = build_prepared(bpy.context, prepared)
-    stand_at_cursor(bpy.context, collection)
+    with mock.patch.object(build, "volumes_may_wait", return_value=True):
+        human = build.build_human(bpy.context, person)
+    stand_at_cursor(bpy.context, human)
     bpy.context.view_layer.update()
-    select_human(bpy.context, collection)
+    select_human(bpy.context, human)
     bpy.ops.ed.undo_push(message="Generate Human")
-    return collection
+    return human
 
 
 def seconds(call: Callable[[], object]) -> float:

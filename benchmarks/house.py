@@ -25,7 +25,7 @@ ROOT = Path(__file__).resolve().parents[1]
 PROGRAMS = {"backend": ROOT / "backend" / "primdiffusion", "extension": ROOT / "blender_primdiffusion"}
 TESTS = {"backend": ROOT / "tests" / "backend", "extension": ROOT / "tests" / "blender"}
 """tests/contract tests both programs together, so it mirrors neither."""
-BLENDERS = ("5.0", "4.5", "5.2")
+BLENDERS = ("5.0", "5.2", "5.3")
 THREAD_MODULES = {"threading", "_thread", "concurrent.futures", "multiprocessing"}
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 

@@ -38,7 +38,6 @@ from blender_primdiffusion.scene.armature import keyframe_poses, model_origin, p
 from blender_primdiffusion.scene.attachment import set_attachment, show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.material import set_density_gain
 from blender_primdiffusion.scene.volumes import person_memory
 
@@ -151,7 +150,7 @@ def main() -> None:
     show_in_viewport(person, True)
     bpy.context.view_layer.update()
     figures["seconds_first_evaluation"] = time.perf_counter() - began - figures["build_seconds"]
-    armature = armature_of(person)
+    armature = person
     strong = strong_poses(FRAMES)
     keyframe_poses(armature, np.arange(1, FRAMES + 1), strong, np.zeros((FRAMES, 3)))
     figures["frame_ms"] = frame_ms()

@@ -85,10 +85,11 @@ def surroundings() -> dict[str, str | int | float]:
 
 def device() -> str:
     """The name of the graphics card that torch uses, otherwise of the processor."""
-    import torch
+    with contextlib.suppress(ImportError):  # Blender's environments from 5.2 on have no torch
+        import torch
 
-    if torch.cuda.is_available():
-        return torch.cuda.get_device_name()
+        if torch.cuda.is_available():
+            return torch.cuda.get_device_name()
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):

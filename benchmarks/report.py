@@ -12,7 +12,11 @@ SOURCES = {
     "people": ("Payloads against their meshes", "benchmarks/people.py --assets DIR --json docs/results/people.json"),
     "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json --table docs/results/march_table.md"),
     "march_cuda": ("The marcher on a CUDA device", "benchmarks/march_cuda.py --json docs/results/march_cuda.json"),
-    "extension": ("The extension on Blender 5.0 and 4.5", "benchmarks/extension.py --json docs/results/extension.json"),
+    "extension": ("The extension on Blender 5.0", "benchmarks/extension.py --json docs/results/extension.json"),
+    "splats": (
+        "A human as splats on Blender 5.3",
+        "benchmarks/splats.py --pictures DIR --json docs/results/splats.json",
+    ),
     "first_sight": (
         "From the backend's answer to a human in Blender",
         "benchmarks/first_sight.py --json docs/results/first_sight.json --window FIGURES ... viewport.json",

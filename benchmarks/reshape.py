@@ -38,6 +38,8 @@ from primdiffusion.human_file import save_human
 from primdiffusion.render.march import march
 from record import command_line, report, run
 
+from blender_primdiffusion.scene.human import parts_of
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import reshape
@@ -82,7 +84,7 @@ def main() -> None:
         "reshape_ms": statistics.median(setting),
         "reshape_evaluate_ms": statistics.median(evaluating),
         "graph_ms": statistics.median(linking),
-        "reshape_volumes": sum(obj.type == "VOLUME" for obj in person.all_objects),
+        "reshape_volumes": sum(obj.type == "VOLUME" for obj in parts_of(person)),
     }
     report(figures, given.json)
 

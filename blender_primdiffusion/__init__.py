@@ -14,9 +14,10 @@ _registered: list[ModuleType] = []
 
 
 def register() -> None:
-    """Called by Blender when the extension is enabled. Without numpy only a panel is registered: what to install.
+    """Called by Blender when the extension is enabled.
 
-    Raises RuntimeError, before anything is registered, if the other build (the extension or its viewer) is enabled.
+    Raises, before anything is registered, RuntimeError if the other build (the extension or its viewer) is enabled, and
+    ImportError for a Blender whose Python lacks numpy, as Debian's may; Blender shows both.
     """
     import bpy  # here, so that the backend's client can be imported without bpy
 
@@ -26,14 +27,13 @@ def register() -> None:
         )
     bpy.utils.expose_bundled_modules()
     if importlib.util.find_spec("numpy") is None:
-        from . import without_numpy
+        raise ImportError(
+            "The Python of this Blender lacks numpy: install it (on Debian and Ubuntu: sudo apt install python3-numpy "
+            "python3-openvdb), or use Blender from blender.org"
+        )
+    from . import engine, ui  # which import numpy
 
-        packages = [without_numpy]
-    else:
-        from . import engine, ui  # which import numpy
-
-        packages = [engine, ui]
-    for package in packages:
+    for package in (engine, ui):
         package.register()
         _registered.append(package)
     if not bpy.app.binary_path:
@@ -43,9 +43,8 @@ def register() -> None:
 def unregister() -> None:
     """Called by Blender when the extension is disabled, and at its exit; ends the child processes.
 
-    As a Python module, Blender 4.5 does not call this at exit and hangs while the engine is active: hence `atexit`.
-    Newer ones call it too, after `atexit`; a second call does nothing. In the application `atexit` would be too late:
-    Blender's data are freed before.
+    As a Python module, Blender may not call this at exit: hence `atexit`. A second call does nothing.
+    In the application `atexit` would be too late: Blender's data are freed before.
     """
     atexit.unregister(unregister)
     while _registered:

@@ -18,8 +18,8 @@ from .formats.regular_files import printable
 from .formats.schema import descriptions, field_types, split
 from .formats.whole_files import write_atomically
 
-DONE, FAILED, UNUSABLE, NO_BACKEND, CANCELLED = 0, 1, 2, 3, 130
-"""Exit codes: all done; some failed, and the report lists them; usage error; no Python runs the backend; stopped."""
+DONE, FAILED, UNUSABLE, CANCELLED = 0, 1, 2, 130
+"""Exit codes: all done; some failed, and the report lists them; usage error; stopped."""
 
 
 class Stopped(Exception):
@@ -122,7 +122,7 @@ def stopped_by_signals() -> Iterator[Stop]:
 
 @dataclasses.dataclass
 class Report:
-    """Results of a batch so far."""
+    """Results so far."""
 
     done: list[str] = dataclasses.field(default_factory=list)
     """Subjects that were finished now."""

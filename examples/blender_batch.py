@@ -27,19 +27,19 @@ def main(options: list[str]) -> None:
     operators = bpy.ops.primdiffusion
     scene, out = bpy.context.scene, arguments.out.resolve()
     out.mkdir(parents=True, exist_ok=True)
-    bpy.ops.wm.save_as_mainfile(filepath=str(out / "people.blend"))  # the people's files are saved next to it
+    bpy.ops.wm.save_as_mainfile(filepath=str(out / "people.blend"))
 
     for x, seed in zip((-0.6, 0.6), arguments.seeds, strict=True):
         before = set(humans())
         operators.generate(seed=seed, steps=arguments.steps, count=1)
         (person,) = set(humans()) - before
         person.name = f"Person {seed}"
-        armature_of(person).location.x = x
-    first, second = (bpy.data.collections[f"Person {seed}"] for seed in arguments.seeds)
+        person.location.x = x
+    first, second = (bpy.data.objects[f"Person {seed}"] for seed in arguments.seeds)
 
-    select(armature_of(first))
+    select(first)
     operators.apply_pose(pose_name="Waving")
-    select(armature_of(second))
+    select(second)
     if arguments.motion is not None:
         operators.import_motion(filepath=str(arguments.motion))
     else:
@@ -58,14 +58,9 @@ def main(options: list[str]) -> None:
     bpy.ops.wm.save_mainfile()
 
 
-def humans() -> list[bpy.types.Collection]:
-    """The people in the file."""
-    return [collection for collection in bpy.data.collections if "primdiffusion_human" in collection]
-
-
-def armature_of(person: bpy.types.Collection) -> bpy.types.Object:
-    """The armature, which is posed, moved and animated."""
-    return next(obj for obj in person.objects if obj.type == "ARMATURE")
+def humans() -> list[bpy.types.Object]:
+    """The people in the file: armatures, which are posed, moved and animated."""
+    return [obj for obj in bpy.data.objects if "primdiffusion_human" in obj]
 
 
 def select(obj: bpy.types.Object) -> None:

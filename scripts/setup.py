@@ -5,7 +5,7 @@
     python -m scripts.setup help
 
 `make demo`, `make test` and so on call it. It needs Python 3.11 and nothing else; each environment is a folder in the
-checkout (.venv, .venv45, .venv52), and nothing else on the machine is touched. Environment variables: PYTHON313,
+checkout (.venv, .venv52, .venv53), and nothing else on the machine is touched. Environment variables: PYTHON313,
 TEST_ARGS, MINUTES (see `help`).
 """
 
@@ -26,13 +26,12 @@ WINDOWS = os.name == "nt"
 BY_MAKE = "MAKELEVEL" in os.environ
 TEST_ARGS = shlex.split(os.environ.get("TEST_ARGS", ""))
 MINUTES = os.environ.get("MINUTES") or "30"
-VENV, VENV45, VENV52 = ROOT / ".venv", ROOT / ".venv45", ROOT / ".venv52"
-"""One environment for each Blender, which is a Python module: 5.0, 4.5 and 5.2."""
-MEGABYTES = {VENV: 3700, VENV45: 850, VENV52: 1300}
+VENV, VENV52, VENV53 = ROOT / ".venv", ROOT / ".venv52", ROOT / ".venv53"
+"""One environment for each Blender, which is a Python module: 5.0, 5.2 and 5.3."""
+MEGABYTES = {VENV: 3700, VENV52: 1300, VENV53: 1300}
 """Installed sizes with torch's CPU build, MB (`du -sm`): missing disk space is reported before pip begins."""
 PIP_MB = 1500
 """Space that pip needs in its temporary folder, MB."""
-BLENDER45 = "bpy==4.5.15"
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE"}
 ON_EVERY_BLENDER = ["tests/blender", "--confcutdir", "tests/blender", "-m", "not slow and not gpu and not any_blender"]
 
@@ -58,13 +57,13 @@ def help_(_: Sequence[str]) -> None:
 
 
 def test(arguments: Sequence[str]) -> None:
-    '''the tests on Blender 5.0, 4.5 and 5.2; options for pytest: TEST_ARGS="-x -k motion"'''
+    '''the tests on Blender 5.0, 5.2 and 5.3; options for pytest: TEST_ARGS="-x -k motion"'''
     has_313 = python313() is not None
-    check_room([VENV, VENV45, *([VENV52] if has_313 else [])])
-    versions = {"5.0": test_50, "4.5": test_45, "5.2": test_52}
+    check_room([VENV, *([VENV52, VENV53] if has_313 else [])])
+    versions = {"5.0": test_50, "5.2": test_52, "5.3": test_53}
     failures = {version: _failure(test_one, arguments) for version, test_one in versions.items()}
     for version, failure in failures.items():
-        passed = "passed" if version != "5.2" or has_313 else "not tested, without a Python 3.13"
+        passed = "passed" if version == "5.0" or has_313 else "not tested, without a Python 3.13"
         print(f"Blender {version}: {failure or passed}", flush=True)
     if any(failures.values()):
         sys.exit(1)
@@ -87,35 +86,32 @@ def test_50(arguments: Sequence[str]) -> None:
     run_pytest(VENV, arguments)
 
 
-def test_45(arguments: Sequence[str]) -> None:
-    """the tests that depend on Blender's version, on Blender 4.5"""
-    ready45()
-    run_pytest(VENV45, [*ON_EVERY_BLENDER, *arguments])
-
-
 def test_52(arguments: Sequence[str]) -> None:
-    """the same on Blender 5.2, if a Python 3.13 is found (PYTHON313=/path/to/python3.13 names one)"""
+    """the tests that depend on Blender's version, on 5.2; PYTHON313=/path/to/python3.13 names its Python"""
+    _test_on_313("5.2", VENV52, arguments)
+
+
+def test_53(arguments: Sequence[str]) -> None:
+    """the same on Blender 5.3"""
+    _test_on_313("5.3", VENV53, arguments)
+
+
+def _test_on_313(version: str, folder: Path, arguments: Sequence[str]) -> None:
     python = python313()
     if python is None:
         name = "/path/to/python3.13"
         way = f"make test PYTHON313={name}" if BY_MAKE else f"set the environment variable PYTHON313 to {name}"
-        print(f"Blender 5.2 was not tested: its module needs Python 3.13. Install it, or name it: {way}")
+        print(f"Blender {version} was not tested: its module needs Python 3.13. Install it, or name it: {way}")
         return
-    ready_to_test()  # .venv52 has no torch: the backend's process runs in .venv
-    ready52(python)
-    run_pytest(VENV52, [*ON_EVERY_BLENDER, *arguments], PRIMDIFFUSION_PYTHON=program(VENV))
+    ready_to_test()  # the other has no torch: the backend's process runs in .venv
+    ready_313(folder, python)
+    run_pytest(folder, [*ON_EVERY_BLENDER, *arguments], PRIMDIFFUSION_PYTHON=program(VENV))
 
 
 def test_all(arguments: Sequence[str]) -> None:
     """all tests, with the slow ones, on Blender 5.0"""
     ready_to_test()
     run([program(VENV), "-m", "pytest", "-m", "not gpu", *TEST_ARGS, *arguments])
-
-
-def fuzz(arguments: Sequence[str]) -> None:
-    """feed damaged files and messages to every reader for MINUTES=30; see tests/fuzz"""
-    ready_to_test()
-    run([program(VENV), "-m", "tests.fuzz", "--minutes", MINUTES, *arguments], **ONE_THREAD)
 
 
 def chaos(arguments: Sequence[str]) -> None:
@@ -156,10 +152,9 @@ TARGETS: dict[str, Callable[[Sequence[str]], None]] = {
     "help": help_,
     "test": test,
     "test-5.0": test_50,
-    "test-4.5": test_45,
     "test-5.2": test_52,
+    "test-5.3": test_53,
     "test-all": test_all,
-    "fuzz": fuzz,
     "chaos": chaos,
     "lint": lint,
     "types": types,
@@ -196,31 +191,15 @@ def ready_to_test() -> None:
         mark.touch()
 
 
-def ready45() -> None:
-    """Set up .venv45 with Blender 4.5's module; everything else comes from .venv."""
-    ready_to_test()
-    mark = VENV45 / "ready"
-    if is_newer(mark, VENV / "ready-to-test", Path(__file__)):
+def ready_313(folder: Path, python: str) -> None:
+    """Set up .venv52 or .venv53 with the module of that Blender, by the lock of the same number."""
+    mark, lock = folder / "ready", f"requirements{folder.name.removeprefix('.venv')}.lock"
+    if is_newer(mark, ROOT / lock):
         return
-    check_room([VENV45])
-    own, shared = program(VENV45), program(VENV)
-    if not Path(own).exists():
-        run([shared, "-m", "venv", "--without-pip", str(VENV45)])
-    run([shared, "-m", "pip", "--python", own, "install", *PIP_OPTIONS, "--no-deps", BLENDER45])
-    packages = f"import site; site.addsitedir({packages_of(shared)!r})\n"
-    Path(packages_of(own), "zz_shared.pth").write_text(packages, encoding="utf-8")
-    mark.touch()
-
-
-def ready52(python: str) -> None:
-    """Set up .venv52 with Blender 5.2's module on Python 3.13."""
-    mark = VENV52 / "ready"
-    if is_newer(mark, ROOT / "requirements52.lock"):
-        return
-    check_room([VENV52])
-    if not Path(program(VENV52)).exists():
-        run([python, "-m", "venv", str(VENV52)])
-    run([program(VENV52), "-m", "pip", "install", *PIP_OPTIONS, "--no-deps", "-r", "requirements52.lock"])
+    check_room([folder])
+    if not Path(program(folder)).exists():
+        run([python, "-m", "venv", str(folder)])
+    run([program(folder), "-m", "pip", "install", *PIP_OPTIONS, "--no-deps", "-r", lock])
     mark.touch()
 
 
@@ -235,11 +214,6 @@ def pip_install(requirement: str) -> None:
 def program(folder: Path, name: str = "python") -> str:
     """The path of a program in an environment."""
     return str(folder / "Scripts" / f"{name}.exe" if WINDOWS else folder / "bin" / name)
-
-
-def packages_of(python: str) -> str:
-    """The folder of the packages of an interpreter."""
-    return answer_of([python, "-c", "import sysconfig; print(sysconfig.get_path('purelib'))"])
 
 
 def is_newer(mark: Path, *sources: Path) -> bool:

@@ -102,7 +102,7 @@ def load_human(path: str | Path) -> Human:
     if not path.is_file():
         raise FileNotFoundError(f"there is no human file {path}: check the path, or generate a human")
     with as_file_error(path, "is damaged or no safetensors file", "generate the human again", OSError):
-        file = tensor_file.opened(path, LARGEST_FILE)
+        file = tensor_file.TensorFile(path, LARGEST_FILE)
         tensors, metadata = file.finite_tensors(_KNOWN), file.metadata
     _check_format(path, metadata)
     tensors = _expanded(path, tensors, metadata)

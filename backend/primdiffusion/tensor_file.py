@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import io
 import json
 import math
 from collections.abc import Callable, Container, Mapping
@@ -12,20 +10,23 @@ from typing import Any, TypeVar
 
 import safetensors.torch
 import torch
+from safetensors import SafetensorError, safe_open
 from torch import Tensor, nn
 from torch.overrides import TorchFunctionMode
 
 from primdiffusion.formats.arrays import LARGEST_NUMBER
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import open_regular, private_content
-from primdiffusion.formats.tensor_layout import LENGTH_BYTES, StoredTensor, TensorLayout, check_limits, read_layout
+from primdiffusion.formats.regular_files import open_regular
 
 LARGEST_FILE = 16 * 2**30
-_KINDS = {
-    "F64": torch.float64, "F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "I64": torch.int64,
-    "I32": torch.int32, "I16": torch.int16, "I8": torch.int8, "U8": torch.uint8, "BOOL": torch.bool,
-}  # fmt: skip
-"""torch's types of the dtypes in `formats.tensor_layout`."""
+LENGTH_BYTES = 8
+"""Size of the header's length at the start of a file, and what the header is padded to a multiple of."""
+LARGEST_HEADER = 4 * 2**20
+"""Largest header, bytes: names and shapes take many times as much in memory."""
+_TYPES = (
+    torch.float64, torch.float32, torch.float16, torch.bfloat16, torch.int64, torch.int32, torch.int16, torch.int8,
+    torch.uint8, torch.bool,
+)  # fmt: skip
 _MAKERS = {torch.empty, torch.zeros, torch.ones, torch.full, torch.rand, torch.randn}
 _COPIES, _SMALL = 2, 100_000
 """Layers with weight normalisation make their weights twice; networks count and place with small tensors."""
@@ -38,78 +39,48 @@ def read(path: Path, limit: int = LARGEST_FILE) -> tuple[dict[str, Tensor], dict
     Raises ValueError, also for numbers that are not finite or above LARGEST_NUMBER; FileError for a larger file,
     FileNotFoundError and other OSErrors.
     """
-    file = opened(path, limit)
+    file = TensorFile(path, limit)
     return file.finite_tensors(), file.metadata
 
 
-def read_metadata(path: Path, limit: int = LARGEST_FILE) -> dict[str, str]:
-    """Return the metadata without reading tensors. Raises as `read`."""
-    with open_regular(path, limit) as file:
-        return _layout(file).metadata
-
-
-def opened(path: Path, limit: int = LARGEST_FILE) -> TensorFile:
-    """Open a file for reading parts of its tensors. Raises as `read`."""
-    with open_regular(path, limit) as file:
-        return TensorFile(file)
-
-
 class TensorFile:
-    """A safetensors file in memory; tensors are views of it, and writing to them leaves the file as it is.
+    """An open safetensors file, mapped into memory."""
 
-    Everything is read from the file that was opened, also after another one has taken its name; up to COPIED_BYTES also
-    after it was overwritten (see `private_content`).
-    """
-
-    def __init__(self, file: io.BufferedReader | io.BytesIO) -> None:
-        """Check and keep the content of an open file, which may be closed. Raises ValueError, OSError."""
-        self._layout = _layout(file)
-        self._bytes = private_content(file)
-        if len(self._bytes) < self._layout.size:
-            raise ValueError("it was cut short while it was read")
-
-    @property
-    def metadata(self) -> dict[str, str]:
-        """The metadata, empty without any."""
-        return self._layout.metadata
-
-    @property
-    def tensors(self) -> Mapping[str, StoredTensor]:
-        """Type, shape and place of each tensor."""
-        return self._layout.tensors
+    def __init__(self, path: Path, limit: int = LARGEST_FILE) -> None:
+        """Open a file of at most `limit` bytes. Raises as `read`, but reads no numbers."""
+        with open_regular(path, limit) as file:
+            if int.from_bytes(file.read(LENGTH_BYTES), "little") > LARGEST_HEADER:
+                raise ValueError(f"its header is longer than {LARGEST_HEADER / 2**20:.0f} MB")
+        try:
+            self._file = safe_open(path, "pt")
+        except SafetensorError as error:
+            raise ValueError(f"{error!s:.120}") from error
+        self.names = sorted(self._file.keys())
+        self.metadata: dict[str, str] = self._file.metadata() or {}
 
     def tensor(self, name: str) -> Tensor:
-        """A tensor of the file, of any values. Raises KeyError."""
-        stored = self._layout.tensors[name]
-        kind, size = _KINDS[stored.dtype], stored.end - stored.begin
-        if size == 0:
-            return torch.empty(stored.shape, dtype=kind)
-        begin = self._layout.data_start + stored.begin
-        values = torch.frombuffer(self._bytes, dtype=torch.uint8, count=size, offset=begin)
-        if begin % kind.itemsize:
-            values = values.clone()  # kernels may rely on addresses that are multiples of the size
-        return values.view(kind).reshape(stored.shape)
+        """A tensor of any values: a view of the mapped file, which stays as it is when the tensor is written to.
+
+        Raises ValueError for a type that no tensor here has.
+        """
+        try:
+            values = self._file.get_tensor(name)
+        except (SafetensorError, RuntimeError, OverflowError, TypeError) as error:
+            raise ValueError(f"{name!r:.60} cannot be read: {error!s:.80}") from error
+        if values.dtype not in _TYPES:
+            raise ValueError(f"{name!r:.60} is {values.dtype}, a type that no tensor here has")
+        return values
 
     def finite_tensors(self, names: Container[str] | None = None) -> dict[str, Tensor]:
-        """All tensors, or those of `names`.
+        """All tensors, or those of `names`, copied: no program can replace a file on Windows while it is mapped.
 
         Raises ValueError for numbers that are not finite or above LARGEST_NUMBER.
         """
-        tensors = {name: self.tensor(name) for name in self._layout.tensors if names is None or name in names}
+        tensors = {name: self.tensor(name).clone() for name in self.names if names is None or name in names}
         for name, values in tensors.items():
             if not ((values >= -LARGEST_NUMBER) & (values <= LARGEST_NUMBER)).all():
                 raise ValueError(f"{name!r:.60} holds NaN or infinite values, or numbers above {LARGEST_NUMBER:g}")
         return tensors
-
-    def sha256(self) -> str:
-        """SHA-256 of the whole file, hexadecimal."""
-        return hashlib.sha256(self._bytes).hexdigest()
-
-
-def _layout(file: io.BufferedReader | io.BytesIO) -> TensorLayout:
-    layout = read_layout(file)
-    check_limits(layout)
-    return layout
 
 
 def save(tensors: Mapping[str, Tensor], metadata: Mapping[str, str] | None = None) -> bytes:

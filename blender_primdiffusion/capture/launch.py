@@ -27,7 +27,7 @@ def run_command() -> int:
 
 
 def leave(code: int) -> NoReturn:
-    """End the process without Blender's own end: 4.5 as a module hangs there while a thread waits for stdin."""
+    """End the process without Blender's own end, which may wait for a thread that reads stdin."""
     sys.stdout.flush()
     sys.stderr.flush()
     shutil.rmtree(bpy.app.tempdir, ignore_errors=True)

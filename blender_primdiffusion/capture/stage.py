@@ -157,8 +157,7 @@ def _set_up_cycles(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
     cycles.transparent_max_bounces = _LAYERS
     cycles.caustics_reflective = cycles.caustics_refractive = False
     files = render.image_settings
-    if bpy.app.version >= (5, 0):
-        files.media_type = "MULTI_LAYER_IMAGE"
+    files.media_type = "MULTI_LAYER_IMAGE"
     files.file_format, files.color_depth, files.exr_codec = "OPEN_EXR_MULTILAYER", "32", "NONE"
 
 

@@ -32,7 +32,7 @@ class PRIMDIFFUSION_RenderEngine(bpy.types.RenderEngine):
     bl_use_eevee_viewport = True
 
     def __init__(self, *args: object, **kwargs: object):
-        super().__init__(*args, **kwargs)  # without it Blender 4.5 and later draw nothing
+        super().__init__(*args, **kwargs)  # without it Blender draws nothing
         self._viewport: Viewport | None = None
 
     def update_render_passes(self, scene: bpy.types.Scene, renderlayer: bpy.types.ViewLayer) -> None:

@@ -15,7 +15,8 @@ from ..formats.joints import JOINT_NAMES
 from ..scene.armature import model_origin
 from ..scene.blend_values import stored_numbers
 from ..scene.convention import transforms_to_backend
-from ..scene.human import BETA_COUNT, BETAS, MARK, person_file
+from ..scene.human import BETA_COUNT, BETAS, is_human
+from ..scene.payload import session_file
 from .solids import scene_solids, stored, visible_instances
 
 SMALLEST_SCALE = 1e-4
@@ -109,7 +110,7 @@ def world_colour(depsgraph: bpy.types.Depsgraph) -> tuple[float, float, float]:
     world = getattr(depsgraph.view_layer_eval, "world_override", None) or depsgraph.scene.world
     if world is None:
         return (0.0, 0.0, 0.0)
-    if world.node_tree is not None and (bpy.app.version >= (5, 0) or world.use_nodes):
+    if world.node_tree is not None:
         output = world.node_tree.get_output_node("ALL")
         links = output.inputs["Surface"].links if output is not None else ()
         shader = links[0].from_node if links else None
@@ -131,58 +132,47 @@ def posed_humans(depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D | 
     a pose that holds NaN.
     """
     armatures = human_armatures(visible_instances(depsgraph, space))
-    return [pose_of(obj, matrix, owner) for _, obj, matrix, owner in armatures]
+    return [pose_of(obj, matrix) for _, obj, matrix in armatures]
 
 
 def human_armatures(
     instances: Iterable[bpy.types.DepsgraphObjectInstance],
-) -> Iterator[tuple[bpy.types.Object, bpy.types.Object, NDArray[np.float64], bpy.types.Collection]]:
-    """Of `visible_instances`, those that show a human: the object that shows it (the armature, or what instances it),
-    the evaluated armature, which is valid until the next one, its world matrix [4, 4], and the human's collection."""
-    owners = dict(_armatures())
+) -> Iterator[tuple[bpy.types.Object, bpy.types.Object, NDArray[np.float64]]]:
+    """Of `visible_instances`, those that show a human: the object that shows it (the human, or what instances it), the
+    evaluated armature, which is valid until the next one, and its world matrix [4, 4]."""
     for instance in instances:
         obj = instance.object
-        owner = owners.get(obj.original) if obj.type == "ARMATURE" else None
-        matrix = np.array(instance.matrix_world, np.float64)
-        if owner is not None and not abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_SCALE**3:
-            yield (instance.parent or obj).original, obj, matrix, owner
+        if is_human(obj) and all(name in obj.data.bones for name in JOINT_NAMES):
+            matrix = np.array(instance.matrix_world, np.float64)
+            if not abs(np.linalg.det(matrix[:3, :3])) < SMALLEST_SCALE**3:
+                yield (instance.parent or obj).original, obj, matrix
 
 
-def _armatures() -> Iterator[tuple[bpy.types.Object, bpy.types.Collection]]:
-    """Each armature with SMPL's joints and its human's collection, in this file and in linked ones."""
-    for collection in bpy.data.collections:
-        if MARK not in collection:
-            continue
-        for obj in collection.objects:
-            if obj.type == "ARMATURE" and all(name in obj.data.bones for name in JOINT_NAMES):
-                yield obj, collection
-
-
-def pose_of(armature: bpy.types.Object, matrix: NDArray, owner: bpy.types.Collection) -> PosedHuman:
+def pose_of(armature: bpy.types.Object, matrix: NDArray) -> PosedHuman:
     """A human as its armature is posed, with the object at `matrix` [4, 4]. Raises as `posed_humans` does."""
     bones = armature.pose.bones
     posed = np.array([bones[name].matrix for name in JOINT_NAMES], np.float64)
     rest = np.array([bones[name].bone.matrix_local for name in JOINT_NAMES], np.float64)
     if not (np.isfinite(posed).all() and np.isfinite(matrix).all()):
-        raise ValueError(f"the armature of {owner.name!r} holds NaN or infinite numbers: check its pose and drivers")
+        raise ValueError(f"the armature {armature.name!r} holds NaN or infinite numbers: check its pose and drivers")
     origin = np.eye(4)
     origin[:3, 3] = model_origin(armature.data)
     return PosedHuman(
-        person_file(owner),
+        session_file(armature.original),
         transforms_to_backend(matrix @ origin),
         transforms_to_backend(np.linalg.inv(origin) @ posed @ np.linalg.inv(rest) @ origin),
-        _betas(armature, owner.name),
+        _betas(armature),
         (matrix @ posed[0])[:3, 3],
     )
 
 
-def _betas(armature: bpy.types.Object, name: str) -> list[float] | None:
+def _betas(armature: bpy.types.Object) -> list[float] | None:
     if BETAS not in armature:
         return None
     betas = stored_numbers(armature, BETAS, BETA_COUNT)
     if betas is None:
         raise ValueError(
-            f"the custom property {BETAS!r} on the armature of {name!r} is not a list of numbers: "
+            f"the custom property {BETAS!r} of {armature.name!r} is not a list of numbers: "
             "make it a list of ten numbers, or delete it"
         )
     return betas

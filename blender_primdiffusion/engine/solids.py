@@ -17,7 +17,7 @@ from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from ..scene.place import is_solid, triangles_of
 
-UNRELATED_TYPES = frozenset({"ARMATURE", "CAMERA", "VOLUME", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
+UNRELATED_TYPES = frozenset({"ARMATURE", "CAMERA", "VOLUME", "POINTCLOUD", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
 """Types of objects that are no solids; their children report changes of their own."""
 _SOLID_DATA = (
     bpy.types.Mesh,

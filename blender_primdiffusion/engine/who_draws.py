@@ -8,7 +8,7 @@ import bpy
 
 ENGINE = "PRIMDIFFUSION"
 WORKBENCH = "BLENDER_WORKBENCH"
-EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0, 0) else "BLENDER_EEVEE_NEXT"
+EEVEE = "BLENDER_EEVEE"
 
 
 class Drawer(enum.Enum):
@@ -37,7 +37,7 @@ def view_engine(engine: str, shading: str) -> str:
 
 def renders_volumes(engine: str) -> bool:
     """Whether an engine lights volumes. Engines declare that as Blender's own do: their name is in COMPAT_ENGINES of
-    the panel of a volume's file (in Blender 4.5 to 5.2 Cycles, EEVEE and Hydra Storm). Workbench declares it too, but
+    the panel of a volume's file (in Blender 5.0 to 5.3 Cycles, EEVEE and Hydra Storm). Workbench declares it too, but
     draws a grey fog."""
     panel = getattr(bpy.types, "DATA_PT_volume_file", None)
     return engine in getattr(panel, "COMPAT_ENGINES", ()) and engine not in (WORKBENCH, ENGINE)

@@ -23,7 +23,8 @@ from ..places import own_folder
 from ..scene.armature import build_armature, keyframe_poses
 from ..scene.blend_values import as_shown
 from ..scene.convention import points_to_blender
-from ..scene.human import armature_of, person_file, provenance_of
+from ..scene.human import provenance_of
+from ..scene.payload import session_file
 from .queue import Job
 from .target import HumanTarget
 
@@ -42,7 +43,7 @@ def mark(asset: bpy.types.ID, description: str, tags: Iterable[str], picture: ND
     show(asset, picture)
 
 
-def asset_description(person: bpy.types.Collection) -> tuple[str, list[str]]:
+def asset_description(person: bpy.types.Object) -> tuple[str, list[str]]:
     """Description and tags of a human: its seed and attributes."""
     made = provenance_of(person)
     asked = made.get("attributes")
@@ -117,9 +118,9 @@ class PoseAssetJob(Job):
     """[3]."""
 
     @classmethod
-    def of(cls, person: bpy.types.Collection, name: str) -> PoseAssetJob:
+    def of(cls, person: bpy.types.Object, name: str) -> PoseAssetJob:
         """Raises ValueError for a rig that lacks the bones."""
-        rotations, translation = current_pose(armature_of(person))
+        rotations, translation = current_pose(person)
         frozen = tuple(tuple(map(tuple, rows)) for rows in rotations.tolist())
         return cls(HumanTarget.of(person), name, frozen, tuple(translation.tolist()))
 
@@ -136,22 +137,23 @@ class PoseAssetJob(Job):
     def marked(self, picture: Path) -> str:
         """Mark the pose's action as an asset with this picture; returns a message. Raises OSError, ValueError."""
         pixels = picture_of_file(picture)
-        armature = armature_of(self.target.found())
+        armature = self.target.found()
         action = pose_action(armature, np.array(self.rotations), np.array(self.translation), self.name)
         mark(action, f"Pose of {self.target.name}", [POSE_TAG, self.target.name], pixels)
         return f"The pose {action.name} is an asset now; save the file in a folder of your asset libraries"
 
 
-def mark_human(person: bpy.types.Collection, picture: Path) -> str:
+def mark_human(person: bpy.types.Object, picture: Path) -> str:
     """Mark a human as an asset with this picture; returns a message. Raises OSError, ValueError."""
     mark(person, *asset_description(person), picture_of_file(picture))
     return f"{person.name} is an asset now; save the file in a folder of your asset libraries"
 
 
-def _drawing(person: bpy.types.Collection, pose: np.ndarray, folder: Path) -> dict[str, Any]:
+def _drawing(person: bpy.types.Object, pose: np.ndarray, folder: Path) -> dict[str, Any]:
     """Parameters of the child's method `render`."""
     sides = {"width": SIDE, "height": SIDE}
-    return {"human": str(person_file(person)), "out": str(folder / _PICTURE), "pose": pose.ravel().tolist(), **sides}
+    human = str(session_file(person))
+    return {"human": human, "out": str(folder / _PICTURE), "pose": pose.ravel().tolist(), **sides}
 
 
 LIBRARY = "PrimDiffusion"

@@ -20,9 +20,9 @@ from ..formats.regular_files import exists_in_its_folder, remove_file
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
-from ..scene.attachment import attachment_of, set_attachment
+from ..scene.attachment import attachment_of, set_attachment, showing
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
-from ..scene.human import BODY_FILE, PERSON_FILE, armature_of, person_file
+from ..scene.human import link_part
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
     HumanMotion,
@@ -34,30 +34,30 @@ from ..scene.human_file import (
     with_motion,
     write_tensors,
 )
-from ..scene.merged import MergedGrid, merged_of, read_grid, write_grid
+from ..scene.merged import read_grid, write_grid
+from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
-from ..scene.surface import carrier_of, primitives_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
 
 
-def show(person: bpy.types.Collection, what: str) -> None:
+def show(person: bpy.types.Object, what: str) -> None:
     """Switch to `what`: VOLUMES, VIEWPORT or MESH. Raises ValueError where there is no proxy; makes no undo step."""
     proxy = proxy_of(person)
     if proxy is None:
         raise ValueError(f"{person.name!r} has no mesh proxy yet: press Add Mesh Proxy")
     set_attachment(person, attachment_of(person))  # shows the parts of the current attachment
     proxy.hide_viewport, proxy.hide_render = what == "VOLUMES", what != "MESH"
-    for part in (primitives_of(person), carrier_of(person), merged_of(person)):
+    for part in showing(person).values():
         if part is not None:
             part.hide_viewport = part.hide_viewport or what != "VOLUMES"
             part.hide_render = part.hide_render or what == "MESH"
 
 
-def shown(person: bpy.types.Collection) -> str:
+def shown(person: bpy.types.Object) -> str:
     """What is shown now: VOLUMES, VIEWPORT or MESH."""
     proxy = proxy_of(person)
     if proxy is None or proxy.hide_viewport:
@@ -84,7 +84,7 @@ class ProxyJob(Job):
             "triangles": self.triangles,
         }
 
-    def built(self, person: bpy.types.Collection, result: ProxyAnswer) -> bpy.types.Object:
+    def built(self, person: bpy.types.Object, result: ProxyAnswer) -> bpy.types.Object:
         """The proxy as an object, in no collection, with the current shape of the body."""
         made = np.array(result.betas, np.float64)
         proxy = build_proxy(person, read_proxy(result.proxy), result.texture, made)
@@ -108,11 +108,10 @@ class ExportMeshJob(ProxyJob):
 
     def finish(self, context: bpy.types.Context, result: ProxyAnswer, _folder: Path) -> str:
         person = self.target.found()
-        armature = armature_of(person)
-        check_ready(armature)
+        check_ready(person)
         proxy = self.built(person, result)
         try:
-            write_model(context, armature, proxy, self.path, self.format, self.frames)
+            write_model(context, person, proxy, self.path, self.format, self.frames)
         finally:
             remove_proxy(proxy)
         size = self.path.stat().st_size / 1e6
@@ -133,11 +132,11 @@ class AddProxyJob(ProxyJob):
 
     def finish(self, _context: bpy.types.Context, result: ProxyAnswer, _folder: Path) -> str:
         person = self.target.found()
-        proxy = self.built(person, result)
         earlier = proxy_of(person)
+        proxy = self.built(person, result)
         if earlier is not None:
             remove_proxy(earlier)
-        person.objects.link(proxy)
+        link_part(person, proxy)
         show(person, "VIEWPORT")
         show_textures_in_solid()
         return f"Mesh proxy of {result.triangles} triangles for {person.name} in {result.seconds:.1f} s"
@@ -150,33 +149,30 @@ def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
     return FrameRange(scene.frame_current, scene.frame_current)
 
 
-def posed_now(context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+def posed_now(context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
     """The human at the current frame: see `posed_frames`."""
     return posed_frames(context, person, [context.scene.frame_current])[0]
 
 
-def posed_frames(
-    context: bpy.types.Context, person: bpy.types.Collection, frames: Iterable[int]
-) -> list[dict[str, Any]]:
+def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: Iterable[int]) -> list[dict[str, Any]]:
     """The human at these frames: file, object matrix, joints and shape, as parameters of the child's `draw`.
 
     Raises ValueError for an armature in Edit Mode or without SMPL's bones, FileNotFoundError where the file is missing.
     """
-    armature = armature_of(person)
-    check_ready(armature)
+    check_ready(person)
     found = []
-    with scene_with_only(context, armature) as scene:
+    with scene_with_only(context, person) as scene:
         for frame in frames:
             if frame != scene.frame_current:
                 scene.frame_set(frame)
-            evaluated = armature.evaluated_get(scene.view_layers[0].depsgraph)
-            found.append(pose_of(evaluated, np.array(evaluated.matrix_world, np.float64), person).params())
+            evaluated = person.evaluated_get(scene.view_layers[0].depsgraph)
+            found.append(pose_of(evaluated, np.array(evaluated.matrix_world, np.float64)).params())
     return found
 
 
 def write_human(
     context: bpy.types.Context,
-    person: bpy.types.Collection,
+    person: bpy.types.Object,
     path: Path,
     frames: FrameRange | None,
     *,
@@ -189,7 +185,7 @@ def write_human(
     The motion is that of the joints in the armature's space, constraints and layers included; the object's own
     transform is left out.
     """
-    human = read_tensors(person_file(person))
+    human = read_tensors(session_file(person))
     if has_custom_shape(person):
         betas = betas_of(person)
         human = reshaped(human, betas, shape_model_of(person).growth(generated_betas(person), betas))
@@ -197,10 +193,10 @@ def write_human(
     write_tensors(path, with_motion(compacted(human) if compact else expanded(human), motion))
 
 
-def _motion(context: bpy.types.Context, person: bpy.types.Collection, frames: FrameRange) -> HumanMotion:
+def _motion(context: bpy.types.Context, person: bpy.types.Object, frames: FrameRange) -> HumanMotion:
     numbers = range(frames.first, frames.last + 1)
     joints = np.array([entry["joints"] for entry in posed_frames(context, person, numbers)], np.float64)
-    pelvis = rest_joints(armature_of(person))[0]
+    pelvis = rest_joints(person)[0]
     rotations = nearest(joints[..., :3])  # bones may be scaled and mirrored
     translations = joints[:, 0, :, :3] @ pelvis + joints[:, 0, :, 3] - pelvis
     render = context.scene.render
@@ -268,7 +264,7 @@ class ExportVdbSequenceJob(Job):
         written = []
         for index, grid in enumerate(result.files):
             name = f"{self.stem}_{self.first + index:04d}.vdb"
-            write_grid(_for_other_programs(read_grid(grid)), folder / name)
+            write_grid(read_grid(grid), folder / name)
             remove_file(grid, grid.parent)
             written.append(folder / name)
         size = sum(path.stat().st_size for path in written) / 1e6
@@ -293,10 +289,6 @@ class ImportHumanJob(Job):
     def label(self) -> str:
         return f"Import {Path(self.path).name}"
 
-    @property
-    def new_person(self) -> str:
-        return name_of(self.path)
-
     def params(self, folder: Path) -> dict[str, Any]:
         return {"person": self.path, "out_dir": str(folder), "size": PREVIEW_PX}
 
@@ -306,12 +298,11 @@ class ImportHumanJob(Job):
     def finish(self, context: bpy.types.Context, result: HumanAnswer, _folder: Path) -> str:
         motion = motion_in(read_tensors(Path(self.path), CHOOSE_ANOTHER), Path(self.path).name)
         person, notice = build_person(context, result, "Imported", name_of(self.path))
-        armature = armature_of(person)
         if motion is not None:
-            _move(armature, motion)
+            _move(person, motion)
         if self.at is not None:
-            armature.location.xy = self.at[:2]
-            armature.location.z += self.at[2]
+            person.location.xy = self.at[:2]
+            person.location.z += self.at[2]
         return notice
 
 
@@ -348,12 +339,6 @@ def put(source: Path, target: Path) -> None:
     """Copy a finished file to its destination, where it appears whole. Raises OSError."""
     with written_whole(target) as unfinished:
         shutil.copyfile(source, unfinished)
-
-
-def _for_other_programs(grid: MergedGrid) -> MergedGrid:
-    """Undo the half voxel by which `write_grid` moves grids for old versions of Cycles."""
-    shift = 0.5 * grid.voxel if bpy.app.version < (5, 0) else 0.0
-    return dataclasses.replace(grid, origin=grid.origin + shift)
 
 
 def _move(armature: bpy.types.Object, motion: HumanMotion) -> None:

@@ -1,100 +1,23 @@
-"""Follow jobs to their end: by a timer while there is a window, by waiting in background mode.
-
-A result is read, and volumes that viewports show are written, in slices of time before the operator runs, so that it
-returns quickly. Other volumes are written afterwards (`deferred_volumes`).
-"""
+"""Follow jobs to their end: by a timer while there is a window, by waiting in background mode."""
 
 from __future__ import annotations
 
 import time
 import traceback
-from pathlib import Path
 from typing import Any
 
 import bpy
 
 from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import error_text, sentence
-from ..formats.answers import HumanAnswer
 from ..formats.regular_files import printable
 from ..places import backend_is_named
-from ..scene.states import Preparation, PreparedHuman
 from .deferred_volumes import keep_writing
 from .memory import release_when_idle
-from .picture_in_view import follow_picture
 from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
 from .remedies import error_before_the_scene
 from .windows import in_the_way, redraw, window_of
-
-SLICE_S = 0.05
-"""Of reading the human or writing volumes between two redraws."""
-_SHOWN_STEPS = 10
-"""Of the bar: a redraw may take longer than SLICE_S."""
-
-
-class Building:
-    """The result of one job at a time. All methods are for Blender's main thread."""
-
-    def __init__(self) -> None:
-        self._entry: Entry | None = None
-        self._person: Path | None = None
-        self._preparing: Preparation | None = None
-        self._shown = 0
-
-    @property
-    def fraction(self) -> float:
-        """Progress from 0 to 1; 1 when there is nothing to build."""
-        return 1.0 if self._preparing is None or self._preparing.over else self._preparing.fraction
-
-    @property
-    def busy(self) -> bool:
-        """The human is left to read, or volumes to write."""
-        return self._preparing is not None and not self._preparing.over
-
-    def moved(self) -> bool:
-        """Whether the bar has advanced a step since the last call."""
-        before, self._shown = self._shown, int(_SHOWN_STEPS * self.fraction)
-        return self._shown != before
-
-    def begin(self, entry: Entry, result: Any) -> None:
-        """Start on the human of the child's answer, if it has one; once for each entry."""
-        if entry is self._entry:
-            return
-        self.close()
-        self._entry, job = entry, entry.job
-        if not isinstance(result, HumanAnswer):
-            return
-        try:
-            replaced = job.replaced()
-        except (ValueError, OSError):  # reported by the operator
-            return
-        if job.new_person or replaced is not None:
-            self._person = result.person
-            self._preparing = Preparation(self._person, job.new_person or "Human", replaced)
-
-    def advance(self, *, may_work: bool) -> bool:
-        """Do some of the work if `may_work`; whether more is left before the operator runs."""
-        if not self.busy:
-            return False  # after a failure the operator tries again and reports it
-        if may_work:
-            self._preparing.work(SLICE_S)
-        return True  # the operator has a tick of its own
-
-    def take(self, person: Path) -> PreparedHuman | None:
-        """The prepared human of this file, whose files are the caller's from now on; None if not prepared."""
-        return self._preparing.take() if self._preparing is not None and person == self._person else None
-
-    def close(self) -> None:
-        """Stop, and remove files that were written but not taken."""
-        if self._preparing is not None:
-            self._preparing.stop()
-        self._entry = self._person = self._preparing = None
-        self._shown = 0
-
-
-building = Building()
-"""One, as there is one queue."""
 
 
 def enter() -> None:
@@ -231,16 +154,12 @@ def keep_following() -> None:
 def follow() -> float | None:
     """The timer: one tick of the queue; a result enters the scene as soon as nothing is in the way."""
     changed = queue.tick()
-    if queue.ready and not queue.advancing:
-        changed |= _advance()
-    if not queue.ready:
-        building.close()
+    if queue.ready and not queue.advancing and not in_the_way():
+        enter()
+        changed = True
     changed |= so_far.show(queue.request.picture if queue.request is not None else None)
-    follow_picture()
     if changed:
         redraw()
-    if queue.ready and not queue.advancing and not in_the_way():
-        return 0.0  # input events still come first
     return TICK_S if queue.busy else None
 
 
@@ -270,14 +189,3 @@ def _wait_for(entry: Entry) -> JobOutcome:
         else:
             time.sleep(TICK_S / 4)
     return queue.last
-
-
-def _advance() -> bool:
-    """Build some of the result, and let it enter the scene when built; True when something visible changed."""
-    building.begin(queue.current, queue.request.result)
-    blocked = bool(in_the_way())
-    if building.advance(may_work=not blocked):
-        return building.moved()
-    if not blocked:
-        enter()
-    return not blocked

@@ -20,10 +20,12 @@ from ..formats.camera_rig import View
 from ..formats.json_files import read_json
 from ..formats.regular_files import as_file_error
 from ..motion.pose_library import check_posable, take_world_posture, world_posture
+from ..scene.attachment import showing
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
 from ..scene.handles import handles_from_joints, joints_from_handles
-from ..scene.human import BODY_FILE, armature_of, state_folder
+from ..scene.human import humans
+from ..scene.payload import BODY
 from ..scene.shape import betas_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
@@ -33,9 +35,9 @@ POSTURE_FORMAT = "primdiffusion-posture"
 """As `posture/file.py` of the backend writes it."""
 
 
-def on_own_body(person: bpy.types.Collection) -> bool:
+def on_own_body(person: bpy.types.Object) -> bool:
     """Whether a human stands on a body of the user's files, whose shape and skeleton the fit does not know."""
-    return (state_folder(person) / BODY_FILE).exists()
+    return BODY in person
 
 
 @dataclasses.dataclass(frozen=True)
@@ -56,9 +58,7 @@ class PictureTask:
     """Pose, translation and betas of the human posed over the picture; None to start from a standing one."""
 
     @classmethod
-    def of(
-        cls, context: bpy.types.Context, mask: str, mask_label: int, person: bpy.types.Collection | None
-    ) -> PictureTask:
+    def of(cls, context: bpy.types.Context, mask: str, mask_label: int, person: bpy.types.Object | None) -> PictureTask:
         """The scene's camera with its picture, and `person` as it is posed over it. Raises ValueError."""
         camera = context.scene.camera
         image = picture_of(camera)
@@ -67,14 +67,13 @@ class PictureTask:
         view = picture_view(context, camera, image)
         posed = None
         if person is not None:
-            armature = armature_of(person)
             if on_own_body(person):
                 raise ValueError(
                     f"the human {person.name!r} is on a body of your own files: pose one of the default body"
                 )
-            check_posable(armature)
-            joints_from_handles(context, armature)
-            pose, translation = world_posture(armature)
+            check_posable(person)
+            joints_from_handles(context, person)
+            pose, translation = world_posture(person)
             posed = {
                 "pose": [pose.ravel().tolist()],
                 "translation": [translation.tolist()],
@@ -154,13 +153,12 @@ class FitPictureJob(Job):
 
     def finish(self, context: bpy.types.Context, result: FitPostureAnswer, _folder: Path) -> str:
         fitted, person = read_fitted(result.posture, self.task.size), self.target.found()
-        armature = armature_of(person)
         check_shapeable(person)
-        check_posable(armature)
+        check_posable(person)
         reshape(person, fitted.betas)
-        take_world_posture(armature, fitted.pose, fitted.translation)
+        take_world_posture(person, fitted.pose, fitted.translation)
         context.view_layer.update()
-        handles_from_joints(context, armature)
+        handles_from_joints(context, person)
         if (camera := self.task.camera_now()) is not None:
             aim_at_picture(camera, fitted.view)
         return " ".join([f"Fitted in {result.seconds:.1f} s.", *map(sentence, result.warnings)])
@@ -173,13 +171,12 @@ class PictureJob(Job):
     kind = "from_picture"
     method = "reconstruct"
     undo = "Human from Picture"
-    new_person = "Human"
 
     task: PictureTask
     seed: int = -1
     """-1 for the most probable unseen sides."""
     posed_over: int = 0
-    """Session uid of the collection of the human posed over the picture, which is hidden; 0 for none."""
+    """Session uid of the human posed over the picture, which is hidden; 0 for none."""
 
     @property
     def label(self) -> str:
@@ -192,8 +189,7 @@ class PictureJob(Job):
     def finish(self, context: bpy.types.Context, result: ReconstructAnswer, _folder: Path) -> str:
         assert result.posture is not None
         fitted = read_fitted(result.posture, self.task.size)
-        collection, notice = build_person(context, result, "Made")
-        armature = armature_of(collection)
+        armature, notice = build_person(context, result, "Made")
         armature.matrix_world = Matrix.Identity(4)
         context.view_layer.update()
         take_world_posture(armature, fitted.pose, fitted.translation)
@@ -202,9 +198,10 @@ class PictureJob(Job):
             aim_at_picture(camera, fitted.view)
         if not self.posed_over:
             _stand_at_origin(context, armature, camera)
-        for other in context.scene.collection.children_recursive:
+        for other in humans(context.scene):
             if other.session_uid == self.posed_over:
-                other.hide_viewport = other.hide_render = True
+                for hidden in (other, *filter(None, showing(other).values())):
+                    hidden.hide_viewport = hidden.hide_render = True
         return notice
 
 

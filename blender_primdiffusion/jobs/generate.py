@@ -13,13 +13,11 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
 from ..formats.requests import ReconstructRequest
-from ..scene.build import build_prepared
+from ..scene.build import build_human
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import select_human
-from ..scene.human import armature_of, humans
+from ..scene.human import humans
 from ..scene.place import stand_at_cursor
-from ..scene.states import prepare_now
-from .follow import building
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .views import bring_into_view, eye
 
@@ -29,24 +27,23 @@ FIRST_HUMAN_SHARE = 0.25
 
 def build_person(
     context: bpy.types.Context, result: HumanAnswer, made: str, name: str = "Human"
-) -> tuple[bpy.types.Collection, str]:
-    """Build the human of the child's `result`; returns the collection and the message ("Generated in 1.2 s.").
+) -> tuple[bpy.types.Object, str]:
+    """Build the human of the child's `result`; returns them and the message ("Generated in 1.2 s.").
 
     Raises as `build_human` does, and then leaves nothing.
     """
-    prepared = building.take(result.person) or prepare_now(result.person, name)
-    collection = build_prepared(context, prepared, name)
-    stand_at_cursor(context, collection, eye())
+    began = time.monotonic()
+    person = build_human(context, result.person, name)
+    stand_at_cursor(context, person, eye())
     if context.mode == "OBJECT":  # else the user is posing or painting
-        select_human(context, collection)
-        others = [human for human in humans(context.scene) if human != collection]
-        bones = [obj for human in others for obj in human.objects if obj.type == "ARMATURE"]
-        bring_into_view(armature_of(collection), 0.0 if others else FIRST_HUMAN_SHARE, bones)
+        select_human(context, person)
+        others = [human for human in humans(context.scene) if human != person]
+        bring_into_view(person, 0.0 if others else FIRST_HUMAN_SHARE, others)
     warnings = list(result.warnings)
-    if overlap := overlap_warning_in(context.scene, collection):
+    if overlap := overlap_warning_in(context.scene, person):
         warnings.append(overlap)
-    notice = f"{made} in {result.seconds + time.monotonic() - prepared.began:.1f} s"
-    return collection, " ".join([sentence(notice), *map(sentence, warnings)])
+    notice = f"{made} in {result.seconds + time.monotonic() - began:.1f} s"
+    return person, " ".join([sentence(notice), *map(sentence, warnings)])
 
 
 _STEP_PICTURE_PX = 256
@@ -59,7 +56,6 @@ class GenerateJob(Job):
 
     kind = method = "generate"
     undo = "Generate Human"
-    new_person = "Human"
 
     seed: int
     sampling: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -90,7 +86,6 @@ class ReconstructJob(Job):
 
     kind = method = "reconstruct"
     undo = "Human from Captures"
-    new_person = "Human"
 
     capture: str
     """Folder of a dataset of captures, or of one subject in it."""

@@ -14,7 +14,6 @@ from ..formats.answers import MergeAnswer, MergeFramesAnswer
 from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import remove_file
 from ..scene.attachment import set_attachment
-from ..scene.human import armature_of
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from .queue import Job
 from .target import HumanTarget
@@ -30,17 +29,17 @@ class Moment:
     """See `pose_digest`."""
 
     @classmethod
-    def now(cls, person: bpy.types.Collection, armature: bpy.types.Object | None = None) -> Moment:
+    def now(cls, person: bpy.types.Object, armature: bpy.types.Object | None = None) -> Moment:
         """The current pose of the human, or of the evaluated `armature` if given.
 
         Raises ValueError for a renamed bone or a pose that holds NaN, FileNotFoundError where the human's file is
         missing.
         """
-        armature = armature_of(person) if armature is None else armature
+        armature = person if armature is None else armature
         missing = [name for name in JOINT_NAMES if name not in armature.pose.bones]
         if missing:
             raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}: give it this name again")
-        pose = pose_of(armature, np.eye(4), person)
+        pose = pose_of(armature, np.eye(4))
         return cls(pose.params(), pose_digest(person, pose.joints, pose.betas))
 
 
@@ -67,7 +66,7 @@ class MergeJob(Job):
     def finish(self, _context: bpy.types.Context, result: MergeAnswer, folder: Path) -> str:
         person = self.target.found()
         digest = write_grid(read_grid(result.out), folder / "grid.vdb")
-        files = publish([folder / "grid.vdb"], [digest], merged_folder(person))
+        files = publish([folder / "grid.vdb"], [digest], merged_folder())
         show_merged(person, files, MergedState((self.moment.digest,), self.voxel))
         set_attachment(person, "MERGED")
         size = files[0].stat().st_size / 1e6
@@ -121,7 +120,7 @@ class MergeFramesJob(Job):
         if self._error is not None:
             raise self._error
         written = [_grid(folder, index).with_suffix(".vdb") for index in range(len(self.moments))]
-        files = publish(written, self._digests, merged_folder(person))
+        files = publish(written, self._digests, merged_folder())
         show_merged(person, files, MergedState(tuple(m.digest for m in self.moments), self.voxel, self.start))
         set_attachment(person, "MERGED")
         size = sum(path.stat().st_size for path in files) / 1e6

@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy.utils.previews
-import numpy as np
-from numpy.typing import NDArray
 
 _NAME = "so far"
 
@@ -45,19 +43,6 @@ class SoFar:
     def icon(self) -> int:
         """For `UILayout.template_icon`; 0 for none, and without a window."""
         return self._collection[_NAME].icon_id if self._shown is not None else 0
-
-    def pixels(self) -> NDArray[np.float32]:
-        """RGBA [h, w, 4] of the picture that is shown, bottom row first; sRGB-encoded after it was premultiplied."""
-        preview = self._collection[_NAME]
-        width, height = preview.image_size
-        values = np.empty(width * height * 4, np.float32)
-        preview.image_pixels_float.foreach_get(values)
-        return values.reshape(height, width, 4)
-
-    @property
-    def version(self) -> tuple[Path, int] | None:
-        """Identifies the picture that is shown: its file, and when this was written; None for none."""
-        return self._shown
 
     @property
     def shown(self) -> Path | None:

@@ -34,8 +34,6 @@ class Job(abc.ABC):
     """The child's method."""
     undo: ClassVar[str] = ""
     """Name of the undo step that `finish` makes; empty when it leaves the scene as it is."""
-    new_person: str = ""
-    """Name of the human that `finish` builds from the result; empty for jobs that build none."""
 
     @property
     @abc.abstractmethod
@@ -65,13 +63,6 @@ class Job(abc.ABC):
         """Process some of the files that the child has written so far, for a timer's tick at most; whether there is
         more to do now. Called while the child is running, and afterwards until nothing is left, before `finish`."""
         return False
-
-    def replaced(self) -> bpy.types.Collection | None:
-        """The human in whose place the result's human is shown; None for other jobs.
-
-        Evaluated when the result has arrived, whose files are prepared before `finish`. ValueError and OSError are
-        ignored: `finish` raises them again."""
-        return None
 
 
 def chosen_checkpoint(name: str) -> str:

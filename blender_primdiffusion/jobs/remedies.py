@@ -31,7 +31,6 @@ _REMEDIES = {
     "environment": Remedy("primdiffusion.set_up_backend", "Set Up Backend", "IMPORT")
     if INSTALLS_BACKEND
     else _PREFERENCES,
-    "missing_volumes": Remedy("primdiffusion.find_missing_volumes", "Find Missing Volumes", "VIEWZOOM"),
     "out_of_memory": Remedy("primdiffusion.release_memory", "Release Memory", "MEMORY"),
     "missing_file": _PREFERENCES,  # a checkpoint's path
     "unwritable": _SAVE_AS,

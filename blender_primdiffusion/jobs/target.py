@@ -6,7 +6,8 @@ import dataclasses
 
 import bpy
 
-from ..scene.human import check_editable, human_of, humans, person_file, state_of
+from ..scene.human import check_editable, human_of, humans
+from ..scene.payload import session_file, state_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -14,22 +15,22 @@ class HumanTarget:
     """A human as it was when the job was queued. Holds no Blender objects, since undo may replace them."""
 
     uid: int
-    """The collection's identity while the file is open (`session_uid`)."""
+    """The armature's identity while the file is open (`session_uid`)."""
     name: str
     state: str
-    """The human's state by `state_of`."""
+    """What the human holds, by `state_of`."""
 
     @classmethod
-    def of(cls, person: bpy.types.Collection) -> HumanTarget:
+    def of(cls, person: bpy.types.Object) -> HumanTarget:
         """Raises ValueError for a human that cannot be edited."""
         check_editable(person)
         return cls(person.session_uid, person.name, state_of(person))
 
-    def found(self) -> bpy.types.Collection:
+    def found(self) -> bpy.types.Object:
         """The human. Raises ValueError where it is no longer in a scene, or has changed."""
-        people = [person for scene in bpy.data.scenes for person in humans(scene)]
+        people = (person for scene in bpy.data.scenes for person in humans(scene))
         person = next((person for person in people if person.session_uid == self.uid), None)
-        if person is None or not any(obj.type == "ARMATURE" for obj in person.objects):
+        if person is None:
             raise ValueError(
                 f"the human {self.name!r} was removed during the edit; nothing was changed. Undo the "
                 "removal and edit again"
@@ -42,16 +43,13 @@ class HumanTarget:
         return person
 
     def file_now(self) -> str:
-        """Path of the human's own file at this time: the first save of the .blend moves it.
-
-        Raises as `found` does, and FileNotFoundError.
-        """
-        return str(person_file(self.found()))
+        """Path of the human's own file. Raises as `found` and `session_file` do."""
+        return str(session_file(self.found()))
 
 
-def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
+def selected_person(context: bpy.types.Context) -> bpy.types.Object:
     """The human of the active object, else the only human of the scene. Raises ValueError."""
-    person = human_of(context.view_layer.objects.active, context.scene)
+    person = human_of(context.view_layer.objects.active)
     if person is not None:
         return person
     people = humans(context.scene)
@@ -62,8 +60,8 @@ def selected_person(context: bpy.types.Context) -> bpy.types.Collection:
     raise ValueError(f"{len(people)} humans are in the scene: select the one you mean")
 
 
-def named_person(context: bpy.types.Context, name: str) -> bpy.types.Collection:
-    """The human of the scene whose collection has this name. Raises ValueError, naming those there are."""
+def named_person(context: bpy.types.Context, name: str) -> bpy.types.Object:
+    """The human of the scene of this name. Raises ValueError, naming those there are."""
     people = humans(context.scene)
     for person in people:
         if person.name == name:

@@ -14,7 +14,7 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.answers import VariationFiles, VariationsAnswer
 from ..formats.regular_files import remove_folder
-from ..scene.human import BODY_FILE, PERSON_FILE
+from ..scene.payload import BODY_FILE, PERSON_FILE
 from .pictures import icons
 from .queue import Job, chosen_checkpoint
 

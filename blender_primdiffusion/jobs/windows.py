@@ -84,7 +84,7 @@ def window_of(scene: bpy.types.Scene | None) -> Iterator[None]:
     """A context with this scene in a window: timers have none.
 
     Where no window shows the scene, one switches to it for the block: operators crash in a context whose scene is not
-    the window's (4.5, 5.0).
+    the window's (5.0).
     """
     windows = list(bpy.context.window_manager.windows)
     window = next((window for window in windows if window.scene == scene), windows[0] if windows else None)

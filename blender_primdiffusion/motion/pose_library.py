@@ -142,9 +142,7 @@ def key_pose(armature: bpy.types.Object, frame: float, joints: Collection[str] =
 def selected_joints(armature: bpy.types.Object) -> list[str]:
     """SMPL's joints whose bones are selected."""
     bones = armature.pose.bones
-    if bpy.app.version >= (5, 0, 0):
-        return [name for name in JOINT_NAMES if name in bones and bones[name].select]
-    return [name for name in JOINT_NAMES if name in bones and bones[name].bone.select]
+    return [name for name in JOINT_NAMES if name in bones and bones[name].select]
 
 
 def _other_side(name: str) -> str:

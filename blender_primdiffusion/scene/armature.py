@@ -1,7 +1,7 @@
 """SMPL's skeleton as a Blender armature; poses given as SMPL joint rotations, and keyframes of many; and the limbs that
 IK handles move, with the bones that `handles` adds for them.
 
-Actions have one layer, strip and slot, the same in Blender 4.5 to 5.2.
+Actions have one layer, strip and slot, the same in Blender 5.0 to 5.3.
 """
 
 from __future__ import annotations
@@ -30,6 +30,11 @@ _SHORTEST = 0.01
 POLE_M = 0.4
 """From the limb to its pole, metres."""
 _HANDLE_M, _POLE_LENGTH_M = 0.2, 0.1
+
+
+def floor_below(vertices: NDArray) -> NDArray[np.float64]:
+    """The displacement [3] that puts the soles of a body at rest, vertices [V, 3], on z = 0: see `human.ORIGIN`."""
+    return np.array([0.0, 0.0, -vertices[:, 2].min()])
 
 
 def bone_tails(joints: NDArray) -> NDArray[np.float64]:

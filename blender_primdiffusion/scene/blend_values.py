@@ -1,4 +1,4 @@
-"""Read what a .blend holds as a stranger's: custom properties, and paths of volumes and of scene settings.
+"""Read what a .blend holds as a stranger's: custom properties, and paths of pictures and of scene settings.
 
 Anyone can write anything into a .blend. A value of another type, form or size than the extension stores counts as
 missing, so that neither drawing nor saving raises, and no name or path leads out of its folder. Nothing else in the
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import os
-import re
 from collections.abc import Sequence
 from pathlib import Path, PureWindowsPath
 from typing import Any, cast
@@ -35,16 +34,11 @@ def stored_text(holder: bpy.types.bpy_struct, name: str) -> str | None:
     return value if isinstance(value, str) and len(value) <= LONGEST_TEXT else None
 
 
-def stored_name(holder: bpy.types.bpy_struct, name: str, pattern: re.Pattern[str]) -> str | None:
-    """A custom property that is a file name of this pattern; None for any other."""
-    text = stored_text(holder, name)
-    return text if text is not None and pattern.fullmatch(text) else None
-
-
-def stored_folder(holder: bpy.types.bpy_struct, name: str) -> Path | None:
-    """A custom property that is the absolute path of a folder, which need not exist; None for any other."""
-    text = stored_text(holder, name)
-    return _folder(text, bpy.data.filepath) if text else None
+def stored_image(holder: bpy.types.bpy_struct, name: str, largest: int) -> bpy.types.Image | None:
+    """A custom property that is an image with a packed file of at most `largest` bytes; None for any other."""
+    image = holder.get(name)
+    packed = image.packed_file if isinstance(image, bpy.types.Image) else None
+    return image if packed is not None and packed.size <= largest else None
 
 
 def stored_record(holder: bpy.types.bpy_struct, name: str) -> dict[str, Any]:

@@ -1,10 +1,9 @@
-"""Build a human in the scene: one collection with armature, body mesh and volumes."""
+"""Build a human in the scene: an armature with body mesh and volumes as its children."""
 
 from __future__ import annotations
 
 import itertools
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -13,81 +12,82 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..formats.poses.rotation import matrix_to_quaternion
-from .armature import build_armature
-from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT
-from .convention import frames_to_blender, points_to_blender
-from .human import BETAS, BODY_MARK, HOME, MARK, ORIGIN, stored_path, volume_name
-from .material import volume_material
+from .armature import build_armature, floor_below
+from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, set_attachment, volumes_may_wait
+from .convention import points_to_blender
+from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, link_part
+from .payload import pack
+from .pending import write_volumes
+from .rest_human import read_human, shape_model_of
+from .shape import betas_of
+from .splats import SPLATS_AVAILABLE
 from .stand_in import build_stand_in
-from .states import NAME_LENGTH, PreparedHuman, prepare_now
+
+NAME_LENGTH = 40
+"""Characters of a new human's name; names of its parts are longer, and Blender allows 63."""
 
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
-_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials")
+_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials", "images", "pointclouds")
 
 
-def build_human(context: bpy.types.Context, person: str | Path, name: str = "Human") -> bpy.types.Collection:
-    """Build the human of a file in the scene, with its volumes where they cannot come later; see `build_prepared`.
-
-    Raises as `states.prepare`, and then leaves neither data nor files.
-    """
-    return build_prepared(context, prepare_now(Path(person), name), name)
-
-
-def build_prepared(context: bpy.types.Context, prepared: PreparedHuman, name: str = "Human") -> bpy.types.Collection:
-    """Build a human whose files are there: armature, hidden body mesh and a volume for every primitive.
+def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human") -> bpy.types.Object:
+    """Build the human of a file in a collection of their own: an armature that holds the file, and its parts.
 
     The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
-    space, the backend's axes are turned z up and the body is raised by ORIGIN. Raises ValueError, and then leaves
-    neither data nor files. Makes no undo step.
+    space, the backend's axes are turned z up and the body is raised by ORIGIN. Without a window the volumes' files are
+    written too. Raises as `read_human`, also for what cannot be written, and then leaves no data. Makes no undo step.
     """
-    with prepared.entering():
-        return _build(context, prepared, name)
-
-
-def _build(context: bpy.types.Context, prepared: PreparedHuman, name: str) -> bpy.types.Collection:
-    human, model, rest = prepared.human, prepared.human.model, prepared.human.rest
-    if model.uv_corner is None:
+    file = Path(file)
+    human = read_human(file)
+    if human.model.uv_corner is None:
         raise ValueError("the body's file is of an earlier version, without texture coordinates: import it again")
     with _no_data_left_on_failure():
         collection = bpy.data.collections.new(name[:NAME_LENGTH])
-        label = collection.name
-        vertices = points_to_blender(rest.vertices)
-        origin = floor_below(vertices)
-        armature = build_armature(label, points_to_blender(rest.joints) + origin)
-        armature.data[ORIGIN] = origin.tolist()
-        armature[BETAS] = human.payload.betas.tolist()
-        armature.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
-        collection.objects.link(armature)
-        body = build_body_mesh(
-            f"{label}_body", armature, vertices + origin, model.faces, model.uv_corner, model.skin_weights
-        )
-        collection.objects.link(body)
-        collection.objects.link(build_stand_in(label, armature, body))
-        primitives = bpy.data.collections.new(f"{label}_primitives")
-        primitives.hide_viewport = not VOLUMES_IN_VIEWPORT
-        primitives.objects.link(armature)  # the Outliner then shows the volumes inside the armature's closed row
-        collection.children.link(primitives)
-        attach_volumes(
-            label,
-            armature,
-            primitives,
-            [prepared.folder / volume_name(k) for k in range(len(rest.position))],
-            points_to_blender(rest.position) + origin,
-            frames_to_blender(rest.rotation),
-            model.primitive_weights(),
-            volume_material(),
-        )
-        collection[MARK] = prepared.provenance
-        collection[HOME] = str(prepared.folder)
-        collection[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
+        origin = floor_below(points_to_blender(human.rest.vertices))
+        person = build_armature(collection.name, points_to_blender(human.rest.joints) + origin)
+        pack(person, file, own_body=human.payload.rest_half_extent is not None)
+        person.data[ORIGIN] = origin.tolist()
+        person[BETAS] = human.payload.betas.tolist()
+        person.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
+        person[MARK] = human.provenance()
+        person[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
+        collection.objects.link(person)
+        build_missing_parts(person)
         context.scene.collection.children.link(collection)
-    return collection
+    return person
 
 
-def floor_below(vertices: NDArray) -> NDArray[np.float64]:
-    """The displacement [3] that puts the soles of a body at rest, vertices [V, 3], on z = 0: see `human.ORIGIN`."""
-    return np.array([0.0, 0.0, -vertices[:, 2].min()])
+def build_missing_parts(person: bpy.types.Object) -> None:
+    """Give a human, such as a copy of the armature alone, its body and, where it has none of both, splats or volumes.
+
+    Raises as `read_human` does, and then leaves no data. Makes no undo step.
+    """
+    with _no_data_left_on_failure():
+        for collection in _with_volumes_of_others(person):
+            collection.objects.unlink(person)
+        if body_of(person) is None:
+            _build_body(person)
+        set_attachment(person, "SPLATS" if SPLATS_AVAILABLE else "ARMATURE")
+        if not volumes_may_wait(person):
+            write_volumes(person)
+
+
+def _build_body(person: bpy.types.Object) -> None:
+    """The hidden body mesh, and what stands in for the human in a Blender without the extension."""
+    model = shape_model_of(person)
+    vertices = points_to_blender(model.surface(betas_of(person)))
+    vertices += floor_below(vertices)
+    label = f"{person.name}_body"
+    body = build_body_mesh(label, person, vertices, model.faces, model.uv_corner, model.skin_weights)
+    link_part(person, body)
+    if not SPLATS_AVAILABLE:  # they show without the extension
+        link_part(person, build_stand_in(person.name, person, body))
+
+
+def _with_volumes_of_others(person: bpy.types.Object) -> list[bpy.types.Collection]:
+    """The collections in which Blender has put a copy because the copied human was there, beside its volumes."""
+    found = [one for one in person.users_collection if any(obj.type == "VOLUME" for obj in one.objects)]
+    return found if len(found) < len(person.users_collection) else []
 
 
 @contextmanager
@@ -153,90 +153,3 @@ def _by_weight(weights: NDArray) -> Iterator[tuple[list[int], float]]:
     alike = vertices.tolist()
     for start, end in itertools.pairwise([*starts, len(alike)]):
         yield alike[start:end], float(ordered[start])
-
-
-def attach_volumes(
-    name: str,
-    armature: bpy.types.Object,
-    collection: bpy.types.Collection,
-    files: Sequence[Path],
-    position: NDArray,
-    rotation: NDArray,
-    weights: NDArray,
-    material: bpy.types.Material,
-) -> list[bpy.types.Object]:
-    """A Volume object for each file, in `collection`, with rest position [K, 3] and rotation [K, 3, 3] (z up).
-
-    Parented to the armature, with an Armature constraint of one target per non-zero weight [K, 24] and preserve volume
-    off: the evaluated matrix is A (sum_j w_j G_j) [rotation | position], with the armature object's matrix A and SMPL's
-    skinning transforms G_j. It shears where joints bend, as linear blending does. Turns off the viewports' relationship
-    lines, of which there would be thousands.
-    """
-    hide_relationship_lines()
-    positions, quaternions = np.asarray(position).tolist(), matrix_to_quaternion(rotation).tolist()
-    paths = [os.path.split(path) for path in files]
-    folders = {folder: stored_path(Path(folder)) for folder in {folder for folder, _ in paths}}
-    targets = _targets(weights)
-    labels = [f"{name}_prim_{k:04d}" for k in range(len(files))]
-    volumes = _volumes(f"{name}_prim", material, len(files))
-    objects = [bpy.data.objects.new(label, volume) for label, volume in zip(labels, volumes, strict=True)]
-    prototypes: dict[tuple[str, ...], bpy.types.ArmatureConstraint] = {}
-    for k, primitive in enumerate(objects):  # a loop of its own: new data make these changes slow
-        volume = volumes[k]
-        folder, file = paths[k]
-        volume.filepath = os.path.join(folders[folder], file)
-        primitive.parent = armature
-        primitive.rotation_mode = "QUATERNION"
-        primitive.location = positions[k]
-        primitive.rotation_quaternion = quaternions[k]
-        bones = tuple(bone for bone, _ in targets[k])
-        if bones in prototypes:
-            constraint = primitive.constraints.copy(prototypes[bones])
-        else:
-            constraint = prototypes[bones] = _armature_constraint(primitive, armature, bones)
-        constraint.targets.foreach_set("weight", [weight for _, weight in targets[k]])
-        collection.objects.link(primitive)
-    return objects
-
-
-def _volumes(name: str, material: bpy.types.Material, count: int) -> list[bpy.types.Volume]:
-    """New volume data without files, which Blender numbers.
-
-    Appending a material takes a time in proportion to the number of objects in the file; copies do not.
-    """
-    first = bpy.data.volumes.new(name)
-    first.render.space = "WORLD"
-    first.materials.append(material)
-    return [first, *(first.copy() for _ in range(count - 1))][:count]
-
-
-def _armature_constraint(
-    primitive: bpy.types.Object, armature: bpy.types.Object, bones: Sequence[str]
-) -> bpy.types.ArmatureConstraint:
-    """A new constraint of `primitive` with these targets, which copies have too: setting them takes longer."""
-    constraint = primitive.constraints.new("ARMATURE")
-    constraint.use_deform_preserve_volume = False
-    for bone in bones:
-        target = constraint.targets.new()
-        target.target = armature
-        target.subtarget = bone
-    return constraint
-
-
-def _targets(weights: NDArray) -> list[list[tuple[str, float]]]:
-    """Bones and their non-zero weights for each row of weights [K, 24]."""
-    rows, joints = np.nonzero(weights)
-    found: list[list[tuple[str, float]]] = [[] for _ in weights]
-    for row, joint, weight in zip(rows.tolist(), joints.tolist(), weights[rows, joints].tolist(), strict=True):
-        found[row].append((JOINT_NAMES[joint], weight))
-    return found
-
-
-def hide_relationship_lines() -> None:
-    """Turn Blender's dashed lines from children to parents off in the 3D viewports of all workspaces: a human's
-    volumes would have two thousand. Overlays > Relationship Lines shows them again."""
-    for screen in bpy.data.screens:
-        for area in screen.areas:
-            for space in area.spaces:
-                if space.type == "VIEW_3D":
-                    space.overlay.show_relationship_lines = False

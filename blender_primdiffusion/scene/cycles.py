@@ -10,7 +10,7 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from .blend_values import stored_text
-from .human import MARK, armature_of, humans, provenance_of, volumes_of
+from .human import MARK, humans, provenance_of, volumes_of
 from .shape import betas_of, has_custom_shape
 
 _FOCAL_MM, _SENSOR_MM = 70.0, 36.0
@@ -59,32 +59,28 @@ def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
     cycles.volume_bounces = 0
     cycles.transparent_max_bounces = 1024  # every box in a row costs two
     cycles.volume_step_rate = 1.0
-    if bpy.app.version >= (5, 0):
-        cycles.volume_biased = True  # unbiased tracking takes seconds per volume object, an hour a frame
+    cycles.volume_biased = True  # unbiased tracking takes seconds per volume object, an hour a frame
 
 
 def humans_extent(scene: bpy.types.Scene) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lowest and highest corner [3] of all humans in a scene, as posed. Raises ValueError when there are none."""
-    extents = [posed_extent(collection) for collection in humans(scene)]
+    extents = [posed_extent(person) for person in humans(scene)]
     if not extents:
         raise ValueError(f"there is no human in the scene {scene.name!r}; add one first")
     return np.min([low for low, _ in extents], 0), np.max([high for _, high in extents], 0)
 
 
-def posed_extent(collection: bpy.types.Collection) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def posed_extent(person: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lowest and highest corner [3] in the world of a human's bones as posed, with a margin for flesh."""
-    armature = armature_of(collection)
     bpy.context.view_layer.update()
-    bones = [bone for bone in armature.pose.bones if bone.bone.use_deform]
-    ends = [armature.matrix_world @ end for bone in bones for end in (bone.head, bone.tail)]
+    bones = [bone for bone in person.pose.bones if bone.bone.use_deform]
+    ends = [person.matrix_world @ end for bone in bones for end in (bone.head, bone.tail)]
     points = np.array(ends, np.float64)
     return points.min(0) - _FLESH_M, points.max(0) + _FLESH_M
 
 
 def _flat_world(grey: float) -> bpy.types.World:
     world = bpy.data.worlds.new("PrimDiffusion Preview")
-    if bpy.app.version < (5, 0):
-        world.use_nodes = True
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
     background.inputs["Color"].default_value = (grey, grey, grey, 1.0)
     return world
@@ -144,41 +140,41 @@ _counted: dict[tuple[int, str, tuple[float, ...]], int] = {}
 """Results for humans with custom shapes, since panels ask whenever they are drawn."""
 
 
-def overlap_warning(collection: bpy.types.Collection) -> str | None:
+def overlap_warning(person: bpy.types.Object) -> str | None:
     """A sentence for the user where Cycles will drop volumes of this human in its current shape, else None."""
 
     try:
-        most = current_overlap(collection)
+        most = current_overlap(person)
     except ValueError:  # changed by hand
         return None
     if most <= CYCLES_LIMIT:
         return None
     return (
-        f"Cycles leaves out parts of {collection.name!r}, where {most} volumes overlap and it draws only "
+        f"Cycles leaves out parts of {person.name!r}, where {most} volumes overlap and it draws only "
         f"{CYCLES_LIMIT}; render with PrimDiffusion (Exact)"
     )
 
 
-def overlap_warning_in(scene: bpy.types.Scene, collection: bpy.types.Collection) -> str | None:
-    """`overlap_warning` where Cycles is the scene's engine: no other engine drops volumes."""
-    return overlap_warning(collection) if scene.render.engine == "CYCLES" else None
+def overlap_warning_in(scene: bpy.types.Scene, person: bpy.types.Object) -> str | None:
+    """`overlap_warning` for a human with volumes where Cycles is the scene's engine: no other engine drops any."""
+    return overlap_warning(person) if scene.render.engine == "CYCLES" and volumes_of(person) else None
 
 
-def current_overlap(collection: bpy.types.Collection) -> int:
+def current_overlap(person: bpy.types.Object) -> int:
     """The largest number of volumes at a point, at rest.
 
     The number stored with the human where it has the shape of its file, or where volumes are hidden (when attached to
     the surface or merged) or missing. For other shapes it is counted once, in some 50 ms, from what Blender has
-    evaluated. Raises ValueError where the collection's provenance was changed by hand.
+    evaluated. Raises ValueError where the human's provenance was changed by hand.
     """
-    stored = provenance_of(collection).get("most_overlapping")
+    stored = provenance_of(person).get("most_overlapping")
     if not isinstance(stored, int):
-        raise ValueError(f"the custom property {MARK!r} of {collection.name!r} was changed by hand")
-    if not has_custom_shape(collection):
+        raise ValueError(f"the custom property {MARK!r} of {person.name!r} was changed by hand")
+    if not has_custom_shape(person):
         return stored
-    key = (collection.session_uid, stored_text(collection, MARK) or "", tuple(betas_of(collection)))
+    key = (person.session_uid, stored_text(person, MARK) or "", tuple(betas_of(person)))
     if key not in _counted:
-        volumes = [obj for objects in volumes_of(collection).values() for obj in objects]
+        volumes = [obj for objects in volumes_of(person).values() for obj in objects]
         if not volumes or not all(obj.visible_get() for obj in volumes):  # else Blender would read all files
             return stored
         centre, rotation, half = _boxes(volumes)

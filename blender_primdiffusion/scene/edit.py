@@ -4,7 +4,7 @@ region painted for an edit by the backend; and its result in place of the human 
 from __future__ import annotations
 
 import dataclasses
-import os
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -12,55 +12,41 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rotation import matrix_to_quaternion
-from .armature import move_rest_joints
-from .build import floor_below
+from .armature import floor_below, move_rest_joints
 from .convention import frames_to_blender, points_to_blender
-from .human import (
-    BETA_COUNT,
-    BETAS,
-    HOME,
-    LARGEST_BETA,
-    MARK,
-    ORIGIN,
-    armature_of,
-    body_of,
-    check_editable,
-    own_data,
-    stored_path,
-    volume_name,
-    volumes_of,
-)
+from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data, volumes_of
+from .payload import pack, session_file
+from .pending import show_volume
 from .proxy import follow_shape, proxy_of
-from .rest_human import shape_model_of
+from .rest_human import read_human, shape_model_of
 from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
-from .states import PreparedHuman
+from .splats import replace_splats, scale_splats
 from .surface import scale_surface
-from .volumes import reload_volume
 
 _FLOOR_TOLERANCE = 1e-3
 """Metres the soles may be off the floor and still count as on it."""
 
 
-def check_shapeable(collection: bpy.types.Collection) -> None:
+def check_shapeable(person: bpy.types.Object) -> None:
     """Raises ValueError for a human whose bones, mesh or volumes cannot follow a shape now."""
-    armature, body = armature_of(collection), body_of(collection)
-    for obj in (armature, armature.data, body and body.data):
+    body = body_of(person)
+    for obj in (person, person.data, body and body.data):
         if obj and obj.library is not None:
             raise ValueError(
-                f"the human {collection.name!r} is linked from {obj.library.filepath!r}: reshape it there, or "
+                f"the human {person.name!r} is linked from {obj.library.filepath!r}: reshape it there, or "
                 "make it local with Object > Relations > Make Local > All"
             )
-    missing = [name for name in JOINT_NAMES if name not in armature.data.bones]
+    missing = [name for name in JOINT_NAMES if name not in person.data.bones]
     if missing:
         raise ValueError(
-            f"the armature {armature.name!r} has no bone {missing[0]!r}: give it this name again to change the shape"
+            f"the armature {person.name!r} has no bone {missing[0]!r}: give it this name again to change the shape"
         )
-    for obj in (armature, body):
+    for obj in (person, body):
         if obj is not None and obj.data.is_editmode:
             raise ValueError(f"{obj.name!r} is in Edit Mode: leave it (Tab) to change the shape")
 
 
-def reshape(collection: bpy.types.Collection, betas: NDArray) -> str:
+def reshape(person: bpy.types.Object, betas: NDArray) -> str:
     """Give a human another shape [10]; returns what could not follow in a sentence, empty when everything did.
 
     Bones, body mesh, volumes and mesh proxy move to their new rest places, with the soles where they were; pose,
@@ -70,50 +56,52 @@ def reshape(collection: bpy.types.Collection, betas: NDArray) -> str:
     if betas.shape != (BETA_COUNT,) or not np.abs(betas).max() <= LARGEST_BETA:
         limit = f"{LARGEST_BETA:g}"
         raise ValueError(f"a shape is {BETA_COUNT} numbers from -{limit} to {limit}, not {betas.tolist()}")
-    check_shapeable(collection)
-    model, generated = shape_model_of(collection), generated_betas(collection)
-    notice = apply_rest(collection, model.rest(betas), betas, model.growth(generated, betas))
-    follow_shape(collection, proxy_of(collection), betas)
+    check_shapeable(person)
+    model, generated = shape_model_of(person), generated_betas(person)
+    growth = model.growth(generated, betas)
+    notice = apply_rest(person, model.rest(betas), betas, growth)
+    scale_splats(person, model, betas, growth)
+    follow_shape(person, proxy_of(person), betas)
     return notice
 
 
-def apply_rest(collection: bpy.types.Collection, rest: Rest, betas: NDArray, growth: NDArray) -> str:
+def apply_rest(person: bpy.types.Object, rest: Rest, betas: NDArray, growth: NDArray) -> str:
     """Move bones, body mesh and volumes to `rest` (see `reshape`), volumes scaled by `growth` [K, 3]; returns a warning
     as `reshape` does."""
-    armature, body = armature_of(collection), body_of(collection)
-    bones = own_data(armature, collection)
+    body = body_of(person)
+    bones = own_data(person, person)
     vertices, on_floor = points_to_blender(rest.vertices), ORIGIN in bones
     origin = floor_below(vertices) if on_floor else np.zeros(3)
     vertices += origin
-    mesh = None if body is None else own_data(body, collection)
+    mesh = None if body is None else own_data(body, person)
     unchanged = mesh is not None and len(mesh.vertices) == len(vertices) and mesh.shape_keys is None
     lowest = float(_heights(mesh).min()) if unchanged else None
     move_rest_joints(bones, points_to_blender(rest.joints) + origin)
     if on_floor:
         bones[ORIGIN] = origin.tolist()
         bones.update_tag()
-    armature[BETAS] = betas.tolist()
+    person[BETAS] = betas.tolist()
     position = points_to_blender(rest.position) + origin
     quaternion = matrix_to_quaternion(frames_to_blender(rest.rotation))
-    for k, objects in volumes_of(collection).items():
+    for k, objects in volumes_of(person).items():
         for obj in objects if k < len(growth) else ():  # the number is the file name's
             obj.location, obj.rotation_quaternion, obj.scale = position[k], quaternion[k], growth[k]
-    scale_surface(collection, growth)
-    armature.update_tag()
+    scale_surface(person, growth)
+    person.update_tag()
     if lowest is not None:
         if not on_floor:
-            _keep_on_floor(armature, lowest, float(vertices[:, 2].min()))
+            _keep_on_floor(person, lowest, float(vertices[:, 2].min()))
         mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
         mesh.update()
     return "" if body is None or unchanged else f"the mesh {body.name!r} was changed by hand and keeps its shape"
 
 
-def apply_growth(collection: bpy.types.Collection, growth: NDArray) -> None:
+def apply_growth(person: bpy.types.Object, growth: NDArray) -> None:
     """Scale volumes by `growth` [K, 3], however they are attached."""
-    for k, objects in volumes_of(collection).items():
+    for k, objects in volumes_of(person).items():
         for obj in objects if k < len(growth) else ():
             obj.scale = growth[k]
-    scale_surface(collection, growth)
+    scale_surface(person, growth)
 
 
 def _heights(mesh: bpy.types.Mesh) -> NDArray[np.float32]:
@@ -141,49 +129,42 @@ class Replaced:
     """What could not be done, in a sentence; empty otherwise."""
 
 
-def replace_person(collection: bpy.types.Collection, prepared: PreparedHuman) -> Replaced:
-    """Show the prepared human where `collection` shows another: its next state.
+def replace_person(person: bpy.types.Object, file: Path) -> Replaced:
+    """Show the human of a file where `person` shows another.
 
     Armature, pose, animation, transform, names, materials and other changes by hand stay, as do deleted volumes. Where
     the edit has changed the betas, the bones' rest, the body mesh and the volumes' places follow, unless the user has
     given the human a custom shape, which stays. Makes no undo step.
 
-    Raises ValueError or FileNotFoundError before the scene is touched, and then leaves no files.
+    Raises as `read_human` and `check_editable` before the scene is touched.
     """
-    with prepared.entering():
-        return _replace(collection, prepared)
-
-
-def _replace(collection: bpy.types.Collection, prepared: PreparedHuman) -> Replaced:
-    human, betas = prepared.human, prepared.human.payload.betas.astype(np.float64)
-    check_editable(collection)
-    shown, count = volumes_of(collection), len(human.payload.density)
-    if max(shown) >= count:
+    human = read_human(file)
+    betas = human.payload.betas.astype(np.float64)
+    check_editable(person)
+    shown, count = volumes_of(person), len(human.payload.density)
+    if max(shown, default=0) >= count:
         raise ValueError(
-            f"the human {collection.name!r} has a volume {max(shown)} and the edited one only {count}; "
+            f"the human {person.name!r} has a volume {max(shown)} and the edited one only {count}; "
             "use an add-on and a backend of the same release"
         )
-    new_betas = not np.allclose(betas, generated_betas(collection), atol=SAME_BETAS)
-    custom = has_custom_shape(collection)
+    new_betas = not np.allclose(betas, generated_betas(person), atol=SAME_BETAS)
+    custom = has_custom_shape(person)
     reshaped = new_betas and not custom
     if reshaped:
-        check_shapeable(collection)
-    growth = human.model.growth(betas, betas_of(collection)) if custom else np.ones((count, 3))
-    warning = apply_rest(collection, human.rest, betas, growth) if reshaped else ""
+        check_shapeable(person)
+    growth = human.model.growth(betas, betas_of(person)) if custom else np.ones((count, 3))
+    pack(person, file, own_body=human.payload.rest_half_extent is not None)
+    warning = apply_rest(person, human.rest, betas, growth) if reshaped else ""
     if reshaped:
-        follow_shape(collection, proxy_of(collection), betas)
+        follow_shape(person, proxy_of(person), betas)
     if new_betas and custom:
-        apply_growth(collection, growth)
-    folder = stored_path(prepared.folder)
-    for k, objects in shown.items():
-        for obj in objects:
-            volume = own_data(obj, collection)
-            volume.filepath = os.path.join(folder, volume_name(k))
-            if volume.grids.error_message:  # its file was missing
-                reload_volume(volume)
-    collection[MARK] = prepared.provenance
-    collection[HOME] = str(prepared.folder)
-    armature_of(collection).update_tag()
+        apply_growth(person, growth)
+    replace_splats(person, human)
+    scale_splats(person, human.model, betas_of(person), growth)
+    for volume in {own_data(obj, person) for objects in shown.values() for obj in objects}:
+        show_volume(volume, session_file(person).parent)
+    person[MARK] = human.provenance()
+    person.update_tag()
     return Replaced(reshaped, warning)
 
 
@@ -247,13 +228,12 @@ def leave_mode(context: bpy.types.Context) -> None:
         bpy.ops.object.mode_set(mode="OBJECT")
 
 
-def select_human(context: bpy.types.Context, person: bpy.types.Collection) -> None:
-    """Make a human's armature active. Raises ValueError for one that cannot be selected in this view layer."""
-    armature = armature_of(person)
-    if context.view_layer.objects.get(armature.name) != armature:
-        raise ValueError(f"the armature of {person.name!r} is not in this view layer: enable its collection first")
+def select_human(context: bpy.types.Context, person: bpy.types.Object) -> None:
+    """Make a human active. Raises ValueError for one that cannot be selected in this view layer."""
+    if context.view_layer.objects.get(person.name) != person:
+        raise ValueError(f"the human {person.name!r} is not in this view layer: enable its collection first")
     leave_mode(context)
     for obj in context.view_layer.objects.selected:
         obj.select_set(False)
-    armature.select_set(True)
-    context.view_layer.objects.active = armature
+    person.select_set(True)
+    context.view_layer.objects.active = person

@@ -148,10 +148,9 @@ def _show(armature: bpy.types.Object, limb: Limb) -> None:
         collection.assign(bone)
         bone.color.palette = _COLOUR
         bone.bbone_x = bone.bbone_z = size
-        if hasattr(bone, "display_type"):  # Blender 5.0
-            bone.display_type = "BBONE"
+        bone.display_type = "BBONE"
     tip = armature.pose.bones[limb.tip]
-    (tip if bpy.app.version >= (5, 0) else tip.bone).hide = True
+    tip.hide = True
 
 
 def _constrain(armature: bpy.types.Object, limb: Limb) -> None:

@@ -28,9 +28,10 @@ from ..formats.human_layout import (
 from ..formats.json_files import parse_json
 from ..formats.poses.rotation import first_improper, improper_text
 from ..formats.regular_files import FileError, as_file_error, read_regular
-from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, check_limits, read_layout
+from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, read_layout
 from ..formats.whole_files import written_whole
-from .human import BETA_COUNT, LARGEST_PERSON
+from .human import BETA_COUNT
+from .payload import LARGEST_PERSON
 
 _METADATA = "__metadata__"
 _MOTION = {"motion.frames": ("F",), "motion.rotations": ("F", 24, 3, 3), "motion.translations": ("F", 3)}
@@ -74,7 +75,6 @@ def read_tensors(path: Path, remedy: str = GENERATE_AGAIN) -> HumanTensors:
     data = read_regular(path, LARGEST_PERSON)
     with as_file_error(path, "contains no human", remedy):
         layout = read_layout(io.BytesIO(data))
-        check_limits(layout)
     if layout.metadata.get("format") != "primdiffusion.human":
         raise FileError(path, "contains no human but something else", remedy)
     arrays = {name: (one.dtype, one.shape, layout.raw(data, name)) for name, one in layout.tensors.items()}
@@ -85,7 +85,6 @@ def body_arrays(path: Path) -> dict[str, NDArray]:
     """The arrays of a body's file. Raises ValueError for a file of another kind or a damaged one, OSError."""
     data = read_regular(path, LARGEST_PERSON)
     layout = read_layout(io.BytesIO(data))
-    check_limits(layout)
     if layout.metadata.get("format") != "primdiffusion.body":
         raise ValueError("it contains no body")
     return {name: layout.array(data, name) for name in layout.tensors}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 
 from ..formats.requests import DENSITY_GAIN
+from .human import parts_of
 
 MATERIAL_NAME = "PrimDiffusion Volume"
 GAIN_NODE = "Density Gain"
@@ -20,8 +21,6 @@ def volume_material() -> bpy.types.Material:
     if existing is not None and existing.node_tree is not None and GAIN_NODE in existing.node_tree.nodes:
         return existing
     material = bpy.data.materials.new(MATERIAL_NAME)
-    if bpy.app.version < (5, 0):
-        material.use_nodes = True  # always true, and deprecated, since 5.0
     tree = material.node_tree
     tree.nodes.clear()
 
@@ -59,38 +58,38 @@ def volume_material() -> bpy.types.Material:
 _SAME = 1e-4
 
 
-def person_material(collection: bpy.types.Collection) -> bpy.types.Material:
+def person_material(person: bpy.types.Object) -> bpy.types.Material:
     """The material of the human's volumes, as the first one has it."""
-    for data in _volumes(collection):
+    for data in _volumes(person):
         if data.materials and data.materials[0] is not None:
             return data.materials[0]
     return volume_material()
 
 
-def density_gain(collection: bpy.types.Collection) -> float | None:
+def density_gain(person: bpy.types.Object) -> float | None:
     """The factor on density in the human's material; None where the user has assigned one without it."""
-    node = _gain_node(person_material(collection))
+    node = _gain_node(person_material(person))
     return None if node is None else node.outputs[0].default_value
 
 
-def set_density_gain(collection: bpy.types.Collection, gain: float) -> None:
+def set_density_gain(person: bpy.types.Object, gain: float) -> None:
     """Give a human this factor: by the shared material where it is the default, else by a material of its own.
 
     Raises ValueError for a human whose material has no such factor or is linked.
     """
-    material = person_material(collection)
+    material = person_material(person)
     if _gain_node(material) is None:
         raise ValueError(
-            f"the material {material.name!r} of {collection.name!r} has no node {GAIN_NODE!r}: give the human's "
+            f"the material {material.name!r} of {person.name!r} has no node {GAIN_NODE!r}: give the human's "
             f"volumes the material {volume_material().name!r} again"
         )
-    if material.library is not None or any(data.library is not None for data in _volumes(collection)):
-        raise ValueError(f"the human {collection.name!r} is linked: make it local to change the density gain")
+    if material.library is not None or any(data.library is not None for data in _volumes(person)):
+        raise ValueError(f"the human {person.name!r} is linked: make it local to change the density gain")
     current = _gain_node(material).outputs[0]
     if abs(current.default_value - gain) <= _SAME:
         return
-    shown_to_others = _make_data_own(collection)
-    volumes = _volumes(collection)
+    shown_to_others = _make_data_own(person)
+    volumes = _volumes(person)
     default = _gain_node(volume_material()).outputs[0].default_value
     if abs(gain - default) <= _SAME:
         _assign(volumes, volume_material())
@@ -98,15 +97,15 @@ def set_density_gain(collection: bpy.types.Collection, gain: float) -> None:
     shown_by = bpy.data.user_map(subset=[material])[material]
     if material == volume_material() or shown_to_others or not shown_by <= set(volumes):
         material = material.copy()
-        material.name = f"{volume_material().name} {collection.name}"
+        material.name = f"{volume_material().name} {person.name}"
         _assign(volumes, material)
         current = _gain_node(material).outputs[0]
     current.default_value = gain
 
 
-def _make_data_own(collection: bpy.types.Collection) -> bool:
+def _make_data_own(person: bpy.types.Object) -> bool:
     """Copy the data of volumes that other humans (duplicates) use too; returns whether there were any."""
-    own = [obj for obj in collection.all_objects if obj.type == "VOLUME"]
+    own = [obj for obj in parts_of(person) if obj.type == "VOLUME"]
     mine = set(own)
     others = {obj.data for obj in bpy.data.objects if obj.type == "VOLUME" and obj not in mine}
     shared = [obj for obj in own if obj.data in others]
@@ -115,8 +114,8 @@ def _make_data_own(collection: bpy.types.Collection) -> bool:
     return bool(shared)
 
 
-def _volumes(collection: bpy.types.Collection) -> list[bpy.types.Volume]:
-    return [obj.data for obj in collection.all_objects if obj.type == "VOLUME"]
+def _volumes(person: bpy.types.Object) -> list[bpy.types.Volume]:
+    return [obj.data for obj in parts_of(person) if obj.type == "VOLUME"]
 
 
 def _gain_node(material: bpy.types.Material) -> bpy.types.Node | None:

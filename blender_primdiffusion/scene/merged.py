@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,10 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.arrays import all_finite, check_shapes, read_arrays
-from ..formats.regular_files import FileError, as_file_error, remove_file
+from ..formats.regular_files import FileError, as_file_error, check_inside, real_path, remove_file
+from ..formats.whole_files import written_whole
 from .blend_values import stored_record
-from .human import armature_of, copy_file, home_of, state_of, stored_path, write_error
+from .human import link_part, parts_of, write_error
 from .material import person_material
+from .payload import session_folder, state_of
 from .volumes import write_vdb
 
 MARK = "primdiffusion_merged"
@@ -67,16 +70,10 @@ def read_grid(path: Path) -> MergedGrid:
     return MergedGrid(stored["density"], stored["colour"], stored["origin"], float(stored["voxel"]))
 
 
-def index_to_local(grid: MergedGrid, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
-    """VDB's row-vector transform [4, 4]; Cycles before 5.0 draws half a voxel too high on each axis (see `volumes`)."""
-    transform = np.diag([grid.voxel] * 3 + [1.0])
-    transform[3, :3] = grid.origin - (0.5 * grid.voxel if blender_version < (5, 0) else 0.0)
-    return transform
-
-
 def write_grid(grid: MergedGrid, path: Path) -> str:
     """Write a grid as a VDB file; returns a digest of its content. Raises FileError."""
-    transform = index_to_local(grid, bpy.app.version)
+    transform = np.diag([grid.voxel] * 3 + [1.0])  # VDB's are of row vectors
+    transform[3, :3] = grid.origin
     try:
         write_vdb(path, grid.density, grid.colour, transform)
     except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
@@ -99,7 +96,7 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
     try:
         for source, target in zip(files, targets, strict=True):
             if target in new:
-                copy_file(source, target, folder.parent)
+                _copy(source, target)
     except (OSError, FileError) as error:
         for path in new:
             if path.is_file():
@@ -110,18 +107,18 @@ def publish(files: Sequence[Path], digests: Sequence[str], folder: Path) -> list
     return targets
 
 
-def show_merged(collection: bpy.types.Collection, files: Sequence[Path], state: MergedState) -> bpy.types.Object:
+def show_merged(person: bpy.types.Object, files: Sequence[Path], state: MergedState) -> bpy.types.Object:
     """Show these files in the human's merged object, made if there is none; it moves with the armature object."""
-    merged = merged_of(collection)
+    merged = merged_of(person)
     if merged is None:
-        label = f"{collection.name}_merged"
+        label = f"{person.name}_merged"
         merged = bpy.data.objects.new(label, bpy.data.volumes.new(label))
-        merged.parent = armature_of(collection)
+        merged.parent = person
         merged.data.render.space = "WORLD"
-        merged.data.materials.append(person_material(collection))
-        collection.objects.link(merged)
+        merged.data.materials.append(person_material(person))
+        link_part(person, merged)
     volume = merged.data
-    volume.filepath = stored_path(files[0])
+    volume.filepath = _stored(files[0])
     volume.is_sequence = len(files) > 1
     if volume.is_sequence:
         volume.frame_start, volume.frame_duration, volume.frame_offset = state.start, len(files), 0
@@ -130,9 +127,9 @@ def show_merged(collection: bpy.types.Collection, files: Sequence[Path], state: 
     return merged
 
 
-def merged_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
+def merged_of(person: bpy.types.Object) -> bpy.types.Object | None:
     """The human's merged object, if any."""
-    return next((obj for obj in collection.all_objects if obj.type == "VOLUME" and MARK in obj), None)
+    return next((obj for obj in parts_of(person) if obj.type == "VOLUME" and MARK in obj), None)
 
 
 def merged_state(merged: bpy.types.Object) -> MergedState:
@@ -144,22 +141,38 @@ def merged_state(merged: bpy.types.Object) -> MergedState:
     return MergedState(tuple(map(str, poses)), float(voxel), start)
 
 
-def remove_merged(collection: bpy.types.Collection) -> None:
+def remove_merged(person: bpy.types.Object) -> None:
     """Remove the merged object from the .blend; its files stay for undo."""
-    merged = merged_of(collection)
+    merged = merged_of(person)
     if merged is not None:
         bpy.data.volumes.remove(merged.data)  # removes the object too
 
 
-def merged_folder(collection: bpy.types.Collection) -> Path:
-    """Where merged files go: beside the folders of the human's states, if these are of this .blend."""
-    return home_of(collection)
+def merged_folder() -> Path:
+    """Where merged files go: `<blendname>_volumes` beside the .blend, a temporary folder while it is unsaved."""
+    blend = Path(bpy.data.filepath)
+    return real_path(blend).parent / f"{blend.stem}_volumes" if blend.name else session_folder() / "merged"
 
 
-def pose_digest(collection: bpy.types.Collection, joints: NDArray, betas: Sequence[float] | None) -> str:
+def _stored(path: Path) -> str:
+    """A path as the .blend stores it: relative (`//`) when it is saved, else absolute."""
+    try:
+        return bpy.path.relpath(str(path)) if bpy.data.filepath else str(path)
+    except ValueError:  # another drive on Windows
+        return str(path)
+
+
+def _copy(source: Path, target: Path) -> None:
+    check_inside(target, target.parent.parent)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    with written_whole(target) as unfinished:
+        shutil.copyfile(source, unfinished)
+
+
+def pose_digest(person: bpy.types.Object, joints: NDArray, betas: Sequence[float] | None) -> str:
     """Identifies a human in a pose: hash of its state, the shape and the joints [24, 3, 4]."""
     rounded = np.round(np.asarray(joints, np.float64), _DECIMALS) + 0.0  # no negative zeros
     shape = [] if betas is None else [round(float(value), _DECIMALS) for value in betas]
-    digest = hashlib.sha256(f"{state_of(collection)} {shape}".encode())
+    digest = hashlib.sha256(f"{state_of(person)} {shape}".encode())
     digest.update(rounded.tobytes())
     return digest.hexdigest()[:16]

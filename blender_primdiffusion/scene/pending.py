@@ -1,114 +1,124 @@
-"""Volumes that are still to be written: those that a human has in the scene and whose files are absent, or in a format
-that only a newer Blender can read.
+"""Volumes for Cycles and EEVEE that are still to be written: those that a human has in the scene, without their files.
 
-They are written from the human's own file, in folders of this .blend alone, to which `collect.collect_pending` brings
-humans from elsewhere. Any Blender can write them, in steps and after any interruption. Until it is closed, Blender
-remembers the paths that it could not read, so files of newer formats have to be written before viewports try.
+They are written from the human's own file, beside it in the temporary folder of this session (see `payload`), in steps
+and after any interruption. A .blend that comes from another session, or from a stranger, names folders of its own: its
+volumes are pointed to that folder before anything is read.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Generator, Sequence
+from collections.abc import Generator
 from pathlib import Path
 
 import bpy
 
-from ..formats.regular_files import exists_in_its_folder
 from ..formats.whole_files import remove_abandoned
-from .attachment import in_viewport
-from .human import MARK, PERSON_FILE, PRIMITIVE_VDB, is_own, state_folder, volume_name, volume_path, write_error
-from .rest_human import read_human
-from .volumes import format_of, is_readable, readable_format, reload_volume, write_volume
-
-_WRITTEN_AS = (5, 0, 0)
-"""The version of Blender by which grids of a newer format are placed: what older ones cannot read came later."""
+from .attachment import attachment_of
+from .human import all_humans, body_of, primitive_of, volume_name, volumes_of, write_error
+from .payload import session_file, state_of
+from .rest_human import read_human, shape_model_of
+from .volumes import reload_volume, write_volume
 
 
 @dataclasses.dataclass(frozen=True)
 class PendingVolumes:
-    """Volumes of one human in its folder. Holds no Blender objects, since undo may replace them."""
+    """Volumes of one human. Holds no Blender objects, since undo may replace them."""
 
     human: str
-    """Name of the human's collection."""
-    folder: Path
-    """The folder of the human's state."""
+    """The human's name."""
+    file: Path
+    """The human's own file."""
     primitives: tuple[int, ...]
     """The primitives whose volumes the human has, in the order in which they are written."""
-    newer: int | None
-    """The format version of a newer Blender in which they are; None where they are absent."""
-    in_views: bool
-    """Viewports read them."""
+
+
+def open_humans() -> list[str]:
+    """Point the volumes of all humans to the files of this session; returns what is wrong with humans, in sentences.
+
+    For files that were opened and humans that were appended or linked, before undo takes note of them. A human whose
+    data are missing or damaged shows its body mesh.
+    """
+    faults = []
+    for person in all_humans():
+        try:
+            folder = session_file(person).parent
+            shape_model_of(person)
+        except (ValueError, OSError) as error:
+            faults.append(f"the human {person.name!r} cannot be drawn: {error}")
+            if (body := body_of(person)) is not None:
+                body.hide_viewport = False
+            continue
+        for volume in {obj.data for objects in volumes_of(person).values() for obj in objects}:
+            show_volume(volume, folder)
+    return faults
+
+
+def show_volume(volume: bpy.types.Volume, folder: Path) -> None:
+    """Have a volume of a primitive show its file in this folder."""
+    path = str(folder / volume_name(primitive_of(volume)))
+    if volume.filepath != path:
+        volume.filepath = path
 
 
 def pending_volumes() -> list[PendingVolumes]:
-    """What all humans of the .blend have of such volumes, in its own folders.
-
-    Without humans whose own file is missing. Lists each folder, and reads the headers of two volumes in it.
-    """
-    every = (pending_of(person) for person in bpy.data.collections if MARK in person)
-    return [one for one in every if one is not None and is_own(one.folder)]
+    """What all humans of the .blend have of such volumes; without humans that cannot be read."""
+    every = map(pending_of, all_humans())
+    return [one for one in every if one is not None]
 
 
-def pending_of(person: bpy.types.Collection) -> PendingVolumes | None:
-    """What one human has of such volumes, wherever it is; None where that is nothing or its own file is missing."""
-    folder = state_folder(person)
-    if not exists_in_its_folder(folder / PERSON_FILE):
+def pending_of(person: bpy.types.Object) -> PendingVolumes | None:
+    """What one human has of such volumes; None for nothing, and for a human that cannot be read or that splats show."""
+    if attachment_of(person) == "SPLATS":
         return None
-    paths = {volume_path(obj.data) for obj in person.all_objects if obj.type == "VOLUME"}
-    names = (PRIMITIVE_VDB.fullmatch(path.name) for path in paths if path is not None and path.parent == folder)
-    shown = sorted(int(name[1]) for name in names if name is not None)
-    there = {path.name for path in folder.glob("prim_*.vdb")}
+    try:
+        file = session_file(person)
+    except (ValueError, OSError):
+        return None
+    there = {path.name for path in file.parent.glob("prim_*.vdb")}
+    shown = sorted(volumes_of(person))
     absent = [k for k in shown if volume_name(k) not in there]
-    ends = [folder / volume_name(k) for k in (shown[:1] + shown[-1:]) if k not in absent]  # written first and last
-    formats = [version for path in ends if (version := format_of(path) or 0) > readable_format()]
-    if not (absent or formats):
-        return None
-    in_views = in_viewport(person) or _instanced(person)
-    return PendingVolumes(person.name, folder, tuple(shown), max(formats, default=None), in_views)
+    return PendingVolumes(person.name, file, tuple(shown)) if absent else None
 
 
 def is_wanted(pending: PendingVolumes) -> bool:
     """Whether a human of the .blend is still in this state."""
-    return any(MARK in person and state_folder(person) == pending.folder for person in bpy.data.collections)
-
-
-def _instanced(person: bpy.types.Collection) -> bool:
-    """Whether an object instances the human: viewports then read its volumes, hidden or not."""
-    instanced = {obj.instance_collection for obj in bpy.data.objects if obj.instance_type == "COLLECTION"} - {None}
-    return any(person == collection or person in collection.children_recursive for collection in instanced)
+    return any(state_of(person) == pending.file.parent.name for person in all_humans())
 
 
 def write_pending(pending: PendingVolumes) -> Generator[None, None, None]:
-    """Write these volumes, a file a step; those that can be read by now stay.
+    """Write these volumes, a file a step; those that are there stay.
 
     Several may write the same volumes, as a timer and a render do. Raises as `read_human`, also for what cannot be
     written, and ValueError for a human with fewer primitives.
     """
-    folder = pending.folder
-    human = read_human(folder / PERSON_FILE)
+    human = read_human(pending.file)
     yield
     if max(pending.primitives) >= len(human.payload.density):
-        raise ValueError(
-            f"the volumes of {pending.human!r} cannot be written from {str(folder / PERSON_FILE)!r}, which holds "
-            "another human: put its own file back, or generate the human again"
-        )
+        raise ValueError(f"{pending.human!r} has more volumes than its data has primitives: generate the human again")
     grids = human.grids()
     yield
+    folder = pending.file.parent
     remove_abandoned(folder)
-    version = bpy.app.version if pending.newer is None else _WRITTEN_AS
     for k in pending.primitives:
         path = folder / volume_name(k)
         try:
-            if not is_readable(path):
-                write_volume(grids, k, version, path)
+            if not path.is_file():
+                write_volume(grids, k, path)
         except (OSError, RuntimeError) as error:  # openvdb reports a full disk as RuntimeError
             raise write_error(folder, error) from error
         yield
 
 
+def write_volumes(person: bpy.types.Object) -> None:
+    """Write those of one human, which takes seconds. Raises as `write_pending`."""
+    pending = pending_of(person)
+    for _ in write_pending(pending) if pending is not None else ():
+        pass
+
+
 def write_all_pending() -> None:
-    """Write all of them, which takes seconds for each human. Raises as `write_pending`."""
+    """Write all of them. Raises as `write_pending`."""
     for pending in pending_volumes():
         for _ in write_pending(pending):
             pass
@@ -117,15 +127,5 @@ def write_all_pending() -> None:
 def show_written() -> None:
     """Have Blender show the volumes that it has looked for before they were written."""
     for volume in bpy.data.volumes:
-        path = volume_path(volume) if volume.grids.error_message else None
-        if path is not None and exists_in_its_folder(path):
+        if volume.grids.error_message and primitive_of(volume) is not None and Path(volume.filepath).is_file():
             reload_volume(volume)
-
-
-def newer_text(pending: Sequence[PendingVolumes]) -> str:
-    """What is written again, and why: a sentence."""
-    names, newest = ", ".join(repr(one.human) for one in pending), max(one.newer or 0 for one in pending)
-    return (
-        f"volumes of {names:.120} are in a format of a newer Blender ({newest}; this one reads up to "
-        f"{readable_format()}): they are written again from the human's own file"
-    )

@@ -11,7 +11,7 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from .human import BODY_MARK, armature_of, humans
+from .human import BODY_MARK, humans
 from .proxy import PROXY_MARK
 from .stand_in import STAND_IN
 
@@ -37,23 +37,12 @@ _SOLID_TYPES = frozenset({"MESH", "CURVE", "SURFACE", "FONT", "META"})
 _OF_HUMANS = (BODY_MARK, PROXY_MARK, STAND_IN)
 
 
-def stand_at_cursor(context: bpy.types.Context, collection: bpy.types.Collection, eye: Vector | None = None) -> None:
+def stand_at_cursor(context: bpy.types.Context, person: bpy.types.Object, eye: Vector | None = None) -> None:
     """Move a new human from the world's origin to the nearest place at the 3D cursor's height that nothing cuts and the
     `eye` [3] sees, along the world's x axis where others stand there. Evaluates the scene."""
-    armature = armature_of(collection)
-    armature.location += context.scene.cursor.location
+    person.location += context.scene.cursor.location
     context.view_layer.update()
-    armature.location.xy += Vector(_move(context, _extent(armature), _others(context.scene, collection), eye))
-
-
-def stand_beside_others(context: bpy.types.Context, collection: bpy.types.Collection) -> None:
-    """Move a human along the world's x axis, as little as needed to stand clear of the scene's other humans and solid
-    objects. Evaluates the scene. Raises ValueError as `armature_of`."""
-    armature, others = armature_of(collection), _others(context.scene, collection)
-    context.view_layer.update()
-    extent = _extent(armature)
-    around = _Surroundings.of(context, extent, others, None)
-    armature.location.x += _nearest(_along_the_row(extent, others, around), extent, others, around)[0]
+    person.location.xy += Vector(_move(context, _extent(person), _others(context.scene, person), eye))
 
 
 def next_place(context: bpy.types.Context, eye: Vector | None = None) -> NDArray[np.float64]:
@@ -171,9 +160,9 @@ def _too_close(extent: NDArray, others: NDArray) -> bool:
     return bool(((low < other[:, 1] + gap) & (other[:, 0] < high + gap)).all(1).any())
 
 
-def _others(scene: bpy.types.Scene, but: bpy.types.Collection | None = None) -> NDArray[np.float64]:
+def _others(scene: bpy.types.Scene, but: bpy.types.Object | None = None) -> NDArray[np.float64]:
     """`_extent` [N, 2, 3] of the scene's humans except `but`, where they have bones."""
-    found = [obj for human in humans(scene) if human != but for obj in human.objects if obj.type == "ARMATURE"]
+    found = [person for person in humans(scene) if person != but]
     return np.array([_extent(armature) for armature in found if armature.data.bones]).reshape(-1, 2, 3)
 
 

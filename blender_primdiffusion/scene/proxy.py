@@ -23,11 +23,12 @@ from numpy.typing import NDArray
 from ..formats.arrays import all_finite, check_shapes, read_arrays
 from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import FileError, as_file_error, portable_name
-from .armature import model_origin
+from .armature import floor_below, model_origin
 from .blend_values import as_numbers, stored_record
-from .build import build_body_mesh, floor_below
+from .build import build_body_mesh
 from .convention import points_to_blender
-from .human import BETA_COUNT, BODY_MARK, ORIGIN, armature_of, own_data, state_of
+from .human import BETA_COUNT, BODY_MARK, ORIGIN, own_data, parts_of
+from .payload import state_of
 from .rest_human import shape_model_of
 from .shape import SAME_BETAS, ShapeModel
 
@@ -74,33 +75,31 @@ def read_proxy(path: Path) -> ProxyMesh:
     return ProxyMesh(**{name: arrays[name].astype(np.int64 if name == "faces" else np.float64) for name in _SHAPES})
 
 
-def build_proxy(
-    collection: bpy.types.Collection, proxy: ProxyMesh, texture: Path, betas: NDArray | None
-) -> bpy.types.Object:
+def build_proxy(person: bpy.types.Object, proxy: ProxyMesh, texture: Path, betas: NDArray | None) -> bpy.types.Object:
     """The proxy as an object that follows the human's armature, shown and rendered, linked to no collection.
 
     The texture is packed into the .blend. `betas` [10]: the shape it was made in.
     """
-    name = f"{collection.name}_proxy"
-    vertices = points_to_blender(proxy.vertices) + _model_origin(collection, betas)
-    made = build_body_mesh(name, armature_of(collection), vertices, proxy.faces, proxy.uv_corner, proxy.skin_weights)
+    name = f"{person.name}_proxy"
+    vertices = points_to_blender(proxy.vertices) + _model_origin(person, betas)
+    made = build_body_mesh(name, person, vertices, proxy.faces, proxy.uv_corner, proxy.skin_weights)
     del made[BODY_MARK]
-    made[PROXY_MARK] = json.dumps(_origin(collection, betas))
+    made[PROXY_MARK] = json.dumps(_origin(person, betas))
     made.hide_viewport = made.hide_render = False
     made.data.materials.append(_material(name, texture))
     return made
 
 
-def proxy_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
+def proxy_of(person: bpy.types.Object) -> bpy.types.Object | None:
     """The human's proxy in the scene, if any."""
-    return next((obj for obj in collection.all_objects if obj.type == "MESH" and PROXY_MARK in obj), None)
+    return next((obj for obj in parts_of(person) if obj.type == "MESH" and PROXY_MARK in obj), None)
 
 
-def is_outdated(collection: bpy.types.Collection, proxy: bpy.types.Object, betas: NDArray | None) -> bool:
+def is_outdated(person: bpy.types.Object, proxy: bpy.types.Object, betas: NDArray | None) -> bool:
     """Whether the human was edited since, or has a shape that the proxy could not follow."""
     shown = shown_betas(proxy)
     same_shape = shown is None if betas is None else shown is not None and np.allclose(shown, betas, atol=1e-4)
-    return stored_record(proxy, PROXY_MARK).get("file") != state_of(collection) or not same_shape
+    return stored_record(proxy, PROXY_MARK).get("file") != state_of(person) or not same_shape
 
 
 def shown_betas(proxy: bpy.types.Object) -> NDArray[np.float64] | None:
@@ -135,7 +134,7 @@ def remove_proxy(proxy: bpy.types.Object) -> None:
             bpy.data.batch_remove([block])
 
 
-def follow_shape(collection: bpy.types.Collection, proxy: bpy.types.Object | None, betas: NDArray) -> None:
+def follow_shape(person: bpy.types.Object, proxy: bpy.types.Object | None, betas: NDArray) -> None:
     """Move a human's proxy, if there is one, to the body of these betas [10], at rest.
 
     Takes some tenths of a second for a new mesh, a few milliseconds afterwards. A proxy that has shape keys, is in Edit
@@ -147,26 +146,26 @@ def follow_shape(collection: bpy.types.Collection, proxy: bpy.types.Object | Non
     change = np.asarray(betas, np.float64) - shown
     if np.abs(change).max() <= SAME_BETAS:
         return
-    model, mesh = shape_model_of(collection), own_data(proxy, collection)
-    origin = _model_origin(collection, shown)
+    model, mesh = shape_model_of(person), own_data(proxy, person)
+    origin = _model_origin(person, shown)
     moved = _vertices(mesh) + _basis(_Bound(mesh, shown, origin), model) @ change
-    moved += _model_origin(collection, betas) - origin
+    moved += _model_origin(person, betas) - origin
     mesh.vertices.foreach_set("co", moved.astype(np.float32).ravel())
     mesh.update()
     show_betas(proxy, betas)
 
 
-def _model_origin(collection: bpy.types.Collection, betas: NDArray | None) -> NDArray[np.float64]:
+def _model_origin(person: bpy.types.Object, betas: NDArray | None) -> NDArray[np.float64]:
     """The origin of the body model in the armature's space [3] when the human has these betas [10], not those it has
     now: see `human.ORIGIN`. Raises as `shape_model_of`."""
-    bones = armature_of(collection).data
+    bones = person.data
     if ORIGIN not in bones or betas is None:
         return model_origin(bones)
-    return floor_below(points_to_blender(shape_model_of(collection).surface(betas)))
+    return floor_below(points_to_blender(shape_model_of(person).surface(betas)))
 
 
-def _origin(collection: bpy.types.Collection, betas: NDArray | None) -> dict[str, object]:
-    return {"file": state_of(collection), "betas": None if betas is None else _rounded(betas)}
+def _origin(person: bpy.types.Object, betas: NDArray | None) -> dict[str, object]:
+    return {"file": state_of(person), "betas": None if betas is None else _rounded(betas)}
 
 
 def _rounded(betas: NDArray) -> list[float]:
@@ -182,8 +181,6 @@ def _material(name: str, texture: Path) -> bpy.types.Material:
         image.pack()
     image.filepath_raw = f"//{file}"  # `filepath` would look for the file at once
     material = bpy.data.materials.new(name)
-    if bpy.app.version < (5, 0):
-        material.use_nodes = True  # always true, and deprecated, since 5.0
     nodes = material.node_tree.nodes
     shader = next(node for node in nodes if node.type == "BSDF_PRINCIPLED")
     picture = nodes.new("ShaderNodeTexImage")

@@ -18,7 +18,7 @@ from ..formats.body_layout import body_data, half_extents, read_layout, stencils
 from ..formats.human_layout import provenance_of
 from ..formats.regular_files import FileError, as_file_error, exists_in_its_folder
 from .cycles import max_overlap
-from .human import BODY_FILE, LARGEST_BETA, person_file
+from .human import LARGEST_BETA
 from .human_file import (
     GENERATE_AGAIN,
     FileVersion,
@@ -29,13 +29,14 @@ from .human_file import (
     read_sizes,
     read_tensors,
 )
+from .payload import BODY_FILE, session_file
 from .shape import FIELDS, OPTIONAL_FIELDS, Rest, ShapeModel, faulty_field
 from .volumes import Grids, bake
 
 
-def shape_model_of(collection: bpy.types.Collection) -> ShapeModel:
-    """The model by which the human's body follows its shape. Raises as `person_file` and `body_of_file`."""
-    return body_of_file(person_file(collection))
+def shape_model_of(person: bpy.types.Object) -> ShapeModel:
+    """The model by which the human's body follows its shape. Raises as `session_file` and `body_of_file`."""
+    return body_of_file(session_file(person))
 
 
 def body_of_file(person: Path) -> ShapeModel:
@@ -119,9 +120,9 @@ class RestHuman:
         own = self.payload.rest_half_extent
         return np.asarray(self.model.rest_half_extent if own is None else own, np.float64)
 
-    def provenance(self, grids: Grids) -> str:
-        """JSON for the custom property `human.MARK`; `grids` as above."""
-        offset, half = grids.drawn_box()
+    def provenance(self) -> str:
+        """JSON for the custom property `human.MARK`."""
+        offset, half = self.grids().drawn_box()
         centre = self.rest.position + np.einsum("kij,kj->ki", self.rest.rotation, offset)
         betas = np.round(self.payload.betas.astype(np.float64), 6).tolist()
         most = max_overlap(centre, self.rest.rotation, half)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ..formats.arrays import all_finite
 from ..formats.body_layout import LARGEST_STRETCH
 from .blend_values import as_numbers, stored_numbers
-from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, armature_of, provenance_of
+from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, provenance_of
 
 _TINY = 1e-12
 """Smallest divisor when normalising, as in the backend."""
@@ -111,6 +111,10 @@ class ShapeModel:
         """
         rotation = tangent_frames(*self._planes(vertices))
         return np.einsum("kc,kcx->kx", self.barycentric, vertices[self.faces[self.face]]), rotation
+
+    def rest_sides(self, betas: NDArray) -> NDArray[np.float64]:
+        """Lengths along T and widths along B [K, 2] of the primitives' cells at these betas [10] at rest, metres."""
+        return _sides(*self._planes(self.surface(betas)))
 
     def growth(self, before: NDArray, after: NDArray) -> NDArray[np.float64]:
         """Scale factors [K, 3] of boxes along T, B, N when the betas [10] change from `before` to `after`.
@@ -269,37 +273,36 @@ def _unit(vectors: NDArray) -> NDArray[np.float64]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), _TINY)
 
 
-def betas_of(collection: bpy.types.Collection) -> NDArray[np.float64]:
+def betas_of(person: bpy.types.Object) -> NDArray[np.float64]:
     """The human's shape [10] as the engine draws it now. Raises ValueError where it is no list of ten numbers."""
-    armature = armature_of(collection)
-    if BETAS not in armature:
-        return generated_betas(collection)
-    betas = stored_numbers(armature, BETAS, BETA_COUNT)
+    if BETAS not in person:
+        return generated_betas(person)
+    betas = stored_numbers(person, BETAS, BETA_COUNT)
     if betas is None:
         raise ValueError(
-            f"the custom property {BETAS!r} on the armature of {collection.name!r} is no list of {BETA_COUNT} numbers: "
+            f"the custom property {BETAS!r} on the armature of {person.name!r} is no list of {BETA_COUNT} numbers: "
             "delete it"
         )
     return np.array(betas)
 
 
-def generated_betas(collection: bpy.types.Collection) -> NDArray[np.float64]:
+def generated_betas(person: bpy.types.Object) -> NDArray[np.float64]:
     """The shape [10] that the human was generated with, or got from its last edit.
 
-    Raises ValueError where the collection's provenance is damaged.
+    Raises ValueError where the human's provenance is damaged.
     """
-    betas = as_numbers(provenance_of(collection).get("betas"), BETA_COUNT)
+    betas = as_numbers(provenance_of(person).get("betas"), BETA_COUNT)
     if betas is None:
         raise ValueError(
-            f"the custom property {MARK!r} of {collection.name!r} was changed by hand and holds no shape: undo that, "
+            f"the custom property {MARK!r} of {person.name!r} was changed by hand and holds no shape: undo that, "
             "or generate the human again"
         )
     return np.array(betas)
 
 
-def has_custom_shape(collection: bpy.types.Collection) -> bool:
+def has_custom_shape(person: bpy.types.Object) -> bool:
     """Whether the shape differs from the one in the human's file: the user has set it."""
     try:
-        return not np.allclose(betas_of(collection), generated_betas(collection), atol=SAME_BETAS)
+        return not np.allclose(betas_of(person), generated_betas(person), atol=SAME_BETAS)
     except ValueError:
         return True

@@ -10,13 +10,14 @@ node group evaluates them on the skinned body:
 from __future__ import annotations
 
 import re
+from collections import Counter
 from typing import Any
 
 import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from .human import armature_of, body_of, own_data, volumes_of
+from .human import body_of, link_part, own_data, parts_of, volumes_of
 from .rest_human import shape_model_of
 from .shape import ShapeModel, betas_of, generated_betas
 
@@ -31,50 +32,50 @@ BODY, VOLUMES = "Body", "Volumes"
 """Inputs of the group."""
 
 
-def carrier_of(collection: bpy.types.Collection) -> bpy.types.Object | None:
+def carrier_of(person: bpy.types.Object) -> bpy.types.Object | None:
     """The human's carrier; None before it was first attached to the surface."""
-    return next((obj for obj in collection.all_objects if MARK in obj), None)
+    return next((obj for obj in parts_of(person) if MARK in obj), None)
 
 
-def primitives_of(collection: bpy.types.Collection) -> bpy.types.Collection:
-    """The collection of the human's volumes. Raises ValueError where they have none to themselves."""
-    volumes = {obj for objects in volumes_of(collection).values() for obj in objects}
-    children = collection.children_recursive
-    counts = [sum(obj in volumes for obj in child.objects) for child in children]
-    if not any(counts):
-        raise ValueError(
-            f"the volumes of {collection.name!r} are in no collection of their own: move them into a new one inside "
-            f"{collection.name!r}"
-        )
-    return children[int(np.argmax(counts))]
+def primitives_of(person: bpy.types.Object) -> bpy.types.Collection | None:
+    """The collection of the human's volumes; None for a human without. Raises ValueError where they have none to
+    themselves."""
+    body, volumes = body_of(person), [obj for objects in volumes_of(person).values() for obj in objects]
+    if not volumes:
+        return None
+    inside = Counter(collection for obj in volumes for collection in obj.users_collection)
+    own = [collection for collection, _ in inside.most_common() if body is None or body.name not in collection.objects]
+    if not own:
+        raise ValueError(f"the volumes of {person.name!r} are in no collection of their own: move them into a new one")
+    return own[0]
 
 
-def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
+def build_surface(person: bpy.types.Object) -> bpy.types.Object:
     """Make or update the human's carrier; shows and hides nothing (see `attachment`).
 
     Raises ValueError for a human of an earlier version, or whose body mesh was deleted or changed, and
     FileNotFoundError where the body's file is missing.
     """
-    model, body, primitives = shape_model_of(collection), body_of(collection), primitives_of(collection)
+    model, body, primitives = shape_model_of(person), body_of(person), primitives_of(person)
     if body is None or len(body.data.vertices) != len(model.template):
         state = "was deleted" if body is None else "has other vertices now"
         raise ValueError(
-            f"the body mesh of {collection.name!r} {state}: undo that, or generate the human again, to attach volumes "
+            f"the body mesh of {person.name!r} {state}: undo that, or generate the human again, to attach volumes "
             "to its surface"
         )
-    carrier = carrier_of(collection)
-    growth = model.growth(generated_betas(collection), betas_of(collection))
-    mesh = carrier_mesh(f"{collection.name}_surface", model, picks(collection, primitives, len(model.face)))
+    carrier = carrier_of(person)
+    growth = model.growth(generated_betas(person), betas_of(person))
+    mesh = carrier_mesh(f"{person.name}_surface", model, picks(person, primitives, len(model.face)))
     if carrier is None:
         carrier = bpy.data.objects.new(mesh.name, mesh)
         carrier[MARK] = True
-        carrier.parent = armature_of(collection)
-        collection.objects.link(carrier)
+        carrier.parent = person
+        link_part(person, carrier)
     else:
         former, carrier.data = carrier.data, mesh
         if former.users == 0:
             bpy.data.meshes.remove(former)
-    scale_surface(collection, growth)
+    scale_surface(person, growth)
     modifier = carrier.modifiers.get("Surface") or carrier.modifiers.new("Surface", "NODES")
     modifier.node_group = surface_group()
     sockets = {
@@ -85,20 +86,24 @@ def build_surface(collection: bpy.types.Collection) -> bpy.types.Object:
     return carrier
 
 
-def scale_surface(collection: bpy.types.Collection, growth: NDArray) -> None:
+def scale_surface(person: bpy.types.Object, growth: NDArray) -> None:
     """Scale the volumes on the human's carrier, if there is one, by `growth` [K, 3]."""
-    carrier = carrier_of(collection)
+    carrier = carrier_of(person)
     if carrier is None:
         return
-    mesh = own_data(carrier, collection)
+    set_of_primitives(own_data(carrier, person), GROWTH, growth)
+
+
+def set_of_primitives(mesh: bpy.types.Mesh, name: str, values: NDArray) -> None:
+    """Set a vector attribute of a `carrier_mesh` from the values of the primitives [K, 3]."""
     primitive = np.empty(len(mesh.vertices), np.int32)
     mesh.attributes[PRIMITIVE].data.foreach_get("value", primitive)
-    attribute = mesh.attributes.get(GROWTH) or mesh.attributes.new(GROWTH, "FLOAT_VECTOR", "POINT")
-    attribute.data.foreach_set("vector", growth[primitive].astype(np.float32).ravel())
+    attribute = mesh.attributes.get(name) or mesh.attributes.new(name, "FLOAT_VECTOR", "POINT")
+    attribute.data.foreach_set("vector", values[primitive].astype(np.float32).ravel())
     mesh.update_tag()
 
 
-def picks(collection: bpy.types.Collection, primitives: bpy.types.Collection, count: int) -> NDArray[np.int32]:
+def picks(person: bpy.types.Object, primitives: bpy.types.Collection, count: int) -> NDArray[np.int32]:
     """The index of each primitive's volume among the collection's children [count]; -1 where it was deleted.
 
     The node sorts objects and collections together, by name, as `_natural_order` does.
@@ -106,7 +111,7 @@ def picks(collection: bpy.types.Collection, primitives: bpy.types.Collection, co
     children = sorted([*primitives.objects, *primitives.children], key=lambda child: _natural_order(child.name))
     rank = {child: number for number, child in enumerate(children)}
     found = np.full(count, _DELETED, np.int32)
-    for k, objects in volumes_of(collection).items():
+    for k, objects in volumes_of(person).items():
         here = [rank[obj] for obj in objects if obj in rank]
         if here and k < count:
             found[k] = min(here)
@@ -114,7 +119,10 @@ def picks(collection: bpy.types.Collection, primitives: bpy.types.Collection, co
 
 
 def carrier_mesh(name: str, model: ShapeModel, pick: NDArray) -> bpy.types.Mesh:
-    """A vertex, with its weights, for each body vertex in the sums of each primitive's centre and tangent plane."""
+    """A vertex, with its weights, for each body vertex in the sums of each primitive's centre and tangent plane.
+
+    Vertex k is the first of primitive k.
+    """
     count, width = model.stencil_vertex.shape
     vertex = np.concatenate([model.faces[model.face], model.stencil_vertex], 1)
     no_corners, no_stencil = np.zeros((count, 3)), np.zeros((count, width))
@@ -124,18 +132,19 @@ def carrier_mesh(name: str, model: ShapeModel, pick: NDArray) -> bpy.types.Mesh:
         np.concatenate([no_corners, model.stencil_dv], 1),
     )
     used = np.any([weight != 0 for weight in weights], 0)
-    used[:, 0] = True  # the point that becomes the instance
-    primitive = np.broadcast_to(np.arange(count)[:, None], used.shape)[used]
-    first = np.concatenate([[True], primitive[1:] != primitive[:-1]]) & (pick[primitive] != _DELETED)
+    used[:, 0] = False
+    others, columns = np.nonzero(used)
+    primitive = np.concatenate([np.arange(count), others])
+    column = np.concatenate([np.zeros(count, np.int64), columns])
     mesh = bpy.data.meshes.new(name)
     mesh.vertices.add(len(primitive))
     for attribute, kind, values in (
-        (VERTEX, "INT", vertex[used].astype(np.int32)),
+        (VERTEX, "INT", vertex[primitive, column].astype(np.int32)),
         (PRIMITIVE, "INT", primitive.astype(np.int32)),
         (PICK, "INT", np.maximum(pick, 0)[primitive].astype(np.int32)),
-        (FIRST, "BOOLEAN", first),
+        (FIRST, "BOOLEAN", (np.arange(len(primitive)) < count) & (pick[primitive] != _DELETED)),
         *(
-            (weight_name, "FLOAT", values[used].astype(np.float32))
+            (weight_name, "FLOAT", values[primitive, column].astype(np.float32))
             for weight_name, values in zip(WEIGHTS, weights, strict=True)
         ),
     ):

@@ -10,7 +10,6 @@ import ctypes
 import dataclasses
 import functools
 import os
-import struct
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,9 +19,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.regular_files import exists_in_its_folder, open_regular
 from ..formats.whole_files import temporary_folder
-from .human import volume_path
+from .human import volume_name, volumes_of
+from .payload import session_file
 
 bpy.utils.expose_bundled_modules()
 try:
@@ -44,8 +43,6 @@ _ALMOST_EMPTY = 1e-4
 """Opacity per metre of the one voxel of an empty primitive: Cycles complains of grids without any value."""
 _ALL_ACTIVE = -1.0
 """A tolerance below every difference from the background, so that zeros become active voxels too."""
-LARGEST_VDB = 4 << 30
-"""Bytes of a file whose header is read; a merged human has a few hundred MB."""
 
 
 def openvdb() -> ModuleType:
@@ -56,14 +53,6 @@ def openvdb() -> ModuleType:
             "install it (on Debian and Ubuntu: sudo apt install python3-openvdb), then start Blender again"
         )
     return _openvdb
-
-
-def readable_format() -> int:
-    """The newest format version that this Blender reads; 5.2 writes 225, and 5.0 reads up to 224.
-
-    Without the module it is not known, and nothing can be written in another: any.
-    """
-    return sys.maxsize if _openvdb is None else _openvdb.FILE_FORMAT_VERSION
 
 
 def grid_bytes(path: Path) -> int:
@@ -129,20 +118,18 @@ def bake(density: NDArray, rgb: NDArray, half_extent: NDArray) -> Grids:
     )
 
 
-def index_to_local(half_extent: NDArray, blender_version: tuple[int, ...]) -> NDArray[np.float64]:
+def index_to_local(half_extent: NDArray) -> NDArray[np.float64]:
     """VDB's row-vector index-to-object transform [4, 4] of a box with half sides [3] in metres.
 
-    Voxel i of the eight (the padding has -1 and 8) has its centre at half_extent * (-1 + 2 i / 7). Cycles before 5.0
-    draws every voxel half a voxel too high on each axis, so its files are shifted down.
+    Voxel i of the eight (the padding has -1 and 8) has its centre at half_extent * (-1 + 2 i / 7).
     """
     step = 2.0 * np.asarray(half_extent) / (VOXELS - 1)
-    shift = -0.5 * step if blender_version < (5, 0) else 0.0
     transform = np.diag([*step, 1.0])
-    transform[3, :3] = -half_extent + shift
+    transform[3, :3] = -half_extent
     return transform
 
 
-def write_volume(grids: Grids, k: int, blender_version: tuple[int, ...], path: Path) -> None:
+def write_volume(grids: Grids, k: int, path: Path) -> None:
     """Write a primitive's volume to `path`, where it appears whole or not at all.
 
     Raises OSError, and RuntimeError when the disk is full.
@@ -153,7 +140,7 @@ def write_volume(grids: Grids, k: int, blender_version: tuple[int, ...], path: P
             hidden / path.name,
             grids.density[k][part],
             grids.colour[k][part],
-            index_to_local(grids.half_extent[k], blender_version),
+            index_to_local(grids.half_extent[k]),
             tuple((grids.first[k] - PAD).tolist()),
             _ALL_ACTIVE,
         )
@@ -182,25 +169,6 @@ def write_vdb(
         grid.transform = transform
         grid.saveFloatAsHalf = True
     vdb.write(str(path), grids=[fog, cd])
-
-
-_HEADER = struct.Struct("<8sI")
-_MAGIC = b" BDV\0\0\0\0"
-
-
-def format_of(path: Path) -> int | None:
-    """The format version that a VDB file's header states; None for another file, or where it cannot be read."""
-    try:
-        with open_regular(path, LARGEST_VDB) as file:
-            magic, version = _HEADER.unpack(file.read(_HEADER.size))
-    except (OSError, ValueError, struct.error):
-        return None
-    return version if magic == _MAGIC else None
-
-
-def is_readable(path: Path) -> bool:
-    """Whether a volume's file is there and in no newer format than this Blender's. Damage is not looked for."""
-    return exists_in_its_folder(path) and (format_of(path) or 0) <= readable_format()
 
 
 _LOWEST_LIMIT_MB = 1
@@ -237,14 +205,15 @@ class Memory:
     renders."""
 
 
-def person_memory(collection: bpy.types.Collection) -> Memory:
-    """Memory of all of a human's volumes, shown or hidden; zero until all are written.
+def person_memory(person: bpy.types.Object) -> Memory:
+    """Memory of the volumes of a human's primitives, shown or hidden; zero until all are written.
 
-    Reads the files' headers once, about .2 s for 1024 of them, and caches the result by their names.
+    Reads the files' headers once, about .2 s for 1024 of them, and caches the result by their names. Raises as
+    `session_file`.
     """
-    shown = {volume_path(obj.data) for obj in collection.all_objects if obj.type == "VOLUME"}
-    paths = sorted(path for path in shown if path is not None)
-    return _memory_of(tuple(paths)) if all(map(exists_in_its_folder, paths)) else Memory(0, 0)
+    folder = session_file(person).parent
+    paths = [folder / volume_name(k) for k in sorted(volumes_of(person))]
+    return _memory_of(tuple(paths)) if all(path.is_file() for path in paths) else Memory(0, 0)
 
 
 @functools.lru_cache(maxsize=64)

@@ -12,13 +12,13 @@ from types import ModuleType
 
 import bpy
 
-from ..jobs import copies, deferred_volumes, follow, missing_files, picture_in_view, windows
+from ..jobs import deferred_volumes, follow, parts, windows
 from ..scene import stand_in
 from . import (
     advanced_panel,
     attributes,
     backend_state,
-    batch,
+    captures_command,
     captures_panel,
     captures_settings,
     edit_panel,
@@ -30,6 +30,7 @@ from . import (
     import_motion,
     jobs_panel,
     manual,
+    menus,
     motion_panel,
     picture_panel,
     pose_panel,
@@ -42,10 +43,10 @@ from . import (
 
 MODULES = (
     *backend_state.MODULES, windows, follow, jobs_panel, attributes,
-    generate_panel, variations_panel, human_panel, shape_panel, edit_panel, missing_files, copies,
+    generate_panel, variations_panel, human_panel, shape_panel, edit_panel, parts,
     deferred_volumes, import_motion, motion_panel, pose_panel, picture_panel,
     render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
-    captures_panel, reconstruct_panel, viewport_humans, picture_in_view, batch, manual, stand_in,
+    captures_panel, reconstruct_panel, viewport_humans, captures_command, manual, menus, stand_in,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

@@ -7,14 +7,13 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.regular_files import printable
 from ..formats.requests import DENSITY_GAIN, VOXEL
-from ..jobs.deferred_volumes import deferred_volumes
+from ..jobs.deferred_volumes import deferred_volumes, keep_writing
 from ..jobs.export import show, shown
 from ..jobs.follow import submit
 from ..jobs.merge import MergeFramesJob, MergeJob, Moment
 from ..jobs.target import HumanTarget, selected_person
 from ..places import backend_is_named
 from ..scene.attachment import (
-    MODES,
     attachment_before_merge,
     attachment_of,
     in_viewport,
@@ -23,11 +22,12 @@ from ..scene.attachment import (
 )
 from ..scene.blend_values import as_shown
 from ..scene.cycles import current_overlap, overlap_warning_in
-from ..scene.human import armature_of, humans, provenance_of
+from ..scene.human import humans, parts_of, provenance_of
 from ..scene.material import density_gain, set_density_gain
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import proxy_of
-from ..scene.volumes import person_memory
+from ..scene.splats import SPLATS_AVAILABLE, cloud_of
+from ..scene.volumes import Memory, person_memory
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend
@@ -37,6 +37,12 @@ ATTACHMENT_ITEMS = (
     ("ARMATURE", "Armature", "Each volume is an object that follows the bones; fast, and the default"),
     ("SURFACE", "Surface", "Volumes are placed on the posed skin in each pose, as in the PrimDiffusion engine"),
     ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
+    (
+        "SPLATS",
+        "Splats",
+        "Gaussian splats, which every view and engine draws: they cast shadows, but keep the light of their colors "
+        "(Blender 5.3)",
+    ),
 )
 _MOST_FRAMES = 3_000
 
@@ -53,8 +59,9 @@ class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
         name="Attachment", description="How volumes follow the body", items=ATTACHMENT_ITEMS, default="ARMATURE"
     )
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         set_attachment(person, self.mode)
+        keep_writing()  # volumes that splats had made unnecessary
         return {"FINISHED"}
 
 
@@ -67,7 +74,7 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
 
     everyone: bpy.props.BoolProperty(name="All Humans", description="Do it for all humans of the scene", options=SKIP)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         visible = not in_viewport(person)
         if visible:
             deferred_volumes.finish()
@@ -112,7 +119,7 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
     frame_start: bpy.props.IntProperty(name="Start", description="Not given: the scene's", options=SKIP)
     frame_end: bpy.props.IntProperty(name="End", description="Not given: the scene's", options=SKIP)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         if self.what == "NOTHING":
             _unmerge(person)
             bpy.ops.ed.undo_push(message="Unmerge")
@@ -130,7 +137,7 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
         return submit(self, context, MergeFramesJob(target, moments, start, voxel))
 
 
-def _unmerge(person: bpy.types.Collection) -> None:
+def _unmerge(person: bpy.types.Object) -> None:
     """Raises ValueError where there is no merged volume."""
     if merged_of(person) is None:
         raise ValueError(f"{person.name!r} has no merged volume")
@@ -139,11 +146,11 @@ def _unmerge(person: bpy.types.Collection) -> None:
     remove_merged(person)
 
 
-def _moment(person: bpy.types.Collection, graph: bpy.types.Depsgraph) -> Moment:
-    return Moment.now(person, armature_of(person).evaluated_get(graph))
+def _moment(person: bpy.types.Object, graph: bpy.types.Depsgraph) -> Moment:
+    return Moment.now(person, person.evaluated_get(graph))
 
 
-def _moments(context: bpy.types.Context, person: bpy.types.Collection, frames: range) -> list[Moment]:
+def _moments(context: bpy.types.Context, person: bpy.types.Object, frames: range) -> list[Moment]:
     """The human in each frame; the scene is at its own frame again afterwards."""
     scene, now = context.scene, context.scene.frame_current
     moments = []
@@ -174,12 +181,12 @@ class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
     )
 
 
-def _gain(person: bpy.types.Collection) -> float:
+def _gain(person: bpy.types.Object) -> float:
     gain = density_gain(person)
     return DENSITY_GAIN if gain is None else gain
 
 
-def _set_gain(person: bpy.types.Collection, gain: float) -> None:
+def _set_gain(person: bpy.types.Object, gain: float) -> None:
     try:
         set_density_gain(person, gain)
     except ValueError as error:  # a property has no report
@@ -187,7 +194,7 @@ def _set_gain(person: bpy.types.Collection, gain: float) -> None:
 
 
 def gain_property() -> bpy.props.FloatProperty:
-    """`collection.primdiffusion_density_gain` of a human's collection."""
+    """`armature.primdiffusion_density_gain` of a human."""
     return bpy.props.FloatProperty(
         name="Density Gain",
         description="Factor on the density in Cycles, which absorbs exponentially while the PrimDiffusion "
@@ -213,12 +220,6 @@ class PRIMDIFFUSION_PT_advanced(SidebarPanel, bpy.types.Panel):
         layout = property_columns(self.layout)
         if humans(context.scene):
             _draw_person(layout, context)
-        files = draw_section(layout, "files", text="Files", page="editing", section="undo-and-files-on-disk")
-        if files is not None:
-            files.operator("primdiffusion.collect_files", icon="PACKAGE")
-            find = files.operator("primdiffusion.find_missing_volumes", text="Find Volumes in Folder", icon="VIEWZOOM")
-            find.choose = True
-            files.operator("primdiffusion.remove_unused_files", icon="TRASH")
         if not backend_is_named():
             return
         backend = draw_section(layout, "backend", text="Backend", page="troubleshooting")
@@ -247,18 +248,20 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
             content(body, context, person)
 
 
-def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Collection) -> None:
+def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
     """How volumes follow the body."""
     now = attachment_of(person)
+    absent = {"MERGED": merged_of(person) is None, "SPLATS": not SPLATS_AVAILABLE}
     row = layout.row(align=True)
     for mode, label, _ in ATTACHMENT_ITEMS:
-        if mode != MODES[2] or merged_of(person) is not None:
+        if not absent.get(mode):
             row.operator("primdiffusion.set_attachment", text=label, depress=mode == now).mode = mode
-    icon = "RESTRICT_VIEW_OFF" if in_viewport(person) else "RESTRICT_VIEW_ON"
-    layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)
+    if now != "SPLATS":
+        icon = "RESTRICT_VIEW_OFF" if in_viewport(person) else "RESTRICT_VIEW_ON"
+        layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)
 
 
-def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Collection) -> None:
+def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
     """One volume for Cycles."""
     layout.prop(context.scene.primdiffusion_merging, "voxel")
     draw_job(layout, "merge", "primdiffusion.merge", "VOLUME_DATA", text="Merge Pose")
@@ -270,8 +273,11 @@ def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: 
         layout.operator("primdiffusion.merge", text="Unmerge", icon="X").what = "NOTHING"
 
 
-def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Collection) -> None:
+def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
     """What brings Cycles near the exact picture."""
+    if attachment_of(person) == "SPLATS":
+        draw_lines(layout, "Splats look the same in every engine", "INFO")
+        return
     if density_gain(person) is None:
         draw_lines(layout, "The human's material has no node Density Gain", "INFO")
     else:
@@ -281,14 +287,14 @@ def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, pe
         draw_lines(layout, sentence(f"{warning}, or merge the human"), "ERROR")
 
 
-def _draw_memory(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Collection) -> None:
+def _draw_memory(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
     """How the human was made, and what it takes."""
     column = layout.column(align=True)
     for name, value in details(person):
         column.label(text=f"{name}: {value}", translate=False)
 
 
-def outdated(person: bpy.types.Collection, scene: bpy.types.Scene) -> bool:
+def outdated(person: bpy.types.Object, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or human than the armature as it is now."""
     try:
         return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)
@@ -302,7 +308,7 @@ _MOST_LINES = 60
 """Lines about the provenance."""
 
 
-def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
+def details(person: bpy.types.Object) -> list[tuple[str, str]]:
     """Names and values: how the human was made, what its files and volumes take."""
     provenance = provenance_of(person)
     attributes, edits = provenance.get("attributes"), provenance.get("edits")
@@ -318,8 +324,16 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
             rest = [f"{key} {value}" for key, value in edit.items() if key != "edit" and not isinstance(value, dict)]
             lines.append((f"Edit: {as_shown(edit.get('edit', '?'))}", as_shown(", ".join(rest))))
     del lines[_MOST_LINES:]
-    volumes = [obj for obj in person.all_objects if obj.type == "VOLUME"]
-    memory = person_memory(person)
+    cloud = cloud_of(person)
+    if cloud is not None:
+        lines.append(("Splats", f"{len(cloud.data.points):,}"))
+    volumes = [obj for obj in parts_of(person) if obj.type == "VOLUME"]
+    if not volumes:
+        return lines
+    try:
+        memory = person_memory(person)
+    except (ValueError, OSError):  # the panel Human says why
+        memory = Memory(0, 0)
     try:
         most = str(current_overlap(person))
     except ValueError:  # changed by hand
@@ -332,5 +346,5 @@ def details(person: bpy.types.Collection) -> list[tuple[str, str]]:
 
 PROPERTIES = (
     (bpy.types.Scene, "primdiffusion_merging", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_merging)),
-    (bpy.types.Collection, "primdiffusion_density_gain", gain_property()),
+    (bpy.types.Object, "primdiffusion_density_gain", gain_property()),
 )

@@ -16,7 +16,7 @@ import bpy
 
 from ..formats.json_files import parse_json
 from ..formats.regular_files import as_file_error, is_local_path, open_regular
-from ..formats.tensor_layout import check_limits, read_layout
+from ..formats.tensor_layout import read_layout
 from ..places import backend_module_path, preference
 
 _LARGEST_FILE = 16 << 30
@@ -57,7 +57,6 @@ def read_vocabulary(path: Path) -> Vocabulary:
     with as_file_error(path, "is damaged or no checkpoint of a diffusion model", "choose another file"):
         with open_regular(path, _LARGEST_FILE) as file:
             layout = read_layout(file)
-        check_limits(layout)
         text = layout.metadata["architecture"]
         if len(text) > _LONGEST_TEXT:
             raise ValueError(f"its architecture has {len(text)} characters, and {_LONGEST_TEXT} are the most")

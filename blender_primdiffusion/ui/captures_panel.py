@@ -156,7 +156,7 @@ class PRIMDIFFUSION_OT_preview_rig(Reporting, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def remove_rig(collection: bpy.types.Collection) -> None:
+def remove_rig(collection: bpy.types.Object) -> None:
     """Remove the preview, but no objects that the user has added to its collection."""
     ours = [obj for obj in collection.objects if obj.type == "CAMERA" and obj.name.startswith("Capture ")]
     cameras = [obj.data for obj in ours]

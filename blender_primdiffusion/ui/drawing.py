@@ -9,7 +9,7 @@ import bpy
 
 from ..backend.requests import RequestError
 from ..formats.regular_files import printable
-from ..jobs.follow import building, in_the_way
+from ..jobs.follow import in_the_way
 from ..jobs.pictures import so_far
 from ..jobs.queue import JobOutcome, queue
 from ..jobs.remedies import remedy_for
@@ -114,9 +114,7 @@ def _wrapped(text: str, width: int = _LINE) -> list[str]:
 def _draw_progress(layout: bpy.types.UILayout) -> None:
     """The running job: progress, time left, Cancel."""
     row = layout.row(align=True)
-    row.progress(
-        factor=building.fraction if queue.ready else queue.request.fraction, text=_progress_text(), translate=False
-    )
+    row.progress(factor=1.0 if queue.ready else queue.request.fraction, text=_progress_text(), translate=False)
     row.operator("primdiffusion.cancel", text="", icon="CANCEL").number = 0
 
 

@@ -20,7 +20,8 @@ from ..jobs.follow import Reporting, submit
 from ..jobs.target import selected_person
 from ..places import backend_is_named
 from ..scene.edit import end_painting, painted_weights, start_painting
-from ..scene.human import BODY_MARK, MARK, body_of, humans, person_file
+from ..scene.human import BODY_MARK, body_of, humans
+from ..scene.payload import session_file
 from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
 from .declared import PANELS, SKIP, declared, not_given
 from .drawing import draw_job, property_columns
@@ -47,8 +48,8 @@ def parts_property():
     )
 
 
-def _may_be_other(_self: PRIMDIFFUSION_PG_edit, collection: bpy.types.Collection) -> bool:
-    return MARK in collection and collection in humans(bpy.context.scene)
+def _may_be_other(_self: PRIMDIFFUSION_PG_edit, obj: bpy.types.Object) -> bool:
+    return obj in humans(bpy.context.scene)
 
 
 class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
@@ -80,7 +81,7 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
     )
     attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
     other: bpy.props.PointerProperty(
-        name="Other Human", description="The other human", type=bpy.types.Collection, poll=_may_be_other
+        name="Other Human", description="The other human", type=bpy.types.Object, poll=_may_be_other
     )
     what: bpy.props.EnumProperty(name="Transfer", description="What the human gets", items=TRANSFER_ITEMS)
     harmonise: declared(TransferRequest, "harmonise")
@@ -129,11 +130,11 @@ class _Edit(OnPerson):
     seed: not_given(VaryRequest, "seed")
     steps: not_given(VaryRequest, "steps")
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         params = {"steps": self.chosen("steps", context.scene.primdiffusion), **self.params(context, person)}
         return submit(self, context, getattr(edit, self.job).of(person, params))
 
-    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+    def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         """The edit's parameters of the child's method: see `EditJob.asked`."""
         raise NotImplementedError
 
@@ -146,9 +147,7 @@ class _Region:
         name="Vertex Group", description="Vertex group with a painted region, instead of parts", options=SKIP
     )
 
-    def region(
-        self, settings: bpy.types.PropertyGroup, person: bpy.types.Collection
-    ) -> list[str] | dict[str, list[float]]:
+    def region(self, settings: bpy.types.PropertyGroup, person: bpy.types.Object) -> list[str] | dict[str, list[float]]:
         """Names of parts, or painted weights [V]."""
         if self.given("vertex_group") or (not self.given("parts") and settings.region == "PAINTED"):
             body = body_of(person)
@@ -174,7 +173,7 @@ class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
     )
     guidance: not_given(VaryRequest, "guidance")
 
-    def params(self, context: bpy.types.Context, _person: bpy.types.Collection) -> dict[str, Any]:
+    def params(self, context: bpy.types.Context, _person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         params = {"amount": self.chosen("amount", settings), "seed": self.chosen("seed", settings)}
         wanted = parsed(self.attributes)
@@ -195,7 +194,7 @@ class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
     )
     guidance: not_given(VaryRequest, "guidance")
 
-    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+    def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         params: dict[str, Any] = {"region": self.region(settings, person), "seed": self.chosen("seed", settings)}
         wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
@@ -215,10 +214,10 @@ class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
     what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=PANELS, options=SKIP)
     harmonise: not_given(TransferRequest, "harmonise")
 
-    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+    def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         return {
-            "source": str(person_file(other_human(context, person, self.source))),
+            "source": str(session_file(other_human(context, person, self.source))),
             "region": self.region(settings, person),
             "what": self.chosen("what", settings),
             "harmonise": self.chosen("harmonise", settings),
@@ -236,10 +235,10 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
     other: bpy.props.StringProperty(name="Other", description=f"Name of the other human. {PANELS}", options=SKIP)
     fraction: not_given(InterpolateRequest, "fraction")
 
-    def params(self, context: bpy.types.Context, person: bpy.types.Collection) -> dict[str, Any]:
+    def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         other = other_human(context, person, self.other)
-        return {"other": str(person_file(other)), "fraction": self.chosen("fraction", settings)}
+        return {"other": str(session_file(other)), "fraction": self.chosen("fraction", settings)}
 
 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)

@@ -26,7 +26,6 @@ from ..jobs.follow import Reporting, submit
 from ..jobs.queue import Job
 from ..jobs.target import HumanTarget
 from ..scene.export_model import check_ready
-from ..scene.human import armature_of
 from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
 from ..scene.proxy import proxy_of, remove_proxy
 from .declared import PANELS, SKIP, declared, not_given
@@ -196,7 +195,7 @@ class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
         for name in ("format", *OPTIONS[self.format]):
             layout.prop(self, name)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         kind = self._format(context)
         path = destination(self.filepath, ENDINGS[kind])
         if kind == "HUMAN":
@@ -209,14 +208,14 @@ class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
         panel = context.scene.primdiffusion_export
         return self.format if self.given("format") else by_ending or panel.format
 
-    def _write_human(self, context: bpy.types.Context, person: bpy.types.Collection, path: Path) -> set[str]:
+    def _write_human(self, context: bpy.types.Context, person: bpy.types.Object, path: Path) -> set[str]:
         settings = context.scene.primdiffusion_export
         frames = scene_frames(context.scene, True) if self.chosen("motion", settings) else None
         write_human(context, person, path, frames, compact=self.chosen("compact", settings))
         self.report({"INFO"}, f"Exported {person.name} to {path.name}")
         return {"FINISHED"}
 
-    def _job(self, context: bpy.types.Context, person: bpy.types.Collection, kind: str, path: Path) -> Job:
+    def _job(self, context: bpy.types.Context, person: bpy.types.Object, kind: str, path: Path) -> Job:
         """What writes a mesh, Gaussians or volumes. Raises ValueError."""
         target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
         if kind == "PLY":
@@ -225,7 +224,7 @@ class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
             first, last = self._frames(context.scene)
             people = posed_frames(context, person, range(first, last + 1))
             return ExportVdbSequenceJob(target, path.parent, path.stem, people, first, self.chosen("voxel", settings))
-        check_ready(armature_of(person))
+        check_ready(person)
         px, triangles = int(self.chosen("texture_px", settings)), self.chosen("triangles", settings)
         frames = scene_frames(context.scene, self.chosen("animation", settings))
         return ExportMeshJob(target, px, triangles, path, kind, frames)
@@ -247,9 +246,9 @@ class PRIMDIFFUSION_OT_add_proxy(OnPerson, bpy.types.Operator):
     texture_px: not_given(ProxyRequest, "texture_px", name="Texture")
     triangles: not_given(ProxyRequest, "triangles")
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
-        check_ready(armature_of(person))
+        check_ready(person)
         px, triangles = int(self.chosen("texture_px", settings)), self.chosen("triangles", settings)
         return submit(self, context, AddProxyJob(target, px, triangles))
 
@@ -263,7 +262,7 @@ class PRIMDIFFUSION_OT_show_proxy(OnPerson, bpy.types.Operator):
 
     shown: bpy.props.EnumProperty(name="Show", description="How the human is shown", items=SHOWN)
 
-    def run(self, _context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, _context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         removed = self.shown == "REMOVED"
         show(person, "VOLUMES" if removed else self.shown)
         if removed:

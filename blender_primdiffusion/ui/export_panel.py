@@ -14,7 +14,7 @@ from ..jobs.follow import Reporting, submit
 from ..jobs.target import HumanTarget, selected_person
 from ..places import INSTALLS_BACKEND, backend_is_named
 from ..scene.handles import joints_from_handles
-from ..scene.human import armature_of, humans
+from ..scene.human import humans
 from ..scene.proxy import is_outdated, proxy_of
 from ..scene.shape import betas_of
 from . import gallery
@@ -57,9 +57,9 @@ class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
         options=SKIP,
     )
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         if self.what == "POSE":
-            joints_from_handles(context, armature_of(person))
+            joints_from_handles(context, person)
         of_pose = PoseAssetJob.of(person, self.name.strip() or "Pose") if self.what == "POSE" else None
         job = of_pose or HumanAssetJob(HumanTarget.of(person))
         if not self.picture:

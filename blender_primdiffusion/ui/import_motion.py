@@ -17,7 +17,7 @@ from ..formats.joints import JOINT_NAMES
 from ..formats.poses.bvh import bone_names, parse_bvh
 from ..formats.poses.files import ENDINGS, read_motion
 from ..formats.regular_files import FileError
-from ..scene.human import armature_of, humans
+from ..scene.human import humans
 from .drawing import draw_lines, property_columns
 from .motion_placing import Placement, extend_range, facts, place_motion
 from .on_person import OnArmature, WhereTo, target_armature
@@ -33,12 +33,8 @@ def person_under(context: bpy.types.Context, event: bpy.types.Event) -> str:
         return ""
     seen = {}
     for person in humans(context.scene):
-        try:
-            armature = armature_of(person)
-        except ValueError:
-            continue
-        bones = [armature.pose.bones[name] for name in JOINT_NAMES if name in armature.pose.bones]
-        spots = [location_3d_to_region_2d(region, view, armature.matrix_world @ bone.head) for bone in bones]
+        bones = [person.pose.bones[name] for name in JOINT_NAMES if name in person.pose.bones]
+        spots = [location_3d_to_region_2d(region, view, person.matrix_world @ bone.head) for bone in bones]
         seen[person.name] = np.array([spot for spot in spots if spot is not None]).reshape(-1, 2)
     return nearest_to((event.mouse_region_x, event.mouse_region_y), seen)
 

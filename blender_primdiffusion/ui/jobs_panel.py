@@ -15,9 +15,8 @@ from bpy.app.handlers import persistent
 
 from ..backend.requests import error_text
 from ..jobs import follow, memory
-from ..jobs.follow import Reporting, building, redraw, submit
+from ..jobs.follow import Reporting, redraw, submit
 from ..jobs.memory import device_line
-from ..jobs.picture_in_view import follow_picture
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
@@ -257,9 +256,7 @@ def draw_backend(layout: bpy.types.UILayout) -> None:
 def drop_before_loading(*_: object) -> None:
     """Handler of load_pre: the results of jobs belong into the file that is being closed."""
     queue.drop()
-    building.close()
     so_far.show(None)
-    follow_picture()
 
 
 @persistent
@@ -284,7 +281,6 @@ def register() -> None:
 def unregister() -> None:
     """End the child and the timers."""
     queue.close()
-    building.close()
     so_far.close()
     for timer in (follow.follow, follow.watch):
         if bpy.app.timers.is_registered(timer):

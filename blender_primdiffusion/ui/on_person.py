@@ -5,10 +5,10 @@ from __future__ import annotations
 import bpy
 
 from ..formats.joints import JOINT_NAMES
-from ..jobs.copies import separate
 from ..jobs.follow import Reporting
+from ..jobs.parts import complete
 from ..jobs.target import named_person, selected_person
-from ..scene.human import armature_of, human_of, humans
+from ..scene.human import human_of, humans
 from .declared import SKIP
 from .drawing import SidebarPanel
 
@@ -17,7 +17,7 @@ class OnPerson(Reporting):
     """Base of operators on one human, which it finds; subclasses define `run`."""
 
     human: bpy.props.StringProperty(
-        name="Human", description="Name of the human's collection; empty: the selected human", options=SKIP
+        name="Human", description="Name of the human; empty: the selected human", options=SKIP
     )
 
     @classmethod
@@ -28,14 +28,14 @@ class OnPerson(Reporting):
         return found
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        separate()
+        complete()
         return self.run(context, self.person(context))
 
-    def person(self, context: bpy.types.Context) -> bpy.types.Collection:
+    def person(self, context: bpy.types.Context) -> bpy.types.Object:
         """The human named, else the selected one. Raises ValueError."""
         return named_person(context, self.human) if self.human else selected_person(context)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         """The operator itself."""
         raise NotImplementedError
 
@@ -55,7 +55,7 @@ class HumanPanel(SidebarPanel):
         return True
 
 
-def other_human(context: bpy.types.Context, person: bpy.types.Collection, name: str) -> bpy.types.Collection:
+def other_human(context: bpy.types.Context, person: bpy.types.Object, name: str) -> bpy.types.Object:
     """The other human, named by a script, or picked in the panel where the name is empty. Raises ValueError."""
     picked = context.scene.primdiffusion_edit.other
     if not name and picked is None:
@@ -76,15 +76,15 @@ def target_armature(context: bpy.types.Context, person: str = "") -> bpy.types.O
     Raises ValueError; for an active armature with some of SMPL's bones it names the first one missing.
     """
     if person:
-        return armature_of(named_person(context, person))
+        return named_person(context, person)
     active = context.view_layer.objects.active
     if active is not None and active.type == "ARMATURE":
         missing = [name for name in JOINT_NAMES if name not in active.data.bones]
         if not missing:
             return active
-        if len(missing) < len(JOINT_NAMES) or human_of(active, context.scene) is not None:
+        if len(missing) < len(JOINT_NAMES) or human_of(active) is not None:
             raise ValueError(f"the armature {active.name!r} has no bone {missing[0]!r}: rename it back, or undo")
-    return armature_of(selected_person(context))
+    return selected_person(context)
 
 
 def may_have_joints(context: bpy.types.Context) -> bool:
@@ -109,7 +109,7 @@ class OnArmature(Reporting):
 
     person: bpy.props.StringProperty(
         name="Human",
-        description="Name of the human's collection; empty: the active armature or the selected human",
+        description="Name of the human; empty: the active armature or the selected human",
         options={"SKIP_SAVE"},
     )
 
@@ -121,7 +121,7 @@ class OnArmature(Reporting):
         return found
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        separate()
+        complete()
         return self.on(context, target_armature(context, self.person))
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:

@@ -8,12 +8,12 @@ import bpy
 import numpy as np
 
 from ..capture.cameras import add_picture_camera, picture_of
-from ..jobs.copies import separate
 from ..jobs.follow import Reporting, submit
 from ..jobs.from_picture import FitPictureJob, PictureJob, PictureTask
+from ..jobs.parts import complete
 from ..jobs.target import HumanTarget, named_person
 from ..scene.blend_values import setting_path
-from ..scene.human import armature_of, human_of
+from ..scene.human import human_of
 from .declared import SKIP
 from .drawing import BackendPanel, draw_job, property_columns
 
@@ -65,7 +65,7 @@ class PRIMDIFFUSION_OT_choose_picture(Reporting, bpy.types.Operator):
         if not path:
             raise ValueError("choose a picture first")
         person = _posed(context)
-        place = np.zeros(3) if person is None else np.array(armature_of(person).matrix_world.translation)
+        place = np.zeros(3) if person is None else np.array(person.matrix_world.translation)
         add_picture_camera(context, Path(path), place)
         if context.region_data is not None:
             context.region_data.view_perspective = "CAMERA"
@@ -85,7 +85,7 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
     )
     human: bpy.props.StringProperty(
         name="Human",
-        description="Name of the collection of the human posed over the picture; empty: the selected one, if any",
+        description="Name of the human posed over the picture; empty: the selected one, if any",
         options=SKIP,
     )
     mask: bpy.props.StringProperty(name="Mask", description="Empty: the panel's", subtype="FILE_PATH", options=SKIP)
@@ -98,7 +98,7 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
         return cls.__doc__ or ""
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        separate()
+        complete()
         asked = context.scene.primdiffusion_picture
         mask = bpy.path.abspath(self.mask) or setting_path(asked.mask, "Mask")
         person = named_person(context, self.human) if self.human else _posed(context)
@@ -112,10 +112,10 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
         return submit(self, context, PictureJob(task, seed, 0 if person is None else person.session_uid))
 
 
-def _posed(context: bpy.types.Context) -> bpy.types.Collection | None:
+def _posed(context: bpy.types.Context) -> bpy.types.Object | None:
     """The human of the active object, if that is selected."""
     active = context.view_layer.objects.active
-    return human_of(active, context.scene) if active is not None and active.select_get() else None
+    return human_of(active) if active is not None and active.select_get() else None
 
 
 class PRIMDIFFUSION_PT_human_from_picture(BackendPanel, bpy.types.Panel):

@@ -142,7 +142,7 @@ class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
 
     def act(self, context: bpy.types.Context) -> set[str]:
         scene = context.scene
-        person = human_of(context.view_layer.objects.active, scene)
+        person = human_of(context.view_layer.objects.active)
         extent = humans_extent(scene) if person is None else posed_extent(person)
         camera = new_camera(scene)
         camera.name = camera.data.name = "Human Camera"

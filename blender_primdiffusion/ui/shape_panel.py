@@ -1,4 +1,4 @@
-"""The panel Shape of the selected human; its name, shape and loop are properties of the armature, applied at once."""
+"""The panel Shape of the selected human; its shape and loop are properties of the armature, applied at once."""
 
 from __future__ import annotations
 
@@ -13,9 +13,8 @@ from ..backend.requests import sentence
 from ..formats.regular_files import printable
 from ..jobs.target import selected_person
 from ..scene.actions import action_curves, end_repeat, loops, repeat
-from ..scene.copies import rename_human
 from ..scene.edit import check_shapeable, reshape
-from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, armature_of, humans
+from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human
 from ..scene.rest_human import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP
@@ -35,29 +34,17 @@ _SETTINGS = {"GIVEN": ("betas", "height", "weight"), "RANDOM": ("seed", "spread"
 """Properties of the operator that matter, by shape."""
 
 
-def person_of(armature: bpy.types.Object) -> bpy.types.Collection:
-    """The human whose armature this is. Raises ValueError for another object."""
-    for collection in armature.users_collection:
-        if MARK in collection:
-            return collection
-    raise ValueError(f"the object {armature.name!r} is not the armature of a human: select one")
+def person_of(armature: bpy.types.Object) -> bpy.types.Object:
+    """The human whose properties these are. Raises ValueError for another object."""
+    if not is_human(armature):
+        raise ValueError(f"the object {armature.name!r} is not a human: select one")
+    return armature
 
 
 def measures_of(armature: bpy.types.Object) -> BodyMeasures:
     """Height and weight as set by the sliders. Raises ValueError or FileNotFoundError where they are unknown."""
     person = person_of(armature)
     return measure(shape_model_of(person), betas_of(person))
-
-
-def _name(self: PRIMDIFFUSION_PG_human) -> str:
-    try:
-        return person_of(self.id_data).name
-    except ValueError:
-        return ""
-
-
-def _rename(self: PRIMDIFFUSION_PG_human, name: str) -> None:
-    _printed(lambda: rename_human(person_of(self.id_data), name))
 
 
 def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
@@ -94,7 +81,7 @@ def _set_weight(self: PRIMDIFFUSION_PG_human, weight: float) -> None:
     _printed(lambda: set_measures(person_of(self.id_data), measures_of(self.id_data).height, weight))
 
 
-def set_measures(person: bpy.types.Collection, height: float | None = None, weight: float | None = None) -> str:
+def set_measures(person: bpy.types.Object, height: float | None = None, weight: float | None = None) -> str:
     """Reshape a human as little as possible to `height` metres and `weight` kilograms.
 
     Raises ValueError where no body has these, and as `reshape`.
@@ -124,9 +111,6 @@ def _loop(self: PRIMDIFFUSION_PG_human, looped: bool) -> None:
 class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     """`armature.primdiffusion_human`."""
 
-    person: bpy.props.StringProperty(
-        name="Name", description="Name of the human's collection and its objects", get=_name, set=_rename
-    )
     betas: bpy.props.FloatVectorProperty(
         name="Shape",
         description="Difference from the mean body, in standard deviations",
@@ -220,13 +204,13 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         for name in ("to", *_SETTINGS[self.to]):
             layout.prop(self, name)
 
-    def run(self, context: bpy.types.Context, person: bpy.types.Collection) -> set[str]:
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         warning = reshape(person, self._betas(context, person))
         if warning:
             self.report({"WARNING"}, warning)
         return {"FINISHED"}
 
-    def _betas(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
+    def _betas(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
         """The new shape [10]. Raises ValueError."""
         if self.to == "GENERATED":
             return generated_betas(person)
@@ -239,7 +223,7 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         height, weight = (getattr(self, name) if self.given(name) else None for name in ("height", "weight"))
         return betas_of_measures(shape_model_of(person), betas, height, weight)
 
-    def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Collection) -> NDArray:
+    def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
         other = other_human(context, person, self.other)
         if len(shape_model_of(other).template) != len(shape_model_of(person).template):
             raise ValueError(
@@ -262,15 +246,15 @@ class PRIMDIFFUSION_PT_shape(HumanPanel, bpy.types.Panel):
         layout = property_columns(self.layout)
         person = selected_person(context)
         try:
-            armature, names = armature_of(person), slider_names(shape_model_of(person))
+            names = slider_names(shape_model_of(person))
             check_shapeable(person)
         except (OSError, ValueError) as error:
             draw_lines(layout, sentence(error), "INFO")
             return
-        settings = armature.primdiffusion_human
+        settings = person.primdiffusion_human
         layout.prop(settings, "height")
         layout.prop(settings, "weight")
-        shown = in_the_scene(context.scene, armature, settings.height)
+        shown = in_the_scene(context.scene, person, settings.height)
         if shown:
             layout.label(text=f"In the scene: {shown}", icon="BLANK1", translate=False)
         _draw_sliders(layout, settings, {index: name for index, name in enumerate(names) if not name.isdecimal()})
@@ -282,7 +266,7 @@ class PRIMDIFFUSION_PT_shape(HumanPanel, bpy.types.Panel):
             row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
             if context.scene.primdiffusion_edit.other is not None:
                 row.operator("primdiffusion.reshape", text="", icon="PASTEDOWN").to = "OTHER"
-        if _animated(armature):
+        if _animated(person):
             draw_lines(layout, _ANIMATED, "INFO")
         header, body = layout.panel("primdiffusion_more_sliders", default_closed=True)
         header.label(text="More Sliders")

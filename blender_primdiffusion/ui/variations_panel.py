@@ -213,9 +213,9 @@ def _only(wanted: list[Variation], what_to_do: str) -> Variation:
     return wanted[0]
 
 
-def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Collection], str]:
+def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bpy.types.Object], str]:
     """The humans built, and what went wrong with the next one in a sentence; empty for nothing."""
-    built: list[bpy.types.Collection] = []
+    built: list[bpy.types.Object] = []
     context.window_manager.progress_begin(0, len(wanted))
     try:
         for variation in wanted:

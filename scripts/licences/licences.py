@@ -32,7 +32,7 @@ EXCEPTIONS = {
 INTRODUCTION = """\
 # Licences of dependencies
 
-Every package of `requirements.lock`, `requirements52.lock` and the extension's locks in
+Every package of `requirements.lock`, `requirements52.lock`, `requirements53.lock` and the extension's locks in
 `blender_primdiffusion/requirements/`, with the licence that its metadata state. `python scripts/licences` writes this
 page. The extension's zip contains none of these packages: *Set Up Backend* lets pip download those marked in the last
 column. Tests, training and tools use the others. Compiled libraries inside a wheel may have licences of their own,
@@ -101,7 +101,7 @@ def locked() -> dict[str, tuple[set[str], bool]]:
         for name, version in _PIN.findall(lock.read_text(encoding="utf-8")):
             versions[name].add(version)
             backend.add(name)
-    for lock in (ROOT / "requirements.lock", ROOT / "requirements52.lock"):
+    for lock in (ROOT / "requirements.lock", ROOT / "requirements52.lock", ROOT / "requirements53.lock"):
         for name, version in _PIN.findall(lock.read_text(encoding="utf-8")):
             versions[re.sub(r"[-_.]+", "-", name).lower()].add(version)
     return {name: (found, name in backend) for name, found in versions.items()}

@@ -13,7 +13,7 @@ class Target:
     platform: str
     """The extension's name for it: linux_x86_64, linux_arm64, windows_x86_64, macos_arm64."""
     python: str
-    """3.11 (Blender 4.5, 5.0), 3.13 (5.1 and newer) or 3.14 (used by some Linux distributions)."""
+    """3.11 (Blender 5.0), 3.13 (5.1 and newer) or 3.14 (used by some Linux distributions)."""
     compute: str
     """cpu, cuda, apple."""
     uv_platform: str

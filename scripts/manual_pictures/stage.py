@@ -32,23 +32,18 @@ def empty_file(blend: Path) -> bpy.types.Scene:
     return scene
 
 
-def generate(seed: int, position: tuple[float, float] = (0.0, 0.0), attributes: str = "") -> bpy.types.Collection:
+def generate(seed: int, position: tuple[float, float] = (0.0, 0.0), attributes: str = "") -> bpy.types.Object:
     """Generate a person at x, y, and select them."""
-    before = set(bpy.data.collections)
+    before = set(bpy.data.objects)
     bpy.ops.primdiffusion.generate(seed=seed, steps=30, attributes=attributes)
-    person = next(c for c in set(bpy.data.collections) - before if "primdiffusion_human" in c)
-    armature = armature_of(person)
-    armature.location.xy = position
-    bpy.context.view_layer.objects.active = armature
+    person = next(obj for obj in set(bpy.data.objects) - before if "primdiffusion_human" in obj)
+    person.location.xy = position
+    bpy.context.view_layer.objects.active = person
     return person
 
 
-def armature_of(person: bpy.types.Collection) -> bpy.types.Object:
-    return next(obj for obj in person.objects if obj.type == "ARMATURE")
-
-
-def pose(person: bpy.types.Collection, name: str) -> None:
-    bpy.context.view_layer.objects.active = armature_of(person)
+def pose(person: bpy.types.Object, name: str) -> None:
+    bpy.context.view_layer.objects.active = person
     bpy.ops.primdiffusion.apply_pose(pose_name=name)
 
 

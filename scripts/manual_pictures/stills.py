@@ -9,7 +9,7 @@ import bpy
 from PIL import Image
 
 from .shrink import save_jpeg
-from .stage import armature_of, empty_file, generate, look, pose, render, tiled_floor
+from .stage import empty_file, generate, look, pose, render, tiled_floor
 
 SIZE = (360, 480)
 _STAND, _AT, _LENS = (1.1, -5.2, 1.25), (0.0, 0.0, 0.88), 78.0
@@ -83,7 +83,7 @@ def _stage(folder: Path, seed: int, name: str) -> bpy.types.Scene:
     pose(person, name)
     tiled_floor(scene, _TILE)
     look(scene, _STAND, _AT, _LENS)
-    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.context.view_layer.objects.active = person
     return scene
 
 

@@ -12,7 +12,7 @@ from blender_primdiffusion.motion.built_in_motions import CYCLE_SECONDS, STRIDE
 from blender_primdiffusion.motion.pose_library import rest_joints
 
 from .shrink import save_gif
-from .stage import armature_of, empty_file, generate, look, render, tiled_floor
+from .stage import empty_file, generate, look, render, tiled_floor
 
 SEEDS = (17, 35, 26)
 FRAMES = 32
@@ -33,7 +33,7 @@ def walk(scratch: Path, out: Path) -> None:
     middle, floors = (len(SEEDS) - 1) / 2, []
     for number, seed in enumerate(SEEDS):
         person = generate(seed, ((number - middle) * _APART, abs(number - middle) * 0.35))
-        armature = armature_of(person)
+        armature = person
         floors.append(_floor(scene, number - middle, STRIDE * leg_ratio(rest_joints(armature))))
         bpy.context.view_layer.objects.active = armature
         bpy.ops.primdiffusion.add_motion(

@@ -24,12 +24,11 @@ from start import (
     begin,
     cancel_all,
     clear_of_the_sidebar,
-    people_file,
     queue_of,
     select,
     with_people,
 )
-from view_scenes import denoising_in_view, dragging, redraw, rendered, rendered_view, shadings, stalls
+from view_scenes import dragging, redraw, rendered, rendered_view, shadings, stalls
 from visible_scene import at_rest, visible_humans
 
 
@@ -162,7 +161,7 @@ def edits(module: str, python: str) -> Steps:
     select(first)
     clear_of_the_sidebar()
     settings = bpy.context.scene.primdiffusion_edit
-    settings.other = next(c for c in second.users_collection if "primdiffusion_human" in c)
+    settings.other = second
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit")
     settings.kind = "TRANSFER"
     yield 0.5
@@ -294,21 +293,6 @@ def cancelled(module: str, python: str) -> Steps:
     yield "cancelled"
 
 
-def missing(module: str, python: str) -> Steps:
-    """The person's files are missing."""
-    yield from with_people(module, python, FIRST_SEED)
-    folder = people_file(module).with_name(people_file(module).stem + "_humans")
-    away = folder.with_name("elsewhere")
-    folder.rename(away)
-    try:
-        bpy.ops.wm.open_mainfile(filepath=str(people_file(module)), load_ui=False)
-        yield 2.0
-        yield from show("PRIMDIFFUSION_PT_human")
-        yield "missing_files"
-    finally:
-        away.rename(folder)
-
-
 def paint(armature: bpy.types.Object) -> None:
     """Set the weights of the chest, because brush strokes need a mouse."""
     body = bpy.context.view_layer.objects.active
@@ -349,12 +333,10 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "shadings": shadings,
     "dragging": dragging,
     "rendered": rendered,
-    "denoising_in_view": denoising_in_view,
     "captures": captures,
     "from_picture": from_picture,
     "export": export,
     "cancelled": cancelled,
-    "missing": missing,
     "five_humans": five_humans,
     "other_files": other_files,
     "copies": copies,

@@ -17,7 +17,6 @@ _OURS = (
     ("jobs.follow", "Building", "advance"),
     ("jobs.follow", "", "enter"),
     ("jobs.deferred_volumes", "DeferredVolumes", "work"),
-    ("jobs.picture_in_view", "PictureInView", "draw"),
     ("engine.gpu.overlay", "Overlay", "advance"),
     ("engine.gpu.overlay", "Overlay", "draw"),
 )

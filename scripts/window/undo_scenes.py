@@ -87,9 +87,8 @@ class Round:
 
     def _import(self) -> None:
         """Ask for a human, which changes nothing yet."""
-        human = import_module(f"{self.module}.scene.human")
-        person = human.humans(bpy.context.scene)[0]
-        press("primdiffusion.import_human", "EXEC_DEFAULT", filepath=str(human.person_file(person)))
+        file = import_module(f"{self.module}.scene.payload").session_file(armatures()[0])
+        press("primdiffusion.import_human", "EXEC_DEFAULT", filepath=str(file))
         self.asked = self.steps
 
 

@@ -128,36 +128,6 @@ def rendered(module: str, python: str) -> Steps:
     yield "rendered_by_child"
 
 
-def denoising_in_view(module: str, python: str) -> Steps:
-    """A human's picture among solids while it is generated: level, from above, beside a human; gone after a cancel."""
-    yield from with_people(module, python, FIRST_SEED)
-    bpy.ops.mesh.primitive_cube_add(size=0.4, location=(1.9, -0.5, 0.3))
-    bpy.ops.mesh.primitive_plane_add(size=8)
-    wide_view()
-    space, queue = view()[1].spaces.active, queue_of(module)
-    space.shading.type, around = "SOLID", space.region_3d
-    picture = import_module(f"{module}.jobs.picture_in_view").picture_in_view
-    around.view_location, around.view_distance = (1.0, 0.0, 0.9), 7.0
-    yield 15.0
-    press("primdiffusion.generate", seed=SECOND_SEED, steps=200)
-    yield from wait(lambda: picture.shown or not queue.busy, 120)
-    measured = Stalls()
-    yield "denoising_in_view"
-    for turn, axis in ((0.6, (0, 0, 1)), (0.6, (0, 0, 1)), (0.7, (1, 0, 0))):
-        around.view_rotation = Quaternion(axis, turn) @ around.view_rotation
-        yield 2.0
-    yield "denoising_in_view_turned"
-    print(f"pictures in the view: {measured.end()}", flush=True)
-    if not picture.shown:
-        raise RuntimeError("no picture was shown until the end of the turn")
-    press("primdiffusion.cancel")
-    yield from wait(lambda: not queue.busy, 10)
-    yield 1.0
-    if picture.shown:
-        raise RuntimeError("the picture stays after a cancel")
-    yield "denoising_in_view_cancelled"
-
-
 def stalls(module: str, python: str) -> Steps:
     """Measures how long the window is blocked by adding two people, varying one, and dragging a slider."""
     yield from begin(module, python)

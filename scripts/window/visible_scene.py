@@ -60,7 +60,7 @@ def visible_share(module: str, name: str, armature: bpy.types.Object) -> Steps:
     were = {setting: getattr(space, setting) for setting in alone}
     set_all(space, alone)
     space.overlay.show_overlays = False
-    humans = [layer for layer in layers() if "primdiffusion_human" in layer.collection]
+    humans = [layer for layer in layers() if any("primdiffusion_human" in obj for obj in layer.collection.objects)]
     without = [layer for layer in humans if armature.name not in layer.collection.objects]
     for layer in without:
         layer.exclude = True

@@ -111,7 +111,7 @@ def stored(human, tmp_path_factory) -> dict[str, torch.Tensor]:
         ("betas", lambda values: values.to(torch.int64), "betas is torch.int64"),
         ("density", lambda values: values / 0, "'density' holds NaN"),
         ("betas", lambda values: torch.full((10,), 6.0), "largest beta is 6"),
-        ("rgb", lambda values: values.to(torch.float8_e4m3fn), "'rgb' is F8_E4M3"),
+        ("rgb", lambda values: values.to(torch.float8_e4m3fn), "'rgb' is torch.float8_e4m3fn"),
     ],
     ids=["missing", "wrong shape", "whole numbers", "NaN", "giant", "8 bits"],
 )

@@ -1,8 +1,6 @@
 """Safetensors files whose bytes depend on their content alone."""
 
-import json
 import os
-import pathlib
 import subprocess
 import sys
 
@@ -10,8 +8,7 @@ import pytest
 import safetensors.torch
 import torch
 from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.tensor_layout import LARGEST_HEADER
-from primdiffusion.tensor_file import LARGEST_FILE, ParameterLimit, load_network, opened, read, read_metadata, save
+from primdiffusion.tensor_file import LARGEST_FILE, ParameterLimit, load_network, read, save
 from safetensors import safe_open
 from support.errors import refused
 from torch import nn
@@ -51,34 +48,12 @@ def test_a_view_is_refused():
         save({"x": torch.ones(3, 4).T})
 
 
-def with_header(path, header):
-    text = header if isinstance(header, bytes) else json.dumps(header).encode()
-    path.write_bytes(len(text).to_bytes(8, "little") + text + bytes(64))
-    return path
-
-
 def test_what_was_saved_is_read(tmp_path):
     path = tmp_path / "a.safetensors"
     path.write_bytes(save(TENSORS, METADATA))
     tensors, metadata = read(path)
-    assert metadata == read_metadata(path) == METADATA
+    assert metadata == METADATA
     assert all(torch.equal(tensors[name], value) for name, value in TENSORS.items())
-
-
-@pytest.mark.parametrize(
-    "header",
-    [
-        {"a": {"dtype": "F8_E4M3", "shape": [4], "data_offsets": [0, 4]}},
-        {"a": {"dtype": "C64", "shape": [1], "data_offsets": [0, 8]}},
-        {"a": {"dtype": "F32", "shape": [1] * 200, "data_offsets": [0, 4]}},
-        {"a": {"dtype": "F32", "shape": [2**62, 2**62], "data_offsets": [0, 4]}},
-        {"a": {"dtype": "F32", "shape": [1], "data_offsets": [0, 2**63]}},
-        {"a": None}, [], b"{", b"[" * 9000, b" " * (LARGEST_HEADER + 1),
-    ],
-)  # fmt: skip
-def test_a_hostile_header_is_one_short_reason(tmp_path, header):
-    with pytest.raises(ValueError, match=r"^.{1,200}$"):
-        opened(with_header(tmp_path / "a.safetensors", header))
 
 
 def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
@@ -91,35 +66,22 @@ def test_only_regular_files_of_a_limited_size_are_opened(tmp_path):
     os.mkfifo(path)
     with pytest.raises(PermissionError):
         read(path)
-    if os.path.exists("/proc/self/pagemap"):
-        with refused(ValueError, "shorter than"):
-            read(pathlib.Path("/proc/self/pagemap"))
 
 
-@pytest.mark.parametrize("how", ["overwritten", "cut short", "replaced"])
-def test_what_is_overwritten_later_is_not_read(tmp_path, how):
+def test_a_file_that_was_read_may_be_overwritten(tmp_path):
     path = tmp_path / "a.safetensors"
     path.write_bytes(save({"a": torch.arange(100_000.0)}))
-    size, file = path.stat().st_size, opened(path)
-    if how == "cut short":
-        os.truncate(path, 10)
-    elif how == "overwritten":
-        with path.open("r+b") as again:
-            again.write(bytes([255]) * size)
-    else:
-        path.unlink()
-        path.write_bytes(bytes(size))
-    assert torch.equal(file.finite_tensors()["a"], torch.arange(100_000.0))
+    tensors, _ = read(path)
+    path.write_bytes(b"another one")
+    assert torch.equal(tensors["a"], torch.arange(100_000.0))
 
 
-def test_a_file_above_the_size_of_copies_is_mapped(tmp_path, monkeypatch):
-    monkeypatch.setattr("primdiffusion.formats.regular_files.COPIED_BYTES", 100)
+@pytest.mark.parametrize("number", [float("nan"), float("inf"), 1e30])
+def test_numbers_that_nothing_can_compute_with_are_named(tmp_path, number):
     path = tmp_path / "a.safetensors"
-    path.write_bytes(save({"a": torch.arange(1000.0)}))
-    file = opened(path)
-    file.tensor("a")[:] = 0
-    assert not file.tensor("a").any()
-    assert torch.equal(read(path)[0]["a"], torch.arange(1000.0))
+    path.write_bytes(save({"fine": torch.ones(2), "faulty": torch.tensor([0, number])}))
+    with refused(ValueError, "'faulty'"):
+        read(path)
 
 
 def test_a_network_gets_the_weights_of_a_file():

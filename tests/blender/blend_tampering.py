@@ -25,37 +25,21 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
 
-from blender_primdiffusion.jobs import missing_files
 from blender_primdiffusion.places import EXTENSION
-from blender_primdiffusion.scene import attachment, earlier_files, merged, proxy, stand_in, surface
+from blender_primdiffusion.scene import attachment, merged, proxy, splats, stand_in, surface
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import replace_person
-from blender_primdiffusion.scene.human import (
-    BETAS,
-    BODY_MARK,
-    HOME,
-    MARK,
-    ORIGIN,
-    armature_of,
-    body_of,
-    state_folder,
-    volume_path,
-)
-from blender_primdiffusion.scene.pending import write_all_pending
-from blender_primdiffusion.scene.states import prepare_now
+from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, is_human, link_part, parts_of
+from blender_primdiffusion.scene.payload import BODY, PAYLOAD
+from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 from blender_primdiffusion.ui.drawing import DATA
 from blender_primdiffusion.ui.on_person import FACTS
 
 COUNT = 3
 """Volumes of the human."""
 SECRET = b"a user's file"
-HASH = "0123456789ab"
-LINK = {
-    earlier_files._PERSON: f"person_{HASH}.human.safetensors",
-    earlier_files._BODY: f"body_{HASH}.npz",
-    "volume.filepath": f"prim_0000_{HASH}.vdb",
-}
-"""Names that these may have, of links to a user's file and to a device; all are of the earlier layout."""
+LINK, DEVICE = "prim_0000.vdb", "prim_0001.vdb"
+"""Names, among the stranger's files, of links to a user's file and to a device."""
 LONGEST_SENTENCE = 400
 _LONGEST_LABEL, _LONGEST_PATH = 1000, 1024
 
@@ -64,7 +48,7 @@ class Stage:
     """The folders of one attempt.
 
     `home/.bashrc` is the user's; `home/me/project/shot.blend` is the stranger's file, saved by the user;
-    `downloads/zip/blender_0/primdiffusion_humans/Anna/0001` has the files of its human, which saving copies.
+    `downloads/zip` has files that its volumes name.
     """
 
     def __init__(self, root: Path):
@@ -72,10 +56,10 @@ class Stage:
         self.users = root / "home" / ".bashrc"
         self.project = root / "home" / "me" / "project"
         self.blend = self.project / "shot.blend"
-        self.humans = self.project / "shot_humans"
+        self.volumes = self.project / "shot_volumes"
         self.source = root.with_name("source")
         """Files of the human as the backend would write them."""
-        self.shipped = root / "downloads" / "zip" / "blender_0" / "primdiffusion_humans" / "Anna" / "0001"
+        self.shipped = root / "downloads" / "zip"
 
     def before(self) -> dict[Path, bytes]:
         """All files with their content; links with where they lead."""
@@ -87,7 +71,7 @@ class Stage:
         and are gone or different, and copies of the user's file."""
         after, found = self.before(), []
         for path in sorted({*before, *after}):
-            inside = path.is_relative_to(self.humans)
+            inside = path.is_relative_to(self.volumes)
             allowed = path.name.startswith("shot.blend") or (inside and path not in before)
             if not allowed and before.get(path) != after.get(path):
                 found.append(f"{path.relative_to(self.root)} changed")
@@ -99,7 +83,7 @@ class Stage:
 def build(stage: Stage) -> None:
     """Make the stage's folders: a human with all that can be stored with one, whose files are the stranger's."""
     stage.project.mkdir(parents=True)
-    stage.shipped.parent.mkdir(parents=True)
+    stage.shipped.mkdir(parents=True)
     stage.users.write_bytes(SECRET)
     (stage.root / "downloads" / ".bashrc").write_bytes(b"the stranger's")
     first = stage.source
@@ -110,50 +94,52 @@ def build(stage: Stage) -> None:
     bpy.ops.wm.save_as_mainfile(filepath=str(stage.blend))
     person = build_human(bpy.context, first / "person.human.safetensors", "Anna")
     attachment.set_attachment(person, "SURFACE")
-    armature = armature_of(person)
+    armature = person
     bpy.context.view_layer.objects.active = armature
     armature.animation_data_create().action = bpy.data.actions.new("Walk")
     mesh = bpy.data.objects.new("Anna_proxy", body_of(person).data.copy())
     mesh[proxy.PROXY_MARK] = json.dumps({"file": "person.human.safetensors", "betas": [0.0] * 10})
-    person.objects.link(mesh)
+    mesh.parent = person
+    link_part(person, mesh)
     whole = bpy.data.objects.new("Anna_merged", bpy.data.volumes.new("Anna_merged"))
     whole[merged.MARK] = json.dumps({"poses": ["0"], "voxel": 0.01, "start": 0})
-    whole.data.filepath = str(stage.shipped / f"merged_{HASH}.vdb")
-    person.objects.link(whole)
-    shutil.move(state_folder(person), stage.shipped)
-    (stage.shipped / f"merged_{HASH}.vdb").write_bytes(b"merged")
-    for name in LINK.values():
-        (stage.shipped / name).symlink_to(os.path.relpath(stage.users, stage.shipped))
-        (stage.shipped / name.replace(HASH, "f" * 12)).symlink_to("/dev/zero")
+    whole.data.filepath = str(stage.shipped / "merged_0123456789ab.vdb")
+    whole.parent = person
+    link_part(person, whole)
+    cloud = bpy.data.objects.new("Anna_splats", bpy.data.pointclouds.new("Anna_splats"))
+    cells = bpy.data.objects.new("Anna_cells", body_of(person).data.copy())
+    cloud[splats.SPLATS_MARK] = cells[splats.CELLS_MARK] = True
+    for part in (cloud, cells):
+        part.parent = person
+        link_part(person, part)
+    (stage.shipped / "merged_0123456789ab.vdb").write_bytes(b"merged")
+    (stage.shipped / LINK).symlink_to(os.path.relpath(stage.users, stage.shipped))
+    (stage.shipped / DEVICE).symlink_to("/dev/zero")
     for volume in bpy.data.volumes:  # relative, so that copies of the stage hold together
-        volume.filepath = bpy.path.relpath(str(stage.shipped / volume_path(volume).name))
-    bpy.app.handlers.save_pre.remove(missing_files.collect_before_saving)  # the stranger has no extension
-    try:
-        bpy.ops.wm.save_mainfile()
-    finally:
-        bpy.app.handlers.save_pre.append(missing_files.collect_before_saving)
+        volume.filepath = bpy.path.relpath(str(stage.shipped / Path(volume.filepath).name))
+    bpy.ops.wm.save_mainfile()
     shutil.copy(stage.blend, stage.blend.with_name("other.blend"))
-    shutil.rmtree(stage.humans)
 
 
-def person() -> bpy.types.Collection:
-    return next(collection for collection in bpy.data.collections if MARK in collection)
+def person() -> bpy.types.Object:
+    return next(filter(is_human, bpy.data.objects))
 
 
 def _with(mark: str) -> Callable[[], bpy.types.Object]:
-    return lambda: next(obj for obj in person().all_objects if mark in obj)
+    return lambda: next(obj for obj in parts_of(person()) if mark in obj)
 
 
 HOLDERS: dict[str, Callable[[], Any]] = {
-    **dict.fromkeys((MARK, HOME, attachment.ATTACHMENT, attachment._BEFORE), person),
+    **dict.fromkeys((MARK, attachment.ATTACHMENT, attachment._BEFORE), person),
     attachment.IN_VIEWPORT: person,
-    **dict.fromkeys((earlier_files._PERSON, earlier_files._BODY), person),
-    BETAS: lambda: armature_of(person()),
-    ORIGIN: lambda: armature_of(person()).data,
+    **dict.fromkeys((BETAS, PAYLOAD, BODY), person),
+    ORIGIN: lambda: person().data,
     BODY_MARK: lambda: body_of(person()),
     proxy.PROXY_MARK: _with(proxy.PROXY_MARK),
     merged.MARK: _with(merged.MARK),
     surface.MARK: _with(surface.MARK),
+    splats.SPLATS_MARK: _with(splats.SPLATS_MARK),
+    splats.CELLS_MARK: _with(splats.CELLS_MARK),
     stand_in.STAND_IN: _with(stand_in.STAND_IN),
     FACTS: lambda: bpy.data.actions["Walk"],
 }
@@ -225,13 +211,13 @@ PROPERTIES: dict[str, Callable[[object], None]] = {
     "volume.filepath": _set_volume,
     "merged.filepath": _set_merged,
     "library.filepath": _set_library,
-    "collection.name": _set_name,
+    "armature.name": _set_name,
     **{f"{group}.{name}": _set_setting(group, name) for group, names in SETTINGS.items() for name in names},
     **{f"{group}.{name}": _set_setting(group, name) for group, names in TEXTS.items() for name in names},
     **{f"preferences.{name}": _set_preference(name) for name in PREFERENCES},
 }
 """How each is set, as a stranger would."""
-TEXT_ONLY = {"volume.filepath", "merged.filepath", "library.filepath", "collection.name"} | {
+TEXT_ONLY = {"volume.filepath", "merged.filepath", "library.filepath", "armature.name"} | {
     f"preferences.{name}" for name in PREFERENCES
 }
 """Blender itself stores these as text."""
@@ -243,8 +229,6 @@ ODD_RECORD = {
 
 def values(name: str, stage: Stage) -> dict[str, object]:
     """What is stored in a property, by what it is."""
-    link = LINK.get(name, "link")
-    linked = str(stage.shipped / link) if name == "volume.filepath" else link
     texts = {
         "up": "../../../.bashrc",
         "up from the file": "//../../.bashrc",
@@ -256,13 +240,13 @@ def values(name: str, stage: Stage) -> dict[str, object]:
         "server": r"\\host\share\x",
         "two slashes": "//x",
         "address": "https://host/x.vdb",
-        "link": linked,
-        "link to a device": linked.replace(HASH, "f" * 12),
+        "link": str(stage.shipped / LINK),
+        "link to a device": str(stage.shipped / DEVICE),
         "device": "/dev/zero",
         "empty": "",
         "control characters": "a\n\x1b[2Jb",
         "long": "x" * 2**20,
-        "long parts": "/".join(["", "p" * 300, "q" * 300, f"prim_0000_{HASH}.vdb"]),
+        "long parts": "/".join(["", "p" * 300, "q" * 300, "prim_0000.vdb"]),
         "deep": "[" * 100_000,
         "list": "[1, 2]",
         "odd record": json.dumps(ODD_RECORD),
@@ -296,10 +280,9 @@ def _menus() -> list[type]:
 
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
-    ("set_attachment", {"mode": "ARMATURE"}), ("reshape", {"to": "GENERATED"}), ("collect_files", {}),
-    ("find_missing_volumes", {}), ("human_from_captures", {}), ("verify_captures", {}),
+    ("set_attachment", {"mode": "ARMATURE"}), ("reshape", {"to": "GENERATED"}),
+    ("human_from_captures", {}), ("verify_captures", {}),
     ("show_proxy", {"shown": "REMOVED"}), ("merge", {"what": "NOTHING"}),
-    ("remove_unused_files", {}),
 )  # fmt: skip
 """Pressed one after the other; those that need the backend are what `edit_fault` does with its result."""
 
@@ -320,8 +303,8 @@ def operators_fault() -> str:
 def edit_fault(stage: Stage, source: Path) -> str:
     """What goes wrong when an edit's result and a merged volume enter the scene; empty when nothing does."""
     try:
-        replace_person(person(), prepare_now(source / "person.human.safetensors", replaced=person()))
-        merged.publish([source / "grid.vdb"], ["a"], merged.merged_folder(person()))
+        replace_person(person(), source / "person.human.safetensors")
+        merged.publish([source / "grid.vdb"], ["a"], merged.merged_folder())
         write_all_pending()
     except (ValueError, OSError):
         return ""
@@ -334,9 +317,8 @@ def saving_fault() -> str:
     """What goes wrong when the file is saved and looked through; empty when nothing does."""
     with contextlib.redirect_stderr(io.StringIO()) as errors:
         try:
-            missing_files.collect_before_saving(bpy.data.filepath)
             bpy.ops.wm.save_mainfile()
-            missing_files.look()
+            open_humans()
         except Exception as error:
             return f"saving raises {error!r:.300}"
     return f"saving prints {errors.getvalue()[-800:]}" if "Traceback" in errors.getvalue() else ""

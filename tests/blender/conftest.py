@@ -45,7 +45,10 @@ GRIDS_KEPT_MB = 64
 @pytest.fixture
 def empty_scene():
     """A context with an empty, unsaved file."""
+    from blender_primdiffusion.scene.payload import forget_session_files
+
     bpy.ops.wm.read_factory_settings(use_empty=True)
+    forget_session_files()
     bpy.context.preferences.system.memory_cache_limit = GRIDS_KEPT_MB
     return bpy.context
 
@@ -64,6 +67,21 @@ def volumes_shown(monkeypatch):
 
     for module in (attachment, build):
         monkeypatch.setattr(module, "VOLUMES_IN_VIEWPORT", True)
+
+
+@pytest.fixture
+def splats():
+    """New humans are shown by splats, if this Blender has them."""
+
+
+@pytest.fixture(autouse=True)
+def only_volumes(request, monkeypatch):
+    """New humans are shown by volumes on every Blender, unless a test asks for `splats`."""
+    if "splats" not in request.fixturenames:
+        from blender_primdiffusion.scene import attachment, build, parts
+
+        for module in (attachment, build, parts):
+            monkeypatch.setattr(module, "SPLATS_AVAILABLE", False)
 
 
 @pytest.fixture

@@ -5,17 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+from human_files import paths_of
 from jobs_driven import drive
 
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import (
-    humans,
-    humans_folder,
-    volume_path,
-    volumes_of,
-)
+from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.payload import session_folder
 from blender_primdiffusion.scene.pending import pending_of
 
 COUNT = 12
@@ -23,7 +20,7 @@ COUNT = 12
 STATES = ("absent", "half", "written")
 
 
-def generated(seed: int = 7) -> bpy.types.Collection:
+def generated(seed: int = 7) -> bpy.types.Object:
     queue.add(bpy.context, GenerateJob(seed, {"steps": 1}))
     drive()
     return humans(bpy.context.scene)[-1]
@@ -39,15 +36,11 @@ def advance(state_wanted: str) -> None:
             pass
 
 
-def on_disk(root: Path | None = None) -> list[Path]:
-    return sorted((root or humans_folder()).rglob("prim_*.vdb"))
+def on_disk() -> list[Path]:
+    return sorted(session_folder().rglob("prim_*.vdb"))
 
 
-def paths_of(person: bpy.types.Collection) -> list[Path]:
-    return [volume_path(obj.data) for objects in volumes_of(person).values() for obj in objects]
-
-
-def check_complete(person: bpy.types.Collection) -> None:
+def check_complete(person: bpy.types.Object) -> None:
     """Every volume of the human has its file, and nothing is left to write."""
     paths = paths_of(person)
     assert len(paths) == COUNT

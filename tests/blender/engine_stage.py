@@ -14,10 +14,8 @@ from unittest import mock
 import bpy
 import numpy as np
 
-from blender_primdiffusion.scene import states
-from blender_primdiffusion.scene.build import build_prepared
-from blender_primdiffusion.scene.pending import pending_of, write_pending
-from blender_primdiffusion.scene.states import prepare_now
+from blender_primdiffusion.scene import build, volume_objects
+from blender_primdiffusion.scene.rest_human import read_human
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = os.environ.get("PRIMDIFFUSION_PYTHON", sys.executable)
@@ -63,17 +61,13 @@ class Oracle:
         self._process.wait()
 
 
-def add_human(folder: Path) -> bpy.types.Collection:
+def add_human(folder: Path) -> bpy.types.Object:
     """Build the human of `Oracle.make`, with few of its volumes, so that it is quick."""
-    with mock.patch.object(states, "volumes_may_wait", return_value=True):
-        prepared = prepare_now(folder / "person.human.safetensors")
-    whole, few = prepared.human, slice(PRIMITIVES_IN_BLENDER)
+    whole, few = read_human(folder / "person.human.safetensors"), slice(PRIMITIVES_IN_BLENDER)
     fields = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")
     model = dataclasses.replace(whole.model, **{name: getattr(whole.model, name)[few] for name in fields})
-    human = dataclasses.replace(whole, model=model, rest=model.rest(whole.payload.betas))
-    person = build_prepared(bpy.context, dataclasses.replace(prepared, human=human))
-    list(write_pending(pending_of(person)))
-    return person
+    with mock.patch.object(volume_objects, "shape_model_of", return_value=model):
+        return build.build_human(bpy.context, folder / "person.human.safetensors")
 
 
 def set_up_render(
@@ -106,8 +100,6 @@ def cube(name="cube", centre=(0.0, 0.0, 1.0), half=0.2) -> bpy.types.Object:
 def material(colour, name="paint") -> bpy.types.Material:
     """A Principled shader of this linear colour."""
     made = bpy.data.materials.new(name)
-    if bpy.app.version < (5, 0):
-        made.use_nodes = True
     shader = next(node for node in made.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Base Color"].default_value = (*colour, 1)
     return made
@@ -163,8 +155,7 @@ def render_exr(path: Path) -> tuple[np.ndarray, np.ndarray]:
     for layer in scene.view_layers:
         layer.use_pass_z = True
     settings = scene.render.image_settings
-    if bpy.app.version >= (5, 0):
-        settings.media_type = "MULTI_LAYER_IMAGE"
+    settings.media_type = "MULTI_LAYER_IMAGE"
     settings.file_format, settings.color_depth = "OPEN_EXR_MULTILAYER", "32"
     scene.render.filepath = str(path)
     assert bpy.ops.render.render(write_still=True) == {"FINISHED"}

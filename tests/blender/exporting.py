@@ -37,8 +37,8 @@ def write_person(path: Path, betas: np.ndarray | None = None, **metadata: str) -
     tensor_files.write_tensors(path, tensors, {**about, **metadata})
 
 
-def add_person(store: Path, name: str = "Anna") -> bpy.types.Collection:
+def add_person(store: Path, name: str = "Anna") -> bpy.types.Object:
     """Built in the scene, with the backend's file beside the volumes; the armature is active."""
     person = build_human(bpy.context, store / "person.human.safetensors", name)
-    bpy.context.view_layer.objects.active = person.objects[0]
+    bpy.context.view_layer.objects.active = person
     return person

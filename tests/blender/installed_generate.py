@@ -44,9 +44,10 @@ report = {
     "outcome": sorted(outcome),
     "module": module,
     "volumes": len(volumes),
+    "splats": sum(len(o.data.points) for o in bpy.context.scene.objects if o.type == "POINTCLOUD"),
     "loaded": sum(o.data.grids.load() for o in volumes),
     "bones": len(armature.data.bones),
-    "files": len(list(Path(blend).parent.rglob("*.vdb"))),
+    "files": len(list(Path(bpy.app.tempdir).rglob("*.vdb"))),
     "written_into_the_addon": [p.name for p in installed.rglob("*") if p.suffix in (".nbi", ".nbc")]
     + [str(p) for p in (installed / "bundled").rglob("*.pyc") if "formats" not in p.parts],  # which Blender imports
     "backend_in_zip": (installed / "bundled" / "primdiffusion" / "human.py").is_file(),

@@ -33,8 +33,8 @@ def centres() -> np.ndarray:
     """Where the engine draws the boxes of the first human."""
     bpy.context.view_layer.update()
     person = human.humans(bpy.context.scene)[0]
-    armature = human.armature_of(person)
-    return boxes.boxes_of(picture.pose_of(armature, np.array(armature.matrix_world), person)).position
+    armature = person
+    return boxes.boxes_of(picture.pose_of(armature, np.array(armature.matrix_world))).position
 
 
 report = {"module": module}
@@ -42,7 +42,7 @@ started = time.perf_counter()
 report["added"] = sorted(press.add_from_gallery(human="Ada.human"))
 report["seconds"] = time.perf_counter() - started
 person = human.humans(bpy.context.scene)[0]
-armature = human.armature_of(person)
+armature = person
 report["name"], report["bones"] = person.name, len(armature.data.bones)
 rest = centres()
 bone = armature.pose.bones["left_shoulder"]
@@ -59,7 +59,7 @@ report["exported"] = sorted(press.export(filepath=str(file), compact=True))
 report["bytes"] = file.stat().st_size
 report["imported"] = sorted(press.import_human(filepath=str(file)))
 report["humans"] = len(human.humans(bpy.context.scene))
-report["volumes"] = len(list(folder.rglob("*.vdb")))
+report["volumes"] = len(list(Path(bpy.app.tempdir).rglob("*.vdb")))
 try:
     press.generate(seed=7)
 except RuntimeError as error:
@@ -83,8 +83,8 @@ if program is not None:
     bpy.context.preferences.addons[module].preferences.backend_python = str(program)
     report["generated"].append(sorted(press.generate(seed=8, steps=2)))
     made = human.humans(bpy.context.scene)[2:]
-    report["boxes"] = [sum(obj.type == "VOLUME" for obj in one.all_objects) for one in made]
+    report["boxes"] = [sum(obj.type == "VOLUME" for obj in human.parts_of(one)) for one in made]
     report["provenance"] = [json.loads(one[human.MARK])["seed"] for one in made]
-    report["standing"] = [human.armature_of(one).name in bpy.context.view_layer.objects for one in made]
+    report["standing"] = [one.name in bpy.context.view_layer.objects for one in made]
 bpy.ops.preferences.addon_disable(module=module)
 print("REPORT " + json.dumps(report), flush=True)

@@ -6,6 +6,8 @@ import bpy
 import numpy as np
 from synthetic import skinning
 
+from blender_primdiffusion.scene.human import parts_of
+
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Blender from backend, written out by hand: forward +z becomes -y, up +y becomes +z."""
 TOLERANCE_M = 2e-5
@@ -41,8 +43,8 @@ def world_from_model(armature: bpy.types.Object, vertices: np.ndarray) -> np.nda
     return np.array(armature.matrix_world) @ raised(vertices)
 
 
-def evaluated_matrices(collection: bpy.types.Collection) -> np.ndarray:
+def evaluated_matrices(collection: bpy.types.Object) -> np.ndarray:
     """World matrices [K, 4, 4] of a person's volumes, in the order of their names."""
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    volumes = sorted((o for o in collection.all_objects if o.type == "VOLUME"), key=lambda o: o.name)
+    volumes = sorted((o for o in parts_of(collection) if o.type == "VOLUME"), key=lambda o: o.name)
     return np.array([np.array(o.evaluated_get(depsgraph).matrix_world) for o in volumes])

@@ -8,11 +8,13 @@ import bpy
 import numpy as np
 
 from blender_primdiffusion.scene.edit import Replaced, replace_person
-from blender_primdiffusion.scene.states import prepare_now
+from blender_primdiffusion.scene.pending import write_volumes
 
 
 def replace(collection: bpy.types.Collection, person: Path) -> Replaced:
-    return replace_person(collection, prepare_now(person, replaced=collection))
+    done = replace_person(collection, person)
+    write_volumes(collection)
+    return done
 
 
 def render(path: Path) -> np.ndarray:

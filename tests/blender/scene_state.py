@@ -19,5 +19,5 @@ def state() -> tuple:
     selected = sorted(obj.name for obj in bpy.context.view_layer.objects.selected)
     places = {obj.name: [list(row) for row in obj.matrix_basis] for obj in bpy.data.objects}
     paths = {volume.name: volume.filepath for volume in bpy.data.volumes}
-    marks = {c.name: {key: str(c[key]) for key in c.keys()} for c in bpy.data.collections}  # noqa: SIM118
+    marks = {c.name: {key: str(c[key]) for key in c.keys()} for c in bpy.data.objects}  # noqa: SIM118
     return everything(), active and (active.name, active.mode), selected, places, paths, marks

@@ -15,16 +15,18 @@ from unittest.mock import MagicMock
 import bpy
 import pytest
 import synthetic_shape
+from human_files import lose_data
 from jobs_driven import drive
 from scene_state import state
 from shown_words import ways
 
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.generate import GenerateJob
+from blender_primdiffusion.jobs.parts import complete
 from blender_primdiffusion.jobs.queue import Job, queue
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.handles import add_handles
-from blender_primdiffusion.scene.human import armature_of, body_of, humans
+from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.ui.drawing import DATA
 
 ELSEWHERE = {"test_backend", "set_up_backend", "make_pose_assets", "copy_diagnostics"}
@@ -75,11 +77,11 @@ def _enter(obj: bpy.types.Object, mode: str) -> None:
 
 
 def armature_in_edit_mode(person) -> None:
-    _enter(armature_of(person), "EDIT")
+    _enter(person, "EDIT")
 
 
 def armature_in_pose_mode(person) -> None:
-    _enter(armature_of(person), "POSE")
+    _enter(person, "POSE")
 
 
 def body_in_edit_mode(person) -> None:
@@ -91,11 +93,11 @@ def body_being_painted(person) -> None:
 
 
 def armature_deleted(person) -> None:
-    bpy.data.objects.remove(armature_of(person))
+    bpy.data.objects.remove(person)
 
 
 def armature_data_deleted(person) -> None:
-    bpy.data.armatures.remove(armature_of(person).data)
+    bpy.data.armatures.remove(person.data)
 
 
 def volumes_deleted(_person) -> None:
@@ -107,7 +109,7 @@ def body_deleted(person) -> None:
 
 
 def bones_renamed(person) -> None:
-    armature_of(person).data.bones["spine2"].name = "Wirbelsäule"
+    person.data.bones["spine2"].name = "Wirbelsäule"
 
 
 def mark_damaged(person) -> None:
@@ -143,11 +145,11 @@ def excluded(person) -> None:
 
 def hidden(person) -> None:
     bpy.context.view_layer.layer_collection.children[person.name].hide_viewport = True
-    person.hide_viewport = True
+    bpy.data.collections[person.name].hide_viewport = True
 
 
-def files_missing(_person) -> None:
-    shutil.move(Path(bpy.data.filepath).with_name("shot_humans"), Path(bpy.data.filepath).with_name("gone"))
+def data_missing(person) -> None:
+    lose_data(person)
 
 
 def never_saved(person) -> None:
@@ -172,17 +174,17 @@ def two_people(_person) -> None:
 
 def tiny_units(person) -> None:
     bpy.context.scene.unit_settings.scale_length = 0.01
-    armature_of(person).scale = (100, 100, 100)
+    person.scale = (100, 100, 100)
 
 
 def with_ik_handles(person) -> None:
-    add_handles(bpy.context, armature_of(person))
+    add_handles(bpy.context, person)
 
 
 SITUATIONS: list[Callable] = [
     empty, nothing_active, armature_in_edit_mode, armature_in_pose_mode, body_in_edit_mode, body_being_painted,
     armature_deleted, armature_data_deleted, volumes_deleted, body_deleted, bones_renamed, mark_damaged, linked,
-    overridden, instanced, excluded, hidden, files_missing, never_saved, backend_missing, two_people, tiny_units,
+    overridden, instanced, excluded, hidden, data_missing, never_saved, backend_missing, two_people, tiny_units,
     with_ik_handles,
 ]  # fmt: skip
 SOURCE: dict[str, Path] = {}
@@ -196,11 +198,10 @@ def anna(addon, tmp_path, monkeypatch):
     SOURCE.update(file=synthetic_shape.write(tmp_path / "human", 8))
     monkeypatch.setenv("FAKE_HUMAN", str(SOURCE["file"]))
     person = build_human(addon, SOURCE["file"], "Anna")
-    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.context.view_layer.objects.active = person
     bpy.context.scene.frame_end = 2
     bpy.ops.wm.save_mainfile()
     (tmp_path / "for the child").mkdir()
-    shutil.copytree(tmp_path / "shot_humans", tmp_path / "kept_aside")
     yield tmp_path
     shutil.rmtree(tmp_path / "for the child")  # threads wait there for the child's files
 
@@ -253,11 +254,9 @@ def test_every_operator_works_or_reports_what_is_wrong(anna, situation, monkeypa
     again = True
     for name, properties in operators():
         if again:
-            shutil.rmtree(anna / "shot_humans", ignore_errors=True)
-            shutil.rmtree(anna / "gone", ignore_errors=True)
-            shutil.copytree(anna / "kept_aside", anna / "shot_humans")
             bpy.ops.wm.open_mainfile(filepath=str(anna / "shot.blend"))
             situation(humans(bpy.context.scene)[0])
+            complete()  # operators do it first
         before = state()
         wrong = fault(name, properties)
         again = before != state()

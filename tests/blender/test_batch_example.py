@@ -12,7 +12,7 @@ from engine_stage import pixels
 from support.errors import refused
 from support.fake_child import FAILS
 
-from blender_primdiffusion.scene.human import armature_of, humans
+from blender_primdiffusion.scene.human import humans
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "blender_batch.py"
 """A seed that the fake child takes as an order."""
@@ -48,10 +48,10 @@ def test_it_generates_poses_moves_renders_and_saves(addon, tmp_path, example, mo
     bpy.ops.wm.open_mainfile(filepath=str(out / "people.blend"))
     first, second = sorted(humans(bpy.context.scene), key=lambda person: person.name)
     assert (first.name, second.name) == ("Person 7", "Person 8")
-    assert armature_of(first).pose.bones["right_shoulder"].rotation_quaternion.angle > 0.2
-    assert armature_of(first).animation_data is None
-    assert armature_of(second).animation_data.action.frame_range[1] >= 2
-    assert armature_of(second).location.x == pytest.approx(0.6)
+    assert first.pose.bones["right_shoulder"].rotation_quaternion.angle > 0.2
+    assert first.animation_data is None
+    assert second.animation_data.action.frame_range[1] >= 2
+    assert second.location.x == pytest.approx(0.6)
 
 
 def test_a_failure_of_an_operator_ends_it(addon, tmp_path, example):

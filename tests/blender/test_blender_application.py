@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import build_addon
-from blender_primdiffusion.console import DONE, FAILED, NO_BACKEND, UNUSABLE
+from blender_primdiffusion.console import DONE, UNUSABLE
 
 BLENDER = os.environ.get("BLENDER") or shutil.which("blender")
 MODULE = "bl_ext.user_default.primdiffusion"
@@ -73,15 +73,6 @@ def command(installed) -> Run:
     return lambda *words: installed("-c", "primdiffusion", *words, PRIMDIFFUSION_PYTHON=str(engine_stage.PYTHON))
 
 
-@pytest.fixture(scope="module")
-def people(command, tmp_path_factory) -> Path:
-    out = tmp_path_factory.mktemp("Leute in Köln") / "people"
-    done = command("generate", "--count", 2, "--seed", 7, "--steps", 5, "--pictures", 128, "--blend", "--out", out)
-    assert done.returncode == DONE, done.stdout + done.stderr
-    assert "2 done, 0 were there, 0 failed" in done.stdout
-    return out
-
-
 def _complaints(done: subprocess.CompletedProcess) -> list[str]:
     lines = (done.stdout + done.stderr).splitlines()
     return [line for line in lines if "Traceback" in line or "Error" in line or "rror:" in line]
@@ -91,38 +82,6 @@ def test_blender_validates_the_zip_and_rejects_a_spoiled_one(bare, archive, tmp_
     assert bare("--command", "extension", "validate", archive).returncode == 0
     (tmp_path / "spoiled.zip").write_bytes(archive.read_bytes()[:1000])
     assert bare("--command", "extension", "validate", tmp_path / "spoiled.zip").returncode != 0
-
-
-def test_the_command_makes_people_with_pictures_and_a_blend(people):
-    for name in ("person_000007", "person_000008"):
-        there = {path.name for path in (people / name).iterdir()}
-        assert {"person.human.safetensors", "front.png", "person.blend", "person_humans"} <= there
-
-
-def test_the_same_command_continues_with_the_python_that_preferences_name(installed, people):
-    import engine_stage
-
-    preferences = (
-        f"import bpy; bpy.context.preferences.addons[{MODULE!r}].preferences.backend_python = "
-        f"{str(engine_stage.PYTHON)!r}; bpy.ops.wm.save_userpref()"
-    )
-    assert installed("-b", "--python-exit-code", 1, "--python-expr", preferences).returncode == 0
-    words = ["generate", "--count", 3, "--seed", 7, "--steps", 5, "--pictures", 128, "--blend", "--out", people]
-    done = installed("-c", "primdiffusion", *words)
-    assert done.returncode == DONE, done.stdout + done.stderr
-    assert "1 done, 2 were there, 0 failed" in done.stdout
-    forget = f"import bpy; bpy.context.preferences.addons[{MODULE!r}].preferences.backend_python = ''"
-    assert installed("-b", "--python-expr", f"{forget}; bpy.ops.wm.save_userpref()").returncode == 0
-
-
-def test_human_files_and_their_blends_render_alike(command, people, tmp_path):
-    blend = people / "person_000007" / "person.blend"
-    for source, out in ((people / "person_000007", tmp_path / "person"), (blend, tmp_path / "blend")):
-        done = command("render", source, "--out", out, "--size", "128x128")
-        assert done.returncode == DONE, done.stdout + done.stderr
-    pictures = [_pixels(tmp_path / "person" / "person_000007.png"), _pixels(tmp_path / "blend" / "person.png")]
-    assert 0.03 < (pictures[0].sum(-1) > 0.1).mean() < 0.5
-    assert np.abs(pictures[0] - pictures[1]).mean() < 0.004
 
 
 def test_a_rigged_mesh_is_captured(command, tmp_path, empty_scene):
@@ -145,21 +104,11 @@ def test_a_rigged_mesh_is_captured(command, tmp_path, empty_scene):
     assert "nothing can be written to" in done.stderr
 
 
-def test_a_human_that_cannot_be_rendered_is_reported_and_fails_the_command(command, tmp_path):
-    (tmp_path / "anna.human").write_bytes(b"no person at all")
-    done = command("render", tmp_path, "--out", tmp_path / "out")
-    assert done.returncode == FAILED
-    assert json.loads((tmp_path / "out" / "report.json").read_text())["failed"]
-
-
 @pytest.mark.parametrize(
     "words",
     [
         [],
         ["nonsense"],
-        ["generate"],
-        ["generate", "--count", "0", "--out", "x"],
-        ["render", "/nowhere", "--out", "x"],
         ["capture", "--people", "/nowhere", "--out", "x"],
     ],
 )
@@ -170,29 +119,12 @@ def test_wrong_words_end_with_their_exit_code_and_a_sentence(installed, words):
     assert done.stderr.strip()
 
 
-def test_a_folder_that_cannot_be_written_to_ends_with_a_sentence(command, people, tmp_path):
-    (tmp_path / "file").write_text("")
-    for words in (["generate"], ["render", people / "person_000007"]):
-        done = command(*words, "--out", tmp_path / "file" / "folder")
-        assert done.returncode == UNUSABLE
-        assert "nothing can be written to" in done.stderr
-
-
-def test_without_a_backend_no_file_is_left_and_the_error_names_the_remedy(installed, tmp_path):
-    words = ["-c", "primdiffusion", "generate", "--out", tmp_path / "people", "--python", "/nowhere/python"]
-    done = installed(*words)
-    assert done.returncode == NO_BACKEND
-    assert "/nowhere/python" in done.stderr
-    assert "press Set Up Backend" in done.stderr
-    assert not (tmp_path / "people").exists()
-
-
-def test_a_script_runs_the_operators_on_a_file_and_a_failing_one_ends_with_its_exit_code(installed, people, tmp_path):
+def test_a_script_runs_the_operators_and_a_failing_one_ends_with_its_exit_code(installed, tmp_path):
     import engine_stage
 
     python = str(engine_stage.PYTHON)
     script = ROOT / "examples" / "blender_batch.py"
-    words = ["-b", people / "person_000007" / "person.blend", "--python-exit-code", 9, "--python", script, "--"]
+    words = ["-b", "--python-exit-code", 9, "--python", script, "--"]
     words += ["--out", tmp_path, "--steps", 3, "--frames", 1, "--size", 64, 64]
     done = installed(*words, PRIMDIFFUSION_PYTHON=python)
     assert done.returncode == 0, done.stdout + done.stderr

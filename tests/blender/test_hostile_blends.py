@@ -1,14 +1,15 @@
-"""A stranger's .blend: whatever its names and paths are, saving it and pressing buttons changes nothing outside."""
+"""A stranger's .blend: whatever its names, paths and packed files are, opening and saving it and pressing buttons
+changes nothing outside."""
 
 from __future__ import annotations
 
-import shutil
+import os
 from pathlib import Path
 
 import bpy
 import pytest
 from blend_tampering import COUNT, PROPERTIES, SECRET, Stage, build, in_preferences, panels_fault, person, tried
-from blender_primdiffusion.formats.regular_files import FileError
+from human_files import folder_of, paths_of, person_file
 from support.errors import refused
 
 from blender_primdiffusion.backend import environment
@@ -16,18 +17,10 @@ from blender_primdiffusion.backend.environment import BackendNotFound, candidate
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_before_rendering
 from blender_primdiffusion.jobs.queue import chosen_checkpoint, queue
 from blender_primdiffusion.places import EXTENSION, preference
-from blender_primdiffusion.scene import collect, merged
-from blender_primdiffusion.scene.edit import replace_person
-from blender_primdiffusion.scene.human import (
-    armature_of,
-    folder_of,
-    humans_folder,
-    person_file,
-    volume_path,
-    volumes_of,
-)
+from blender_primdiffusion.scene import payload
+from blender_primdiffusion.scene.human import body_of
+from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_folder
 from blender_primdiffusion.scene.pending import pending_of
-from blender_primdiffusion.scene.states import prepare_now
 from blender_primdiffusion.ui.setup import known
 
 
@@ -49,64 +42,6 @@ def test_no_value_of_a_property_leaves_the_folder_or_raises(pristine, tmp_path, 
     assert pristine.users.read_bytes() == SECRET
 
 
-def test_a_strangers_human_is_collected_where_its_names_are_right(pristine):
-    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
-    bpy.ops.wm.save_mainfile()
-    folder = pristine.humans / "Anna" / "0002"  # this Blender has built the stranger's human as 0001
-    primitives = [volume_path(obj.data) for objects in volumes_of(person()).values() for obj in objects]
-    assert {path.parent for path in primitives} == {folder}
-    assert person_file(person()) == folder / "person.human.safetensors"
-    assert (folder / "body.safetensors").is_file()
-
-
-@pytest.mark.parametrize("size", ["same", "other"])
-def test_saving_replaces_no_file_of_another_content(pristine, size):
-    there = pristine.humans / "Anna" / "0001"
-    there.mkdir(parents=True)
-    for path in pristine.shipped.iterdir():
-        if not path.is_symlink():
-            (there / path.name).write_bytes(b"x" * (path.stat().st_size if size == "same" else 3))
-    before = {path: path.read_bytes() for path in pristine.humans.rglob("*") if path.is_file()}
-    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
-    bpy.ops.wm.save_mainfile()
-    assert {path: path.read_bytes() for path in before} == before
-    assert person_file(person()).parent == pristine.humans / "Anna" / "0002"
-    assert person_file(person()).read_bytes() == (pristine.shipped / "person.human.safetensors").read_bytes()
-
-
-def test_an_edit_writes_nothing_through_a_link_in_place_of_the_humans_folder(pristine, tmp_path):
-    (tmp_path / "outside").mkdir()
-    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
-    pristine.humans.mkdir()
-    folder_of(person()).symlink_to(tmp_path / "outside")
-    with refused(FileError):
-        replace_person(person(), prepare_now(pristine.source / "person.human.safetensors", replaced=person()))
-    with refused(FileError):
-        merged.publish([pristine.source / "grid.vdb"], ["a"], merged.merged_folder(person()))
-    assert not list((tmp_path / "outside").iterdir())
-
-
-def elsewhere(stage: Stage, place: str) -> Path:
-    """A .blend whose human is in a folder of the user's, where its volumes are still to be written."""
-    folder = {"temporary": stage.shipped, "named": stage.root / "home" / ".config" / "Anna" / "0001"}[place]
-    bpy.ops.wm.open_mainfile(filepath=str(stage.blend))
-    if folder != stage.shipped:
-        folder.parent.mkdir(parents=True)
-        shutil.move(stage.shipped, folder)
-        for volume in bpy.data.volumes:
-            volume.filepath = str(folder / Path(volume.filepath).name)
-    names = sorted(path.name for path in folder.glob("prim_*.vdb") if not path.is_symlink())
-    for name in names:
-        (folder / name).unlink()
-    saving = bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:]
-    bpy.app.handlers.save_pre.clear()  # the stranger has no extension
-    bpy.app.handlers.save_post.clear()
-    bpy.ops.wm.save_mainfile()
-    bpy.app.handlers.save_pre[:], bpy.app.handlers.save_post[:] = saving
-    assert len(names) == COUNT
-    return folder
-
-
 def by_timer() -> None:
     while deferred_volumes.work(0.0):
         pass
@@ -116,73 +51,96 @@ WRITERS = {
     "timer": by_timer,
     "render": lambda: write_before_rendering(bpy.context.scene),
     "viewport": lambda: bpy.ops.primdiffusion.volumes_in_viewport(),
-    "save": lambda: (bpy.ops.wm.save_mainfile(), by_timer()),
     "undo": lambda: (bpy.ops.ed.undo_push(), bpy.ops.ed.undo_push(), bpy.ops.ed.undo(), by_timer()),
 }
 
 
-@pytest.mark.parametrize("place", ["temporary", "named"])
 @pytest.mark.parametrize("writer", WRITERS)
-def test_no_volume_is_written_in_a_folder_that_a_blend_merely_names(pristine, writer, place):
-    folder = elsewhere(pristine, place)
+def test_no_volume_is_read_or_written_in_a_folder_that_a_blend_names(pristine, writer):
     before = pristine.before()
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
-    bpy.context.view_layer.objects.active = armature_of(person())
+    bpy.context.view_layer.objects.active = person()
     WRITERS[writer]()
-    primitives = [volume_path(obj.data) for objects in volumes_of(person()).values() for obj in objects]
-    own = pristine.humans if writer == "save" else humans_folder("")
-    assert len(primitives) == COUNT
-    assert all(path.is_file() and path.is_relative_to(own) for path in primitives)
-    assert not pristine.changed_outside(before)
-    assert (folder / "person.human.safetensors").is_file(), "the stranger's file stays"
+    assert len(paths_of(person())) == COUNT
+    assert all(path.is_file() and path.is_relative_to(session_folder()) for path in paths_of(person()))
+    assert pristine.before() == before
     assert pending_of(person()) is None
     assert not deferred_volumes.error
 
 
 @pytest.mark.parametrize("link", [False, True])
 def test_no_volume_is_written_beside_a_blend_that_a_human_is_appended_or_linked_from(pristine, link):
-    elsewhere(pristine, "named")
     before = pristine.before()
     bpy.ops.wm.read_homefile(use_empty=True)
     with bpy.data.libraries.load(str(pristine.blend), link=link) as (_, wanted):
         wanted.collections = ["Anna"]
     bpy.context.scene.collection.children.link(bpy.data.collections["Anna"])
     by_timer()
-    paths = [volume_path(obj.data) for objects in volumes_of(person()).values() for obj in objects]
-    assert len(paths) == COUNT
-    assert all(path.is_file() and path.is_relative_to(humans_folder("")) for path in paths)
-    assert person_file(person()).is_file()
+    assert len(paths_of(person())) == COUNT
+    assert all(path.is_file() and path.is_relative_to(session_folder()) for path in paths_of(person()))
     assert pristine.before() == before
 
 
-def test_nothing_is_written_through_a_link_in_place_of_a_folder_of_volumes(pristine, tmp_path):
-    folder = elsewhere(pristine, "named")
-    pristine.humans.mkdir()
-    (pristine.humans / "Anna").symlink_to(folder.parent)
+def another(data: bytes) -> bpy.types.Image:
+    image = bpy.data.images.new("foreign", 1, 1)
+    image.pack(data=data, data_len=len(data))
+    return image
+
+
+def damage(kind: str) -> None:
+    """As a stranger's file has it."""
+    armature = person()
+    whole = armature[PAYLOAD].packed_file.data
+    if kind in ("missing", "old"):
+        del armature[PAYLOAD]
+    elif kind == "text":
+        armature[PAYLOAD] = "/etc/passwd"
+    elif kind == "unpacked":
+        armature[PAYLOAD] = bpy.data.images.new("empty", 1, 1)
+    elif kind == "no body":
+        del armature[BODY]
+    elif kind == "body damaged":
+        armature[BODY] = another(b"no body")
+    else:
+        content = {"cut": whole[:-50], "noise": os.urandom(500), "empty header": b"\0" * 100, "endless": whole[:8] * 99}
+        armature[PAYLOAD] = another(content[kind])
+
+
+DAMAGED = ("missing", "text", "unpacked", "no body", "body damaged", "cut", "noise", "empty header", "endless")
+
+
+@pytest.mark.parametrize("kind", DAMAGED)
+def test_a_damaged_or_foreign_packed_file_shows_the_body_and_is_told_once(pristine, kind, capsys):
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
-    for volume in bpy.data.volumes:
-        volume.filepath = str(pristine.humans / "Anna" / "0001" / Path(volume.filepath).name)
+    damage(kind)
+    bpy.ops.wm.save_mainfile()
     before = pristine.before()
-    by_timer()
-    assert pristine.before() == before
-    assert volume_path(bpy.data.volumes[0]).is_relative_to(humans_folder(""))
-
-
-def test_a_folder_that_cannot_be_copied_is_told_once(pristine, monkeypatch, capsys):
-    elsewhere(pristine, "named")
-    before = pristine.before()
-
-    def full(*_: object, **__: object) -> bool:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(collect, "copy_file", full)
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
+    assert not body_of(person()).hide_viewport
+    assert "the human 'Anna' cannot be drawn" in deferred_volumes.error
+    assert "\n" not in deferred_volumes.error
     by_timer()
-    by_timer()
-    assert "No space left" in deferred_volumes.error
-    assert capsys.readouterr().out.count("No space left") == 1
+    assert not panels_fault()
+    assert capsys.readouterr().out.count("cannot be drawn") == 1
     assert pristine.before() == before
+
+
+def test_a_packed_file_above_the_limit_is_not_read(pristine, monkeypatch):
+    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
+    monkeypatch.setattr(payload, "LARGEST_PERSON", 1000)
+    with refused(ValueError, "holds no data"):
+        person_file(person())
+
+
+def test_a_whole_file_in_place_of_the_damaged_one_is_drawn_again(pristine):
+    bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
+    whole = person_file(person()).read_bytes()
+    person()[PAYLOAD] = another(b"noise")
+    assert person_file(person()).read_bytes() == b"noise"
+    person()[PAYLOAD] = another(whole)
+    assert person_file(person()).read_bytes() == whole
+    assert folder_of(person()).is_relative_to(session_folder())
 
 
 @pytest.fixture

@@ -15,7 +15,6 @@ from exporting import write_person
 from scene_state import state
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of
 
 LONGEST_SENTENCE = 300
 READS = {
@@ -28,10 +27,10 @@ READS = {
 """Operators that read a file, with their `what` unless it is the default: the property with its path, and endings."""
 WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human", ".vdb"))]
 """Operators that write the file of their `filepath`."""
-FOLDERS = {"find_missing_volumes", "human_from_captures", "make_pose_assets", "set_up_backend"}
+FOLDERS = {"human_from_captures", "make_pose_assets", "set_up_backend"}
 """Operators on the folder of their `directory`."""
 SENT = {"human_from_picture": {"mask"}}
-"""Files that the backend alone reads: tests/fuzz/test_not_files.py tries its reader."""
+"""Files that the backend alone reads: tests/contract/test_bad_files.py tries its reader."""
 PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
 
 
@@ -122,7 +121,7 @@ def fault(name: str, folder: Path, **properties: str) -> str:
 def anna(addon, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     person = build_human(addon, synthetic_shape.write(tmp_path / "human", 8), "Anna")
-    bpy.context.view_layer.objects.active = armature_of(person)
+    bpy.context.view_layer.objects.active = person
     bpy.context.scene.frame_end = 2
     bpy.ops.wm.save_mainfile()
     return tmp_path
@@ -163,7 +162,6 @@ def test_a_place_that_cannot_be_written_is_named_in_one_sentence(anna, name, end
 @pytest.mark.parametrize("name", sorted(FOLDERS))
 def test_a_folder_that_is_none_is_named_in_one_sentence(anna, name, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.ui.setup.operators.follow_session", lambda _: {"FINISHED"})
-    (anna / "shot_humans").rename(anna / "gone")
     (anna / "file").write_bytes(b"a user's file")
     places = ["file", "n" * 300, *([] if name == "make_pose_assets" else ["nowhere"])]  # it makes the folder
     faults = [fault(name, anna, directory=str(anna / place)) for place in places]

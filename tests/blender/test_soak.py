@@ -5,15 +5,15 @@ from __future__ import annotations
 import bpy
 import psutil
 import pytest
+from human_files import remove_human
 from jobs_driven import drive
 
 import blender_primdiffusion
 from blender_primdiffusion.jobs import deferred_volumes, follow
 from blender_primdiffusion.jobs.generate import GenerateJob
-from blender_primdiffusion.jobs.picture_in_view import picture_in_view
 from blender_primdiffusion.jobs.pictures import so_far
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import humans, remove_human
+from blender_primdiffusion.scene.human import humans
 
 pytestmark = [pytest.mark.slow, pytest.mark.any_blender, pytest.mark.timeout(1800)]
 HUMANS, WARM_UP = 50, 10
@@ -67,7 +67,7 @@ def test_fifty_humans_in_and_out_leave_nothing_behind(addon, capsys):
     assert data_blocks() == blocks
     assert growth < MOST_MB, f"the process grew by {growth:.2f} MB with each human (at most {MOST_MB} MB)"
     assert handlers() == before
-    assert (so_far.shown, picture_in_view.update(), queue.busy) == (None, False, False)
+    assert (so_far.shown, queue.busy) == (None, False)
     blender_primdiffusion.unregister()
     try:
         assert not [handler for handler in handlers() if "primdiffusion" in handler]

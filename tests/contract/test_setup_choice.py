@@ -88,7 +88,7 @@ def test_the_environment_goes_to_a_short_folder_only_where_windows_needs_it():
 
 
 BLENDERS = ((3, 11), (3, 13))
-"""Pythons of Blender's own builds: 4.5 and 5.0, 5.1 and newer."""
+"""Pythons of Blender's own builds: 5.0, 5.1 and newer."""
 OF_DISTRIBUTIONS = (3, 14)
 
 

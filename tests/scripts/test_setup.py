@@ -27,14 +27,13 @@ def checkout(tmp_path, monkeypatch):
 
     monkeypatch.setattr(setup, "run", run)
     monkeypatch.setattr(setup, "ROOT", tmp_path)
-    for name in ("VENV", "VENV45", "VENV52"):
+    for name in ("VENV", "VENV52", "VENV53"):
         monkeypatch.setattr(setup, name, tmp_path / getattr(setup, name).name)
     sizes = {tmp_path / folder.name: size for folder, size in setup.MEGABYTES.items()}
     monkeypatch.setattr(setup, "MEGABYTES", sizes)
-    monkeypatch.setattr(setup, "packages_of", lambda python: str(Path(python).parent))
     monkeypatch.setattr(setup, "python311", lambda: "python3.11")
     monkeypatch.setattr(setup.subprocess, "run", lambda *_, **__: SimpleNamespace(returncode=0))
-    for name in ("pyproject.toml", "requirements.lock", "requirements52.lock"):
+    for name in ("pyproject.toml", "requirements.lock", "requirements52.lock", "requirements53.lock"):
         (tmp_path / name).touch()
     return SimpleNamespace(folder=tmp_path, commands=commands)
 
@@ -59,11 +58,11 @@ def disks(checkout, monkeypatch):
 def test_what_is_free_and_what_is_needed_is_one_sentence(checkout, disks):
     disks(900)
     with pytest.raises(setup.Stop) as raised:
-        setup.check_room([setup.VENV, setup.VENV45])
-    wanted = f"0.9 GB are free on the disk of {checkout.folder}, and 6.0 GB are needed"
+        setup.check_room([setup.VENV, setup.VENV52])
+    wanted = f"0.9 GB are free on the disk of {checkout.folder}, and 6.5 GB are needed"
     assert wanted in str(raised.value)
-    disks(6100)
-    setup.check_room([setup.VENV, setup.VENV45])
+    disks(6600)
+    setup.check_room([setup.VENV, setup.VENV52])
 
 
 def test_what_is_installed_is_not_asked_for_again(checkout, disks):
@@ -72,7 +71,7 @@ def test_what_is_installed_is_not_asked_for_again(checkout, disks):
     disks(1)
     setup.check_room([setup.VENV])
     with pytest.raises(setup.Stop):
-        setup.check_room([setup.VENV, setup.VENV45])
+        setup.check_room([setup.VENV, setup.VENV52])
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="/proc is another disk")
@@ -90,11 +89,11 @@ def test_all_tests_run_on_three_blenders_in_environments_that_are_made_once(chec
     disks(99_999)
     monkeypatch.setattr(setup, "python313", lambda: "python3.13")
     setup.test([])
-    pythons = [setup.program(folder) for folder in (setup.VENV, setup.VENV45, setup.VENV52)]
+    pythons = [setup.program(folder) for folder in (setup.VENV, setup.VENV52, setup.VENV53)]
     tests = [command[0] for command in checkout.commands if command[1:3] == ["-m", "pytest"]]
     assert tests == pythons
     installed = [command for command in checkout.commands if "install" in command]
-    assert [command[0] for command in installed] == [pythons[0], pythons[0], pythons[0], pythons[2]]
+    assert [command[0] for command in installed] == [pythons[0], pythons[0], *pythons[1:]]
     assert all("requirements.lock" in command for command in installed[:2])
     checkout.commands.clear()
     setup.test([])
@@ -102,16 +101,16 @@ def test_all_tests_run_on_three_blenders_in_environments_that_are_made_once(chec
     os.utime(setup.VENV / "ready", (1, 1))  # the lock is newer
     checkout.commands.clear()
     setup.test([])
-    assert [command[0] for command in checkout.commands if "install" in command] == [pythons[0]] * 3
+    assert [command[0] for command in checkout.commands if "install" in command] == [pythons[0]] * 2
 
 
-@pytest.mark.parametrize("red", [("5.0",), ("4.5",), ("5.0", "5.2"), ()])
+@pytest.mark.parametrize("red", [("5.0",), ("5.2",), ("5.0", "5.3"), ()])
 def test_a_red_version_keeps_no_other_from_running_and_the_last_lines_say_which(
     checkout, disks, monkeypatch, capsys, red
 ):
     disks(99_999)
     monkeypatch.setattr(setup, "python313", lambda: "python3.13")
-    versions = {"5.0": setup.VENV, "4.5": setup.VENV45, "5.2": setup.VENV52}
+    versions = {"5.0": setup.VENV, "5.2": setup.VENV52, "5.3": setup.VENV53}
     failing, list_command = [setup.program(versions[name]) for name in red], setup.run
 
     def run(command, **variables):
@@ -134,25 +133,34 @@ def test_a_version_that_cannot_be_set_up_is_red_with_its_reason_and_one_without_
     checkout, disks, monkeypatch, capsys
 ):
     disks(99_999)
-    monkeypatch.setattr(setup, "python313", lambda: None)
+    monkeypatch.setattr(setup, "python313", lambda: "python3.13")
+    make = setup.ready_313
 
-    def no_room(*_):
-        raise setup.Stop("no room")
+    def no_room(folder, python):
+        if folder == setup.VENV52:
+            raise setup.Stop("no room")
+        make(folder, python)
 
-    monkeypatch.setattr(setup, "ready45", no_room)
+    monkeypatch.setattr(setup, "ready_313", no_room)
     with pytest.raises(SystemExit) as ended:
         setup.test([])
     assert ended.value.code == 1
     last = capsys.readouterr().out.splitlines()[-3:]
-    assert last[:2] == ["Blender 5.0: passed", "Blender 4.5: FAILED: no room"]
-    assert last[2].startswith("Blender 5.2: not tested")
+    assert last == ["Blender 5.0: passed", "Blender 5.2: FAILED: no room", "Blender 5.3: passed"]
+    monkeypatch.setattr(setup, "python313", lambda: None)
+    setup.test([])
+    last = capsys.readouterr().out.splitlines()[-3:]
+    assert [line.partition(",")[0] for line in last[1:]] == ["Blender 5.2: not tested", "Blender 5.3: not tested"]
 
 
-def test_without_a_python_for_it_blender_52_is_left_out_and_named(checkout, disks, monkeypatch, capsys):
+def test_without_a_python_for_them_newer_blenders_are_left_out_and_named(checkout, disks, monkeypatch, capsys):
     disks(99_999)
     monkeypatch.setenv("PYTHON313", "")
-    setup.test_52([])
-    assert "PYTHON313" in capsys.readouterr().out
+    for test_one, version in ((setup.test_52, "5.2"), (setup.test_53, "5.3")):
+        test_one([])
+        said = capsys.readouterr().out
+        assert f"Blender {version} was not tested" in said
+        assert "PYTHON313" in said
     assert checkout.commands == []
 
 

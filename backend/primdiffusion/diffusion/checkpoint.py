@@ -170,11 +170,11 @@ def read_tensors(path: Path, formats: Sequence[str]) -> tuple[dict[str, Tensor],
     """Return tensors in float32, metadata and SHA-256 of a checkpoint or encoder; errors as in `read_checkpoint`."""
     _check_there(path)
     with _damage_named(path):
-        file = tensor_file.opened(path)
+        file = tensor_file.TensorFile(path)
     _check_format(path, file.metadata, formats)
     with _damage_named(path):
         tensors = file.finite_tensors()
-    return {key: value.float() for key, value in tensors.items()}, file.metadata, file.sha256()
+    return {key: value.float() for key, value in tensors.items()}, file.metadata, file_hash(path)
 
 
 def mismatches_named(path: Path) -> contextlib.AbstractContextManager[None]:
@@ -341,7 +341,7 @@ def read_metadata(path: Path, formats: Sequence[str]) -> dict[str, str]:
     """Return the metadata of a checkpoint or encoder; errors as in `read_checkpoint`."""
     _check_there(path)
     with _damage_named(path):
-        metadata = tensor_file.read_metadata(path)
+        metadata = tensor_file.TensorFile(path).metadata
     _check_format(path, metadata, formats)
     return metadata
 

@@ -78,7 +78,7 @@ def mesh_portraits(colourings: Sequence[TexturedMesh]) -> UInt8[Tensor, "n v h w
     """Portraits of meshes in T pose that differ only in their textures, as `portraits` of boxes."""
     views = []
     for portrait in PORTRAITS:
-        seen = rasterise_colourings(colourings, camera_of(portrait), SUPERSAMPLE)
+        (seen,) = rasterise_colourings(colourings, [camera_of(portrait)], SUPERSAMPLE)
         views.append([_encoded(torch.from_numpy(view.rgb), torch.from_numpy(view.alpha)) for view in seen])
     return torch.stack([torch.stack(own) for own in zip(*views, strict=True)])
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion import tensor_file, torch_file
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.formats.regular_files import FileError, as_file_error
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,28 +117,15 @@ def read_weights(path: Path | str) -> dict[str, Tensor]:
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"no weights file at {path}: check the path")
-    try:
-        if path.suffix == ".safetensors":
+    if path.suffix == ".safetensors":
+        with as_file_error(path, "is damaged or not a safetensors file", "download it again"):
             return tensor_file.read(path)[0]
-        content = torch_file.load(path)
-    except FileError:
-        raise
-    except torch_file.PICKLE_ERRORS as e:
-        raise FileError(
-            path,
-            f"is truncated or not a plain weights file ({_reason(e)})",
-            "download it again, or save the network's state_dict()",
-        ) from e
+    content = torch_file.load(path)
     if not isinstance(content, Mapping) or not all(
         isinstance(value, Tensor) and torch_file.is_plain(value) for value in content.values()
     ):
         raise FileError(path, "is not a dictionary of named tensors", "save the network's state_dict()")
     return dict(content)
-
-
-def _reason(error: Exception) -> str:
-    """First sentence of the message; torch's messages continue with advice to unpickle."""
-    return next(iter(str(error).split(". ")[0].splitlines()), type(error).__name__)[:120]
 
 
 def fill(network: nn.Module, weights: Mapping[str, Tensor], what: str, source: str) -> None:

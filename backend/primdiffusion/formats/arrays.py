@@ -1,18 +1,15 @@
-"""Read untrusted .npz and .npy files: no pickles, no arrays larger than their file, no extraction to disk."""
+"""Read untrusted .npz and .npy files by numpy, without pickles and under the sizes that their own headers state."""
 
 from __future__ import annotations
 
-import collections
 import contextlib
-import dataclasses
 import io
 import math
 import struct
-import tokenize
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, BinaryIO
 
@@ -30,38 +27,16 @@ MOST_BODY_VALUES = 32_000_000
 """Numbers that a file of a body, or of a human on one, may hold: SMPL-X's with all components has 28 million."""
 LARGEST_NUMBER = 1e9
 LARGEST_FILE = 2**31
-_LARGEST_DIRECTORY = 4 * 2**20
-"""Of a zip archive's list of names, bytes; also of a single read."""
-_LOCAL_HEADER = struct.Struct("<26xHH")
-"""A member's header in a zip archive; its last fields are the lengths of the name and of an extra field behind it."""
-_LONGEST_HEADER = 10_000
-"""Of an array, bytes, as in numpy."""
-_CHUNK = 2**20
 _KINDS = "biufUS"
 """Numbers and text: no complex numbers, dates or records."""
 _UNREADABLE = (
     zipfile.BadZipFile, zipfile.LargeZipFile, zlib.error, struct.error, EOFError, OSError, NotImplementedError,
-    RuntimeError, ValueError, OverflowError, LookupError,
+    RuntimeError, ValueError, TypeError, OverflowError, LookupError,
 )  # fmt: skip
-_HEADER_ERRORS = (
-    ValueError, KeyError, SyntaxError, TypeError, MemoryError, RecursionError, OverflowError, struct.error,
-    tokenize.TokenError,
-)  # fmt: skip
-
+"""What zipfile and numpy raise for damaged files."""
 
 Source = str | Path | FileContent
 """A file by its path, or as it was read before."""
-
-
-@dataclasses.dataclass(frozen=True)
-class _Place:
-    """Where an array is: a file of its own, or the member `name` of an archive."""
-
-    path: Source
-    name: str = ""
-
-    def error(self, reason: str, remedy: str) -> FileError:
-        return FileError(self.path, f"holds {self.name!r:.60}, which {reason}" if self.name else reason, remedy)
 
 
 def array_names(path: Source) -> list[str]:
@@ -72,12 +47,8 @@ def array_names(path: Source) -> list[str]:
 
 def array_shape(path: str | Path, name: str) -> tuple[int, ...]:
     """Return the shape of an array without reading its values. Raises as `read_arrays`."""
-    with _archive(path) as archive:
-        member = _needed(archive, path, name)
-        place = _Place(path, name)
-        _check_size(member.file_size, place)
-        with archive.open(member) as stream:
-            return _header(stream, member.file_size, place)[0]
+    with _archive(path) as archive, archive.open(member := _needed(archive, path, name)) as stream:
+        return _header(stream, member.file_size, path, name)
 
 
 def read_arrays(
@@ -92,21 +63,20 @@ def read_arrays(
         FileError: the file is damaged, lacks an array, or one is pickled or larger than `LARGEST_BYTES`.
         OSError: it cannot be opened; FileNotFoundError if it does not exist.
     """
-    arrays, total, packed, values = {}, 0, 0, 0
+    arrays, unpacked, packed, values = {}, 0, 0, 0
     with _archive(path) as archive:
         for name in (*required, *optional):
             if name in optional and _member(archive, name) is None:
                 continue
             member = _needed(archive, path, name)
-            total, packed, place = total + member.file_size, packed + member.compress_size, _Place(path, name)
-            _check_size(total, place)
-            _check_ratio(total, packed, place)
+            unpacked, packed = unpacked + member.file_size, packed + member.compress_size
+            _check_size(unpacked, packed, path, name)
             with archive.open(member) as stream:
-                head = _header(stream, member.file_size, place)
-                values += math.prod(head[0])
+                values += math.prod(_header(stream, member.file_size, path, name))
                 if most_values is not None and values > most_values:
-                    raise place.error(f"makes it {values} values, more than {most_values}", "save fewer in a file")
-                arrays[name] = _filled(stream, *head, place)
+                    raise _error(path, name, f"makes it {values} values, more than {most_values}", "save fewer")
+                stream.seek(0)
+                arrays[name] = np.load(stream, allow_pickle=False)
     return arrays
 
 
@@ -151,78 +121,24 @@ def check_shapes(
 
 def read_npy(path: Source) -> NDArray:
     """Read an .npy file. Raises as `read_arrays`."""
-    with _npy(path) as (stream, size):
-        place = _Place(path)
-        _check_size(size, place)
-        return _filled(stream, *_header(stream, size, place), place)
+    with _npy(path) as stream:
+        return np.load(stream, allow_pickle=False)
 
 
 def map_npy(path: str | Path) -> NDArray:
     """Map an .npy file of any size into memory, read-only. Raises as `read_arrays`."""
-    with contextlib.closing(open_regular(path, 2**62)) as stream:
-        size = stream.seek(0, io.SEEK_END)
-        stream.seek(0)
-        shape, fortran, dtype = _header(stream, size, _Place(path))
-        order = "F" if fortran else "C"
-        # of the open file, whose header was checked: another one may have taken its name
-        return np.memmap(stream, dtype, "r", stream.tell(), shape, order)  # type: ignore[call-overload]
+    with _npy(path, 2**62):
+        return np.load(path, "r", allow_pickle=False)
 
 
 def read_pickled_bytes(path: str | Path, name: str) -> bytes:
     """Return the pickle in an array of objects, for a reader that runs nothing of it. Raises as `read_arrays`."""
     with _archive(path) as archive:
-        member, place = _needed(archive, path, name), _Place(path, name)
-        _check_size(member.file_size, place)
+        member = _needed(archive, path, name)
+        _check_size(member.file_size, member.compress_size, path, name)
         with archive.open(member) as stream:
-            _, _, dtype = _head(stream, place)
-            if not dtype.hasobject:
-                raise place.error(f"is {dtype}, not a dictionary of arrays", "download it again")
-            return b"".join(iter(lambda: stream.read(_CHUNK), b""))
-
-
-@dataclasses.dataclass(frozen=True)
-class StoredMember:
-    """A member of an archive without compression."""
-
-    begin: int
-    """Offset of its first byte in the file."""
-    size: int
-    """Bytes."""
-    checksum: int
-    """CRC-32 of its bytes, as the archive states it."""
-
-
-def stored_members(file: BinaryIO, path: str | Path) -> dict[str, StoredMember]:
-    """Return the members of an archive without compression, as torch.save writes it, from the open file at `path`.
-
-    Names that differ in upper and lower case, or in slashes and backslashes, count as equal: torch's own reader does
-    not tell them apart. Raises FileError, also where two names are equal.
-    """
-    with _archive_in(file, path) as archive:
-        members: dict[str, StoredMember] = {}
-        end = file.seek(0, io.SEEK_END)
-        for info in archive.infolist():
-            if info.compress_type != zipfile.ZIP_STORED or info.compress_size != info.file_size:
-                raise FileError(path, "is compressed, which torch.save never does", "save it again")
-            archive.open(info).close()  # compares its two headers; encrypted members are errors
-            file.seek(info.header_offset)
-            name_bytes, extra_bytes = _LOCAL_HEADER.unpack(file.read(_LOCAL_HEADER.size))
-            begin = info.header_offset + _LOCAL_HEADER.size + name_bytes + extra_bytes
-            if begin + info.file_size > end:
-                raise FileError(path, f"holds only a part of {info.filename!r:.60}", "download it, or make it again")
-            members[info.filename] = StoredMember(begin, info.file_size, info.CRC)
-        _check_names(path, [name.replace("\\", "/").lower() for name in archive.namelist()])
-        return members
-
-
-def stored_archive(members: Iterable[tuple[str, bytes | memoryview]]) -> io.BytesIO:
-    """An archive without compression in memory, of names and contents."""
-    made = io.BytesIO()
-    with zipfile.ZipFile(made, "w", zipfile.ZIP_STORED) as archive:
-        for name, content in members:
-            archive.writestr(name, content)  # type: ignore[arg-type]
-    made.seek(0)
-    return made
+            _header(stream, member.file_size, path, name, kinds="O")
+            return stream.read()
 
 
 def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
@@ -239,51 +155,34 @@ def write_deflated(path: Path, arrays: Mapping[str, NDArray]) -> None:
     archive.close()
 
 
-class _Reads:
-    """A file whose single reads are limited: `zipfile` reads the whole list of names at once."""
-
-    def __init__(self, file: BinaryIO) -> None:
-        self._file, self.seek, self.tell, self.seekable = file, file.seek, file.tell, file.seekable
-
-    def read(self, size: int = -1) -> bytes:
-        data = self._file.read(size if 0 <= size <= _LARGEST_DIRECTORY else _LARGEST_DIRECTORY + 1)
-        if len(data) > _LARGEST_DIRECTORY:
-            raise zipfile.BadZipFile("it lists too many names")
-        return data
+@contextlib.contextmanager
+def _damage_named(path: Source) -> Iterator[None]:
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numpy warns of headers that Python 2 wrote
+            yield
+    except FileError:
+        raise
+    except _UNREADABLE as e:
+        reason = f"is damaged, or holds no arrays ({str(e)[:100]})"
+        raise FileError(path, reason, "download it, or make it again") from e
 
 
 @contextlib.contextmanager
 def _archive(path: Source) -> Iterator[zipfile.ZipFile]:
-    with open_regular(path, LARGEST_FILE) as file, _archive_in(file, path) as archive:
+    with open_regular(path, LARGEST_FILE) as file, _damage_named(path), zipfile.ZipFile(file) as archive:
         yield archive
 
 
 @contextlib.contextmanager
-def _archive_in(file: BinaryIO, path: Source) -> Iterator[zipfile.ZipFile]:
-    try:
-        with zipfile.ZipFile(_Reads(file)) as archive:  # type: ignore[arg-type]
-            _check_names(path, [name.removesuffix(".npy") for name in archive.namelist()])
-            yield archive
-    except FileError:
-        raise
-    except _UNREADABLE as e:
-        reason = f"is damaged, or no archive of arrays ({str(e)[:100]})"
-        raise FileError(path, reason, "download it, or make it again") from e
-
-
-def _check_names(path: Source, names: Sequence[str]) -> None:
-    """Check that names differ: of two members of one name, readers choose different ones."""
-    if len(set(names)) < len(names):
-        twice = next(name for name, count in collections.Counter(names).items() if count > 1)
-        raise FileError(path, f"holds {twice!r:.60} twice", "save it again")
-
-
-@contextlib.contextmanager
-def _npy(path: Source) -> Iterator[tuple[BinaryIO, int]]:
-    with open_regular(path, LARGEST_BYTES) as stream:
+def _npy(path: Source, limit: int = LARGEST_BYTES) -> Iterator[BinaryIO]:
+    """Open an .npy file, whose header was checked."""
+    with open_regular(path, limit) as stream, _damage_named(path):
         size = stream.seek(0, io.SEEK_END)
         stream.seek(0)
-        yield stream, size
+        _header(stream, size, path)
+        stream.seek(0)
+        yield stream
 
 
 def _member(archive: zipfile.ZipFile, name: str) -> zipfile.ZipInfo | None:
@@ -294,74 +193,35 @@ def _needed(archive: zipfile.ZipFile, path: Source, name: str) -> zipfile.ZipInf
     member = _member(archive, name)
     if member is None:
         raise FileError(path, f"holds no array {name!r}", "make it again")
-    place = _Place(path, name)
-    if member.flag_bits & 1:
-        raise place.error("is encrypted", "save it without a password")
     if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):  # others unpack without a limit
-        raise place.error("is compressed in another way than numpy's", "save it with numpy.savez")
-    _check_ratio(member.file_size, member.compress_size, place)
+        raise _error(path, name, "is compressed in another way than numpy's", "save it with numpy.savez")
     return member
 
 
-def _check_ratio(size: int, packed: int, place: _Place) -> None:
-    if size > max(MOST_REPEATED, LARGEST_RATIO * packed):
-        raise place.error(f"unpacks to {size / 2**20:.0f} MB of the same", "split it into smaller files")
+def _error(path: Source, name: str, reason: str, remedy: str) -> FileError:
+    """The fault of an array: of the member `name` of an archive, or of a file of its own."""
+    return FileError(path, f"holds {name!r:.60}, which {reason}" if name else reason, remedy)
 
 
-def _check_size(size: int, place: _Place) -> None:
-    if size > LARGEST_BYTES:
-        most = LARGEST_BYTES // 2**20
-        raise place.error(f"unpacks to {size / 2**20:.0f} MB, more than {most}", "split it into smaller files")
+def _check_size(size: int, packed: int, path: Source, name: str) -> None:
+    if size > LARGEST_BYTES or size > max(MOST_REPEATED, LARGEST_RATIO * packed):
+        reason = f"unpacks to {size / 2**20:.0f} MB from {packed / 2**20:.1f} MB"
+        raise _error(path, name, reason, "split it into smaller files")
 
 
-def _head(stream: IO[bytes], place: _Place) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """Read the header of an array: shape, column-major, dtype."""
+def _header(
+    stream: IO[bytes] | BinaryIO, size: int, path: Source, name: str = "", kinds: str = _KINDS
+) -> tuple[int, ...]:
+    """Read the shape of an array that fits into `size` bytes. Raises FileError."""
     try:
-        start = stream.read(8)
-        wide = {b"\x93NUMPY\x01\x00": 2, b"\x93NUMPY\x02\x00": 4}[start]
-        length = stream.read(wide)
-        count = int.from_bytes(length, "little")
-        if count > _LONGEST_HEADER:
-            raise ValueError("a long header")
-        text = io.BytesIO(length + stream.read(count))
-        read = np.lib.format.read_array_header_1_0 if wide == 2 else np.lib.format.read_array_header_2_0
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # numpy warns of headers that Python 2 wrote
-            shape, fortran, dtype = read(text)
-        if len(shape) > 32 or not all(type(side) is int and 0 <= side < 2**62 for side in shape):
-            raise ValueError("an impossible shape")
-    except _HEADER_ERRORS as e:
-        raise place.error("is not an array of numpy's format", "save it with numpy.save or savez") from e
-    if not dtype.hasobject and (dtype.kind not in _KINDS or dtype.itemsize <= 0):  # sizes of long texts wrap
-        raise place.error(f"is an array of {dtype!s:.60}, not of numbers or text", "save it as one of these")
-    return shape, fortran, dtype
-
-
-def _header(stream: IO[bytes], size: int, place: _Place) -> tuple[tuple[int, ...], bool, np.dtype]:
-    """As `_head`, of numbers or text that fit into `size` bytes."""
-    shape, fortran, dtype = _head(stream, place)
-    if dtype.hasobject:
-        raise place.error("is pickled, and pickles are never read", "save it as plain arrays")
-    wanted = math.prod(shape) * dtype.itemsize
-    if wanted > size:
-        raise _cut_short(place, wanted if wanted < 2**63 else "countless", size)
-    return shape, fortran, dtype
-
-
-def _cut_short(place: _Place, promised: int | str, found: int) -> FileError:
-    reason = f"is cut short (its header promises {promised} bytes, {found} are there)"
-    return place.error(reason, "download it, or make it again")
-
-
-def _filled(stream: IO[bytes], shape: tuple[int, ...], fortran: bool, dtype: np.dtype, place: _Place) -> NDArray:
-    """Read the values of an array, which follow its header."""
-    raw = np.empty(math.prod(shape) * dtype.itemsize, np.uint8)  # memory is taken as it is filled
-    filled = 0
-    while filled < raw.size:
-        chunk = stream.read(min(_CHUNK, raw.size - filled))
-        if not chunk:
-            raise _cut_short(place, raw.size, filled)
-        raw[filled : filled + len(chunk)] = np.frombuffer(chunk, np.uint8)
-        filled += len(chunk)
-    array = raw.view(dtype)
-    return array.reshape(shape[::-1]).T if fortran else array.reshape(shape)
+        version = np.lib.format.read_magic(stream)  # type: ignore[arg-type]
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+        shape, _, dtype = read(stream)  # type: ignore[arg-type]
+    except Exception as e:  # numpy evaluates the header as an expression of Python
+        raise _error(path, name, "is not an array of numpy's format", "save it with numpy.save or savez") from e
+    if dtype.kind not in kinds or dtype.itemsize <= 0:  # sizes of long texts wrap
+        reason = "is pickled, and pickles are not read" if dtype.hasobject else f"is an array of {dtype!s:.60}"
+        raise _error(path, name, reason, "save it as an array of numbers or text")
+    if min(shape, default=0) < 0 or (kinds == _KINDS and math.prod(shape) * dtype.itemsize > size):
+        raise _error(path, name, f"claims the shape {shape!s:.60} in {size} bytes", "download it, or make it again")
+    return shape

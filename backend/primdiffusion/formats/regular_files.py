@@ -8,7 +8,6 @@ import dataclasses
 import errno
 import hashlib
 import io
-import mmap
 import os
 import re
 import shutil
@@ -22,8 +21,6 @@ _DEVICE = re.compile(r"^(con|prn|aux|nul|com\d|lpt\d)(?=\.|$)", re.IGNORECASE)
 """Stems of names that are devices in every folder of Windows."""
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _LONGEST_PATH = 4096
-COPIED_BYTES = 256 * 2**20
-"""Files up to this size are copied into memory before they are checked and used; larger ones are mapped."""
 
 
 class FileError(ValueError):
@@ -125,27 +122,6 @@ def open_regular(path: str | Path | FileContent, limit: int) -> io.BufferedReade
         file.close()
         raise
     return file
-
-
-def private_content(file: io.BufferedReader | io.BytesIO) -> mmap.mmap | bytearray:
-    """Return the content of an open file, so that what is written there stays in memory; the file may be closed then.
-
-    Up to COPIED_BYTES it is a copy, which no other program can change. A larger file is mapped: a program that
-    overwrites it changes the numbers, and one that cuts it short ends this process. Raises OSError, also for lack of
-    memory, and ValueError for a file that is empty now.
-    """
-    if isinstance(file, io.BytesIO):
-        return bytearray(file.getvalue())
-    size = os.fstat(file.fileno()).st_size
-    if size > COPIED_BYTES:
-        return mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)
-    content = bytearray(size)
-    file.seek(0)
-    filled = file.readinto(content)
-    if not filled:
-        raise ValueError("the file is empty now")
-    del content[filled:]
-    return content
 
 
 def read_regular(path: str | Path | FileContent, limit: int) -> bytes:

@@ -266,8 +266,10 @@ def _targets(
 ) -> list[list[TargetImage]]:
     """Renders of each colouring, all from the same cameras."""
     targets: list[list[TargetImage]] = [[] for _ in colourings]
-    for camera, weight in views_of(colourings[0], betas, turn):
-        for own, picture in zip(targets, rasterise_colourings(colourings, camera, SUPERSAMPLE), strict=True):
+    views = views_of(colourings[0], betas, turn)
+    drawn = rasterise_colourings(colourings, [camera for camera, _ in views], SUPERSAMPLE)
+    for (camera, weight), pictures in zip(views, drawn, strict=True):
+        for own, picture in zip(targets, pictures, strict=True):
             rgba = np.concatenate([picture.rgb, picture.alpha[..., None]], axis=-1)
             own.append(TargetImage(frames, camera, rgba, weight))
     return targets

@@ -7,8 +7,9 @@ and averages sub-pixels.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numba
@@ -91,13 +92,16 @@ def rasterise(mesh: TexturedMesh, view: Camera | OrthographicView, supersample: 
     Raises:
         ValueError: see `flatten`; `supersample` is less than 1.
     """
-    return rasterise_colourings([mesh], view, supersample)[0]
+    ((picture,),) = rasterise_colourings([mesh], [view], supersample)
+    return picture
 
 
 def rasterise_colourings(
-    meshes: Sequence[TexturedMesh], view: Camera | OrthographicView, supersample: int = 1
-) -> list[RasterImage]:
-    """As `rasterise`, for meshes that differ only in the colours of their textures; triangles are drawn once.
+    meshes: Sequence[TexturedMesh], views: Sequence[Camera | OrthographicView], supersample: int = 1
+) -> Iterator[list[RasterImage]]:
+    """As `rasterise`, for each view: the images of meshes that differ only in the colours of their textures.
+
+    Triangles are drawn once for a view, and textures gathered once.
 
     Raises:
         ValueError: see `flatten`; `supersample` is less than 1.
@@ -105,29 +109,36 @@ def rasterise_colourings(
     if supersample < 1:
         raise ValueError(f"supersample is {supersample}: give 1 or more")
     soup = flatten(meshes[0])
-    fragments = draw(soup, _finer(view, supersample))
-    pictures = []
-    for mesh in meshes:
-        own = soup if mesh is meshes[0] else dataclasses.replace(soup, texels=gather_textures(mesh))
-        pictures.append(_picture(own, fragments, view, supersample))
-    return pictures
+    coloured = [soup, *(dataclasses.replace(soup, texels=gather_textures(mesh)) for mesh in meshes[1:])]
+    for view in views:
+        fragments = draw(soup, _finer(view, supersample))
+        first = _picture(soup, fragments, view, supersample)
+        yield [first, *(dataclasses.replace(first, rgb=_colour(own, fragments, supersample)) for own in coloured[1:])]
 
 
 def _picture(
     soup: TriangleSoup, fragments: Fragments, view: Camera | OrthographicView, supersample: int
 ) -> RasterImage:
-    rgb = shade(soup, fragments)
     distance = fragments.depth * _ray_lengths(view, supersample)
     part = np.where(fragments.face >= 0, soup.part[fragments.face], -1).astype(np.int32)
-    if supersample == 1:
-        return RasterImage(rgb, (fragments.face >= 0).astype(np.float32), distance, part)
     nearest = _blocks(distance, supersample).argmin(-1)[..., None]
     return RasterImage(
-        rgb=np.stack([_blocks(rgb[..., channel], supersample).mean(-1) for channel in range(3)], -1),
+        rgb=_colour(soup, fragments, supersample),
         alpha=_blocks((fragments.face >= 0).astype(np.float32), supersample).mean(-1),
         depth=np.take_along_axis(_blocks(distance, supersample), nearest, -1)[..., 0],
         part=np.take_along_axis(_blocks(part, supersample), nearest, -1)[..., 0],
     )
+
+
+def _colour(soup: TriangleSoup, fragments: Fragments, supersample: int) -> Float32[np.ndarray, "H W 3"]:
+    """Means over the samples of a pixel."""
+    rgb = shade(soup, fragments)
+    if supersample == 1:
+        return rgb
+    samples = [
+        rgb[row::supersample, column::supersample] for row in range(supersample) for column in range(supersample)
+    ]
+    return functools.reduce(np.add, samples) / np.float32(len(samples))
 
 
 def draw(soup: TriangleSoup, view: Camera | OrthographicView) -> Fragments:

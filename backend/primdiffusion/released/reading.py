@@ -5,7 +5,6 @@ from __future__ import annotations
 import collections
 import dataclasses
 import math
-import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +12,6 @@ from typing import Any, Literal
 from torch import Tensor
 
 from primdiffusion import torch_file
-from primdiffusion.formats.regular_files import FileError
 
 Fate = Literal["imported", "checked", "dropped"]
 """imported: in the new file; checked: validated, then not needed; dropped: not used by design."""
@@ -79,7 +77,7 @@ def read_weights(path: Path) -> dict[str, Tensor]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"no checkpoint at {path}: give the path of the authors' primdiffusion.pt")
-    content = _load(path)
+    content = torch_file.load(path)
     state = content.get(STATE, content) if isinstance(content, Mapping) else content
     if not isinstance(state, Mapping):
         raise ValueError(
@@ -92,24 +90,3 @@ def read_weights(path: Path) -> dict[str, Tensor]:
                 f"primdiffusion.pt, with top-level keys {STATE!r} and 'optimizer'"
             )
     return dict(state)
-
-
-def _load(path: Path) -> object:
-    try:
-        return torch_file.load(path)
-    except FileError:
-        raise
-    except torch_file.PICKLE_ERRORS as error:
-        asked = re.search(r"GLOBAL:? (\S+)|global (\S+)", str(error))
-        if asked:
-            raise ValueError(
-                f"{path} would execute {asked[1] or asked[2]} when loaded, which weights never need; nothing was "
-                "executed: download the file again from its publisher"
-            ) from error
-        raise ValueError(
-            f"{path} is truncated or not a torch file ({_first_sentence(error)}): download it again"
-        ) from error
-
-
-def _first_sentence(error: BaseException) -> str:
-    return re.split(r"\.\s|\n", str(error).strip(), maxsplit=1)[0][:120] or type(error).__name__

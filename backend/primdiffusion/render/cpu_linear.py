@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import itertools
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float32, Int16, Int32, Int64
@@ -21,7 +21,7 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu import draw_with_ends
 from primdiffusion.render.cpu_adjoint import counted_steps
-from primdiffusion.render.cpu_compiled import TILE, at_once, index, kernel, on_all_threads, part, take
+from primdiffusion.render.cpu_compiled import THREADS, TILE, at_once, index, kernel, on_all_threads, part, take
 from primdiffusion.render.cpu_forward import NEVER
 from primdiffusion.render.cpu_sampling import (
     HIT_ROWS,
@@ -36,17 +36,27 @@ from primdiffusion.render.cpu_sampling import (
     tabulate,
     tile_rays,
 )
+from primdiffusion.render.cpu_segments import (
+    WIDTH,
+    add_four_columns,
+    add_four_transposed,
+    add_product,
+    add_transposed_product,
+    merge_sample,
+)
 from primdiffusion.render.lattice import MarchSettings
 
-COLOUR, DENSITY, OPACITY = 0, 1, 4
-"""Columns of `PictureJacobian.weight`: of a voxel's colour, of its density for red, green and blue, and for alpha."""
+DENSITY, OPACITY, COLOUR = 0, 3, 4
+"""Columns of `PictureJacobian.weight`: of a voxel's density for red, green and blue, and for alpha; of its colour."""
 WEIGHTS = 5
 SHORTEST = 4e-5
 """Entries with less than this length of ray (metres) are dropped: 0.8 % of opacity at a density of 200 per metre."""
 FIRST_ROOM, ROOM_PER_PIXEL = 2_000_000, 16
 """Initial capacity in entries; an image of a human has 1.5 million with 176 x 176 pixels, 3 million with 512 x 512."""
 PARTS = 4
-"""Ranges of boxes computed at once. Constant, so that sums over rays are the same on every machine."""
+"""Ranges of boxes, or images, computed at once."""
+BOXES_AT_ONCE = 64
+"""Boxes that all images multiply in turn; their voxels fit a processor's cache."""
 
 
 class PictureJacobian(NamedTuple):
@@ -80,16 +90,14 @@ def linearise(primitives: Primitives, camera: Camera, background: float) -> tupl
 
     `background` is linear. Raises ValueError as `march_reference` does, and for boxes of other than 8^3 voxels.
     """
-    boxes, size = primitives.density.shape[0], primitives.density.shape[-1]
+    size = primitives.density.shape[-1]
     if size**3 != VOXELS:
         raise ValueError(f"boxes of {size}^3 voxels cannot be linearised: give boxes of 8^3")
     rendering, view, scene, ends = draw_with_ends(primitives, camera, MarchSettings())
     saturates = ends.index != NEVER
     share = np.where(saturates, ends.share, np.float32(1))
     behind = np.where(saturates[:, None], ends.rgb, np.float32(background)).astype(np.float32)
-    density = primitives.density.detach().float().contiguous().numpy().reshape(boxes, VOXELS)
-    rgb = primitives.rgb.detach().float().contiguous().numpy().reshape(boxes, 3, VOXELS)
-    room = max(FIRST_ROOM, ROOM_PER_PIXEL * len(behind)) // PARTS
+    room = max(FIRST_ROOM, ROOM_PER_PIXEL * len(behind)) // (PARTS if THREADS > 1 else 1)
 
     def entries_of(first: int, last: int) -> tuple[ndarray, ...]:
         """The arrays of PictureJacobian for a range of boxes."""
@@ -99,7 +107,7 @@ def linearise(primitives: Primitives, camera: Camera, background: float) -> tupl
             ray, start = np.empty(capacity // 8, np.int32), np.empty(capacity // 8 + 1, np.int64)
             voxel, weight = np.empty(capacity, np.int16), np.empty((capacity, WEIGHTS), np.float32)
             segments, entries = _linearise(
-                first, last, box_start, ray, start, voxel, weight, density, rgb, ends.index, share, ends.box, behind,
+                first, last, box_start, ray, start, voxel, weight, ends.index, share, ends.box, behind,
                 scene.boxes, scene.size, scene.rectangle, view.limits, scene.pixel_to_world, view.width, view.height,
                 view.spacing,
             )  # fmt: skip
@@ -107,17 +115,21 @@ def linearise(primitives: Primitives, camera: Camera, background: float) -> tupl
                 return box_start[:-1], ray[:segments], start[:segments], voxel[:entries], weight[:entries]
             capacity *= 2
 
-    ranges = _ranges(_tiles(scene.rectangle))
+    ranges = _ranges(_tiles(scene.rectangle)) if THREADS > 1 else [(0, len(scene.rectangle))]
     parts = list(zip(*at_once([functools.partial(entries_of, *one) for one in ranges]), strict=True))
     jacobian = PictureJacobian(
         _joined(parts[0], parts[1]),
-        np.concatenate(parts[1]),
+        _whole(parts[1]),
         _joined(parts[2], parts[3]),
-        np.concatenate(parts[3]),
-        np.concatenate(parts[4]),
+        _whole(parts[3]),
+        _whole(parts[4]),
         len(behind),
     )
     return rendering, jacobian
+
+
+def _whole(parts: Sequence[ndarray]) -> ndarray:
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 
 def _tiles(rectangle: Int32[ndarray, "k 4"]) -> Int64[ndarray, "k"]:
@@ -140,36 +152,60 @@ def _joined(starts: Sequence[Int64[ndarray, "n"]], items: Sequence[ndarray]) -> 
 
 
 def apply(
-    jacobian: PictureJacobian, change: Float32[ndarray, "v 4"], alpha_free: Float32[ndarray, "r"]
-) -> Float32[ndarray, "r 4"]:
-    """J x: the change of rgb and alpha of every pixel with the voxels' colours and densities (1/m).
+    jacobians: Sequence[PictureJacobian],
+    change: Float32[ndarray, "v 4"],
+    alpha_free: Sequence[Float32[ndarray, "r"]],
+) -> list[Float32[ndarray, "r 4"]]:
+    """J x of each image: the change of rgb and alpha of every pixel with the voxels' colours and densities (1/m).
 
     `alpha_free` is 1 where alpha follows density and 0 where the ray is opaque.
     """
-
-    def part(first: int, last: int) -> ndarray:
-        out = np.zeros((jacobian.rays, 4), np.float32)
-        arrays = jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight
-        _apply(first, last, jacobian.box_start, *arrays, change, out)
-        return out
-
-    parts = at_once([functools.partial(part, *one) for one in _ranges(np.diff(jacobian.box_start))])
-    out = functools.reduce(np.add, parts)
-    out[:, 3] *= alpha_free
+    out = _applied(_apply, [jacobian[:-1] for jacobian in jacobians], change, [one.rays for one in jacobians])
+    for pixels, free in zip(out, alpha_free, strict=True):
+        pixels[:, 3] *= free
     return out
 
 
 def add_transposed(
-    jacobian: PictureJacobian,
-    pixels: Float32[ndarray, "r 4"],
-    alpha_free: Float32[ndarray, "r"],
+    jacobians: Sequence[PictureJacobian],
+    pixels: Sequence[Float32[ndarray, "r 4"]],
+    alpha_free: Sequence[Float32[ndarray, "r"]],
     out: Float32[ndarray, "v 4"],
 ) -> None:
-    """out += J^T y."""
-    freed = pixels.copy()
-    freed[:, 3] *= alpha_free
-    arrays = jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, jacobian.weight
-    on_all_threads(_add_transposed, *arrays, freed, out)
+    """out += J^T y, summed over images."""
+    freed = [
+        y * np.stack([*np.ones((3, len(y)), np.float32), free], 1) for y, free in zip(pixels, alpha_free, strict=True)
+    ]
+    _transposed_onto(_add_transposed, [jacobian[:-1] for jacobian in jacobians], freed, out)
+
+
+Arrays = tuple[ndarray, ...]
+"""Of a matrix, as its kernels take them; the first are the first segments of boxes."""
+
+
+def _applied(kernel: Any, matrices: Sequence[Arrays], x: ndarray, rays: Sequence[int]) -> list[ndarray]:
+    """The product of each matrix with x. All matrices multiply some boxes before the next, whose voxels stay cached."""
+    out = [np.zeros((count, x.shape[1]), np.float32) for count in rays]
+
+    def part(number: int) -> None:
+        for first in range(0, len(x) // VOXELS, BOXES_AT_ONCE):
+            for arrays, pixels in zip(matrices[number::PARTS], out[number::PARTS], strict=True):
+                kernel(first, min(first + BOXES_AT_ONCE, len(arrays[0]) - 1), *arrays, x, pixels)
+
+    at_once([functools.partial(part, number) for number in range(min(PARTS, len(matrices)))])
+    return out
+
+
+def _transposed_onto(kernel: Any, matrices: Sequence[Arrays], pixels: Sequence[ndarray], out: ndarray) -> None:
+    """Add the product of each transposed matrix with its pixels; likewise."""
+
+    def part(begin: int, end: int) -> None:
+        for first in range(begin, end, BOXES_AT_ONCE):
+            for arrays, y in zip(matrices, pixels, strict=True):
+                kernel(first, min(first + BOXES_AT_ONCE, end), *arrays, y, out)
+
+    work = np.sum([np.diff(arrays[0]) for arrays in matrices], axis=0)
+    at_once([functools.partial(part, *one) for one in _ranges(work)])
 
 
 def add_diagonal(
@@ -226,25 +262,26 @@ class ColourMatrix(NamedTuple):
         weight = np.ascontiguousarray(jacobian.weight[:, COLOUR])
         return cls(jacobian.box_start, jacobian.ray, jacobian.start, jacobian.voxel, weight, jacobian.rays)
 
-    def apply(self, colours: Float32[ndarray, "v c"]) -> Float32[ndarray, "r c"]:
-        """A x for any number of columns, such as red, green and blue of several colourings."""
-        out = np.zeros((self.rays, colours.shape[1]), np.float32)
-        _apply_colours(self.box_start, self.ray, self.start, self.voxel, self.weight, colours, out)
-        return out
-
-    def add_transposed(self, pixels: Float32[ndarray, "r c"], out: Float32[ndarray, "v c"]) -> None:
-        """out += A^T y."""
-        _add_colours_transposed(self.box_start, self.ray, self.start, self.voxel, self.weight, pixels, out)
-
     def add_diagonal(self, weight: Float32[ndarray, "r c"], out: Float32[ndarray, "v c"]) -> None:
         """out += diag(A^T W A)."""
-        squared = self.weight * self.weight
-        _add_colours_transposed(self.box_start, self.ray, self.start, self.voxel, squared, weight, out)
+        add_colours_transposed([self._replace(weight=self.weight * self.weight)], [weight], out)
+
+
+def apply_colours(matrices: Sequence[ColourMatrix], colours: Float32[ndarray, "v c"]) -> list[Float32[ndarray, "r c"]]:
+    """A x of each image for any number of columns, such as red, green and blue of several colourings."""
+    return _applied(_apply_colours, [matrix[:-1] for matrix in matrices], colours, [one.rays for one in matrices])
+
+
+def add_colours_transposed(
+    matrices: Sequence[ColourMatrix], pixels: Sequence[Float32[ndarray, "r c"]], out: Float32[ndarray, "v c"]
+) -> None:
+    """out += A^T y, summed over images."""
+    _transposed_onto(_add_colours_transposed, [matrix[:-1] for matrix in matrices], pixels, out)
 
 
 @kernel
 def _linearise(
-    begin_box, end_box, box_start, ray_of, start, voxel, weight, density, rgb, ends, shares, last_box, behind, boxes,
+    begin_box, end_box, box_start, ray_of, start, voxel, weight, ends, shares, last_box, behind, boxes,
     size, rectangle, limits, pixel_to_world, width, height, spacing,
 ):  # fmt: skip
     """Fill the matrix; return the numbers of segments and entries, or -1 if they exceed its capacity."""
@@ -252,7 +289,7 @@ def _linearise(
     table = np.empty(LANES * TABLE_ROWS, np.float32)
     hits = np.empty(HIT_ROWS * LANES, np.float32)
     block = np.empty(8 * SAMPLES, np.float32)
-    sums = np.zeros((VOXELS, WEIGHTS), np.float32)
+    sums = np.zeros((VOXELS, WIDTH), np.float32)
     touched = np.empty(VOXELS, np.int64)
     seen = np.zeros(VOXELS, np.bool_)
     segments, entries = 0, 0
@@ -285,8 +322,8 @@ def _linearise(
                             continue
                         share = shares[ray] if reference + leave * stride == ends[ray] else np.float32(1)
                         count = _merge_segment(
-                            sums, touched, seen, density[k], rgb[k], behind[ray], block, hits, j, enter, leave, size,
-                            length, share,
+                            sums, touched, seen, boxes.voxels, 4 * k * VOXELS, behind[ray, 0], behind[ray, 1],
+                            behind[ray, 2], block, hits, j, enter, leave, size, length, share,
                         )  # fmt: skip
                         if entries + count > len(voxel) or segments + 1 >= len(ray_of):
                             return -1, -1
@@ -299,8 +336,7 @@ def _linearise(
                                 for column_of_weight in range(WEIGHTS):
                                     weight[entries, column_of_weight] = sums[v, column_of_weight]
                                 entries += 1
-                            for column_of_weight in range(WEIGHTS):
-                                sums[v, column_of_weight] = 0
+                            sums[v] = 0
                         if entries > first:
                             ray_of[segments], start[segments] = ray, first
                             segments += 1
@@ -309,9 +345,11 @@ def _linearise(
 
 
 @part()
-def _merge_segment(sums, touched, seen, density, rgb, behind, block, hits, lane, enter, leave, size, length, share):
+def _merge_segment(
+    sums, touched, seen, voxels, base, red, green, blue, block, hits, lane, enter, leave, size, length, share
+):  # fmt: skip
     """Add the samples of a ray in a box to `sums`; return the number of voxels touched, listed in `touched`."""
-    count, slab = 0, size * size
+    count, slab, before = 0, size * size, -1
     for begin in range(enter, leave + 1, SAMPLES):
         place_samples(block, hits, lane, np.float32(begin), size, length)
         samples = min(SAMPLES, leave + 1 - begin)
@@ -322,30 +360,21 @@ def _merge_segment(sums, touched, seen, density, rgb, behind, block, hits, lane,
             if opacity < np.float32(2e-5):
                 continue
             corner = np.int64(block[7 * SAMPLES + s])
-            near, far = block[4 * SAMPLES + s], block[5 * SAMPLES + s]
-            d, r, g, b = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-            for edge in range(4):
-                v = corner + (edge & 1) * size + (edge >> 1) * slab
-                w0, w1 = block[edge * SAMPLES + s] * near, block[edge * SAMPLES + s] * far
-                d += w0 * density[v] + w1 * density[v + 1]
-                r += w0 * rgb[0, v] + w1 * rgb[0, v + 1]
-                g += w0 * rgb[1, v] + w1 * rgb[1, v + 1]
-                b += w0 * rgb[2, v] + w1 * rgb[2, v + 1]
-            r, g, b = r - behind[0], g - behind[1], b - behind[2]
+            merge_sample(
+                sums, voxels, base, corner, size, slab,
+                block[s], block[SAMPLES + s], block[2 * SAMPLES + s], block[3 * SAMPLES + s],
+                block[4 * SAMPLES + s], block[5 * SAMPLES + s], opacity, red, green, blue,
+            )  # fmt: skip
+            if corner == before:
+                continue
+            before = corner
             for edge in range(4):
                 first = corner + (edge & 1) * size + (edge >> 1) * slab
-                for end in range(2):
-                    v = first + end
-                    w = block[edge * SAMPLES + s] * (far if end else near) * opacity
+                for v in range(first, first + 2):
                     if not seen[v]:
                         seen[v] = True
                         touched[count] = v
                         count += 1
-                    sums[v, 0] += w * d
-                    sums[v, 1] += w * r
-                    sums[v, 2] += w * g
-                    sums[v, 3] += w * b
-                    sums[v, 4] += w
     return count
 
 
@@ -354,38 +383,17 @@ def _apply(begin_box, end_box, box_start, ray, start, voxel, weight, x, out):
     for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
-            r, g, b, a = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-            for entry in range(start[segment], start[segment + 1]):
-                v = base + np.int64(voxel[entry])
-                w, d = weight[entry, 0], x[v, 3]
-                r += w * x[v, 0] + weight[entry, 1] * d
-                g += w * x[v, 1] + weight[entry, 2] * d
-                b += w * x[v, 2] + weight[entry, 3] * d
-                a += weight[entry, 4] * d
-            i = ray[segment]
-            out[i, 0] += r
-            out[i, 1] += g
-            out[i, 2] += b
-            out[i, 3] += a
+            first, last = start[segment], start[segment + 1]
+            add_product(out, np.int64(ray[segment]), x, base, voxel, weight, first, last)
 
 
 @kernel
-def _add_transposed(taken, box_start, ray, start, voxel, weight, y, out):
-    while True:
-        k = take(taken)
-        if k >= len(box_start) - 1:
-            break
+def _add_transposed(begin_box, end_box, box_start, ray, start, voxel, weight, y, out):
+    for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
-            i = ray[segment]
-            r, g, b, a = y[i, 0], y[i, 1], y[i, 2], y[i, 3]
-            for entry in range(start[segment], start[segment + 1]):
-                v = base + np.int64(voxel[entry])
-                w = weight[entry, 0]
-                out[v, 0] += w * r
-                out[v, 1] += w * g
-                out[v, 2] += w * b
-                out[v, 3] += weight[entry, 1] * r + weight[entry, 2] * g + weight[entry, 3] * b + weight[entry, 4] * a
+            first, last = start[segment], start[segment + 1]
+            add_transposed_product(out, base, y, np.int64(ray[segment]), voxel, weight, first, last)
 
 
 @kernel
@@ -399,37 +407,39 @@ def _add_diagonal(taken, box_start, ray, start, voxel, weight, y, out):
             i = ray[segment]
             for entry in range(start[segment], start[segment + 1]):
                 v = base + np.int64(voxel[entry])
-                w = weight[entry, 0] * weight[entry, 0]
+                w = weight[entry, COLOUR] * weight[entry, COLOUR]
                 for channel in range(3):
                     out[v, channel] += w * y[i, channel]
-                    out[v, 3] += weight[entry, 1 + channel] * weight[entry, 1 + channel] * y[i, channel]
-                out[v, 3] += weight[entry, 4] * weight[entry, 4] * y[i, 3]
+                for channel in range(4):
+                    out[v, 3] += weight[entry, channel] * weight[entry, channel] * y[i, channel]
 
 
 @kernel
-def _apply_colours(box_start, ray, start, voxel, weight, x, out):
+def _apply_colours(begin_box, end_box, box_start, ray, start, voxel, weight, x, out):
     columns = x.shape[1]
-    for k in range(len(box_start) - 1):
+    for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
-            row = out[ray[segment]]
-            for entry in range(start[segment], start[segment + 1]):
-                w, colours = weight[entry], x[base + np.int64(voxel[entry])]
-                for column in range(columns):
-                    row[column] += w * colours[column]
+            i, first, last = np.int64(ray[segment]), start[segment], start[segment + 1]
+            for column in range(0, columns - 3, 4):
+                add_four_columns(out, i * columns + column, x, base, columns, column, voxel, weight, first, last)
+            for column in range(columns // 4 * 4, columns):
+                for entry in range(first, last):
+                    out[i, column] += weight[entry] * x[base + np.int64(voxel[entry]), column]
 
 
 @kernel
-def _add_colours_transposed(box_start, ray, start, voxel, weight, y, out):
+def _add_colours_transposed(begin_box, end_box, box_start, ray, start, voxel, weight, y, out):
     columns = y.shape[1]
-    for k in range(len(box_start) - 1):
+    for k in range(begin_box, end_box):
         base = k * VOXELS
         for segment in range(box_start[k], box_start[k + 1]):
-            pixel = y[ray[segment]]
-            for entry in range(start[segment], start[segment + 1]):
-                w, colours = weight[entry], out[base + np.int64(voxel[entry])]
-                for column in range(columns):
-                    colours[column] += w * pixel[column]
+            i, first, last = np.int64(ray[segment]), start[segment], start[segment + 1]
+            for column in range(0, columns - 3, 4):
+                add_four_transposed(out, base, columns, column, y, i * columns + column, voxel, weight, first, last)
+            for column in range(columns // 4 * 4, columns):
+                for entry in range(first, last):
+                    out[base + np.int64(voxel[entry]), column] += weight[entry] * y[i, column]
 
 
 @kernel
@@ -438,10 +448,10 @@ def _add_in_basis(start, voxel, weight, slope, basis, out):
         for entry in range(start[segment], start[segment + 1]):
             v = np.int64(voxel[entry])
             for channel in range(3):
-                a = weight[entry, 0] * slope[v, channel]
+                a = weight[entry, COLOUR] * slope[v, channel]
                 for c in range(basis.shape[2]):
                     out[segment, channel, c] += a * basis[v, channel, c]
             for channel in range(4):
-                a = weight[entry, 1 + channel] * slope[v, 3]
+                a = weight[entry, channel] * slope[v, 3]
                 for c in range(basis.shape[2]):
                     out[segment, channel, c] += a * basis[v, 3, c]

@@ -131,6 +131,10 @@ class _Vectors:
     def _vector_at(self, data, place, kind):
         return self.builder.bitcast(self.builder.gep(data, [place]), kind.as_pointer())
 
+    def four_at(self, data, place, stride):
+        """Four floats from data[place * stride] on."""
+        return self.builder.load(self._vector_at(data, self.builder.mul(place, _INT64(stride)), _FOUR), align=4)
+
     def edges(self, data, corner, row, slab):
         """The cell's four edges along w: (h, d) = (0, 0), (1, 0), (0, 1), (1, 1)."""
         back = self.builder.add(corner, slab)

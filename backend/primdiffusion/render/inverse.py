@@ -15,10 +15,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 from torch import Tensor
 
@@ -30,14 +31,20 @@ from primdiffusion.primitives.primitives import Frames, Payload, Primitives, S
 from primdiffusion.render.cpu_linear import (
     ColourMatrix,
     PictureJacobian,
+    add_colours_transposed,
     add_diagonal,
     add_transposed,
     apply,
+    apply_colours,
     linearise,
 )
 
 BACKGROUND = float(decode_srgb(torch.tensor(0.5)))
 """Linear grey behind target and image, in contrast to dark and light humans."""
+
+
+Dot = Callable[[ndarray, ndarray], Any]
+"""A scalar product of voxels."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -68,8 +75,8 @@ class InverseSettings(Checked):
     """Gauss-Newton steps. The last uses all images, earlier ones every other image in turn."""
     iterations: Count = 6
     """Iterations of conjugate gradients per step; more would fit noise."""
-    colour_iterations: Count = 10
-    """Iterations of conjugate gradients for colours alone, which take one step."""
+    colour_iterations: Count = 7
+    """Iterations of conjugate gradients for colours alone, which take one step; each column has its own lengths."""
     pull: NotNegative = 0.03
     """Weight of the distance from the start, in units of the mean diagonal of J^T W J."""
     smoothness: NotNegative = 0.1
@@ -105,8 +112,9 @@ def fit_payload(
         seen = targets if number == settings.steps - 1 else targets[number % 2 :: 2] or targets
         views = [LinearisedView.of(target, _payload(z, start), settings) for target in seen]
         gradient, diagonal = np.zeros_like(z), np.zeros_like(z)
+        jacobians, alpha_free = [view.jacobian for view in views], [view.alpha_free for view in views]
+        add_transposed(jacobians, [view.weight * view.residual for view in views], alpha_free, gradient)
         for view in views:
-            add_transposed(view.jacobian, view.weight * view.residual, view.alpha_free, gradient)
             add_diagonal(view.jacobian, view.weight, view.alpha_free, diagonal)
         gradient, diagonal = gradient * scale, diagonal * scale**2
         unit = _mean_diagonal(diagonal)
@@ -115,7 +123,7 @@ def fit_payload(
         held = ((z <= 0) & (gradient < 0)) | ((z >= limit) & (gradient > 0))
         penalty = _Penalty(unit, settings, diagonal, held)
 
-        z = z + scale * conjugate_gradients(_curvature(views, scale), penalty, gradient, settings.iterations)
+        z = z + scale * conjugate_gradients(_curvature(views, scale), penalty, gradient, settings.iterations, _dot)
     return _payload(z.clip(0, limit), start)
 
 
@@ -166,8 +174,9 @@ def fit_colours(
     for same_camera in zip(*targets, strict=True):
         views.append(_ColourView.of(same_camera, density, z, settings))
     gradient, diagonal = np.zeros_like(z), np.zeros_like(z)
+    matrices = [view.matrix for view in views]
+    add_colours_transposed(matrices, [view.weight * view.residual for view in views], gradient)
     for view in views:
-        view.matrix.add_transposed(view.weight * view.residual, gradient)
         view.matrix.add_diagonal(view.weight, diagonal)
     gradient, diagonal = gradient * scale, diagonal * scale**2
     unit = _mean_diagonal(diagonal)
@@ -175,12 +184,15 @@ def fit_colours(
     penalty = _Penalty(unit, settings, diagonal, held)
 
     def curvature(x: ndarray) -> ndarray:
-        out, scaled = np.zeros_like(x), x * scale
-        for view in views:
-            view.matrix.add_transposed(view.weight * view.matrix.apply(scaled), out)
+        out = np.zeros_like(x)
+        pixels = apply_colours(matrices, x * scale)
+        weighted = [view.weight * one for view, one in zip(views, pixels, strict=True)]
+        add_colours_transposed(matrices, weighted, out)
         return out * scale
 
-    z = (z + scale * conjugate_gradients(curvature, penalty, gradient, settings.colour_iterations)).clip(0, 1)
+    z = (
+        z + scale * conjugate_gradients(curvature, penalty, gradient, settings.colour_iterations, _dot_by_column)
+    ).clip(0, 1)
     return [
         Payload(_rgb(z[:, 3 * i : 3 * i + 3], start), density.density, density.delta_scale)
         for i, start in enumerate(starts)
@@ -218,11 +230,13 @@ class LinearisedView:
 def _curvature(views: Sequence[LinearisedView], scale: ndarray) -> Callable[[ndarray], ndarray]:
     """x -> J^T W J x over all views, in the units of `scale`."""
 
+    jacobians, alpha_free = [view.jacobian for view in views], [view.alpha_free for view in views]
+
     def product(x: ndarray) -> ndarray:
-        out, scaled = np.zeros_like(x), x * scale
-        for view in views:
-            pixels = view.weight * apply(view.jacobian, scaled, view.alpha_free)
-            add_transposed(view.jacobian, pixels, view.alpha_free, out)
+        out = np.zeros_like(x)
+        pixels = apply(jacobians, x * scale, alpha_free)
+        weighted = [view.weight * one for view, one in zip(views, pixels, strict=True)]
+        add_transposed(jacobians, weighted, alpha_free, out)
         return out * scale
 
     return product
@@ -241,7 +255,7 @@ class _ColourView:
         target = targets[0]
         rendering, jacobian = linearise(Primitives.place(target.frames, density), target.camera, BACKGROUND)
         matrix, alpha = ColourMatrix.of(jacobian), rendering.alpha.numpy().reshape(-1, 1)
-        drawn = matrix.apply(z) + (1 - alpha) * BACKGROUND
+        drawn = apply_colours([matrix], z)[0] + (1 - alpha) * BACKGROUND
         wanted = np.concatenate([_over_background(one)[0] for one in targets], axis=1)
         weight = _encoding_slope(wanted, settings.darkest) ** 2
         weight *= target.weight / max(1.0, float(target.rgba[..., 3].sum()))
@@ -261,8 +275,11 @@ class _Penalty:
     """Voxels fixed at a bound, because the gradient points beyond it."""
 
 
-def conjugate_gradients(curvature, penalty: _Penalty, gradient: ndarray, iterations: int) -> ndarray:
-    """Iterate Jacobi-preconditioned conjugate gradients for (curvature + penalty) x = gradient."""
+def conjugate_gradients(curvature, penalty: _Penalty, gradient: ndarray, iterations: int, dot: Dot) -> ndarray:
+    """Iterate Jacobi-preconditioned conjugate gradients for (curvature + penalty) x = gradient.
+
+    `dot` gives the steps: one for all columns, or, by columns that do not depend on each other, their own.
+    """
     settings, unit = penalty.settings, penalty.unit
     own = settings.pull + 6 * settings.smoothness
     inverse = np.where(penalty.held, 0, 1 / np.maximum(penalty.diagonal + unit * own, 1e-30))
@@ -271,19 +288,19 @@ def conjugate_gradients(curvature, penalty: _Penalty, gradient: ndarray, iterati
     x = np.zeros_like(residual)
     preconditioned = inverse * residual
     direction = preconditioned.copy()
-    energy = _dot(residual, preconditioned)
+    energy = dot(residual, preconditioned)
     for _ in range(iterations):
-        if energy <= 0:
+        if not np.any(energy > 0):
             break
         held_back = np.float32(settings.pull) * direction + np.float32(settings.smoothness) * laplacian(direction)
         curved = curvature(direction) + unit * held_back
         curved[penalty.held] = 0
-        length = np.float32(energy / max(_dot(direction, curved), 1e-30))
+        length = np.float32(energy / np.maximum(dot(direction, curved), 1e-30))
         x += length * direction
         residual = residual - length * curved
         preconditioned = inverse * residual
-        before, energy = energy, _dot(residual, preconditioned)
-        direction = preconditioned + np.float32(energy / before) * direction
+        before, energy = energy, dot(residual, preconditioned)
+        direction = preconditioned + np.float32(energy / np.maximum(before, 1e-30)) * direction
     return x
 
 
@@ -328,19 +345,21 @@ def _linear_unit(colours: ndarray, settings: InverseSettings) -> ndarray:
 
 
 def _mean_diagonal(diagonal: ndarray) -> ndarray:
-    """Mean over visible voxels, of all colour columns together and of density (column 3 of 4)."""
-    density = diagonal.shape[1] == 4
-    colours = diagonal[:, :3] if density else diagonal
-    seen = colours[colours > 0]
-    unit = np.full(diagonal.shape[1], seen.mean() if seen.size else 1.0, np.float32)
-    if density:
-        seen = diagonal[:, 3][diagonal[:, 3] > 0]
-        unit[3] = seen.mean() if seen.size else 1.0
+    """Mean over visible voxels, of each colouring's three columns together and of density (column 3 of 4)."""
+    unit = np.ones(diagonal.shape[1], np.float32)
+    for first in range(0, len(unit), 3):
+        columns = diagonal[:, first : first + 3]
+        seen = columns[columns > 0]
+        unit[first : first + 3] = seen.mean() if seen.size else 1.0
     return unit
 
 
-def _dot(a: ndarray, b: ndarray) -> float:
-    return float((a * b).sum(dtype=np.float64))
+def _dot(a: ndarray, b: ndarray) -> np.float64:
+    return (a * b).sum(dtype=np.float64)
+
+
+def _dot_by_column(a: ndarray, b: ndarray) -> Float64[ndarray, "c"]:
+    return (a * b).sum(0, dtype=np.float64)
 
 
 def _voxels(payload: Payload) -> Float32[ndarray, "v 4"]:

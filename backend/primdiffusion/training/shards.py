@@ -12,9 +12,7 @@ from __future__ import annotations
 
 import bisect
 import collections
-import contextlib
 import hashlib
-import io
 import itertools
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -39,7 +37,7 @@ INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1
 PEOPLE_EACH = 32
 LARGEST_SHARD = 4 * 2**30
 """Bytes."""
-_KINDS = {"voxels": ("U8",), "betas": ("F32",), "delta_scale": ("F16", "F32")}
+_TYPES = {"voxels": (torch.uint8,), "betas": (torch.float32,), "delta_scale": (torch.float16, torch.float32)}
 
 
 def open_people(folder: Path) -> PersonDataset:
@@ -98,11 +96,7 @@ def _write_shard(path: Path, people: Sequence[PersonVariants]) -> None:
 def digest_of(path: Path) -> str:
     """SHA-256 of a regular file, hexadecimal. Raises OSError and FileError."""
     with open_regular(path, LARGEST_SHARD) as file:
-        return _digest(file)
-
-
-def _digest(file: io.BufferedReader | io.BytesIO) -> str:
-    return hashlib.file_digest(file, "sha256").hexdigest()
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def damaged_shards(folder: Path) -> list[str]:
@@ -158,33 +152,25 @@ class PackedPeople:
 
     def check(self, shard: int) -> None:
         """Check a shard against its SHA-256. Raises FileError, FileNotFoundError."""
-        with self._checked(shard):
-            pass
-
-    @contextlib.contextmanager
-    def _checked(self, shard: int) -> Iterator[io.BufferedReader | io.BytesIO]:
-        """A shard, open, after a check against its SHA-256, so that what was checked is read. Raises as `check`."""
         path = self.paths[shard]
         if not path.is_file():
             raise FileNotFoundError(f"there is no {path}, which {INDEX} names: pack the humans again")
-        with open_regular(path, LARGEST_SHARD) as file:
-            if _digest(file) != self._digests[shard]:
-                raise FileError(path, f"is damaged: its SHA-256 differs from {INDEX}", "pack the humans again")
-            yield file
+        if digest_of(path) != self._digests[shard]:
+            raise FileError(path, f"is damaged: its SHA-256 differs from {INDEX}", "pack the humans again")
 
     def _check_content(self, number: int, file: TensorFile) -> None:
         people = range(self._firsts[number], self._firsts[number + 1])
         rows = sum(self.variants[index] for index in people)
         wanted = {"voxels": [rows, K, S, S, S, 4], "betas": [len(people), BETAS], "delta_scale": [rows, K, 3]}
         for name, shape in wanted.items():
-            if name == "delta_scale" and name not in file.tensors:
+            if name == "delta_scale" and name not in file.names:
                 continue
-            if name not in file.tensors:
+            if name not in file.names:
                 raise ValueError(f"{name!r} is missing")
-            stored = file.tensors[name]
-            if list(stored.shape) != shape or stored.dtype not in _KINDS[name]:
+            stored = file.tensor(name)
+            if list(stored.shape) != shape or stored.dtype not in _TYPES[name]:
                 raise ValueError(f"{name!r} is {stored.dtype} {list(stored.shape)}, not {shape}")
-            if name != "voxels" and not (file.tensor(name).float().abs() <= LARGEST_NUMBER).all():
+            if name != "voxels" and not (stored.float().abs() <= LARGEST_NUMBER).all():
                 raise ValueError(f"{name!r} holds impossible numbers")
 
     def _rows(self, index: int) -> tuple[int, int, slice]:
@@ -195,7 +181,7 @@ class PackedPeople:
         return shard, index - first, slice(start, start + self.variants[index])
 
     def _scale(self, shard: int, rows: slice) -> Tensor:
-        if "delta_scale" in self._shard(shard).tensors:
+        if "delta_scale" in self._shard(shard).names:
             return self._slice(shard, "delta_scale")[rows].float()
         return torch.ones(rows.stop - rows.start, K, 3)
 
@@ -204,11 +190,9 @@ class PackedPeople:
 
     def _shard(self, number: int) -> TensorFile:
         if number not in self._open:
-            with (
-                self._checked(number) as opened,
-                as_file_error(self.paths[number], "is no shard", "pack the humans again"),
-            ):
-                file = TensorFile(opened)
+            self.check(number)
+            with as_file_error(self.paths[number], "is not a shard", "pack the humans again"):
+                file = TensorFile(self.paths[number], LARGEST_SHARD)
                 self._check_content(number, file)
             self._open[number] = file
         return self._open[number]

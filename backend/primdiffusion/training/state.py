@@ -148,7 +148,7 @@ def saved_step(path: Path) -> int:
     if not path.exists():
         return 0
     with as_file_error(path, "is damaged", "start a new run folder", OSError):
-        return int(tensor_file.read_metadata(path)["step"])
+        return int(tensor_file.TensorFile(path).metadata["step"])
 
 
 def learning_rate_factor(step: int, steps: int) -> float:

@@ -20,7 +20,6 @@ import dataclasses
 import functools
 from collections.abc import Iterator, Sequence
 
-import bpy
 import gpu
 import numpy as np
 from numpy.typing import NDArray
@@ -206,9 +205,6 @@ class GpuMarcher:
     """The shaders, and the common atlas of the humans that were marched last. Needs a GPU context."""
 
     def __init__(self) -> None:
-        """Raises RuntimeError where there are no compute shaders."""
-        if bpy.app.version < (5, 0) and not gpu.capabilities.compute_shader_support_get():
-            raise RuntimeError("this GPU or driver has no compute shaders")
         self._shaders: dict[str, gpu.types.GPUShader] = {}
         self._humans: tuple[GpuPayload, ...] = ()
         self._atlas: gpu.types.GPUTexture | None = None

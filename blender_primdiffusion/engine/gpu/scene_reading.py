@@ -11,9 +11,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.human import BODY_MARK
+from ...scene.human import BODY_MARK, human_of
 from ...scene.human_file import FileVersion, file_version, read_payload
 from ...scene.proxy import PROXY_MARK
+from ...scene.splats import SPLATS_MARK
 from ..boxes import Boxes, boxes_of
 from ..picture import PosedHuman, human_armatures, pose_of
 from ..solids import visible_instances
@@ -107,14 +108,16 @@ class ViewContent:
     by_volumes: bool
     """An engine draws humans by their volumes."""
     types: frozenset[str]
-    """"mesh" and "volume", as far as the view's Object Types Visibility shows them."""
+    """"mesh", "volume" and "pointcloud" (splats), as far as the view's Object Types Visibility shows them."""
 
     @classmethod
     def of(cls, context: bpy.types.Context) -> ViewContent:
         """The content of the context's space."""
         space = context.space_data
         by_volumes = who_draws(context.scene.render.engine, space.shading.type, True) is Drawer.VOLUMES
-        types = frozenset(kind for kind in ("mesh", "volume") if getattr(space, f"show_object_viewport_{kind}"))
+        types = frozenset(
+            kind for kind in ("mesh", "volume", "pointcloud") if getattr(space, f"show_object_viewport_{kind}")
+        )
         local = space.as_pointer() if space.local_view else 0
         return cls(context.view_layer.as_pointer(), local, by_volumes, types)
 
@@ -128,19 +131,19 @@ class SceneReader:
     def read(self, content: ViewContent, depsgraph: bpy.types.Depsgraph, space: bpy.types.SpaceView3D) -> SceneReading:
         """What the space shows, whose content this is."""
         humans: dict[object, ShownHuman] = {}
-        candidates: list[tuple[bpy.types.Object, bpy.types.Collection, PosedHuman | Exception]] = []
-        bones, noted = [np.zeros((0, 2, 3))], {kind: set[bpy.types.Object]() for kind in content.types}
+        candidates: list[tuple[bpy.types.Object, bpy.types.Object, PosedHuman | Exception]] = []
+        bones, noted = [np.zeros((0, 2, 3))], {kind: set[bpy.types.Object | None]() for kind in content.types}
         errors, complete, end = [""], True, time.monotonic() + READING_S
-        for obj, armature, matrix, owner in human_armatures(_noting(visible_instances(depsgraph, space), noted)):
+        for obj, armature, matrix in human_armatures(_noting(visible_instances(depsgraph, space), noted)):
             if armature.show_in_front or armature.original.mode != "OBJECT":
                 bones.append(_bones(armature, matrix))
             try:
-                candidates.append((obj, owner, pose_of(armature, matrix, owner)))
+                candidates.append((obj, armature.original, pose_of(armature, matrix)))
             except (ValueError, OSError) as error:
-                candidates.append((obj, owner, error))
-        for number, (obj, owner, pose) in enumerate(candidates, 1):
-            shown = {kind for kind, found in noted.items() if found and not found.isdisjoint(owner.all_objects)}
-            if "mesh" in shown or (content.by_volumes and "volume" in shown):
+                candidates.append((obj, armature.original, error))
+        for number, (obj, person, pose) in enumerate(candidates, 1):
+            shown = {kind for kind, found in noted.items() if person in found}
+            if not shown.isdisjoint(("mesh", "pointcloud")) or (content.by_volumes and "volume" in shown):
                 continue
             try:
                 if isinstance(pose, Exception):
@@ -163,7 +166,11 @@ class SceneReader:
 def concerns_humans(changed: bpy.types.ID) -> bool:
     """Editing a scene's other objects should not wait until all instances have been looked through."""
     if isinstance(changed, bpy.types.Object):
-        return changed.type in ("ARMATURE", "EMPTY", "VOLUME") or BODY_MARK in changed or PROXY_MARK in changed
+        return (
+            changed.type in ("ARMATURE", "EMPTY", "VOLUME", "POINTCLOUD")
+            or BODY_MARK in changed
+            or PROXY_MARK in changed
+        )
     return not isinstance(changed, _UNRELATED)
 
 
@@ -173,21 +180,21 @@ def _key(pose: PosedHuman) -> object:
 
 
 def _noting(
-    instances: Iterable[bpy.types.DepsgraphObjectInstance], noted: dict[str, set[bpy.types.Object]]
+    instances: Iterable[bpy.types.DepsgraphObjectInstance], noted: dict[str, set[bpy.types.Object | None]]
 ) -> Iterator[bpy.types.DepsgraphObjectInstance]:
-    """The same instances; `noted`, by kind, gets what Blender may draw of humans: volumes, and as "mesh" their mesh
-    proxies and body meshes."""
+    """The same instances; `noted`, by kind, gets what Blender may draw of humans: volumes, splats, and as "mesh" their
+    mesh proxies and body meshes."""
     for instance in instances:
         obj = instance.object
-        kind = "volume" if obj.type == "VOLUME" else "mesh" if PROXY_MARK in obj or BODY_MARK in obj else ""
+        is_mesh = PROXY_MARK in obj or BODY_MARK in obj
+        kind = "mesh" if is_mesh else obj.type.lower() if obj.type == "VOLUME" or SPLATS_MARK in obj else ""
         if kind in noted:
-            noted[kind].add(obj.original)
+            noted[kind].add(human_of(obj.original))
         yield instance
 
 
 def _bones(armature: bpy.types.Object, matrix: NDArray) -> NDArray[np.float64]:
     """Ends [N, 2, 3] of the bones that are not hidden, in Blender's world."""
-    hidden = "hide" if bpy.app.version >= (5, 0) else "bone.hide"
-    shown = [bone for bone in armature.pose.bones if not bone.path_resolve(hidden)]
+    shown = [bone for bone in armature.pose.bones if not bone.hide]
     ends = np.array([(bone.head, bone.tail) for bone in shown], np.float64).reshape(-1, 2, 3)
     return ends @ matrix[:3, :3].T + matrix[:3, 3]

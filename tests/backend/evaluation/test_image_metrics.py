@@ -167,7 +167,7 @@ def test_files_of_another_network_are_rejected(tmp_path):
 
 def test_files_of_no_weights_are_named(tmp_path):
     torch.save(nn.Linear(2, 2), tmp_path / "pickled.pth")
-    with refused(FileError, "state_dict"):
+    with refused(FileError, "pickled.pth", "nothing was executed"):
         load_lpips([tmp_path / "pickled.pth"])
     torch.save([1, 2], tmp_path / "list.pth")
     with refused(FileError):

@@ -10,7 +10,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from primdiffusion.formats import arrays, regular_files
+from primdiffusion.formats import regular_files
 from primdiffusion.formats.arrays import (
     all_finite,
     array_names,
@@ -109,16 +109,6 @@ def test_arrays_of_one_call_share_the_limit(tmp_path, monkeypatch):
     assert len(read_arrays(path, ("b",))["b"]) == 100
 
 
-def test_a_long_list_of_names_is_not_read(tmp_path):
-    entry = struct.pack("<4s4B4HL2L5H2L", b"PK\1\2", 20, 0, 20, 0, *[0] * 7, 1, *[0] * 6) + b"a"
-    count = 100_000
-    end = struct.pack("<4s4H2LH", b"PK\5\6", 0, 0, 65535, 65535, len(entry) * count, 0, 0)
-    path = tmp_path / "many.npz"
-    path.write_bytes(entry * count + end)
-    with refused(FileError):
-        array_names(path)
-
-
 @pytest.mark.parametrize("read", [read_npy, map_npy, array_names])
 def test_folders_and_pipes_are_not_opened(tmp_path, read):
     with pytest.raises(IsADirectoryError):
@@ -212,32 +202,6 @@ def test_headers_of_python_2_are_read_without_a_warning(tmp_path, recwarn):
     (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(4))
     assert read_npy(tmp_path / "a.npy").shape == (1,)
     assert not recwarn
-
-
-@pytest.mark.parametrize("names", [("pose.npy", "pose.npy"), ("pose.npy", "pose"), ("pose", "trans.npy", "pose.npy")])
-@pytest.mark.filterwarnings("ignore:Duplicate name")
-def test_two_arrays_of_one_name_are_rejected(tmp_path, names):
-    with zipfile.ZipFile(tmp_path / "a.npz", "w") as archive:
-        for name in names:
-            archive.writestr(name, npy())
-    for read in (read_arrays, array_names, lambda path: array_shape(path, "pose")):
-        with refused(FileError, "pose"):
-            read(tmp_path / "a.npz")
-
-
-@pytest.mark.unix
-def test_a_mapped_array_is_that_of_the_file_whose_header_was_checked(tmp_path, monkeypatch):
-    path, other = tmp_path / "a.npy", tmp_path / "b.npy"
-    np.save(path, np.arange(100))
-    np.save(other, np.zeros(100, np.int64))
-    header = arrays._header
-
-    def checked_then_replaced(*given):
-        os.replace(other, path)
-        return header(*given)
-
-    monkeypatch.setattr(arrays, "_header", checked_then_replaced)
-    assert np.array_equal(map_npy(path), np.arange(100))
 
 
 @pytest.mark.unix

@@ -222,7 +222,7 @@ def test_an_imported_file_that_contradicts_itself_is_rejected(copied):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ("truncated", "damaged"),
+        ("truncated", "truncated"),
         ("no smpl", "SMPL_NEUTRAL.pkl: no such file"),
         ("another smpl", "SMPL_NEUTRAL.pkl"),
         ("another uv", "smpl_uv.obj"),

@@ -11,9 +11,11 @@ from primdiffusion.render.cpu_linear import (
     VOXELS,
     ColourMatrix,
     PictureJacobian,
+    add_colours_transposed,
     add_diagonal,
     add_transposed,
     apply,
+    apply_colours,
     apply_to_codes,
     linearise,
 )
@@ -47,7 +49,7 @@ def test_transposed_product_is_the_gradient_that_the_marcher_has(scene):
     fields.backward(torch.from_numpy(upstream))
     expected = torch.cat([rgb.grad.movedim(1, -1).flatten(0, -2), density.grad.reshape(-1, 1)], dim=1).numpy()
     got = np.zeros_like(expected)
-    add_transposed(jacobian, upstream, free, got)
+    add_transposed([jacobian], [upstream], [free], got)
     for column, name in ((slice(0, 3), "colour"), (slice(3, 4), "density")):
         difference = np.linalg.norm(got[:, column] - expected[:, column])
         assert difference < 0.02 * np.linalg.norm(expected[:, column]), name
@@ -57,8 +59,8 @@ def test_products_are_each_other_s_adjoint(scene):
     *_, jacobian, free = scene
     x, y = normal(2, jacobian.voxels, 4), normal(3, jacobian.rays, 4)
     back = np.zeros_like(x)
-    add_transposed(jacobian, y, free, back)
-    forward = (apply(jacobian, x, free).astype(np.float64) * y).sum()
+    add_transposed([jacobian], [y], [free], back)
+    forward = (apply([jacobian], x, [free])[0].astype(np.float64) * y).sum()
     assert forward == pytest.approx(float((x.astype(np.float64) * back).sum()), rel=1e-3)
 
 
@@ -70,7 +72,7 @@ def test_diagonal_is_that_of_the_product(scene):
     for place in np.argsort(-diagonal.ravel())[:40:8]:
         unit = np.zeros_like(diagonal)
         unit.ravel()[place] = 1
-        column = apply(jacobian, unit, free)
+        column = apply([jacobian], unit, [free])[0]
         assert diagonal.ravel()[place] == pytest.approx(float((weight * column**2).sum()), rel=1e-4)
 
 
@@ -82,7 +84,7 @@ def test_changes_given_by_codes_move_the_picture_as_the_voxels_that_they_stand_f
     got = apply_to_codes(jacobian, slope, basis, region, values, free)
     changes = slope[..., None] * np.einsum("kvxc,kcn->kvxn", basis[region], values).reshape(-1, 4, columns)
     for column in range(columns):
-        expected = apply(jacobian, np.ascontiguousarray(changes[..., column]), free)
+        expected = apply([jacobian], np.ascontiguousarray(changes[..., column]), [free])[0]
         np.testing.assert_allclose(got[..., column], expected, rtol=1e-3, atol=1e-4 * np.abs(expected).max())
 
 
@@ -90,7 +92,7 @@ def test_colour_matrix_draws_the_picture(scene):
     boxes, camera, jacobian, _ = scene
     colours = boxes.rgb.movedim(1, -1).reshape(-1, 3).numpy()
     expected = march_cpu(boxes, camera).rgb.reshape(-1, 3).numpy()
-    error = np.abs(ColourMatrix.of(jacobian).apply(np.ascontiguousarray(colours)) - expected)
+    error = np.abs(apply_colours([ColourMatrix.of(jacobian)], np.ascontiguousarray(colours))[0] - expected)
     assert error.max() < 0.05
     assert error.mean() < 0.004
 
@@ -98,23 +100,23 @@ def test_colour_matrix_draws_the_picture(scene):
 def test_colour_matrix_multiplies_every_column_alike(scene):
     *_, jacobian, _ = scene
     matrix, colours = ColourMatrix.of(jacobian), normal(5, jacobian.voxels, 6)
-    together = matrix.apply(colours)
-    alone = matrix.apply(np.ascontiguousarray(colours[:, 2:5]))
+    together = apply_colours([matrix], colours)[0]
+    alone = apply_colours([matrix], np.ascontiguousarray(colours[:, 2:5]))[0]
     np.testing.assert_allclose(together[:, 2:5], alone, rtol=1e-5, atol=1e-6)
     back = np.zeros_like(colours)
-    matrix.add_transposed(together, back)
+    add_colours_transposed([matrix], [together], back)
     assert float((colours * back).sum()) == pytest.approx(float((together**2).sum()), rel=1e-3)
 
 
 def test_parts_make_the_same_matrix_as_the_whole(scene, monkeypatch):
     boxes, camera, jacobian, free = scene
     change = normal(4, jacobian.voxels, 4)
-    drawn = apply(jacobian, change, free)
+    drawn = apply([jacobian], change, [free])[0]
     monkeypatch.setattr(cpu_linear, "PARTS", 1)
     _, whole = linearise(boxes, camera, GREY)
     for name, part, wanted in zip(PictureJacobian._fields, jacobian, whole, strict=True):
         assert np.array_equal(part, wanted), name
-    assert np.allclose(drawn, apply(whole, change, free), atol=1e-4)
+    assert np.allclose(drawn, apply([whole], change, [free])[0], atol=1e-4)
 
 
 def test_room_grows_with_the_matrix(scene, monkeypatch):

@@ -103,8 +103,8 @@ def test_a_damaged_shard_is_named_before_anything_of_it_is_used(copied, harm):
 
 
 def test_a_shard_is_checked_once(packed, monkeypatch):
-    digests, digest = [], shards._digest
-    monkeypatch.setattr(shards, "_digest", lambda file: digests.append(pathlib.Path(file.name).name) or digest(file))
+    digests, digest = [], shards.digest_of
+    monkeypatch.setattr(shards, "digest_of", lambda path: digests.append(path.name) or digest(path))
     people = open_people(packed)
     for index in (0, 1, 0, 4):
         people.person(index)

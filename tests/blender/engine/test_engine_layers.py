@@ -47,15 +47,9 @@ def layers(shot, scene) -> tuple[np.ndarray, np.ndarray]:
 def put_together(shot) -> np.ndarray:
     """The solid scene's picture [h, w, 4] with the people's over it, by Blender's compositor."""
     scene = shot.solid
-    if bpy.app.version >= (5, 0):
-        tree = scene.compositing_node_group = bpy.data.node_groups.new("over", "CompositorNodeTree")
-        tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
-        out = tree.nodes.new("NodeGroupOutput")
-    else:
-        scene.use_nodes = True
-        tree = scene.node_tree
-        tree.nodes.clear()
-        out = tree.nodes.new("CompositorNodeComposite")
+    tree = scene.compositing_node_group = bpy.data.node_groups.new("over", "CompositorNodeTree")
+    tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
+    out = tree.nodes.new("NodeGroupOutput")
     over = tree.nodes.new("CompositorNodeAlphaOver")
     pictures = [socket for socket in over.inputs if socket.type == "RGBA"]
     for socket, source in zip(pictures, (shot.solid, shot.people), strict=True):
@@ -64,8 +58,7 @@ def put_together(shot) -> np.ndarray:
         tree.links.new(render_layers.outputs["Image"], socket)
     tree.links.new(over.outputs[0], out.inputs[0])
     settings = scene.render.image_settings
-    if bpy.app.version >= (5, 0):
-        settings.media_type = "IMAGE"
+    settings.media_type = "IMAGE"
     settings.file_format, settings.color_depth, settings.color_mode = "OPEN_EXR", "32", "RGBA"
     scene.render.filepath = str(shot.out.with_name("together.exr"))
     bpy.context.window.scene = scene

@@ -13,7 +13,6 @@ from engine_stage import STEP, Z_UP, add_human, camera_by_hand, eight_bit, rende
 from oracle import world_from_model
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.rest_human import shape_model_of
 from blender_primdiffusion.scene.shape import betas_of
 
@@ -30,7 +29,7 @@ def stage(extension, saved_scene, oracle, folder, tmp_path):
 
 
 def test_the_engine_draws_a_reshaped_posed_person_as_the_backend_does(stage):
-    armature = armature_of(stage.person)
+    armature = stage.person
     rng = np.random.default_rng(2)
     rotations, translation = synthetic.axis_angle(rng.normal(0, 0.3, (24, 3))), np.array([0.1, 0.05, 0.0])
     pose_from_joint_rotations(armature, rotations, translation)

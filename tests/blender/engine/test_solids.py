@@ -11,6 +11,7 @@ from engine_stage import add_human, cube, material, render_exr, render_png, set_
 from support.errors import refused
 
 from blender_primdiffusion.engine.solids import SceneSolids, base_colour, changed_by, scene_solids, stored
+from blender_primdiffusion.scene.human import body_of
 
 
 @pytest.fixture
@@ -85,7 +86,7 @@ def test_curves_texts_metaballs_and_instances_count(stage):
 
 def test_a_persons_own_body_is_left_out_even_when_shown(stage, folder):
     person = add_human(folder)
-    body = next(obj for obj in person.objects if obj.type == "MESH")
+    body = body_of(person)
     body.hide_render = body.hide_viewport = False
     assert len(solids_now().corners) == 0
 

@@ -8,7 +8,7 @@ import pytest
 from blender_primdiffusion.engine.who_draws import Drawer, view_engine, who_draws
 
 pytestmark = pytest.mark.any_blender
-EEVEE = "BLENDER_EEVEE" if bpy.app.version >= (5, 0) else "BLENDER_EEVEE_NEXT"
+EEVEE = "BLENDER_EEVEE"
 SHADINGS = ("WIREFRAME", "SOLID", "MATERIAL", "RENDERED")
 
 

@@ -7,16 +7,15 @@ import pytest
 import synthetic_shape
 from deferred_volumes_stage import COUNT, STATES, advance, generated
 
-from blender_primdiffusion.scene import attachment
+from blender_primdiffusion.jobs import edit
+from blender_primdiffusion.scene import attachment, build
 
 
 @pytest.fixture
 def hidden(addon, tmp_path, monkeypatch):
     """Volumes are written as with a window."""
-    monkeypatch.setattr(
-        "blender_primdiffusion.scene.states.volumes_may_wait",
-        lambda person: person is None or not attachment.in_viewport(person),
-    )
+    for module in (build, edit):
+        monkeypatch.setattr(module, "volumes_may_wait", lambda person: not attachment.in_viewport(person))
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
     return addon
 

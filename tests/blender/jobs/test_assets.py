@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.poses.rotation import from_axis_angle
+from human_files import lose_data, person_file
 from support.errors import refused
 from support.fake_child import PICTURE
 
 from blender_primdiffusion.jobs.assets import SIDE, clay_figure, picture_of_file
 from blender_primdiffusion.motion.pose_library import builtin_poses, current_pose
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file, volume_path
+from blender_primdiffusion.scene.human import MARK, humans, parts_of
 from blender_primdiffusion.ui import export_panel
 
 ops = bpy.ops.primdiffusion
@@ -95,11 +96,10 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     (person,) = humans(bpy.context.scene)
-    volumes = [obj.data for obj in person.all_objects if obj.type == "VOLUME"]
+    volumes = [obj.data for obj in parts_of(person) if obj.type == "VOLUME"]
     assert len(volumes) == 8
-    assert all(volume_path(volume).is_file() for volume in volumes)
     assert person_file(person).is_file()
-    assert armature_of(person).pose.bones["head"]
+    assert person.pose.bones["head"]
     assert (person.library is not None) == link
     if link:
         with refused(RuntimeError, "linked"):
@@ -109,7 +109,7 @@ def test_another_file_finds_the_volumes_of_a_person_it_appends_or_links(person, 
 
 
 def test_a_pose_becomes_an_action_that_gives_it_to_any_human(person, tmp_path):
-    armature = armature_of(person)
+    armature = person
     pose_from_joint_rotations(armature, waving())
     assert ops.mark_as_asset(what="POSE", name="Waving") == {"FINISHED"}
     action = bpy.data.actions["Waving"]
@@ -119,13 +119,13 @@ def test_a_pose_becomes_an_action_that_gives_it_to_any_human(person, tmp_path):
     assert armature.animation_data is None
     np.testing.assert_allclose(np.array(rendered(tmp_path)["pose"]).reshape(24, 3)[17], [0, 0, -1], atol=1e-5)
     ops.generate(seed=8, steps=1)
-    other = armature_of(humans(bpy.context.scene)[1])
+    other = humans(bpy.context.scene)[1]
     other.pose.apply_pose_from_action(action)
     np.testing.assert_allclose(current_pose(other)[0], waving(), atol=1e-4)
 
 
 def test_marking_a_pose_leaves_the_active_action(person):
-    armature = armature_of(person)
+    armature = person
     armature.keyframe_insert("location", frame=3)
     action, slot = armature.animation_data.action, armature.animation_data.action_slot
     ops.mark_as_asset(what="POSE", picture=str(PICTURE))
@@ -149,7 +149,7 @@ def test_the_built_in_poses_become_a_library_and_the_open_file_stays(addon, tmp_
         assert action.asset_data.description.endswith("a built-in pose")
         assert preview(action)[..., 3].mean() > 0.02
     ops.generate(seed=7, steps=1)
-    armature = armature_of(humans(addon.scene)[0])
+    armature = humans(addon.scene)[0]
     name, pose = list(builtin_poses().items())[-1]
     armature.pose.apply_pose_from_action(bpy.data.actions[name[:1].upper() + name[1:]])
     turned = np.einsum("jki,jkl->jil", from_axis_angle(pose), current_pose(armature)[0])
@@ -175,7 +175,7 @@ def test_what_cannot_be_an_asset_is_reported(addon, tmp_path):
     assert not bpy.data.actions
     (person,) = humans(addon.scene)
     assert person.asset_data is None
-    person_file(person).unlink()
+    lose_data(person)
     with refused(RuntimeError, "Human"):
         ops.mark_as_asset()
 

@@ -8,24 +8,19 @@ import time
 import bpy
 import pytest
 from deferred_volumes_stage import COUNT, advance, check_complete, generated, on_disk, paths_of
+from human_files import folder_of, person_file
 
 import blender_primdiffusion
 from blender_primdiffusion.engine.gpu.overlay import overlay
 from blender_primdiffusion.jobs import deferred_volumes as module
 from blender_primdiffusion.jobs import windows
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
-from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
-from blender_primdiffusion.scene.human import (
-    armature_of,
-    humans,
-    person_file,
-    state_folder,
-    volumes_of,
-)
+from blender_primdiffusion.scene.human import humans, volumes_of
 from blender_primdiffusion.scene.pending import pending_of, pending_volumes, write_all_pending, write_pending
+from blender_primdiffusion.scene.surface import primitives_of
 from blender_primdiffusion.scene.volumes import person_memory
 
 ops = bpy.ops.primdiffusion
@@ -36,9 +31,7 @@ def test_the_human_stands_before_any_volume_is_written(person):
     assert pending_of(person).primitives == tuple(range(COUNT))
     assert len(volumes_of(person)) == COUNT
     assert person_file(person).is_file()
-    assert armature_of(person).visible_get()
-    look()
-    assert state.summary == "", "what is not yet written is not missing"
+    assert person.visible_get()
 
 
 def test_the_files_written_later_are_those_that_would_be_written_at_once(person, tmp_path):
@@ -55,10 +48,10 @@ def test_hidden_volumes_cost_the_viewport_nothing_and_renders_have_them(person):
     graph = bpy.context.evaluated_depsgraph_get()
     assert not [instance for instance in graph.object_instances if instance.object.type == "VOLUME"]
     assert not any(isinstance(block, bpy.types.Volume) for block in graph.ids)
-    primitives = next(child for child in person.children if child.name.endswith("_primitives"))
+    primitives = primitives_of(person)
     assert primitives.hide_viewport
     assert not primitives.hide_render
-    assert armature_of(person).name in primitives.objects
+    assert person.name in primitives.objects
 
 
 def test_a_slice_is_as_long_as_the_drawing_before_it_within_limits(person, monkeypatch):
@@ -140,7 +133,7 @@ def test_both_a_render_and_the_timer_may_write_the_same(person):
     check_complete(person)
     while deferred_volumes.work(60.0):
         pass
-    assert not list(state_folder(person).glob(".*.partial*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
 
 
 def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypatch, capsys):
@@ -152,24 +145,17 @@ def test_a_full_disk_is_reported_once_and_a_render_tries_again(person, monkeypat
         pass
     assert "No space left" in deferred_volumes.error
     assert capsys.readouterr().out.count("No space left") == 1
-    assert not list(state_folder(person).glob(".*.partial*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
     monkeypatch.undo()
     deferred_volumes.finish()
     assert deferred_volumes.error == ""
     check_complete(person)
 
 
-def test_a_damaged_file_of_the_human_is_reported(person):
-    person_file(person).write_bytes(b"no human")
-    while deferred_volumes.work(0.0):
-        pass
-    assert person_file(person).name in deferred_volumes.error
-
-
 def test_disabling_the_extension_leaves_no_unfinished_files(person):
     advance("half")
     blender_primdiffusion.unregister()
-    assert not list(state_folder(person).glob(".*.partial*"))
+    assert not list(folder_of(person).glob(".*.partial*"))
     assert pending_of(person) is not None
     blender_primdiffusion.register()
 
@@ -178,7 +164,7 @@ def test_background_mode_writes_at_once(addon):
     assert ops.generate(seed=5) == {"FINISHED"}
     (person,) = humans(bpy.context.scene)
     assert all(path.is_file() for path in paths_of(person))
-    assert person.children[0].hide_viewport
+    assert primitives_of(person).hide_viewport
 
 
 def test_the_memory_of_volumes_is_told_when_they_are_written(in_each_state):
@@ -196,15 +182,3 @@ def test_several_humans_are_written_one_after_another(hidden):
         assert time.monotonic() - began < 300
     for person in people:
         check_complete(person)
-
-
-def test_paths_change_after_undo_only_once_it_rests(person, monkeypatch):
-    brought = []
-    monkeypatch.setattr(deferred_volumes, "bring_here", lambda: brought.append(True))
-    monkeypatch.setattr(windows, "_last_undo", time.monotonic())
-    monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
-    assert module._bring_here_soon() == module.BLOCKED_S
-    assert not brought
-    monkeypatch.setattr(windows, "_last_undo", -math.inf)
-    assert module._bring_here_soon() is None
-    assert brought

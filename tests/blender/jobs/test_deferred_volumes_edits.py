@@ -6,23 +6,13 @@ import shutil
 
 import bpy
 import pytest
-from deferred_volumes_stage import COUNT, STATES, advance, check_complete, generated, on_disk, paths_of
+from deferred_volumes_stage import advance, check_complete, on_disk, paths_of
+from human_files import copy_of, press_x
 from jobs_driven import drive
 
 from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
-from blender_primdiffusion.jobs.missing_files import look, state
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.collect import unused
-from blender_primdiffusion.scene.copies import duplicate_human
-from blender_primdiffusion.scene.human import (
-    armature_of,
-    folder_of,
-    humans,
-    humans_folder,
-    person_file,
-    state_folder,
-    volumes_of,
-)
+from blender_primdiffusion.scene.human import humans, volumes_of
 
 ops = bpy.ops.primdiffusion
 
@@ -40,7 +30,7 @@ def test_undo_redo_and_work_again(in_each_state):
 def test_a_deleted_human_is_not_written_on_and_comes_back_with_undo(in_each_state):
     before = on_disk()
     bpy.ops.ed.undo_push(message="stands")
-    ops.delete_human(human=in_each_state.name)
+    press_x(in_each_state)
     bpy.ops.ed.undo_push(message="deleted")
     assert not deferred_volumes.work(0.0)
     assert on_disk() == before
@@ -54,33 +44,15 @@ def test_saved_and_opened_again_the_rest_is_written(in_each_state):
     deferred_volumes.stop()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     (person,) = humans(bpy.context.scene)
-    look()
-    assert state.summary == ""
     advance("written")
     check_complete(person)
 
 
-@pytest.mark.parametrize("reached", STATES)
-def test_the_first_save_takes_the_volumes_along_however_many_are_written(hidden, tmp_path, reached):
-    bpy.ops.wm.read_homefile(use_empty=True)
-    person = generated()
-    temporary = folder_of(person)
-    while reached != "absent" and len(on_disk(temporary)) < (COUNT if reached == "written" else COUNT // 2):
-        assert deferred_volumes.work(0.0)
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
-    assert state_folder(person).parent == tmp_path / "film_humans" / "Human"
-    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "film.blend"))
-    shutil.rmtree(temporary, ignore_errors=True)
-    advance("written")
-    check_complete(*humans(bpy.context.scene))
-
-
-def test_the_blend_and_its_folder_may_be_moved_before_they_are_written(in_each_state, tmp_path):
+def test_the_blend_may_be_moved_before_they_are_written(in_each_state, tmp_path):
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.read_homefile(use_empty=True)
     (tmp_path / "away").mkdir()
     shutil.move(tmp_path / "shot.blend", tmp_path / "away")
-    shutil.move(tmp_path / "shot_humans", tmp_path / "away")
     bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "away" / "shot.blend"))
     advance("written")
     check_complete(*humans(bpy.context.scene))
@@ -129,28 +101,11 @@ def test_an_edit_in_each_state_ends_with_the_volumes_of_the_edit(in_each_state):
 
 
 def test_a_duplicate_shares_what_is_still_to_be_written(in_each_state):
-    twin = duplicate_human(in_each_state)
-    assert armature_of(twin).name in twin.children[0].objects
+    twin = copy_of(in_each_state)
     advance("written")
     for person in (in_each_state, twin):
         check_complete(person)
-    assert all(obj.parent == armature_of(twin) for objects in volumes_of(twin).values() for obj in objects)
-
-
-def test_collected_files_include_what_is_still_to_be_written(in_each_state, tmp_path):
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "other.blend"))
-    assert ops.collect_files() == {"FINISHED"}
-    shutil.rmtree(tmp_path / "shot_humans")
-    advance("written")
-    check_complete(in_each_state)
-    assert state_folder(in_each_state) == tmp_path / "other_humans" / "Human" / "0001"
-
-
-def test_the_file_that_volumes_are_written_from_is_unused_once_no_human_needs_it(person):
-    source = person_file(person)
-    assert not unused(humans_folder())
-    ops.delete_human(human=person.name)
-    assert source in unused(humans_folder())
+    assert all(obj.parent == twin for objects in volumes_of(twin).values() for obj in objects)
 
 
 def test_what_failed_is_tried_again_when_the_file_is_opened(person, monkeypatch):

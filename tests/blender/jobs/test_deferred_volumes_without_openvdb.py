@@ -5,11 +5,12 @@ from __future__ import annotations
 import bpy
 import pytest
 from deferred_volumes_stage import COUNT, on_disk
+from human_files import person_file
 from support.errors import refused
 
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_after_loading
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, open_after_loading
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.human import humans, person_file, volumes_of
+from blender_primdiffusion.scene.human import humans, volumes_of
 from blender_primdiffusion.scene.volumes import Memory, person_memory
 
 pytestmark = pytest.mark.any_blender
@@ -41,7 +42,7 @@ def test_the_panel_says_why_no_volume_is_written_and_writing_stops(person):
 
 
 def test_loading_and_rendering_report_it_without_an_exception(person):
-    write_after_loading()
+    open_after_loading()
     deferred_volumes.finish()
     assert "python3-openvdb" in deferred_volumes.error
 

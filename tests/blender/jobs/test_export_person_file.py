@@ -8,6 +8,7 @@ from pathlib import Path
 import bpy
 import pytest
 import synthetic_shape
+from human_files import person_file
 
 from blender_primdiffusion.jobs.assets import HumanAssetJob, PoseAssetJob
 from blender_primdiffusion.jobs.edit import BlendJob, RedressJob, TransferJob, VaryJob
@@ -24,7 +25,7 @@ from blender_primdiffusion.jobs.queue import Job
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.export_model import FrameRange
-from blender_primdiffusion.scene.human import person_file
+from blender_primdiffusion.scene.payload import forget_session_files
 
 
 @pytest.fixture
@@ -32,7 +33,7 @@ def person(addon, tmp_path):
     return build_human(addon, synthetic_shape.write(tmp_path / "human", 6), "Änne")
 
 
-def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Job]:
+def jobs_about(person: bpy.types.Object, folder: Path) -> list[Job]:
     target, moment, context = HumanTarget.of(person), Moment.now(person), bpy.context
     return [
         VaryJob.of(person, {"steps": 3, "amount": 0.5, "seed": 3}),
@@ -49,13 +50,10 @@ def jobs_about(person: bpy.types.Collection, folder: Path) -> list[Job]:
     ]
 
 
-def test_jobs_ask_where_the_file_is_when_their_turn_comes(person, tmp_path):
-    jobs, before = jobs_about(person, tmp_path), person_file(person)
-    now = before.parent.rename(tmp_path / "elsewhere") / before.name
-    for volume in bpy.data.volumes:
-        volume.filepath = str(now.parent / Path(volume.filepath).name)
-    assert person_file(person) == now
+def test_jobs_send_the_file_of_now_when_their_turn_comes(person, tmp_path):
+    jobs = jobs_about(person, tmp_path)
+    forget_session_files()
     for job in jobs:
-        asked = json.dumps(job.params(tmp_path))
-        assert json.dumps(str(before)) not in asked, job.label
-        assert json.dumps(str(now)) in asked, job.label
+        assert json.dumps(str(person_file(person))) in json.dumps(job.params(tmp_path)), job.label
+        assert person_file(person).read_bytes() == (tmp_path / "human" / "person.human.safetensors").read_bytes()
+        forget_session_files()

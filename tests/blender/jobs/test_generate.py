@@ -10,6 +10,7 @@ from pathlib import Path
 
 import bpy
 import pytest
+from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
@@ -20,7 +21,8 @@ from blender_primdiffusion.jobs import queue as queue_module
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.human import body_of, humans, parts_of
+from blender_primdiffusion.scene.payload import session_folder
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 
 
@@ -35,7 +37,7 @@ def panel_texts(context) -> list[str]:
 def test_generate_builds_a_person_and_keeps_the_backends_file_beside_its_volumes(addon):
     assert bpy.ops.primdiffusion.generate(seed=7, steps=3) == {"FINISHED"}
     (person,) = humans(addon.scene)
-    assert sum(o.type == "VOLUME" for o in person.all_objects) == 8
+    assert sum(o.type == "VOLUME" for o in parts_of(person)) == 8
     sent = request_of(person_file(person))
     assert Path(sent.pop("out_dir")).name.startswith("generate_")
     assert sent == {"seed": 7, "steps": 3, "sampler": "ddim", "guidance": 2.0, "size": 16, "picture_px": 256}
@@ -58,7 +60,7 @@ def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
     for seed in (7, 8):
         bpy.ops.primdiffusion.generate(seed=seed, steps=1)
     first, second = humans(addon.scene)
-    bones = [armature_of(human) for human in (first, second)]
+    bones = [human for human in (first, second)]
     assert asked == [(bones[0], generate.FIRST_HUMAN_SHARE, []), (bones[1], 0.0, bones[:1])]
 
 
@@ -90,7 +92,7 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed,
         bpy.ops.primdiffusion.generate(seed=seed, steps=1)
     assert str(caught.value).count("Error:") == 1
     assert len(bpy.data.objects) == objects
-    assert not (tmp_path / "shot_humans").exists()
+    assert not session_folder().exists()
     assert not list(Path(bpy.app.tempdir).glob("generate_*"))
     assert re.search(sentence, " ".join(panel_texts(addon)))
 
@@ -159,8 +161,8 @@ def test_a_new_human_stands_at_the_cursor_selected(addon):
     addon.scene.cursor.location = (2.0, -1.0, 0.5)
     assert bpy.ops.primdiffusion.generate(seed=7) == {"FINISHED"}
     (person,) = humans(addon.scene)
-    armature = armature_of(person)
-    body = next(obj for obj in person.objects if obj.type == "MESH")
+    armature = person
+    body = body_of(person)
     addon.view_layer.update()
     assert tuple(armature.location)[:2] == (2.0, -1.0)
     assert min((armature.matrix_world @ vertex.co).z for vertex in body.data.vertices) == pytest.approx(0.5, abs=1e-5)
@@ -173,6 +175,6 @@ def test_who_is_being_posed_stays_selected_while_another_human_enters(addon):
     (first,) = humans(addon.scene)
     bpy.ops.object.mode_set(mode="POSE")
     assert bpy.ops.primdiffusion.generate(seed=8) == {"FINISHED"}
-    assert addon.view_layer.objects.active == armature_of(first)
+    assert addon.view_layer.objects.active == first
     assert addon.mode == "POSE"
     bpy.ops.object.mode_set(mode="OBJECT")

@@ -7,10 +7,11 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from human_files import sequence_files, volume_path
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
-from blender_primdiffusion.scene.human import armature_of, humans, sequence_files, volume_path
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.merged import merged_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
@@ -29,20 +30,19 @@ def filled_box(path: Path) -> np.ndarray:
 
     grid = openvdb.read(str(path), "density")
     low, high = grid.evalActiveVoxelBoundingBox()
-    shift = 0.5 * grid.transform.voxelSize()[0] if bpy.app.version < (5, 0) else 0.0
-    return np.array([grid.transform.indexToWorld(corner) for corner in (low, high)]) + shift
+    return np.array([grid.transform.indexToWorld(corner) for corner in (low, high)])
 
 
 def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):
     turns = np.tile(np.eye(3), (24, 1, 1))
     turns[16] = [[np.cos(1.2), np.sin(1.2), 0], [-np.sin(1.2), np.cos(1.2), 0], [0, 0, 1]]
-    pose_from_joint_rotations(armature_of(person), turns)
+    pose_from_joint_rotations(person, turns)
     assert ops.merge(voxel=0.02) == {"FINISHED"}
     box = filled_box(volume_path(merged_of(person).data))
     set_attachment(person, "SURFACE")
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
-    lift = np.array(armature_of(person).matrix_world)[:3, 3]
+    lift = np.array(person.matrix_world)[:3, 3]
     places_of = [np.array(i.matrix_world)[:3, 3] - lift for i in graph.object_instances if i.is_instance]
     assert len(places_of) == 1024
     centres = np.array([np.min(places_of, 0), np.max(places_of, 0)])

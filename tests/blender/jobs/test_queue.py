@@ -9,6 +9,7 @@ from pathlib import Path
 
 import bpy
 import pytest
+from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, IGNORES_CANCEL, NO_MEMORY, TAKES_LONG, request_of
@@ -17,7 +18,7 @@ from blender_primdiffusion.jobs import follow as follow_module
 from blender_primdiffusion.jobs.follow import follow, watch
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import humans, person_file
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.jobs_panel import PRIMDIFFUSION_PT_jobs
 

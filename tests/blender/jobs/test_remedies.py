@@ -46,6 +46,3 @@ def test_a_full_disk_is_a_kind_of_its_own(addon):
     for error in (full, wrapped):
         assert remedies.error_in_the_scene(error).kind == "unwritable"
     assert remedies.error_in_the_scene(ValueError("no")).kind == "scene"
-    missing = ValueError("gone")
-    missing.kind = "missing_volumes"
-    assert remedies.error_in_the_scene(missing).kind == "missing_volumes"

@@ -7,6 +7,7 @@ from pathlib import Path
 import bpy
 import pytest
 from blender_primdiffusion.formats.answers import VariationFiles
+from human_files import person_file
 from jobs_driven import drive, error_of, shown, until_running
 from support.errors import refused
 from support.fake_child import FAILS, TAKES_LONG, request_of
@@ -14,7 +15,7 @@ from support.fake_child import FAILS, TAKES_LONG, request_of
 from blender_primdiffusion.jobs.pictures import icons
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.variations import Sheet, VariationsJob, sheet
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import variations_panel
 
 pytestmark = pytest.mark.any_blender
@@ -85,7 +86,7 @@ def test_the_one_that_is_built_is_the_very_one_seen_and_one_undo_takes_them_away
     ops.select_variation(index=3)
     ops.build_variation()
     assert [sent(person_file(person))["seed"] for person in humans(bpy.context.scene)] == [13, 11, 14]
-    assert len({armature_of(person).location.x for person in humans(bpy.context.scene)}) == 3, "side by side"
+    assert len({person.location.x for person in humans(bpy.context.scene)}) == 3, "side by side"
     bpy.ops.ed.undo()
     assert len(humans(bpy.context.scene)) == 1
     assert [variation.chosen for variation in sheet.variations] == [True, False, False, True], "the sheet stays"

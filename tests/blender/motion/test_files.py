@@ -223,7 +223,7 @@ def bomb(claimed: tuple[int, ...], size: int) -> bytes:
 def test_an_array_larger_than_its_file_is_rejected_before_memory_is_taken(tmp_path):
     with zipfile.ZipFile(tmp_path / "bomb.npz", "w") as archive:
         archive.writestr("poses.npy", bomb((10**9, 72), 100))
-    with refused(FileError, "576000000000"):
+    with refused(FileError, "(1000000000, 72)"):
         read_motion(tmp_path / "bomb.npz")
     (tmp_path / "bomb.npy").write_bytes(bomb((10**9, 72), 100))
     with refused(FileError):

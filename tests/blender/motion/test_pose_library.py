@@ -30,7 +30,6 @@ from blender_primdiffusion.motion.pose_library import (
 )
 from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.ui import pose_panel
 from blender_primdiffusion.ui.pose_panel import PRIMDIFFUSION_PT_poses
 
@@ -41,7 +40,7 @@ REST = np.tile(np.eye(3), (24, 1, 1))
 @pytest.fixture
 def armature(addon, tmp_path, monkeypatch):
     monkeypatch.setattr(pose_panel, "own_folder", lambda: tmp_path / "eigene Dateien")
-    return armature_of(build_human(addon, synthetic.write(tmp_path / "p", 8), "Ann"))
+    return build_human(addon, synthetic.write(tmp_path / "p", 8), "Ann")
 
 
 def test_every_built_in_pose_is_finite_and_has_a_picture(addon):

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from human_files import copy_of, folder_of
 from human_stage import strong_pose
 from oracle import Z_UP, blended_frames, blended_vertices, evaluated_matrices, world_from_model
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import ATTACHMENT, IN_VIEWPORT, attachment_of, set_attachment
+from blender_primdiffusion.scene.attachment import IN_VIEWPORT, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.copies import duplicate_human
-from blender_primdiffusion.scene.human import armature_of, body_of, folder_of, humans, volumes_of
+from blender_primdiffusion.scene.human import body_of, humans, volumes_of
 from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of, primitives_of
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
@@ -49,7 +49,7 @@ def on_the_surface(collection, arrays, rotations, translation) -> np.ndarray:
     position, rotation = synthetic.frames(vertices, arrays)
     frames = np.tile(np.eye(4), (len(position), 1, 1))
     frames[:, :3, :3], frames[:, :3, 3] = rotation, position
-    return world_from_model(armature_of(collection), arrays["vertices"]) @ Z_UP @ frames
+    return world_from_model(collection, arrays["vertices"]) @ Z_UP @ frames
 
 
 def degrees_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
@@ -62,7 +62,7 @@ def degrees_apart(one: np.ndarray, other: np.ndarray) -> np.ndarray:
 def test_volumes_lie_on_the_posed_surface_s_tangent_planes(person, seed):
     collection, arrays = person
     rotations, translation = strong_pose(seed)
-    armature = armature_of(collection)
+    armature = collection
     pose_from_joint_rotations(armature, rotations, translation)
     armature.location, armature.rotation_euler, armature.scale = (1, -2, 0.5), (0.4, -0.3, 2.0), (1.2, 1.2, 1.2)
     set_attachment(collection, "SURFACE")
@@ -83,7 +83,7 @@ def test_modes_differ_in_a_strong_pose_and_agree_at_rest(person):
     assert set(by_armature) == set(on_surface)
     for name, matrix in by_armature.items():
         np.testing.assert_allclose(on_surface[name], matrix, atol=2e-5)
-    pose_from_joint_rotations(armature_of(collection), *strong_pose(1))
+    pose_from_joint_rotations(collection, *strong_pose(1))
     posed = shown()
     set_attachment(collection, "ARMATURE")
     names = sorted(posed)
@@ -93,11 +93,11 @@ def test_modes_differ_in_a_strong_pose_and_agree_at_rest(person):
 def test_back_by_the_armature_volumes_follow_linear_blend_skinning_again(person):
     collection, arrays = person
     rotations, translation = strong_pose(2)
-    pose_from_joint_rotations(armature_of(collection), rotations, translation)
+    pose_from_joint_rotations(collection, rotations, translation)
     set_attachment(collection, "SURFACE")
     set_attachment(collection, "ARMATURE")
     assert len(shown()) == COUNT
-    world = world_from_model(armature_of(collection), arrays["vertices"])
+    world = world_from_model(collection, arrays["vertices"])
     expected = world @ blended_frames(arrays, rotations, translation)
     assert np.abs(evaluated_matrices(collection) - expected).max() < 2e-5
     assert carrier_of(collection).hide_render
@@ -107,7 +107,7 @@ def test_back_by_the_armature_volumes_follow_linear_blend_skinning_again(person)
 def test_saving_and_loading_keeps_the_surface_s_frames(person):
     collection, arrays = person
     rotations, translation = strong_pose(0)
-    pose_from_joint_rotations(armature_of(collection), rotations, translation)
+    pose_from_joint_rotations(collection, rotations, translation)
     set_attachment(collection, "SURFACE")
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
@@ -140,7 +140,7 @@ def test_posing_opens_and_changes_no_file(person):
     for mode in ("SURFACE", "ARMATURE"):
         set_attachment(collection, mode)
         opened.clear()
-        pose_from_joint_rotations(armature_of(collection), *strong_pose(3))
+        pose_from_joint_rotations(collection, *strong_pose(3))
         shown()
         assert not [path for path in opened if str(path).endswith((".vdb", ".npz"))]
     assert {path: path.stat().st_mtime_ns for path in folder_of(collection).iterdir()} == files
@@ -154,7 +154,7 @@ def test_a_deleted_and_a_renamed_volume_leave_the_others_where_they_are(person):
     renamed.name = "Zz 10"
     volumes[6][0].name = "zz 9"
     rotations, translation = strong_pose(4)
-    pose_from_joint_rotations(armature_of(collection), rotations, translation)
+    pose_from_joint_rotations(collection, rotations, translation)
     set_attachment(collection, "SURFACE")
     found = shown()
     assert len(found) == COUNT - 1
@@ -169,7 +169,7 @@ def test_two_people_share_the_nodes_and_keep_to_their_own_bodies(person, tmp_pat
         set_attachment(collection, "SURFACE")
     assert len(shown()) == 2 * COUNT
     assert sum(group.name.startswith(GROUP_NAME) for group in bpy.data.node_groups) == 1
-    pose_from_joint_rotations(armature_of(other), *strong_pose(1))
+    pose_from_joint_rotations(other, *strong_pose(1))
     rest = on_the_surface(person[0], person[1], np.tile(np.eye(3), (24, 1, 1)), np.zeros(3))
     found = shown()
     own = [volume[0].name for _, volume in sorted(volumes_of(person[0]).items())]
@@ -179,9 +179,10 @@ def test_two_people_share_the_nodes_and_keep_to_their_own_bodies(person, tmp_pat
 def test_a_duplicate_on_the_surface_follows_its_own_bones(person):
     collection, arrays = person
     set_attachment(collection, "SURFACE")
-    twin = duplicate_human(collection)
+    twin = copy_of(collection)
+    set_attachment(twin, "SURFACE")
     rotations, translation = strong_pose(1)
-    pose_from_joint_rotations(armature_of(twin), rotations, translation)
+    pose_from_joint_rotations(twin, rotations, translation)
     found = shown()
     assert len(found) == 2 * COUNT
     for owner, turns, shift in (
@@ -205,7 +206,7 @@ def test_unknown_modes_and_what_is_not_merged_are_rejected(person):
         set_attachment(person[0], "BONES")
     with refused(ValueError, "Merge"):
         set_attachment(person[0], "MERGED")
-    assert ATTACHMENT not in person[0]
+    assert attachment_of(person[0]) == "ARMATURE"
 
 
 def test_a_human_of_an_earlier_version_stays_shown_in_viewports(person):

@@ -4,34 +4,29 @@ from __future__ import annotations
 
 import itertools
 import json
-import shutil
 
 import bpy
 import numpy as np
 import pytest
 import synthetic
+from human_files import folder_of
 from human_stage import strong_pose
 from mathutils import Vector
 from oracle import TOLERANCE_M, blended_frames, evaluated_matrices, raised, world_from_model
 from support.errors import refused
 
-from blender_primdiffusion.scene import build
+from blender_primdiffusion.scene import volume_objects
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.build import attach_volumes, build_human
+from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
-from blender_primdiffusion.scene.human import (
-    MARK,
-    armature_of,
-    body_of,
-    folder_of,
-    humans,
-    remove_human,
-)
+from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
+from blender_primdiffusion.scene.payload import forget_session_files, session_folder
+from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
-KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions")
+KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions", "images")
 
 
 def datablocks() -> dict[str, list[str]]:
@@ -50,16 +45,14 @@ def person(saved_scene, tmp_path):
 
 def expected_matrices(collection, arrays, rotations, translation) -> np.ndarray:
     bpy.context.view_layer.update()
-    return world_from_model(armature_of(collection), arrays["vertices"]) @ blended_frames(
-        arrays, rotations, translation
-    )
+    return world_from_model(collection, arrays["vertices"]) @ blended_frames(arrays, rotations, translation)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_volumes_follow_linear_blend_skinning_to_a_hundredth_of_a_millimetre(person, seed):
     collection, arrays = person
     rotations, translation = strong_pose(seed)
-    armature = armature_of(collection)
+    armature = collection
     pose_from_joint_rotations(armature, rotations, translation)
     armature.location, armature.rotation_euler, armature.scale = (1, -2, 0.5), (0.4, -0.3, 2.0), (1.2, 1.2, 1.2)
     expected = expected_matrices(collection, arrays, rotations, translation)
@@ -71,14 +64,14 @@ def test_volumes_follow_linear_blend_skinning_to_a_hundredth_of_a_millimetre(per
 def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
     arrays = synthetic.arrays(1024)
     collection = build_human(saved_scene, synthetic.write(tmp_path / "human", 1024))
-    assert sum(o.type == "VOLUME" for o in collection.all_objects) == 1024
-    assert len(list(folder_of(collection).glob("0001/prim_*.vdb"))) == 1024
+    assert sum(o.type == "VOLUME" for o in parts_of(collection)) == 1024
+    assert len(list(folder_of(collection).glob("prim_*.vdb"))) == 1024
     frames = np.arange(1, 9)
     swing = np.zeros((8, 24, 3))
     swing[:, 1, 0], swing[:, 2, 0] = 0.5 * np.sin(frames), -0.5 * np.sin(frames)
     swing[:, 18, 1], swing[:, 16, 2] = 0.8 * np.cos(frames), -1.0
     rotations, translations = synthetic.axis_angle(swing), np.stack([0 * frames, 0 * frames, 0.1 * frames], -1)
-    keyframe_poses(armature_of(collection), frames, rotations, translations)
+    keyframe_poses(collection, frames, rotations, translations)
     for index in (0, 3, 7):
         bpy.context.scene.frame_set(int(frames[index]))
         expected = expected_matrices(collection, arrays, rotations[index], translations[index])
@@ -88,7 +81,7 @@ def test_1024_volumes_follow_a_keyframed_walk(saved_scene, tmp_path):
 
 def test_soles_stand_on_the_floor_and_the_person_faces_minus_y(person):
     collection, arrays = person
-    armature = armature_of(collection)
+    armature = collection
     assert armature.matrix_world.translation.length == 0, "the origin is on the floor"
     feet = [vertex.co for vertex in body_of(collection).data.vertices]
     assert min(point.z for point in feet) == pytest.approx(0, abs=1e-6)
@@ -102,12 +95,11 @@ def test_soles_stand_on_the_floor_and_the_person_faces_minus_y(person):
 def test_a_volume_covers_its_box_in_the_world(person):
     collection, arrays = person
     bpy.context.view_layer.update()
-    volume = next(o for o in collection.all_objects if o.type == "VOLUME" and o.name.endswith("prim_0007"))
+    volume = next(o for o in parts_of(collection) if o.type == "VOLUME" and o.name.endswith("prim_0007"))
     corners = np.array([volume.matrix_world @ Vector(corner) for corner in volume.bound_box])
     half = arrays["half_extent"][7]
     edge = half * 8 / 7  # half a voxel beyond the centres of the outermost
-    missing = half * 2 / 7 if bpy.app.version < (5, 0) else 0 * half  # Blender 4.5 forgets the last voxel in bound_box
-    local = np.array(list(itertools.product(*[(-e, e - m) for e, m in zip(edge, missing, strict=True)])))
+    local = np.array(list(itertools.product(*[(-e, e) for e in edge])))
     box = blended_frames(arrays, np.tile(np.eye(3), (24, 1, 1)), np.zeros(3))[7]
     expected = local @ box[:3, :3].T + box[:3, 3] + raised(arrays["vertices"])[:3, 3]
     np.testing.assert_allclose(sorted(corners.tolist()), sorted(expected.tolist()), atol=1e-5)
@@ -130,34 +122,21 @@ def test_provenance_and_overlaps_are_stored_on_the_collection(person):
     assert "draws only 31" in overlap_warning(collection)
 
 
-def test_saving_and_loading_keeps_volumes_pose_and_relative_paths(person, tmp_path):
+def test_saving_and_loading_keeps_volumes_and_pose(person, tmp_path):
     collection, arrays = person
     rotations, translation = strong_pose(1)
-    pose_from_joint_rotations(armature_of(collection), rotations, translation)
-    assert all(v.filepath.startswith("//shot_humans/Human/0001/prim_") for v in bpy.data.volumes)
+    pose_from_joint_rotations(collection, rotations, translation)
     bpy.ops.wm.save_mainfile()
-    moved = tmp_path / "elsewhere"
-    moved.mkdir()
-    shutil.move(tmp_path / "shot.blend", moved)
-    shutil.move(tmp_path / "shot_humans", moved)
-    bpy.ops.wm.open_mainfile(filepath=str(moved / "shot.blend"))
+    forget_session_files()
+    bpy.ops.wm.open_mainfile(filepath=str(tmp_path / "shot.blend"))
+    assert open_humans() == []
+    write_all_pending()
     collection = humans(bpy.context.scene)[0]
     expected = expected_matrices(collection, arrays, rotations, translation)
     np.testing.assert_allclose(evaluated_matrices(collection), expected, atol=1e-5)
     for volume in bpy.data.volumes:
         assert volume.grids.load(), volume.grids.error_message
         assert {grid.name for grid in volume.grids} == {"density", "Cd"}
-
-
-def test_removal_takes_everything_but_the_files(person):
-    collection, _ = person
-    keyframe_poses(armature_of(collection), np.array([1]), np.tile(np.eye(3), (1, 24, 1, 1)), np.zeros((1, 3)))
-    files = volume_files()
-    remove_human(collection)
-    left = datablocks()
-    assert left.pop("materials") == ["PrimDiffusion Volume"]
-    assert not any(left.values())
-    assert all(shutil.os.path.exists(path) for path in files)
 
 
 @pytest.mark.parametrize("damage", ["truncated", "NaN"])
@@ -174,21 +153,20 @@ def test_a_corrupted_file_leaves_scene_and_disk_as_they_were(saved_scene, tmp_pa
     assert sorted(tmp_path.rglob("*")) == files
 
 
-def test_a_failure_in_the_middle_of_building_leaves_scene_and_disk_as_they_were(
-    person, saved_scene, tmp_path, monkeypatch
-):
+def test_a_failure_in_the_middle_of_building_leaves_the_scene_as_it_was(person, saved_scene, tmp_path, monkeypatch):
     before, files = datablocks(), volume_files()
+
+    attach_volumes = volume_objects.attach_volumes
 
     def failing(*given):
         attach_volumes(*given)
         raise MemoryError("no memory for the volumes")
 
-    monkeypatch.setattr(build, "attach_volumes", failing)
+    monkeypatch.setattr(volume_objects, "attach_volumes", failing)
     with pytest.raises(MemoryError):
         build_human(saved_scene, synthetic.write(tmp_path / "second", 8, seed=3))
     assert datablocks() == before
-    assert sorted(str(path) for path in tmp_path.rglob("*.vdb")) == files
-    assert [path.name for path in (tmp_path / "shot_humans").iterdir()] == ["Human"]
+    assert sorted(map(str, session_folder().rglob("*.vdb"))) == files
 
 
 def test_building_from_edit_mode_works(saved_scene, tmp_path):
@@ -197,4 +175,4 @@ def test_building_from_edit_mode_works(saved_scene, tmp_path):
     saved_scene.view_layer.objects.active = mesh
     bpy.ops.object.mode_set(mode="EDIT")
     collection = build_human(saved_scene, synthetic.write(tmp_path / "human", 8))
-    assert armature_of(collection).mode == "OBJECT"
+    assert collection.mode == "OBJECT"

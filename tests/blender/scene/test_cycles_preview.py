@@ -12,7 +12,6 @@ from support.errors import refused
 from blender_primdiffusion.scene.armature import model_origin, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import posed_extent, setup_cycles_preview
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.material import GAIN_NODE, MATERIAL_NAME
 
 RED = (0.6, 0.1, 0.05)
@@ -48,7 +47,7 @@ def lone_box(saved_scene, tmp_path):
 def test_a_box_has_its_colour_opacity_size_and_place_in_cycles(lone_box, tmp_path):
     camera = setup_cycles_preview(bpy.context.scene, size=96, samples=4)
     camera.data.type, camera.data.ortho_scale = "ORTHO", 0.24
-    armature = armature_of(lone_box)
+    armature = lone_box
     centre = np.array([0, 0, 0.3]) + np.array(armature.location) + model_origin(armature.data)
     camera.location = (0, -3, centre[2])
     gain = bpy.data.materials[MATERIAL_NAME].node_tree.nodes[GAIN_NODE].outputs[0]
@@ -78,19 +77,16 @@ def test_a_box_has_its_colour_opacity_size_and_place_in_cycles(lone_box, tmp_pat
 
 def test_the_camera_frames_a_posed_person_from_every_side(saved_scene, tmp_path):
     person = build_human(saved_scene, synthetic.write(tmp_path / "human", 8))
-    pose_from_joint_rotations(armature_of(person), synthetic.random_rotations(np.random.default_rng(0), 24), np.ones(3))
-    armature_of(person).location.x += 5
+    pose_from_joint_rotations(person, synthetic.random_rotations(np.random.default_rng(0), 24), np.ones(3))
+    person.location.x += 5
     from bpy_extras.object_utils import world_to_camera_view
 
     for yaw in (0.0, 0.7, np.pi / 2, 3.0):
         camera = setup_cycles_preview(bpy.context.scene, yaw=yaw)
         bpy.context.view_layer.update()
         low, high = posed_extent(person)
-        matrix = armature_of(person).matrix_world
-        seen = [
-            world_to_camera_view(bpy.context.scene, camera, matrix @ bone.head)
-            for bone in armature_of(person).pose.bones
-        ]
+        matrix = person.matrix_world
+        seen = [world_to_camera_view(bpy.context.scene, camera, matrix @ bone.head) for bone in person.pose.bones]
         assert all(0 < point.x < 1 and 0 < point.y < 1 and point.z > 0 for point in seen)
         span = max(np.ptp([point.x for point in seen]), np.ptp([point.y for point in seen]))
         assert span > 0.4

@@ -13,7 +13,6 @@ from support.errors import refused
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.export_model import FrameRange, write_model
 from blender_primdiffusion.scene.handles import add_handles
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.proxy import build_proxy, read_proxy, remove_proxy
 
 EXACT = 1e-4
@@ -32,7 +31,7 @@ def store(saved_scene, tmp_path):
 def moving(store):
     """Somebody who moves on frames 1 to 4, away from the origin and turned."""
     person = exporting.add_person(store)
-    armature = armature_of(person)
+    armature = person
     rng = np.random.default_rng(0)
     turns, places = synthetic.axis_angle(rng.normal(0, 0.3, (4, 24, 3))), rng.normal(0, 0.1, (4, 3))
     keyframe_poses(armature, np.arange(1, 5), turns, places)
@@ -77,7 +76,7 @@ def textures(mesh):
 @pytest.mark.parametrize("frames", [FrameRange(1, 4), FrameRange(3, 3)], ids=["animation", "pose"])
 @pytest.mark.parametrize(("kind", "ending"), [("GLB", ".glb"), ("FBX", ".fbx"), ("USD", ".usdc"), ("USD", ".usdz")])
 def test_joints_and_surface_are_where_they_were(moving, store, tmp_path, kind, ending, frames):
-    armature = armature_of(moving)
+    armature = moving
     proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
     bpy.context.scene.collection.objects.link(proxy)
     bpy.context.scene.frame_set(3)
@@ -103,7 +102,7 @@ def test_textures_are_not_written_through_a_link(moving, store, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "textures").symlink_to(tmp_path / "outside")
     with refused(FileError, "textures"):
-        write_model(bpy.context, armature_of(moving), proxy, tmp_path / "out" / "a.usdc", "USD", FrameRange(1, 1))
+        write_model(bpy.context, moving, proxy, tmp_path / "out" / "a.usdc", "USD", FrameRange(1, 1))
     assert not list((tmp_path / "outside").iterdir())
     assert not (tmp_path / "out" / "a.usdc").exists()
 
@@ -111,7 +110,7 @@ def test_textures_are_not_written_through_a_link(moving, store, tmp_path):
 @pytest.mark.parametrize(("kind", "ending"), [("GLB", ".glb"), ("FBX", ".fbx"), ("USD", ".usdc")])
 def test_ik_handles_are_not_exported_and_their_effect_is(store, tmp_path, kind, ending):
     person = exporting.add_person(store)
-    armature = armature_of(person)
+    armature = person
     add_handles(bpy.context, armature)
     armature.pose.bones["pelvis"].location.y = -0.1
     for frame, height in ((1, 0.0), (4, 0.3)):
@@ -131,7 +130,7 @@ def test_ik_handles_are_not_exported_and_their_effect_is(store, tmp_path, kind, 
 
 def test_exporting_leaves_the_scene_as_it_was(moving, store, tmp_path):
     proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
-    armature = armature_of(moving)
+    armature = moving
     armature.hide_viewport, armature.data.pose_position = True, "REST"
     bpy.context.scene.frame_set(2)
     kinds = ("scenes", "objects", "meshes", "armatures", "actions", "materials", "images", "collections")
@@ -149,7 +148,7 @@ def test_an_exporter_that_is_disabled_is_enabled_for_the_moment(moving, store, t
     proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
     addon_utils.disable("io_scene_fbx")
     try:
-        write_model(bpy.context, armature_of(moving), proxy, tmp_path / "a.fbx", "FBX", FrameRange(1, 2))
+        write_model(bpy.context, moving, proxy, tmp_path / "a.fbx", "FBX", FrameRange(1, 2))
         assert (tmp_path / "a.fbx").is_file()
         assert not addon_utils.check("io_scene_fbx")[1]
     finally:
@@ -158,7 +157,7 @@ def test_an_exporter_that_is_disabled_is_enabled_for_the_moment(moving, store, t
 
 def test_an_armature_in_edit_mode_or_without_a_bone_is_rejected(moving, store, tmp_path):
     proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
-    armature = armature_of(moving)
+    armature = moving
     armature.data.bones["head"].name = "skull"
     with refused(ValueError, "'head'"):
         write_model(bpy.context, armature, proxy, tmp_path / "a.glb", "GLB", FrameRange(1, 1))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
+from human_files import copy_of
 from mathutils import Matrix, Vector
 from oracle import Z_UP
 
@@ -23,10 +24,8 @@ from blender_primdiffusion.scene.armature import (
     pose_from_joint_rotations,
 )
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.copies import duplicate_human, separate_copies
 from blender_primdiffusion.scene.cycles import posed_extent
 from blender_primdiffusion.scene.handles import add_handles, bake_handles, has_handles
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.place import _extent
 
 MM = 1e-3
@@ -327,7 +326,7 @@ def test_what_cannot_be_done_is_rejected_and_changes_nothing(armature):
 
 
 def test_a_human_with_handles_is_as_large_as_without(person):
-    armature = armature_of(person)
+    armature = person
     before, placed = posed_extent(person), _extent(armature)
     add_handles(bpy.context, armature)
     bpy.context.view_layer.update()
@@ -335,19 +334,10 @@ def test_a_human_with_handles_is_as_large_as_without(person):
     np.testing.assert_allclose(_extent(armature), placed, atol=1e-5)
 
 
-@pytest.mark.parametrize("made_by", ["Duplicate Human", "Shift-D"])
-def test_a_copy_has_handles_of_its_own(person, made_by):
-    armature = armature_of(person)
+def test_a_copy_has_handles_of_its_own(person):
+    armature = person
     add_handles(bpy.context, armature)
-    if made_by == "Shift-D":
-        for obj in bpy.context.view_layer.objects:
-            obj.select_set(obj == armature)
-        bpy.context.view_layer.objects.active = armature
-        bpy.ops.object.duplicate()
-        (name,) = separate_copies()
-        twin = armature_of(bpy.data.collections[name])
-    else:
-        twin = armature_of(duplicate_human(person))
+    twin = copy_of(person)
     before, twins = posed(armature), posed(twin)
     twin.pose.bones["left_foot_ik"].location.y += 0.2
     assert_same(before, posed(armature))

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import os
-
 import bpy
 import numpy as np
 import pytest
 import synthetic_shape
+from human_files import person_file
 
 from blender_primdiffusion.jobs.export import put
 from blender_primdiffusion.motion.pose_library import save_pose
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.collect import collect_before_saving, unused
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.human import copy_file, person_file
 from blender_primdiffusion.scene.human_file import HumanTensors, read_tensors, write_tensors
-from blender_primdiffusion.scene.missing import missing_files
 from blender_primdiffusion.scene.shape import betas_of
 
 COUNT = 12
@@ -58,24 +54,8 @@ def test_nothing_is_written_through_a_link_with_a_temporary_name(tmp_path):
     (tmp_path / "mine").write_text("mine")
     for name in (".a.part", ".source.part", "sit.part", ".a.human.part"):
         (tmp_path / name).symlink_to("mine")
-    copy_file(tmp_path / "source", tmp_path / "a", tmp_path)
     put(tmp_path / "source", tmp_path / "b")
     write_tensors(tmp_path / "a.human", HumanTensors({}, {}))
     save_pose(tmp_path, "sit", np.zeros((24, 3)), np.zeros(3))
     assert (tmp_path / "mine").read_text() == "mine"
-    assert (tmp_path / "a").read_text() == (tmp_path / "b").read_text() == "new"
-
-
-def test_pipes_in_place_of_files_count_as_missing_and_links_in_a_circle_do_no_harm(addon, tmp_path):
-    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "shot.blend"))
-    person = build_human(addon, synthetic_shape.write(tmp_path / "human", COUNT), "Anna")
-    own = person_file(person)
-    (linked, *_) = sorted(own.parent.glob("*.vdb"))
-    own.unlink()
-    linked.unlink()
-    os.mkfifo(own)
-    linked.symlink_to(linked.name)
-    (found,) = missing_files()
-    assert found.file == own.name
-    collect_before_saving(bpy.data.filepath)
-    assert unused(own.parent.parent) == []
+    assert (tmp_path / "b").read_text() == "new"

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import os
-import shutil
 
 import bpy
 import numpy as np
 import psutil
 import pytest
 import synthetic_shape
+from human_files import copy_of, person_file, press_x
 from human_stage import COUNT, named, places, whole
 from support.errors import refused
 from support.fake_child import request_of
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import MARK, armature_of, humans, person_file
+from blender_primdiffusion.scene.human import humans, is_human, parts_of
+from blender_primdiffusion.scene.payload import forget_session_files
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 
@@ -34,7 +35,7 @@ def test_undo_and_redo_across_generate_edit_reshape_and_delete(source, addon):
     ops.reshape(height=1.6)
     step("reshape")
     reshaped = places(humans(bpy.context.scene)[0])
-    ops.delete_human()
+    press_x(humans(bpy.context.scene)[0])
     step("delete")
     assert not humans(bpy.context.scene)
     bpy.ops.ed.undo()
@@ -55,7 +56,7 @@ def test_undo_and_redo_across_generate_edit_reshape_and_delete(source, addon):
 def test_a_human_generated_after_a_deletion_leaves_the_file_of_the_deleted(source, addon):
     step("empty")
     ops.generate(seed=7)
-    ops.delete_human()
+    press_x(humans(bpy.context.scene)[0])
     step("delete")
     ops.generate(seed=9)
     assert request_of(person_file(humans(bpy.context.scene)[0]))["seed"] == 9
@@ -66,7 +67,7 @@ def test_a_human_generated_after_a_deletion_leaves_the_file_of_the_deleted(sourc
     assert request_of(person_file(person))["seed"] == 7
 
 
-def test_appended_people_are_whole_and_can_be_edited_and_collected(person, tmp_path):
+def test_appended_people_are_whole_and_can_be_edited(person, tmp_path):
     where, other = places(person), tmp_path / "other"
     other.mkdir()
     bpy.ops.wm.read_homefile(use_empty=True)
@@ -75,10 +76,9 @@ def test_appended_people_are_whole_and_can_be_edited_and_collected(person, tmp_p
     assert whole(named(), where)
     assert ops.vary(human="Anna", seed=13) == {"FINISHED"}
     assert whole(named(), where)
-    assert ops.collect_files() == {"FINISHED"}
-    assert person_file(named()).is_relative_to(other)
     bpy.ops.wm.save_mainfile()
-    shutil.rmtree(tmp_path / "shot_humans")
+    (tmp_path / "shot.blend").unlink()
+    forget_session_files()
     bpy.ops.wm.open_mainfile(filepath=str(other / "film.blend"))
     assert whole(named(), where)
 
@@ -90,26 +90,26 @@ def linked(tmp_path, folder="other"):
     with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True, relative=True) as (_, wanted):
         wanted.collections = ["Anna"]
     bpy.context.scene.collection.children.link(wanted.collections[0])
-    return wanted.collections[0]
+    return bpy.data.objects["Anna"]
 
 
 def test_linked_people_are_whole_and_reject_edits(person, tmp_path):
     where = places(person)
     anna = linked(tmp_path)
     assert whole(anna, where)
-    for operator in (ops.vary, ops.reshape, ops.delete_human, ops.duplicate_human):
+    for operator in (ops.vary, ops.reshape):
         with refused(RuntimeError, "linked"):
             operator()
-    assert ops.collect_files() == {"FINISHED"}
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     assert whole(named(), where)
 
 
 def test_linked_people_with_overrides_can_be_posed_and_made_local(person, tmp_path):
-    anna = linked(tmp_path)
-    override = anna.override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
-    armature = armature_of(override)
+    linked(tmp_path)
+    made = bpy.data.collections["Anna"].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    override = next(filter(is_human, made.all_objects))
+    armature = override
     armature.pose.bones["head"].rotation_quaternion = (0.9, 0.1, 0.2, 0.1)
     armature.location.x = 3
     where = places(override)
@@ -118,7 +118,7 @@ def test_linked_people_with_overrides_can_be_posed_and_made_local(person, tmp_pa
         ops.vary(human=override.name)
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
-    override = next(c for c in bpy.data.collections if MARK in c and c.library is None)
+    override = next(one for one in humans(bpy.context.scene) if one.library is None)
     assert whole(override, where)
 
 
@@ -132,25 +132,25 @@ def test_made_local(person, tmp_path):
 
 def test_blenders_own_duplicate_of_all_parts(person):
     where = places(person)
-    for obj in list(person.all_objects):
+    for obj in list(parts_of(person)):
         obj.hide_viewport = False
         obj.select_set(True)
     bpy.ops.object.duplicate()
     copies = [obj for obj in bpy.context.selected_objects if obj.type == "VOLUME"]
     assert len(copies) == COUNT
     (armature,) = {obj.parent for obj in copies}
-    assert armature != armature_of(person) or len(copies) == COUNT
+    assert armature != person or len(copies) == COUNT
     assert all(obj.data.grids.load() for obj in copies)
-    originals = [obj for obj in person.all_objects if obj.type == "VOLUME" and obj not in copies]
+    originals = [obj for obj in parts_of(person) if obj.type == "VOLUME" and obj not in copies]
     bpy.context.view_layer.update()
     assert np.isfinite([list(row) for obj in originals for row in obj.matrix_world]).all()
     bpy.data.batch_remove([obj for obj in bpy.context.selected_objects])
     assert whole(person, where)
 
 
-def test_our_duplicate_and_two_people(person):
+def test_a_duplicate_of_the_armature_and_two_people(person):
     where = places(person)
-    ops.duplicate_human()
+    copy_of(person)
     ops.vary(human="Anna.001", seed=14)
     assert whole(named(), where)
     assert whole(named("Anna.001"))
@@ -171,7 +171,7 @@ def test_copies_of_a_scene(person, kind):
 
 def test_two_scenes_share_a_person(person):
     other = bpy.data.scenes.new("Other")
-    other.collection.children.link(person)
+    other.collection.children.link(bpy.data.collections[person.name])
     first = bpy.context.scene
     ops.vary(seed=14)
     for scene in (first, other):
@@ -181,21 +181,21 @@ def test_two_scenes_share_a_person(person):
 
 def test_names_and_collections_of_parts_may_change(person):
     where = [list(row) for row in places(person)]
-    person.name = "Wer?"
-    order = sorted((obj for obj in person.all_objects if obj.type == "VOLUME"), key=lambda obj: obj.name)
+    person.users_collection[0].name = "Wer?"
+    order = sorted((obj for obj in parts_of(person) if obj.type == "VOLUME"), key=lambda obj: obj.name)
     for number, obj in enumerate(order):
         obj.name = f"x{number}"
-    armature_of(person).name = "Rig"
+    person.name = "Rig"
     bpy.ops.wm.save_mainfile()
-    assert whole(named("Wer?"), where)
+    assert whole(named("Rig"), where)
     ops.vary(seed=14)
-    assert whole(named("Wer?"), where)
+    assert whole(named("Rig"), where)
 
 
 def test_the_armature_turned_and_scaled_in_a_scene_of_centimetres(person):
     bpy.context.scene.unit_settings.scale_length = 0.01
     bpy.context.scene.render.fps = 60
-    armature = armature_of(person)
+    armature = person
     before, old = places(person), np.array(armature.matrix_world)
     armature.scale, armature.rotation_euler = (100, 100, 100), (0.3, 0.2, 1.0)
     bpy.context.view_layer.update()
@@ -207,7 +207,7 @@ def test_the_armature_turned_and_scaled_in_a_scene_of_centimetres(person):
 def test_memory_of_deleted_people_is_given_back_and_undo_shows_them_again(person):
     where = places(person)
     step("before")
-    ops.delete_human()
+    press_x(humans(bpy.context.scene)[0])
     step("delete")
     bpy.ops.ed.undo()
     assert whole(named(), where)

@@ -11,13 +11,12 @@ import pytest
 import synthetic
 from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.formats.requests import DENSITY_GAIN
+from human_files import copy_of, folder_of, sequence_files, volume_path
 from support.errors import refused
 
 from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.collect import collect_before_saving, unused
-from blender_primdiffusion.scene.copies import duplicate_human
-from blender_primdiffusion.scene.human import folder_of, sequence_files, state_folder, volume_path
+from blender_primdiffusion.scene.human import parts_of
 from blender_primdiffusion.scene.material import (
     density_gain,
     person_material,
@@ -27,7 +26,6 @@ from blender_primdiffusion.scene.material import (
 from blender_primdiffusion.scene.merged import (
     MergedGrid,
     MergedState,
-    index_to_local,
     merged_folder,
     merged_of,
     merged_state,
@@ -63,7 +61,7 @@ def person(saved_scene, tmp_path):
 def merge(person, tmp_path, seeds=(0,), start=0) -> bpy.types.Object:
     written = [tmp_path / f"grid_{seed}.vdb" for seed in seeds]
     digests = [write_grid(grid(seed), path) for seed, path in zip(seeds, written, strict=True)]
-    files = publish(written, digests, merged_folder(person))
+    files = publish(written, digests, merged_folder())
     return show_merged(person, files, MergedState(tuple(f"pose {seed}" for seed in seeds), 0.02, start))
 
 
@@ -83,18 +81,10 @@ def test_openvdb_reads_back_what_was_merged(tmp_path):
         read.copyToArray(found)
         np.testing.assert_array_equal(found, values.astype(np.float32))
         assert read.saveFloatAsHalf
-        shift = 0.01 if bpy.app.version < (5, 0) else 0.0
-        np.testing.assert_allclose(np.add(read.transform.indexToWorld((0, 0, 0)), shift), origin, atol=1e-7)
-        np.testing.assert_allclose(
-            np.add(read.transform.indexToWorld((1, 2, 3)), shift), origin + np.array([0.02, 0.04, 0.06])
-        )
+        np.testing.assert_allclose(read.transform.indexToWorld((0, 0, 0)), origin, atol=1e-7)
+        np.testing.assert_allclose(read.transform.indexToWorld((1, 2, 3)), origin + np.array([0.02, 0.04, 0.06]))
     box = openvdb.read(str(tmp_path / "m.vdb"), "density").evalActiveVoxelBoundingBox()
     assert box == ((3, 2, 2), (14, 9, 6))  # what is empty is not stored
-
-
-def test_blender_before_5_gets_the_grid_half_a_voxel_lower():
-    shift = index_to_local(grid(), (5, 0, 1))[3, :3] - index_to_local(grid(), (4, 5, 15))[3, :3]
-    np.testing.assert_allclose(shift, 0.01)
 
 
 def test_a_merged_person_is_one_volume_and_goes_back(person, tmp_path):
@@ -102,7 +92,7 @@ def test_a_merged_person_is_one_volume_and_goes_back(person, tmp_path):
     set_attachment(person, "MERGED")
     assert visible_volumes() == {merged.name}
     assert merged.data.materials[0] == volume_material()
-    assert merged.data.filepath.startswith("//shot_humans/Human/merged_")
+    assert merged.data.filepath.startswith("//shot_volumes/merged_")
     assert merged.data.grids.load(), merged.data.grids.error_message
     assert {one.name for one in merged.data.grids} == {"density", "Cd"}
     back = attachment_before_merge(person)
@@ -159,20 +149,6 @@ def test_the_state_survives_on_the_object(person, tmp_path):
     assert merged_state(merged) == MergedState(("pose 0", "pose 1"), 0.02, 3)
 
 
-def test_a_sequence_made_before_the_first_save_is_collected_whole(empty_scene, tmp_path):
-    person = build_human(empty_scene, synthetic.write(tmp_path / "human", 3))
-    volume = merge(person, tmp_path, (0, 1, 2)).data
-    (tmp_path / "new").mkdir()
-    collect_before_saving(str(tmp_path / "new" / "shot.blend"))
-    assert [path.parent for path in sequence_files(volume)] == [tmp_path / "new" / "shot_humans" / "Human"] * 3
-
-
-def test_files_of_earlier_merges_are_unused_and_those_of_a_shown_sequence_are_not(person, tmp_path):
-    earlier = volume_path(merge(person, tmp_path, (7,)).data)
-    merge(person, tmp_path, (0, 1, 2))
-    assert unused(folder_of(person)) == [earlier]
-
-
 def test_a_folder_that_cannot_be_written_leaves_nothing(person, tmp_path):
     digest = write_grid(grid(), tmp_path / "grid.vdb")
     (tmp_path / "file").write_text("in the way")
@@ -212,17 +188,17 @@ def test_a_gain_of_one_s_own_is_a_material_of_one_s_own(person, tmp_path):
 
 
 def test_a_duplicate_s_gain_is_its_own(person):
-    twin = duplicate_human(person)
+    twin = copy_of(person)
     set_density_gain(person, 2.0)
     set_density_gain(twin, 1.9)
     assert density_gain(person) == pytest.approx(2.0)
     assert density_gain(twin) == pytest.approx(1.9)
-    assert {volume_path(data) for data in bpy.data.volumes} == set(state_folder(person).glob("prim_*.vdb"))
+    assert {volume_path(data) for data in bpy.data.volumes} == set(folder_of(person).glob("prim_*.vdb"))
 
 
 def test_a_material_without_the_factor_is_rejected(person):
     other = bpy.data.materials.new("Smoke")
-    for obj in person.all_objects:
+    for obj in parts_of(person):
         if obj.type == "VOLUME":
             obj.data.materials[0] = other
     assert density_gain(person) is None
@@ -231,14 +207,14 @@ def test_a_material_without_the_factor_is_rejected(person):
 
 
 def test_memory_is_what_openvdb_reports_for_the_loaded_grids(person):
-    files = sorted(state_folder(person).glob("prim_*.vdb"))
+    files = sorted(folder_of(person).glob("prim_*.vdb"))
     memory = person_memory(person)
     assert memory.files == sum(path.stat().st_size for path in files)
     assert memory.grids == sum(one.memUsage() for path in files for one in openvdb.readAll(str(path))[0])
 
 
 def test_missing_files_take_no_memory(person):
-    for path in state_folder(person).glob("prim_*.vdb"):
+    for path in folder_of(person).glob("prim_*.vdb"):
         path.rename(path.with_suffix(".gone"))
     assert person_memory(person).files == 0
 

@@ -6,10 +6,10 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from human_files import remove_human
 from mathutils import Vector
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.scene.place import (
     GAP_M,
     REACH_M,
@@ -18,7 +18,6 @@ from blender_primdiffusion.scene.place import (
     _thinned,
     next_place,
     stand_at_cursor,
-    stand_beside_others,
 )
 
 FRONT, BACK = Vector((8.0, -16.0, 9.0)), Vector((8.0, 16.0, 9.0))
@@ -35,7 +34,7 @@ def standing(source, eye=None) -> bpy.types.Object:
     collection = build_human(bpy.context, source)
     stand_at_cursor(bpy.context, collection, eye)
     bpy.context.view_layer.update()
-    return armature_of(collection)
+    return collection
 
 
 def place(eye=None) -> list[float]:
@@ -52,9 +51,9 @@ def test_the_place_of_the_next_human_is_foreseen(saved_scene, source):
         saved_scene.scene.cursor.location = location
         expected = next_place(saved_scene)
         collection = build_human(saved_scene, source)
-        soles = armature_of(collection).location.copy()
+        soles = collection.location.copy()
         stand_at_cursor(saved_scene, collection)
-        moved = armature_of(collection).location - soles
+        moved = collection.location - soles
         np.testing.assert_allclose(expected, moved, atol=0.25)  # the synthetic human's arms are shorter
         assert expected[1:] == pytest.approx(location[1:])
         bpy.context.view_layer.update()
@@ -63,8 +62,8 @@ def test_the_place_of_the_next_human_is_foreseen(saved_scene, source):
 def test_a_human_stands_on_the_floor_beside_the_default_cube(saved_scene, source):
     bpy.ops.mesh.primitive_cube_add(size=2)
     free = build_human(saved_scene, source)
-    soles = armature_of(free).location.z
-    bpy.data.collections.remove(free)
+    soles = free.location.z
+    remove_human(free)
     armature = standing(source)
     assert armature.location.z == pytest.approx(soles)
     assert apart(_extent(armature), ((-1, -1, -1), (1, 1, 1))) == pytest.approx(GAP_M, abs=1e-5)
@@ -160,15 +159,6 @@ def test_a_human_within_a_closed_solid_is_moved_out_if_the_eye_is_outside(empty_
 def test_where_nothing_within_reach_is_free_a_human_stands_at_the_cursor(empty_scene):
     bpy.ops.mesh.primitive_plane_add(size=10 * REACH_M, location=(0, 0, 1))
     assert place() == [0, 0, 0]
-
-
-def test_a_duplicate_is_clear_of_solid_objects_along_the_row(saved_scene, source):
-    collection = build_human(saved_scene, source)
-    bpy.ops.mesh.primitive_cube_add(size=0.3, location=(0, 0, 1))
-    stand_beside_others(saved_scene, collection)
-    bpy.context.view_layer.update()
-    extent = _extent(armature_of(collection))
-    assert apart(extent, ((-0.15, -0.15), (0.15, 0.15))) >= GAP_M - 1e-5
 
 
 def test_a_box_meets_a_triangle_where_no_plane_is_between_them():

@@ -17,7 +17,7 @@ from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.human import body_of
+from blender_primdiffusion.scene.human import body_of, link_part
 from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, remove_proxy, shown_betas
 from blender_primdiffusion.scene.shape import betas_of, generated_betas
 
@@ -33,7 +33,7 @@ def person(saved_scene, tmp_path):
     arrays["vertices"] = synthetic_shape.arrays()["vertices"]
     np.savez(tmp_path / "proxy.npz", **arrays)
     made = generated_betas(person)
-    person.objects.link(build_proxy(person, read_proxy(tmp_path / "proxy.npz"), tmp_path / "proxy.png", made))
+    link_part(person, build_proxy(person, read_proxy(tmp_path / "proxy.npz"), tmp_path / "proxy.png", made))
     return person
 
 
@@ -68,7 +68,7 @@ def test_the_proxy_of_a_human_of_an_earlier_version_follows_about_its_own_origin
     make_earlier(person)
     before = betas_of(person)
     proxy = build_proxy(person, read_proxy(tmp_path / "proxy.npz"), tmp_path / "proxy.png", before)
-    person.objects.link(proxy)
+    link_part(person, proxy)
     np.testing.assert_allclose(places(proxy), model(before), atol=1e-5)
     reshape(person, before + TALLER)
     off, moved = places(proxy) - model(before + TALLER), model(before + TALLER) - model(before)

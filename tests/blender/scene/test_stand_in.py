@@ -10,13 +10,14 @@ import sys
 import bpy
 import numpy as np
 import pytest
+from human_files import copy_of
 from human_stage import build_posed, named, whole
 
 import blender_primdiffusion
-from blender_primdiffusion.scene.copies import duplicate_human, rename_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
-from blender_primdiffusion.scene.human import armature_of, body_of, volumes_of
+from blender_primdiffusion.scene.human import body_of, parts_of
 from blender_primdiffusion.scene.stand_in import STAND_IN
+from blender_primdiffusion.scene.surface import primitives_of
 
 WITHOUT = """
 import json, sys
@@ -55,7 +56,7 @@ def without(blend, how="open", saved="") -> dict:
 
 
 def stand_in(person) -> bpy.types.Object:
-    (found,) = [obj for obj in person.all_objects if STAND_IN in obj]
+    (found,) = [obj for obj in parts_of(person) if STAND_IN in obj]
     return found
 
 
@@ -115,7 +116,7 @@ def test_it_follows_the_extension_being_disabled_and_enabled(person):
 
 def test_it_stays_hidden_in_undo_redo_and_new_frames(person):
     bpy.ops.ed.undo_push(message="one")
-    armature_of(person).location.x += 1.0
+    person.location.x += 1.0
     bpy.ops.ed.undo_push(message="two")
     for step in (bpy.ops.ed.undo, bpy.ops.ed.redo, lambda: bpy.context.scene.frame_set(7)):
         step()
@@ -125,7 +126,7 @@ def test_it_stays_hidden_in_undo_redo_and_new_frames(person):
 
 
 def test_renders_do_not_show_it(person, tmp_path):
-    bpy.data.batch_remove([obj for objects in volumes_of(person).values() for obj in objects])
+    primitives_of(person).hide_render = True
     scene = bpy.context.scene
     setup_cycles_preview(scene, size=16)
     scene.render.filepath = str(tmp_path / "picture.png")
@@ -135,15 +136,14 @@ def test_renders_do_not_show_it(person, tmp_path):
 
 def test_it_has_the_bodys_shape_and_name_also_in_duplicates(source):
     person = build_posed(source)
-    twin = duplicate_human(person)
+    twin = copy_of(person)
     for one in (person, twin):
         assert stand_in(one).data == body_of(one).data
-        assert stand_in(one).parent == armature_of(one)
-        assert stand_in(one).modifiers["Armature"].object == armature_of(one)
+        assert stand_in(one).parent == one
+        assert stand_in(one).modifiers["Armature"].object == one
     assert body_of(twin).data != body_of(person).data
-    rename_human(twin, "Berta")
-    assert stand_in(twin).name == "Berta_needs_PrimDiffusion"
+    assert stand_in(twin).name == f"{twin.name}_needs_PrimDiffusion"
     body_of(twin).data = stand_in(twin).data = body_of(person).data
-    assert bpy.ops.primdiffusion.reshape(human="Berta", height=1.6) == {"FINISHED"}
+    assert bpy.ops.primdiffusion.reshape(human=twin.name, height=1.6) == {"FINISHED"}
     assert stand_in(twin).data == body_of(twin).data != body_of(person).data
     assert shown() == []

@@ -12,7 +12,7 @@ import synthetic
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.cycles import max_overlap
 from blender_primdiffusion.scene.human import volume_name
-from blender_primdiffusion.scene.volumes import FAINTEST, bake, index_to_local, window, write_volume
+from blender_primdiffusion.scene.volumes import FAINTEST, bake, window, write_volume
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
@@ -22,7 +22,7 @@ def written(grids, folder) -> list[Path]:
     folder.mkdir()
     paths = [folder / volume_name(k) for k in range(len(grids.density))]
     for k, path in enumerate(paths):
-        write_volume(grids, k, bpy.app.version, path)
+        write_volume(grids, k, path)
     return paths
 
 
@@ -85,16 +85,8 @@ def test_voxels_lie_corner_aligned_in_the_box(human, grids, tmp_path):
     for k, path in enumerate(files):
         transform = openvdb.read(str(path), "density").transform
         half = human["half_extent"][k]
-        step = 2 * half / 7
-        drawn_too_high = 0.5 * step if bpy.app.version < (5, 0) else 0
-        np.testing.assert_allclose(np.add(transform.indexToWorld((0, 0, 0)), drawn_too_high), -half, atol=1e-7)
-        np.testing.assert_allclose(np.add(transform.indexToWorld((7, 7, 7)), drawn_too_high), half, atol=1e-7)
-
-
-def test_blender_before_5_gets_grids_half_a_voxel_lower():
-    half = np.array([0.07, 0.14, 0.21])
-    shift = index_to_local(half, (5, 0, 1))[3, :3] - index_to_local(half, (4, 5, 15))[3, :3]
-    np.testing.assert_allclose(shift, half / 7, atol=1e-15)
+        np.testing.assert_allclose(transform.indexToWorld((0, 0, 0)), -half, atol=1e-7)
+        np.testing.assert_allclose(transform.indexToWorld((7, 7, 7)), half, atol=1e-7)
 
 
 def test_density_beyond_half_precision_is_clamped_not_infinite(human):
@@ -113,7 +105,7 @@ def test_a_volume_appears_whole_or_not_at_all(grids, tmp_path, monkeypatch, erro
 
     monkeypatch.setattr(volumes, "write_vdb", half)
     with pytest.raises(type(error)):
-        write_volume(grids, 0, bpy.app.version, path)
+        write_volume(grids, 0, path)
     assert path.read_bytes() == content
     assert sorted(path.parent.iterdir()) == before
 

@@ -8,7 +8,7 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of
+from blender_primdiffusion.scene.human import parts_of
 from blender_primdiffusion.scene.volumes import free_unused_grids
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
@@ -27,13 +27,13 @@ def test_grids_of_deleted_volumes_are_given_back_and_shown_ones_stay(saved_scene
     gone = build_human(saved_scene, synthetic.write(tmp_path / "other", 64, seed=3), "Gone")
     saved_scene.view_layer.update()
     grown = _resident_mb()
-    for obj in list(gone.all_objects):
+    for obj in list(parts_of(gone)):
         bpy.data.objects.remove(obj)
     bpy.ops.outliner.orphans_purge(do_recursive=True)
     free_unused_grids()
     assert grown - before > 30, "a grid takes about 0.9 MB"
     assert _resident_mb() - before < 0.35 * (grown - before)
-    assert all(obj.data.grids.load() for obj in kept.all_objects if obj.type == "VOLUME")
+    assert all(obj.data.grids.load() for obj in parts_of(kept) if obj.type == "VOLUME")
 
 
 def test_grids_of_people_who_are_shown_are_given_back_and_read_again(saved_scene, tmp_path):
@@ -46,11 +46,11 @@ def test_grids_of_people_who_are_shown_are_given_back_and_read_again(saved_scene
     free_unused_grids()
     assert read > 30
     assert _resident_mb() - before < 0.35 * read
-    armature_of(person).pose.bones[0].location.x = 1.0
+    person.pose.bones[0].location.x = 1.0
     saved_scene.view_layer.update()
     assert _resident_mb() - before < 0.35 * read, "posing reads no voxels"
     assert _boxes(person) == boxes
-    for obj in person.all_objects:
+    for obj in parts_of(person):
         obj.update_tag()
         if obj.type == "VOLUME":
             obj.data.update_tag()
@@ -58,9 +58,9 @@ def test_grids_of_people_who_are_shown_are_given_back_and_read_again(saved_scene
     assert _boxes(person) == boxes
 
 
-def _boxes(person: bpy.types.Collection) -> dict[str, list[tuple[float, ...]]]:
+def _boxes(person: bpy.types.Object) -> dict[str, list[tuple[float, ...]]]:
     graph = bpy.context.evaluated_depsgraph_get()
-    volumes = [obj for obj in person.all_objects if obj.type == "VOLUME"]
+    volumes = [obj for obj in parts_of(person) if obj.type == "VOLUME"]
     return {obj.name: [tuple(corner) for corner in obj.evaluated_get(graph).bound_box] for obj in volumes}
 
 

@@ -7,10 +7,9 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import armature_of
 
 
 @pytest.fixture
 def armature(addon, tmp_path) -> bpy.types.Object:
     """Of a human with the name Ann."""
-    return armature_of(build_human(addon, synthetic.write(tmp_path / "p", 8), "Ann"))
+    return build_human(addon, synthetic.write(tmp_path / "p", 8), "Ann")

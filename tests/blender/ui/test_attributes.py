@@ -11,10 +11,11 @@ from unittest.mock import MagicMock
 import bpy
 import pytest
 from blender_primdiffusion.formats.requests import PARTS
+from human_files import person_file
 from support.errors import refused
 from support.fake_child import request_of
 
-from blender_primdiffusion.scene.human import humans, person_file
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.ui import attributes, edit_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_attributes
 

@@ -9,8 +9,9 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from human_files import person_file
 
-from blender_primdiffusion.scene.human import MARK, armature_of, body_of, humans, person_file
+from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 ops = bpy.ops.primdiffusion
@@ -25,7 +26,7 @@ def people(real_child):
 
 
 def files(person) -> dict[int, str]:
-    paths = [Path(obj.data.filepath).name for obj in person.all_objects if obj.type == "VOLUME"]
+    paths = [Path(obj.data.filepath).name for obj in parts_of(person) if obj.type == "VOLUME"]
     return {int(name[5:9]): name for name in paths}
 
 
@@ -67,7 +68,7 @@ def test_a_painted_head_is_all_that_changes(people):
     body = body_of(anna)
     before = files(anna)
     head = body.vertex_groups[JOINT_NAMES.index("head")]
-    bpy.context.view_layer.objects.active = armature_of(anna)
+    bpy.context.view_layer.objects.active = anna
     ops.paint_region()
     painted = body.vertex_groups["PrimDiffusion Region"]
     for vertex in body.data.vertices:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import json
-from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -14,11 +13,12 @@ import numpy as np
 import pytest
 import synthetic
 from backend_python import use_this_python
+from human_files import lose_data
 from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.human import BETAS, armature_of, humans
+from blender_primdiffusion.scene.human import BETAS, humans
 from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.proxy import proxy_of
 from blender_primdiffusion.scene.surface import primitives_of
@@ -59,7 +59,7 @@ def out(tmp_path):
 def moving(person):
     rng = np.random.default_rng(3)
     turns = synthetic.axis_angle(rng.normal(0, 0.2, (3, 24, 3)))
-    keyframe_poses(armature_of(person), np.arange(1, 4), turns, rng.normal(0, 0.1, (3, 3)))
+    keyframe_poses(person, np.arange(1, 4), turns, rng.normal(0, 0.1, (3, 3)))
     bpy.context.scene.frame_end = 3
     return turns
 
@@ -110,18 +110,16 @@ def test_an_impossible_export_is_reported_in_a_sentence(anna, out, operator, pro
     assert not list(out.iterdir())
 
 
-def test_a_missing_persons_file_is_named(anna, out):
-    for path in Path(bpy.data.filepath).parent.rglob("person.human.safetensors"):
-        if "store" not in path.parts:
-            path.unlink()
+def test_a_person_without_data_is_named(anna, out):
+    lose_data(anna)
     for file in ("a.glb", "a.human"):
-        assert_rejected("is missing", OPERATORS.export, filepath=str(out / file))
+        assert_rejected("holds no data", OPERATORS.export, filepath=str(out / file))
 
 
 def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
     OPERATORS.add_proxy(texture_px=64)
     proxy = proxy_of(anna)
-    assert proxy.parent == armature_of(anna)
+    assert proxy.parent == anna
     assert (proxy.hide_viewport, proxy.hide_render) == (False, True)
     assert (primitives_of(anna).hide_viewport, primitives_of(anna).hide_render) == (True, False)
     OPERATORS.show_proxy(shown="MESH")
@@ -144,7 +142,7 @@ def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
     assert drawn() == {"primdiffusion.show_proxy": "Show Mesh in Viewport"}
     OPERATORS.show_proxy(shown="REMOVED")
     assert drawn() == {"primdiffusion.add_proxy": "As Mesh"}
-    bpy.context.scene.collection.children.unlink(anna)
+    bpy.context.scene.collection.children.unlink(bpy.data.collections[anna.name])
     assert drawn() == {}
 
 
@@ -162,7 +160,7 @@ def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):
 def test_gaussians_are_requested_in_the_current_pose(anna, out):
     turns = moving(anna)
     bpy.context.scene.frame_set(2)
-    armature_of(anna).location.x = 3.0
+    anna.location.x = 3.0
     OPERATORS.export(filepath=str(out / "a.ply"), gaussians=123)
     asked = json.loads((out / "a.ply").read_text())
     assert asked["limit"] == 123
@@ -172,7 +170,7 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
 
 def test_a_vdb_for_each_frame_lies_where_the_person_stands(anna, out):
     moving(anna)
-    armature_of(anna).location = (2.0, 0.0, 0.0)
+    anna.location = (2.0, 0.0, 0.0)
     OPERATORS.export(filepath=str(out / "Anna.vdb"), first=1, last=3, voxel=0.01)
     assert sorted(path.name for path in out.iterdir()) == [f"Anna_{frame:04d}.vdb" for frame in (1, 2, 3)]
     bpy.utils.expose_bundled_modules()
@@ -185,7 +183,7 @@ def test_a_vdb_for_each_frame_lies_where_the_person_stands(anna, out):
 
 def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
     turns = moving(anna)
-    armature = armature_of(anna)
+    armature = anna
     shape = np.linspace(-1, 1, 10)
     armature[BETAS] = shape.tolist()
     OPERATORS.export(filepath=str(out / "Anna Müller.human"), motion=True)
@@ -197,14 +195,14 @@ def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
     assert other.name == "Anna Müller"
     bpy.context.scene.frame_set(2)
     for bone in synthetic.NAMES:
-        mine, theirs = (armature_of(person).pose.bones[bone] for person in (anna, other))
+        mine, theirs = (person.pose.bones[bone] for person in (anna, other))
         assert np.abs(np.array(mine.matrix) - np.array(theirs.matrix)).max() < 1e-4
     assert len(turns) == 3
 
 
 def test_a_mirrored_bone_is_exported_as_a_turn_that_can_be_imported(anna, out):
     moving(anna)
-    armature_of(anna).pose.bones["left_elbow"].scale = (-1, 2, 1)
+    anna.pose.bones["left_elbow"].scale = (-1, 2, 1)
     OPERATORS.export(filepath=str(out / "a.human"), motion=True)
     assert OPERATORS.import_human(filepath=str(out / "a.human")) == {"FINISHED"}
 
@@ -219,7 +217,7 @@ def test_a_human_file_without_motion_holds_the_person_alone(anna, out):
 def test_a_person_is_put_where_they_were_dropped(store):
     OPERATORS.import_human(filepath=str(store / "person.human.safetensors"), location=(1.0, 2.0, 0.0))
     person = humans(bpy.context.scene)[0]
-    assert armature_of(person).location.xy[:] == pytest.approx((1.0, 2.0))
+    assert person.location.xy[:] == pytest.approx((1.0, 2.0))
     assert person.name == "person"
 
 

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
+from human_files import person_file
 from jobs_driven import Layout, drive, notice_of, shown
 from support.errors import refused
 from support.fake_child import FAILS, request_of
@@ -19,7 +20,7 @@ from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene import cycles
 from blender_primdiffusion.scene.cycles import posed_extent
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.place import GAP_M
 from blender_primdiffusion.ui import generate_panel
 
@@ -95,7 +96,7 @@ def test_people_stand_side_by_side_and_the_first_at_the_origin(addon):
     extents = sorted((posed_extent(person) for person in humans(addon.scene)), key=lambda extent: extent[0][0])
     for (_, left), (right, _) in itertools.pairwise(extents):
         assert right[0] - left[0] >= GAP_M - 1e-6
-    x = [armature_of(person).location.x for person in humans(addon.scene)]
+    x = [person.location.x for person in humans(addon.scene)]
     assert x[0] == 0.0
     assert np.isclose(x[1], -x[2]), "to both sides in turn"
     assert x[1] > 0
@@ -103,12 +104,12 @@ def test_people_stand_side_by_side_and_the_first_at_the_origin(addon):
 
 def test_a_new_person_takes_the_free_place_in_the_middle(addon):
     bpy.ops.primdiffusion.generate(seed=7, steps=1)
-    armature_of(humans(addon.scene)[0]).location.x = 30.0
+    humans(addon.scene)[0].location.x = 30.0
     bpy.ops.primdiffusion.generate(seed=8, steps=1)
-    assert armature_of(humans(addon.scene)[1]).location.x == 0.0
-    armature_of(humans(addon.scene)[1]).location.y = 5.0
+    assert humans(addon.scene)[1].location.x == 0.0
+    humans(addon.scene)[1].location.y = 5.0
     bpy.ops.primdiffusion.generate(seed=9, steps=1)
-    assert armature_of(humans(addon.scene)[2]).location.x == 0.0, "the one far behind is not in the way"
+    assert humans(addon.scene)[2].location.x == 0.0, "the one far behind is not in the way"
 
 
 def test_seeds_beyond_blenders_numbers_are_rejected(addon):

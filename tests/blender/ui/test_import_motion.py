@@ -24,7 +24,6 @@ from blender_primdiffusion.scene.actions import action_curves
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
-from blender_primdiffusion.scene.human import armature_of
 from blender_primdiffusion.ui.import_motion import PRIMDIFFUSION_OT_import_motion, look_at, nearest_to
 
 ops = bpy.ops.primdiffusion
@@ -116,7 +115,7 @@ def test_of_two_people_the_named_one_moves(addon, armature, tmp_path):
     other = build_human(addon, synthetic.write(tmp_path / "q", 8), "Bob")
     ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Bob")
     assert armature.animation_data is None or armature.animation_data.action is None
-    assert armature_of(other).animation_data.action is not None
+    assert other.animation_data.action is not None
     with refused(RuntimeError, "Eve"):
         ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Eve")
 

@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 from blender_primdiffusion.formats.picture_files import write_png
+from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import request_of
@@ -20,7 +21,7 @@ from blender_primdiffusion.jobs.from_picture import PictureJob, PictureTask
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.motion.pose_library import take_world_posture, world_posture
 from blender_primdiffusion.scene.convention import points_to_backend
-from blender_primdiffusion.scene.human import armature_of, humans, person_file
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.shape import betas_of
 from blender_primdiffusion.ui.picture_panel import PRIMDIFFUSION_OT_choose_picture, PRIMDIFFUSION_PT_human_from_picture
 
@@ -45,7 +46,7 @@ def chosen(addon, picture, monkeypatch):
     return addon
 
 
-def a_human() -> bpy.types.Collection:
+def a_human() -> bpy.types.Object:
     bpy.ops.primdiffusion.generate(seed=100)
     return humans(bpy.context.scene)[0]
 
@@ -88,7 +89,7 @@ def test_what_is_stored_turned_leaves_nothing(addon, tmp_path, picture):
 
 
 def test_a_posture_is_taken_as_it_was_given(addon):
-    armature = armature_of(a_human())
+    armature = a_human()
     armature.rotation_mode = "XYZ"
     armature.rotation_euler, armature.location = (0.1, -0.2, 2.0), (1.0, 2.0, 0.5)
     bpy.context.view_layer.update()
@@ -111,7 +112,7 @@ def test_a_posture_is_taken_as_it_was_given(addon):
 
 def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
     person = a_human()
-    armature, focal = armature_of(person), focal_length(chosen)
+    armature, focal = person, focal_length(chosen)
     pose, translation = world_posture(armature)
     betas = np.array(betas_of(person))
     bpy.ops.ed.undo_push(message="before")
@@ -126,7 +127,7 @@ def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
     assert "A guess." in notice_of("fit_picture")
     assert len(humans(chosen.scene)) == 1
     bpy.ops.ed.undo()
-    armature = armature_of(humans(bpy.context.scene)[0])
+    armature = humans(bpy.context.scene)[0]
     assert world_posture(armature)[1] == pytest.approx(translation, abs=1e-5)
 
 
@@ -143,7 +144,7 @@ def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, pictu
     assert sent["mask_label"] == 3
     assert Path(sent["cameras"]).name == "cameras.json"
     assert "pose" not in sent
-    armature = armature_of(person)
+    armature = person
     pose, translation = world_posture(armature)
     assert pose[LEFT_SHOULDER] == pytest.approx([0, 0, -0.5], abs=1e-5)
     assert np.array(armature.matrix_world.translation) == pytest.approx(np.zeros(3), abs=1e-5)  # on the floor
@@ -158,7 +159,7 @@ def test_make_human_stands_where_the_posed_one_was_which_is_hidden(chosen):
     assert "pose" in request_of(person_file(made))
     assert posed.hide_viewport
     assert posed.hide_render
-    assert world_posture(armature_of(made))[1] == pytest.approx(world_posture(armature_of(posed))[1] + MOVED, abs=0.02)
+    assert world_posture(made)[1] == pytest.approx(world_posture(posed)[1] + MOVED, abs=0.02)
 
 
 def test_without_picture_human_or_equal_size_there_is_a_sentence(addon, picture):
@@ -219,6 +220,6 @@ def test_the_real_child_makes_a_human_of_a_picture(real_child, tmp_path):
     assert bpy.ops.primdiffusion.human_from_picture() == {"FINISHED"}
     (person,) = humans(real_child.scene)
     view = picture_view(real_child, real_child.scene.camera, picture_of(real_child.scene.camera))
-    pixels, depth = view.project(joint_places(armature_of(person)))
+    pixels, depth = view.project(joint_places(person))
     assert (depth > 1).all()
     assert ((pixels > 5) & (pixels < [75, 115])).all()

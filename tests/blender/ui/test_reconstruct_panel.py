@@ -9,13 +9,15 @@ from unittest.mock import MagicMock
 
 import bpy
 import pytest
+from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import request_of
 
 from blender_primdiffusion.jobs import generate
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene.human import humans, person_file
+from blender_primdiffusion.scene.human import humans, parts_of
+from blender_primdiffusion.scene.payload import session_folder
 from blender_primdiffusion.ui import reconstruct_panel
 from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_generate
 from blender_primdiffusion.ui.reconstruct_panel import PRIMDIFFUSION_PT_human_from_captures
@@ -29,7 +31,7 @@ def captures(tmp_path) -> Path:
     return tmp_path / "captures"
 
 
-def asked_of_the_child(person: bpy.types.Collection) -> dict:
+def asked_of_the_child(person: bpy.types.Object) -> dict:
     return request_of(person_file(person))
 
 
@@ -37,7 +39,7 @@ def test_the_operator_builds_a_human_from_the_chosen_captures(addon, captures):
     asked = {"directory": f"{captures}/", "subject": "anna", "frame": 2, "views": 5, "by": "prior"}
     assert bpy.ops.primdiffusion.human_from_captures(**asked) == {"FINISHED"}
     (person,) = humans(addon.scene)
-    assert sum(obj.type == "VOLUME" for obj in person.all_objects) == 8
+    assert sum(obj.type == "VOLUME" for obj in parts_of(person)) == 8
     sent = asked_of_the_child(person)
     assert Path(sent.pop("capture")) == captures
     assert Path(sent.pop("out_dir")).name.startswith("reconstruct_")
@@ -79,7 +81,7 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, captures, tmp_p
         bpy.ops.primdiffusion.human_from_captures(directory=str(captures))
     assert str(caught.value).count("Error:") == 1
     assert not bpy.data.objects
-    assert not (tmp_path / "shot_humans").exists()
+    assert not session_folder().exists()
     assert not list(Path(bpy.app.tempdir).glob("reconstruct_*"))
     assert sentence in " ".join(shown(PRIMDIFFUSION_PT_human_from_captures, addon))
     assert sentence not in " ".join(shown(PRIMDIFFUSION_PT_generate, addon))
@@ -140,4 +142,4 @@ def test_the_real_child_makes_a_person_of_real_captures(real_child, tmp_path, mo
     about = json.loads(person["primdiffusion_human"])
     assert (about["reconstructed_from"], about["checkpoint"]) == ("person_000001", "tiny encoder")
     assert len(about["views"]) == 3
-    assert sum(obj.type == "VOLUME" for obj in person.all_objects) > 500
+    assert sum(obj.type == "VOLUME" for obj in parts_of(person)) > 500

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import synthetic_shape
 from engine_stage import cube
+from human_files import lose_data
 from mathutils import Matrix
 
 from blender_primdiffusion.engine.boxes import Boxes
@@ -21,7 +22,8 @@ from blender_primdiffusion.engine.gpu.start import GpuStart
 from blender_primdiffusion.engine.view import NO_SURFACE_M
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
-from blender_primdiffusion.scene.human import armature_of, body_of, person_file
+from blender_primdiffusion.scene.human import body_of
+from blender_primdiffusion.scene.surface import primitives_of
 from blender_primdiffusion.ui import viewport_humans
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
@@ -56,7 +58,7 @@ def people(addon, tmp_path, monkeypatch):
     found = []
     for seed, (name, x) in enumerate((("Anna", 0.0), ("Bert", 1.0))):
         human = build_human(addon, synthetic_shape.write(tmp_path / name, 12, seed), name)
-        armature_of(human).location.x = x
+        human.location.x = x
         volumes_of(human).hide_viewport = True
         found.append(human)
     bpy.context.view_layer.update()
@@ -64,7 +66,7 @@ def people(addon, tmp_path, monkeypatch):
 
 
 def volumes_of(human) -> bpy.types.Collection:
-    return next(child for child in human.children if child.name.endswith("_primitives"))
+    return primitives_of(human)
 
 
 def context(matrix=PERSPECTIVE, shading="SOLID", volumes=True) -> SimpleNamespace:
@@ -73,7 +75,7 @@ def context(matrix=PERSPECTIVE, shading="SOLID", volumes=True) -> SimpleNamespac
     region = SimpleNamespace(width=SIZE[0], height=SIZE[1], as_pointer=lambda: 1)
     space = SimpleNamespace(
         local_view=None, shading=SimpleNamespace(show_xray=False, type=shading), as_pointer=lambda: 2,
-        show_object_viewport_mesh=True, show_object_viewport_volume=volumes,
+        show_object_viewport_mesh=True, show_object_viewport_volume=volumes, show_object_viewport_pointcloud=True,
     )  # fmt: skip
     around = SimpleNamespace(window_matrix=matrix, view_matrix=LOOK_ALONG_Y)
     return SimpleNamespace(
@@ -123,13 +125,14 @@ def test_humans_whose_meshes_viewports_show_are_not_drawn_twice(people):
 
 
 def test_hidden_humans_are_not_drawn(people):
-    armature_of(people.anna).hide_viewport = True
+    people.anna.hide_viewport = True
     assert names(read(people.overlay)) == ["Bert"]
 
 
 def test_an_instance_is_drawn_and_stands_for_its_human(people):
     empty = bpy.data.objects.new("Instance", None)
-    empty.instance_type, empty.instance_collection, empty.location = "COLLECTION", people.anna, (3, 0, 0)
+    empty.instance_type, empty.instance_collection = "COLLECTION", bpy.data.collections["Anna"]
+    empty.location = (3, 0, 0)
     bpy.context.scene.collection.objects.link(empty)
     reading = read(people.overlay)
     assert names(reading) == ["Anna", "Bert", "Instance"]
@@ -137,8 +140,8 @@ def test_an_instance_is_drawn_and_stands_for_its_human(people):
     np.testing.assert_allclose(pelvis["Instance"] - pelvis["Anna"], [3, 0, 0], atol=1e-5)
 
 
-def test_a_human_without_its_file_is_named_and_the_others_are_drawn(people):
-    person_file(people.anna).unlink()
+def test_a_human_without_data_is_named_and_the_others_are_drawn(people):
+    lose_data(people.anna)
     assert names(read(people.overlay)) == ["Bert"]
     assert "Anna" in people.overlay.error
     volumes_of(people.anna).hide_viewport = False
@@ -204,15 +207,15 @@ def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
     other = cube()
     people.overlay.scene_changed([other, other.data])
     assert people.overlay.reading(context()) is reading
-    people.overlay.scene_changed([other, armature_of(people.bert)])
+    people.overlay.scene_changed([other, people.bert])
     assert people.overlay.reading(context()) is not reading
-    armature_of(people.anna).location.x = 0.5
+    people.anna.location.x = 0.5
     moved = read(people.overlay)
     assert len(set(moved.humans) & set(reading.humans)) == 1
 
 
 def test_bones_in_front_stay_visible_unless_hidden(people):
-    armature = armature_of(people.anna)
+    armature = people.anna
     armature.matrix_world = Matrix.Translation((2, 3, 4)) @ Matrix.Scale(2, 4)
     armature.show_in_front = True
     bone = armature.pose.bones["head"]
@@ -220,14 +223,14 @@ def test_bones_in_front_stay_visible_unless_hidden(people):
     bones = read(people.overlay).bones
     assert bones.shape == (24, 2, 3)
     assert np.abs(bones[:, 0] - head).sum(1).min() < 1e-5
-    (bone if bpy.app.version >= (5, 0) else bone.bone).hide = True
+    bone.hide = True
     bones = read(people.overlay).bones
     assert bones.shape == (23, 2, 3)
 
 
 @pytest.mark.parametrize("mode", ["POSE", "EDIT"])
 def test_bones_are_in_front_while_they_are_posed_or_edited(people, mode):
-    armature = armature_of(people.anna)
+    armature = people.anna
     assert read(people.overlay).bones.shape == (0, 2, 3)
     bpy.context.view_layer.objects.active = armature
     bpy.ops.object.mode_set(mode=mode)
@@ -296,9 +299,9 @@ def test_clicks_select_extend_and_deselect(people, monkeypatch):
 
     for obj in bpy.context.selected_objects:
         obj.select_set(False)
-    armature_of(people.bert).select_set(True)
+    people.bert.select_set(True)
     assert click(extend=True) == ["Anna", "Bert"]
-    assert bpy.context.view_layer.objects.active == armature_of(people.anna)
+    assert bpy.context.view_layer.objects.active == people.anna
     assert click(extend=True) == ["Bert"]
     assert click(extend=False) == ["Anna"]
     around = clickable(people)
@@ -317,7 +320,7 @@ def test_a_press_selects_and_leaves_a_drag_to_blender(people, monkeypatch):
     event = dict(zip(("mouse_region_x", "mouse_region_y"), pixel_of(PERSPECTIVE, (0.0, 0, 1)), strict=True))
     assert click.invoke(held, around, SimpleNamespace(value="PRESS", **event)) == {"RUNNING_MODAL", "PASS_THROUGH"}
     assert begun == [held]
-    assert armature_of(people.anna).select_get()
+    assert people.anna.select_get()
     for kind, value, result in (
         ("MOUSEMOVE", "NOTHING", {"PASS_THROUGH"}),
         ("LEFTMOUSE", "CLICK_DRAG", {"FINISHED", "PASS_THROUGH"}),

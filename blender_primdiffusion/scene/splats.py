@@ -1,0 +1,191 @@
+"""A human as Gaussian splats, which Blender 5.3 and newer draw in every mode and engine: one for each visible voxel.
+
+The splats are one point cloud, a child of the armature. Each has a place in its cell, the frame of a primitive; the
+node group of `splat_nodes` takes the cells from the skinned body, so that Blender's own skinning moves the splats.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from .human import body_of, link_part, own_data, parts_of
+from .payload import session_file
+from .rest_human import RestHuman, default_body, read_human
+from .shape import ShapeModel, betas_of, generated_betas
+from .splat_nodes import CELL, REST_SIDES, follow_body
+from .surface import GROWTH, PRIMITIVE, carrier_mesh, set_of_primitives
+from .volumes import WINDOW_EXPONENT
+
+SPLATS_MARK, CELLS_MARK = "primdiffusion_splats", "primdiffusion_cells"
+"""Custom properties of the objects of a human that hold its splats, and the cells on which these lie."""
+
+SPLATS_AVAILABLE = bpy.app.version >= (5, 3)
+"""Whether this Blender has Gaussian splats."""
+WIDTH = (0.465, 0.465, 0.367)
+"""Standard deviations along T, B, N, in voxel spacings; the trilinear kernel's own is .408."""
+OPACITY_OF_VOXEL = np.geomspace(0.004, 6, 14)[2:-2]
+GAIN = np.array([0.3, 3.7, 5.0, 2.7, 1.8, 1.7, 1.8, 2.0, 3.0, 5.5])
+"""Optical depth of a splat relative to its voxel's opacity, of voxels of the opacities above. Splats composite as
+1 - product(1 - a), while the marcher adds opacities until 1 and so occludes sooner; and what is faint along the normal
+is seen along the skin at the silhouette. These and WIDTH are least squares of pictures of splats and the marcher."""
+COVERED = (0.0, 0.75, 1.5, 2.25)
+SHARE_IF_COVERED = (1.0, 0.8, 0.5, 0.0)
+"""What is left of it below voxels whose opacities add up to COVERED: what no picture shows is left out."""
+FAINTEST = 0.02
+"""Opacity below which a splat is left out."""
+LEAST = 0.004
+"""Opacity of a voxel along the normal below which it makes none."""
+MOST_OPAQUE = 0.995
+_NEVER_STRETCHED = 1e3
+"""Side of a cell, metres, that no skin reaches."""
+C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Splats:
+    """Gaussians in their cells."""
+
+    cell: NDArray[np.int32]
+    """The primitive of each [n]."""
+    position: NDArray[np.float32]
+    """From the primitive's centre along its axes T, B, N [n, 3], metres."""
+    scale: NDArray[np.float32]
+    """Standard deviations along them [n, 3], metres."""
+    opacity: NDArray[np.float32]
+    """Along a ray through the centre [n], in (0, 1)."""
+    rgb: NDArray[np.float32]
+    """Linear [n, 3], in [0, 1]."""
+
+
+def splats_of(human: RestHuman) -> Splats:
+    """The voxels that show, as splats; coarser lattices first (see `_lattice`)."""
+    payload = human.payload
+    half_extent = human.rest_half_extent * payload.delta_scale
+    size = payload.density.shape[-1]
+    share, centre = _kernel(size)
+    window = share[:, None, None] * share[:, None] * share
+    spacing = half_extent * 2 / (size - 1)
+    along_normal = payload.density * window * spacing[:, 2, None, None, None]
+    covered = np.cumsum(along_normal[:, ::-1], 1)[:, ::-1] - along_normal  # by the voxels further out
+    cell, d, h, w = np.nonzero((along_normal >= LEAST) & (covered < COVERED[-1]))
+    raw = along_normal[cell, d, h, w]
+    gain = np.exp(np.interp(np.log(raw), np.log(OPACITY_OF_VOXEL), np.log(GAIN)))
+    gain *= np.interp(covered[cell, d, h, w], COVERED, SHARE_IF_COVERED)
+    in_plane = np.sqrt(spacing[:, 0] * spacing[:, 1]) / spacing[:, 2]
+    opacity = 1 - np.exp(-gain * raw * in_plane[cell])
+    shown = opacity >= FAINTEST
+    cell, d, h, w, opacity = (values[shown] for values in (cell, d, h, w, opacity))
+    order = np.argsort(_lattice(d, h, w), kind="stable")
+    cell, d, h, w, opacity = (values[order] for values in (cell, d, h, w, opacity))
+    local = np.stack([centre[w], centre[h], centre[d]], -1) * half_extent[cell]
+    return Splats(
+        cell.astype(np.int32),
+        local.astype(np.float32),
+        (spacing[cell] * WIDTH).astype(np.float32),
+        np.minimum(opacity, MOST_OPAQUE).astype(np.float32),
+        payload.rgb[cell, :, d, h, w].clip(0, 1).astype(np.float32),
+    )
+
+
+def _lattice(d: NDArray, h: NDArray, w: NDArray) -> NDArray[np.int64]:
+    """The coarsest of four nested lattices that has this voxel: all even, every eighth (0); all odd or all even (1);
+    with an even sum (2); any (3). So the first 1/8, 1/4 and 1/2 of splats in this order cover the human evenly."""
+    odd = np.stack([d, h, w]) % 2
+    alike = (odd[0] == odd[1]) & (odd[1] == odd[2])
+    return np.where(alike, odd[0], np.where(odd.sum(0) % 2 == 0, 2, 3))
+
+
+def _kernel(size: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Mass and centroid of each voxel's linear kernel times the window, along one axis."""
+    place = np.linspace(-1, 1, 4001)
+    spacing = 2 / (size - 1)
+    voxel = np.linspace(-1, 1, size)[:, None]
+    left = (1 - np.abs(place - voxel) / spacing).clip(0) * np.exp(-8.0 * np.abs(place) ** WINDOW_EXPONENT)
+    mass = left.sum(1)
+    return mass * (2 / 4000) / spacing, (left * place).sum(1) / mass
+
+
+def encode_srgb(linear: NDArray) -> NDArray[np.float64]:
+    """sRGB-encoded colours of linear ones in [0, 1]."""
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def fill(cloud: bpy.types.PointCloud, splats: Splats) -> None:
+    """Make a point cloud these splats, whatever it was."""
+    cloud.resize(len(splats.cell))
+    cloud.type = "GAUSSIAN_SPLAT"
+    radiance = np.c_[(encode_srgb(splats.rgb) - 0.5) / C0, splats.opacity]
+    for name, kind, field, values in (
+        ("position", "FLOAT_VECTOR", "vector", splats.position),
+        ("scale", "FLOAT_VECTOR", "vector", splats.scale),
+        ("radiance:base", "FLOAT4", "vector", radiance),
+        (CELL, "INT", "value", splats.cell),
+    ):
+        attribute = cloud.attributes.get(name) or cloud.attributes.new(name, kind, "POINT")
+        data = np.ascontiguousarray(values, np.int32 if kind == "INT" else np.float32)
+        attribute.data.foreach_set(field, data.ravel())
+    cloud.update_tag()
+
+
+def build_splats(person: bpy.types.Object) -> bpy.types.Object:
+    """Give a human splats, which follow its body, and the cells on which they lie.
+
+    Raises as `read_human`, and ValueError where the body mesh was deleted. Makes no undo step.
+    """
+    human, body, betas = read_human(session_file(person)), body_of(person), betas_of(person)
+    if body is None:
+        raise ValueError(f"the body mesh of {person.name!r} was deleted: undo that, or generate the human again")
+    mesh = carrier_mesh(f"{person.name}_cells", human.model, np.zeros(len(human.model.face), np.int32))
+    cloud = bpy.data.pointclouds.new(f"{person.name}_splats")
+    cells, splats = (bpy.data.objects.new(data.name, data) for data in (mesh, cloud))
+    cells.hide_viewport = cells.hide_render = True
+    cells[CELLS_MARK] = splats[SPLATS_MARK] = True
+    for part in (splats, cells):
+        part.parent = person
+        link_part(person, part)
+    _scale_cells(mesh, human.model, betas, human.model.growth(generated_betas(person), betas))
+    fill(cloud, splats_of(human))
+    follow_body(splats, body, cells)
+    return splats
+
+
+def cloud_of(person: bpy.types.Object) -> bpy.types.Object | None:
+    """The human's splats; None for humans without, which were made in an earlier Blender."""
+    return next((obj for obj in parts_of(person) if obj.type == "POINTCLOUD" and SPLATS_MARK in obj), None)
+
+
+def cells_of(person: bpy.types.Object) -> bpy.types.Object | None:
+    """The cells on which they lie; None where there are none, or they were deleted or changed by hand."""
+    marked = (obj for obj in parts_of(person) if obj.type == "MESH" and CELLS_MARK in obj)
+    return next((obj for obj in marked if PRIMITIVE in obj.data.attributes), None)
+
+
+def scale_splats(person: bpy.types.Object, model: ShapeModel, betas: NDArray, growth: NDArray) -> None:
+    """Have a human's splats, if it has any, grow by `growth` [K, 3] with its body, which now has these betas [10]."""
+    cells = cells_of(person)
+    if cells is not None:
+        _scale_cells(own_data(cells, person), model, betas, growth)
+
+
+def replace_splats(person: bpy.types.Object, human: RestHuman) -> None:
+    """Show another human's voxels by the splats of this one, if it has any. Earlier Blenders, which cannot write them,
+    remove them instead: *Attachment* makes them again."""
+    splats, cells = cloud_of(person), cells_of(person)
+    if splats is not None and SPLATS_AVAILABLE:
+        fill(own_data(splats, person), splats_of(human))
+        return
+    for part in filter(None, (splats, cells)):
+        bpy.data.objects.remove(part)
+
+
+def _scale_cells(mesh: bpy.types.Mesh, model: ShapeModel, betas: NDArray, growth: NDArray) -> None:
+    set_of_primitives(mesh, GROWTH, growth)
+    sides = np.full((len(model.face), 3), _NEVER_STRETCHED)
+    if model is default_body():  # the released code's boxes, on other bodies, do not follow the skin
+        sides[:, :2] = model.rest_sides(betas)
+    set_of_primitives(mesh, REST_SIDES, sides)

@@ -1,0 +1,55 @@
+"""Blender's own menus, and with them its search (F3): Add > Human, File > Import and Export."""
+
+from __future__ import annotations
+
+import bpy
+
+from ..places import backend_is_named
+from .gallery import draw_samples
+
+_IMPORT, _EXPORT = "PrimDiffusion Human (.human)", "PrimDiffusion Human (.human, .glb, .ply, .vdb)"
+
+
+class PRIMDIFFUSION_MT_add(bpy.types.Menu):
+    """Ways to add a human."""
+
+    bl_label = "Human"
+
+    def draw(self, _context: bpy.types.Context) -> None:
+        layout = self.layout
+        layout.operator_context = "INVOKE_DEFAULT"
+        if backend_is_named():
+            layout.operator("primdiffusion.generate", icon="OUTLINER_OB_ARMATURE")
+            layout.operator("primdiffusion.choose_picture", text="Human from Picture...", icon="IMAGE_DATA")
+        draw_samples(layout)
+        layout.operator("primdiffusion.import_human", text="Import Human File...", icon="IMPORT")
+
+
+def draw_add(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    """Draw the entry of Add."""
+    menu.layout.menu("PRIMDIFFUSION_MT_add", icon="OUTLINER_OB_ARMATURE")
+
+
+def draw_import(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    """Draw the entry of File > Import."""
+    menu.layout.operator("primdiffusion.import_human", text=_IMPORT)
+
+
+def draw_export(menu: bpy.types.Menu, _context: bpy.types.Context) -> None:
+    """Draw the entry of File > Export."""
+    menu.layout.operator("primdiffusion.export", text=_EXPORT)
+
+
+_ENTRIES = (("VIEW3D_MT_add", draw_add), ("TOPBAR_MT_file_import", draw_import), ("TOPBAR_MT_file_export", draw_export))
+
+
+def register() -> None:
+    """Add the entries to Blender's menus."""
+    for menu, entry in _ENTRIES:
+        getattr(bpy.types, menu).append(entry)
+
+
+def unregister() -> None:
+    """Undo `register`."""
+    for menu, entry in _ENTRIES:
+        getattr(bpy.types, menu).remove(entry)

@@ -1,0 +1,67 @@
+"""A human's data, and where its files are on the disk in this session."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from blender_primdiffusion.scene.human import parts_of, volumes_of
+from blender_primdiffusion.scene.parts import complete_humans
+from blender_primdiffusion.scene.payload import PAYLOAD, session_file
+
+
+def person_file(person: bpy.types.Object) -> Path:
+    """The human's own file, written from the .blend."""
+    return session_file(person)
+
+
+def folder_of(person: bpy.types.Object) -> Path:
+    """The folder of the human's files, volumes among them."""
+    return session_file(person).parent
+
+
+def paths_of(person: bpy.types.Object) -> list[Path]:
+    """What the human's volumes show."""
+    return [Path(obj.data.filepath) for objects in volumes_of(person).values() for obj in objects]
+
+
+def volume_path(volume: bpy.types.Volume) -> Path:
+    """What a volume shows."""
+    return Path(bpy.path.abspath(volume.filepath, library=volume.library))
+
+
+def sequence_files(volume: bpy.types.Volume) -> list[Path]:
+    """All files of a merged volume."""
+    path = volume_path(volume)
+    return sorted(path.parent.glob(path.name.replace("_0001.vdb", "_*.vdb")))
+
+
+def lose_data(person: bpy.types.Object) -> None:
+    """Leave the human without its packed file."""
+    del person[PAYLOAD]
+
+
+def remove_human(person: bpy.types.Object) -> None:
+    """Remove the human and all its parts."""
+    bpy.data.batch_remove(parts_of(person))
+
+
+def copy_of(person: bpy.types.Object) -> bpy.types.Object:
+    """A copy by Blender's Shift-D of the armature, with parts of its own."""
+    for obj in bpy.context.selected_objects:
+        obj.select_set(False)
+    person.select_set(True)
+    bpy.context.view_layer.objects.active = person
+    bpy.ops.object.duplicate()
+    complete_humans()
+    return bpy.context.view_layer.objects.active
+
+
+def press_x(person: bpy.types.Object) -> None:
+    """Delete the armature as Blender's X does, and what goes with it."""
+    for obj in bpy.context.selected_objects:
+        obj.select_set(False)
+    person.select_set(True)
+    bpy.ops.object.delete()
+    complete_humans()

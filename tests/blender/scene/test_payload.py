@@ -1,0 +1,172 @@
+"""A human's file is in the .blend, byte for byte, wherever the armature goes: undo, saving, copies, libraries."""
+
+from __future__ import annotations
+
+import os
+import shutil
+
+import bpy
+import pytest
+from human_files import folder_of, lose_data, person_file
+from human_stage import build_posed, named, places, whole
+from support.errors import refused
+
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
+from blender_primdiffusion.scene.human import BODY_MARK, body_of, humans, is_human, parts_of
+from blender_primdiffusion.scene.payload import BODY, PAYLOAD, forget_session_files, session_file, session_folder
+
+ops = bpy.ops.primdiffusion
+ODD = 'Ä ö\' "x" 100%s 年'
+
+
+@pytest.fixture
+def content(source):
+    """The bytes of the human's file, and of its body's."""
+    return tuple((source / name).read_bytes() for name in ("person.human.safetensors", "body.safetensors"))
+
+
+def held(person) -> tuple[bytes, bytes]:
+    armature = person
+    return tuple(armature[name].packed_file.data for name in (PAYLOAD, BODY))
+
+
+def reopened(path=None) -> bpy.types.Object:
+    """Anna, from the .blend alone."""
+    path = path or bpy.data.filepath
+    forget_session_files()
+    bpy.ops.wm.open_mainfile(filepath=str(path))
+    return named()
+
+
+def test_saved_and_opened_again(person, content):
+    where = places(person)
+    assert held(person) == content
+    anna = reopened()
+    assert held(anna) == content
+    assert whole(anna, where)
+    assert person_file(anna).read_bytes() == content[0]
+
+
+def test_saved_under_another_name_elsewhere_and_then_moved(person, content, tmp_path):
+    where, elsewhere = places(person), tmp_path / ODD
+    elsewhere.mkdir()
+    bpy.ops.wm.save_as_mainfile(filepath=str(elsewhere / "b.blend"))
+    assert whole(named(), where)
+    shutil.move(elsewhere / "b.blend", tmp_path / "c.blend")
+    assert whole(reopened(tmp_path / "c.blend"), where)
+    assert held(named()) == content
+    assert sorted(path.name for path in tmp_path.iterdir() if path.is_dir()) == ["prepared", "source", elsewhere.name]
+
+
+def test_a_file_never_saved_and_then_saved(source, content, tmp_path):
+    bpy.ops.wm.read_homefile(use_empty=True)
+    where = places(build_posed(source))
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "new.blend"))
+    assert whole(reopened(), where)
+    assert held(named()) == content
+
+
+def test_purging_and_packing_take_nothing_away(person, content):
+    bpy.ops.outliner.orphans_purge(do_recursive=True)
+    bpy.ops.file.pack_all()
+    bpy.ops.wm.save_mainfile()
+    assert held(reopened()) == content
+
+
+def test_an_edit_packs_another_file_and_undo_and_redo_switch_it(person, content):
+    bpy.ops.ed.undo_push(message="before")
+    ops.vary(seed=12)
+    edited = held(named())
+    assert edited[0] != content[0]
+    assert edited[1] == content[1]
+    bpy.ops.ed.undo()
+    assert held(named()) == content
+    assert whole(named())
+    bpy.ops.ed.redo()
+    assert held(named()) == edited
+    assert whole(named())
+    bpy.ops.wm.save_mainfile()
+    assert held(reopened()) == edited
+    assert len([image for image in bpy.data.images if image.packed_file]) == 2, "the file before is not saved"
+
+
+@pytest.mark.parametrize("link", [False, True])
+def test_appended_and_linked(person, content, tmp_path, link):
+    where = places(person)
+    bpy.ops.wm.read_homefile(use_empty=True)
+    forget_session_files()
+    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=link) as (_, wanted):
+        wanted.collections = ["Anna"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    assert held(named()) == content
+    assert whole(named(), where)
+
+
+def test_a_library_override(person, content, tmp_path):
+    bpy.ops.wm.read_homefile(use_empty=True)
+    with bpy.data.libraries.load(str(tmp_path / "shot.blend"), link=True) as (_, wanted):
+        wanted.collections = ["Anna"]
+    bpy.context.scene.collection.children.link(wanted.collections[0])
+    made = wanted.collections[0].override_hierarchy_create(bpy.context.scene, bpy.context.view_layer)
+    override = next(filter(is_human, made.all_objects))
+    assert held(override) == content
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "film.blend"))
+    reopened(tmp_path / "film.blend")
+    assert held(next(one for one in humans(bpy.context.scene) if one.library is None)) == content
+
+
+@pytest.mark.parametrize("linked", [False, True], ids=["Shift-D", "Alt-D"])
+def test_blenders_duplicate_of_the_armature_shares_the_file_until_an_edit(person, content, linked):
+    person.select_set(True)
+    bpy.ops.object.duplicate(linked=linked)
+    twin = bpy.context.view_layer.objects.active
+    assert twin[PAYLOAD] == person[PAYLOAD]
+    assert session_file(twin) == person_file(person)
+    ops.vary(human="Anna", seed=12)
+    assert held(named())[0] != content[0]
+    assert twin[PAYLOAD].packed_file.data == content[0]
+
+
+def test_two_humans_of_the_same_body_hold_it_once(person, source):
+    berta = build_posed(source, "Berta")
+    assert berta[BODY] == person[BODY]
+
+
+def test_x_on_the_armature_and_undo(person, content):
+    bpy.ops.ed.undo_push(message="before")
+    person.select_set(True)
+    bpy.ops.object.delete()
+    bpy.ops.ed.undo_push(message="deleted")
+    assert not [obj for obj in bpy.data.objects if obj.type == "ARMATURE"]
+    bpy.ops.ed.undo()
+    assert held(named()) == content
+    assert whole(named())
+
+
+def test_unpacked_by_blender_the_file_is_the_same(person, content, tmp_path):
+    person[PAYLOAD].unpack(method="WRITE_LOCAL")
+    (written,) = [path for path in tmp_path.rglob("*") if path.is_file() and path.parent.name == "textures"]
+    assert written.read_bytes() == content[0]
+
+
+def test_files_of_the_session_are_written_again_where_they_are_removed(person, content):
+    shutil.rmtree(folder_of(person))
+    assert person_file(person).read_bytes() == content[0]
+    assert person_file(person).with_name("body.safetensors").read_bytes() == content[1]
+    assert folder_of(person).is_relative_to(session_folder())
+    assert os.path.dirname(bpy.data.filepath) not in str(session_folder())
+
+
+def test_a_human_of_an_earlier_version_is_named_in_one_sentence(person, capsys):
+    lose_data(person)
+    for obj in parts_of(person):
+        if obj.type == "VOLUME":
+            obj.data.filepath = f"//shot_humans/Anna/0001/{obj.data.filepath[-13:]}"
+    bpy.ops.wm.save_mainfile()
+    anna = reopened()
+    assert "'Anna' holds no data of a human, as in files of earlier versions" in deferred_volumes.error
+    assert capsys.readouterr().out.count("earlier versions") == 1
+    assert not body_of(anna).hide_viewport
+    assert BODY_MARK in body_of(anna)
+    with refused(RuntimeError, "earlier versions"):
+        ops.vary(human="Anna")
