@@ -21,6 +21,7 @@ from blender_primdiffusion.scene.attachment import attachment_of, show_in_viewpo
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import MARK, humans
 from blender_primdiffusion.scene.merged import merged_of, merged_state
+from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE
 from blender_primdiffusion.ui import advanced_panel, render_panel
 
 ops = bpy.ops.primdiffusion
@@ -182,9 +183,9 @@ def test_set_attachment_reports_what_stands_in_the_way(person):
 def test_panels_show_modes_warnings_and_memory(person):
     context = bpy.context
     assert advanced().count("primdiffusion.merge") == 2
-    assert advanced().count("set_attachment") == 2
+    assert advanced().count("set_attachment") == 2 + SPLATS_AVAILABLE
     ops.merge()
-    assert advanced().count("set_attachment") == 3
+    assert advanced().count("set_attachment") == 3 + SPLATS_AVAILABLE
     ops.merge(what="NOTHING")
     person[MARK] = person[MARK].replace('"most_overlapping": ', '"most_overlapping": 9')
     context.scene.render.engine = "CYCLES"
