@@ -20,7 +20,7 @@ from ..formats.regular_files import exists_in_its_folder, remove_file
 from ..formats.whole_files import written_whole
 from ..motion.pose_library import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
-from ..scene.attachment import attachment_of, set_attachment, showing
+from ..scene.attachment import attachment_of, parts_by_mode, set_attachment
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import link_part
 from ..scene.human_file import (
@@ -51,7 +51,7 @@ def show(person: bpy.types.Object, what: str) -> None:
         raise ValueError(f"{person.name!r} has no mesh proxy yet: press Add Mesh Proxy")
     set_attachment(person, attachment_of(person))  # shows the parts of the current attachment
     proxy.hide_viewport, proxy.hide_render = what == "VOLUMES", what != "MESH"
-    for part in showing(person).values():
+    for part in parts_by_mode(person).values():
         if part is not None:
             part.hide_viewport = part.hide_viewport or what != "VOLUMES"
             part.hide_render = part.hide_render or what == "MESH"

@@ -20,7 +20,7 @@ from ..formats.camera_rig import View
 from ..formats.json_files import read_json
 from ..formats.regular_files import as_file_error
 from ..motion.pose_library import check_posable, take_world_posture, world_posture
-from ..scene.attachment import showing
+from ..scene.attachment import parts_by_mode
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
 from ..scene.handles import handles_from_joints, joints_from_handles
@@ -200,7 +200,7 @@ class PictureJob(Job):
             _stand_at_origin(context, armature, camera)
         for other in humans(context.scene):
             if other.session_uid == self.posed_over:
-                for hidden in (other, *filter(None, showing(other).values())):
+                for hidden in (other, *filter(None, parts_by_mode(other).values())):
                     hidden.hide_viewport = hidden.hide_render = True
         return notice
 

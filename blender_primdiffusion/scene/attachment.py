@@ -37,7 +37,7 @@ def set_attachment(person: bpy.types.Object, mode: str) -> None:
     """
     if mode not in MODES:
         raise ValueError(f"there is no attachment {mode!r}: choose from {', '.join(MODES)}")
-    parts = showing(person)
+    parts = parts_by_mode(person)
     if mode == "MERGED" and parts["MERGED"] is None:
         raise ValueError(f"{person.name!r} has no merged volume yet: press Merge")
     if mode == "SPLATS" and not SPLATS_AVAILABLE:
@@ -54,7 +54,7 @@ def set_attachment(person: bpy.types.Object, mode: str) -> None:
     _show(person, parts)
 
 
-def showing(person: bpy.types.Object) -> dict[str, bpy.types.Collection | bpy.types.Object | None]:
+def parts_by_mode(person: bpy.types.Object) -> dict[str, bpy.types.Collection | bpy.types.Object | None]:
     """What each mode shows. Raises ValueError for humans that cannot be edited or whose volumes have no collection."""
     check_editable(person)
     return {
@@ -88,7 +88,7 @@ def show_in_viewport(person: bpy.types.Object, shown: bool) -> None:
 
     Makes no undo step. Raises ValueError for a human that cannot be edited, or whose volumes have no collection.
     """
-    parts = showing(person)
+    parts = parts_by_mode(person)
     person[IN_VIEWPORT] = shown
     _show(person, parts)
 

@@ -70,8 +70,8 @@ def make_payloads(
 ) -> list[Path]:
     """Write the missing files of seeds seed ... seed + count - 1 to `out_dir`; return the paths of all.
 
-    A fitted sample takes about 30 s on one core with all its variants (`from_mesh`: 2 s). Fits start from guesses of
-    `checkpoint` (None: the included one). `report` receives the number of finished samples and the total.
+    A fitted sample of four variants takes the better part of a minute on one core (`from_mesh`: 2 s). Fits start from
+    guesses of `checkpoint` (None: the included one). `report` receives the number of finished samples and the total.
 
     Raises:
         ValueError: a count is not positive; the checkpoint is damaged; a worker process was killed.

@@ -13,11 +13,11 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from primdiffusion.render.cpu_vectors import _EIGHT, _FLOAT, _FOUR, _INT32, _INT64, _Vectors
+from primdiffusion.render.cpu_vectors import EIGHT, FLOAT, FOUR, INT32, INT64, Vectors
 
 _compiled_call: Any = intrinsic  # untyped: callers omit the typing context and pass other types
 
-_NONE = ir.Constant(_FOUR, [0.0] * 4)
+_NONE = ir.Constant(FOUR, [0.0] * 4)
 WIDTH = 8
 """Floats of a voxel's merged weights: five, padded to a register."""
 
@@ -35,29 +35,29 @@ def merge_sample(
 
     def generate(context, builder, signature, arguments):
         sums, voxels, base, corner, size, slab, *numbers, opacity, red, green, blue = arguments
-        code = _Vectors(builder)
+        code = Vectors(builder)
         *weights, gu, fu = numbers
-        four = _INT64(4)
+        four = INT64(4)
         first = builder.add(base, builder.mul(corner, four))
         edges = code.edges(
             code.data(context, signature.args[1], voxels), first, builder.mul(size, four), builder.mul(slab, four)
         )
-        value = code.between(code.weighted(edges, [code.splat(weight, _EIGHT) for weight in weights]), gu, fu)
-        density = builder.extract_element(value, _INT32(3))
-        own = code.subtract(value, code.vector([red, green, blue, _FLOAT(0)]))
-        own = builder.insert_element(own, _FLOAT(1), _INT32(3))
-        by_colour = builder.insert_element(_NONE, density, _INT32(0))
-        wide = builder.shuffle_vector(own, by_colour, code._lanes(*range(8)))
-        wide = code.multiply(wide, code.splat(opacity, _EIGHT))
-        ends = [code.multiply(wide, code.splat(end, _EIGHT)) for end in (gu, fu)]
+        value = code.between(code.weighted(edges, [code.splat(weight, EIGHT) for weight in weights]), gu, fu)
+        density = builder.extract_element(value, INT32(3))
+        own = code.subtract(value, code.vector([red, green, blue, FLOAT(0)]))
+        own = builder.insert_element(own, FLOAT(1), INT32(3))
+        by_colour = builder.insert_element(_NONE, density, INT32(0))
+        wide = builder.shuffle_vector(own, by_colour, code.lanes(*range(8)))
+        wide = code.multiply(wide, code.splat(opacity, EIGHT))
+        ends = [code.multiply(wide, code.splat(end, EIGHT)) for end in (gu, fu)]
         sums = code.data(context, signature.args[0], sums)
         back = builder.add(corner, slab)
         places = (corner, builder.add(corner, size), back, builder.add(back, size))
         for place, weight in zip(places, weights, strict=True):
-            at = builder.mul(place, _INT64(WIDTH))
+            at = builder.mul(place, INT64(WIDTH))
             for number, end in enumerate(ends):
                 code.accumulate(
-                    sums, builder.add(at, _INT64(WIDTH * number)), code.multiply(end, code.splat(weight, _EIGHT))
+                    sums, builder.add(at, INT64(WIDTH * number)), code.multiply(end, code.splat(weight, EIGHT))
                 )
         return context.get_dummy_value()
 
@@ -71,17 +71,17 @@ def add_product(typingctx, out, pixel, x, base, voxel, weight, first, last):
 
     def generate(context, builder, signature, arguments):
         out, pixel, x, base, voxel, weight, first, last = arguments
-        code = _Vectors(builder)
+        code = Vectors(builder)
         x, weight = code.data(context, signature.args[2], x), code.data(context, signature.args[5], weight)
         by_colour, by_density = (cgutils.alloca_once_value(builder, _NONE) for _ in range(2))
-        with cgutils.for_range_slice(builder, first, last, _INT64(1), inc=True) as (entry, _):
+        with cgutils.for_range_slice(builder, first, last, INT64(1), inc=True) as (entry, _):
             own = code.four_at(x, _voxel(code, context, signature.args[4], voxel, entry, base), 4)
-            at = builder.mul(entry, _INT64(5))
-            colour = code.splat(builder.load(builder.gep(weight, [builder.add(at, _INT64(4))])), _FOUR)
+            at = builder.mul(entry, INT64(5))
+            colour = code.splat(builder.load(builder.gep(weight, [builder.add(at, INT64(4))])), FOUR)
             _onto(code, by_colour, code.multiply(own, colour))
             _onto(code, by_density, code.multiply(code.lane(own, 3), code.four_at(weight, at, 1)))
         total = code.add(_without_alpha(builder, builder.load(by_colour)), builder.load(by_density))
-        code.accumulate(code.data(context, signature.args[0], out), builder.mul(pixel, _INT64(4)), total)
+        code.accumulate(code.data(context, signature.args[0], out), builder.mul(pixel, INT64(4)), total)
         return context.get_dummy_value()
 
     return signature, generate
@@ -94,17 +94,17 @@ def add_transposed_product(typingctx, out, base, y, pixel, voxel, weight, first,
 
     def generate(context, builder, signature, arguments):
         out, base, y, pixel, voxel, weight, first, last = arguments
-        code = _Vectors(builder)
+        code = Vectors(builder)
         out, weight = code.data(context, signature.args[0], out), code.data(context, signature.args[5], weight)
         own = code.four_at(code.data(context, signature.args[2], y), pixel, 4)
         rgb = _without_alpha(builder, own)
-        with cgutils.for_range_slice(builder, first, last, _INT64(1), inc=True) as (entry, _):
-            at = builder.mul(entry, _INT64(5))
-            colour = code.splat(builder.load(builder.gep(weight, [builder.add(at, _INT64(4))])), _FOUR)
+        with cgutils.for_range_slice(builder, first, last, INT64(1), inc=True) as (entry, _):
+            at = builder.mul(entry, INT64(5))
+            colour = code.splat(builder.load(builder.gep(weight, [builder.add(at, INT64(4))])), FOUR)
             density = code.total(code.multiply(code.four_at(weight, at, 1), own))
-            change = builder.insert_element(code.multiply(rgb, colour), density, _INT32(3))
+            change = builder.insert_element(code.multiply(rgb, colour), density, INT32(3))
             place = _voxel(code, context, signature.args[4], voxel, entry, base)
-            code.accumulate(out, builder.mul(place, _INT64(4)), change)
+            code.accumulate(out, builder.mul(place, INT64(4)), change)
         return context.get_dummy_value()
 
     return signature, generate
@@ -117,13 +117,13 @@ def add_four_columns(typingctx, out, at, x, base, columns, column, voxel, weight
 
     def generate(context, builder, signature, arguments):
         out, at, x, base, columns, column, voxel, weight, first, last = arguments
-        code = _Vectors(builder)
+        code = Vectors(builder)
         x, weight = code.data(context, signature.args[2], x), code.data(context, signature.args[7], weight)
         total = cgutils.alloca_once_value(builder, _NONE)
-        with cgutils.for_range_slice(builder, first, last, _INT64(1), inc=True) as (entry, _):
+        with cgutils.for_range_slice(builder, first, last, INT64(1), inc=True) as (entry, _):
             place = _voxel(code, context, signature.args[6], voxel, entry, base)
             place = builder.add(builder.mul(place, columns), column)
-            value = code.splat(builder.load(builder.gep(weight, [entry])), _FOUR)
+            value = code.splat(builder.load(builder.gep(weight, [entry])), FOUR)
             _onto(code, total, code.multiply(code.four_at(x, place, 1), value))
         code.accumulate(code.data(context, signature.args[0], out), at, builder.load(total))
         return context.get_dummy_value()
@@ -138,12 +138,12 @@ def add_four_transposed(typingctx, out, base, columns, column, y, at, voxel, wei
 
     def generate(context, builder, signature, arguments):
         out, base, columns, column, y, at, voxel, weight, first, last = arguments
-        code = _Vectors(builder)
+        code = Vectors(builder)
         out, weight = code.data(context, signature.args[0], out), code.data(context, signature.args[7], weight)
         own = code.four_at(code.data(context, signature.args[4], y), at, 1)
-        with cgutils.for_range_slice(builder, first, last, _INT64(1), inc=True) as (entry, _):
+        with cgutils.for_range_slice(builder, first, last, INT64(1), inc=True) as (entry, _):
             place = _voxel(code, context, signature.args[6], voxel, entry, base)
-            value = code.splat(builder.load(builder.gep(weight, [entry])), _FOUR)
+            value = code.splat(builder.load(builder.gep(weight, [entry])), FOUR)
             place = builder.add(builder.mul(place, columns), column)
             code.accumulate(out, place, code.multiply(own, value))
         return context.get_dummy_value()
@@ -154,7 +154,7 @@ def add_four_transposed(typingctx, out, base, columns, column, y, at, voxel, wei
 def _voxel(code, context, kind, voxel, entry, base):
     """The voxel of an entry."""
     builder = code.builder
-    return builder.add(base, builder.sext(builder.load(builder.gep(code.data(context, kind, voxel), [entry])), _INT64))
+    return builder.add(base, builder.sext(builder.load(builder.gep(code.data(context, kind, voxel), [entry])), INT64))
 
 
 def _onto(code, total, value):
@@ -162,4 +162,4 @@ def _onto(code, total, value):
 
 
 def _without_alpha(builder, four):
-    return builder.insert_element(four, _FLOAT(0), _INT32(3))
+    return builder.insert_element(four, FLOAT(0), INT32(3))
