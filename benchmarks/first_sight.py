@@ -53,10 +53,11 @@ from record import command_line, report, resident_mb, trim
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from blender_primdiffusion.scene.pending import write_all_pending
+
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.edit import select_human
-from blender_primdiffusion.scene.pending import write_all_pending
 from blender_primdiffusion.scene.place import stand_at_cursor
 
 FRAMES = 60

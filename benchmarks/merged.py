@@ -32,10 +32,11 @@ from primdiffusion.render.march import march
 from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from blender_primdiffusion.scene.attachment import set_attachment, show_in_viewport
+
 import blender_primdiffusion
 from blender_primdiffusion.scene import merged as merging
 from blender_primdiffusion.scene.armature import keyframe_poses, model_origin, pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import set_attachment, show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.material import set_density_gain

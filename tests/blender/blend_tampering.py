@@ -24,6 +24,7 @@ import synthetic_shape
 sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
+from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 
 from blender_primdiffusion.places import EXTENSION
 from blender_primdiffusion.scene import attachment, merged, proxy, splats, stand_in, surface
@@ -31,7 +32,6 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, is_human, link_part, parts_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD
-from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 from blender_primdiffusion.ui.drawing import DATA
 from blender_primdiffusion.ui.on_person import FACTS
 

@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import bpy
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
+from blender_primdiffusion.scene.pending import pending_of
 from human_files import paths_of
 from jobs_driven import drive
 
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.payload import session_folder
-from blender_primdiffusion.scene.pending import pending_of
 
 COUNT = 12
 """Primitives of the synthetic person."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import bpy
 import numpy as np
 import synthetic
+from blender_primdiffusion.scene.pending import write_all_pending
 from human_files import person_file
 from mathutils import Matrix, Vector
 from oracle import evaluated_matrices
@@ -13,7 +14,6 @@ from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.scene.armature import move_rest_joints, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import ORIGIN, body_of, parts_of
-from blender_primdiffusion.scene.pending import write_all_pending
 
 COUNT = 6
 

@@ -9,18 +9,18 @@ from pathlib import Path
 import bpy
 import pytest
 from blend_tampering import COUNT, PROPERTIES, SECRET, Stage, build, in_preferences, panels_fault, person, tried
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_before_rendering
+from blender_primdiffusion.scene.pending import pending_of
 from human_files import folder_of, paths_of, person_file
 from support.errors import refused
 
 from blender_primdiffusion.backend import environment
 from blender_primdiffusion.backend.environment import BackendNotFound, candidates
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_before_rendering
 from blender_primdiffusion.jobs.queue import chosen_checkpoint, queue
 from blender_primdiffusion.places import EXTENSION, preference
 from blender_primdiffusion.scene import payload
 from blender_primdiffusion.scene.human import body_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_folder
-from blender_primdiffusion.scene.pending import pending_of
 from blender_primdiffusion.ui.setup import known
 
 

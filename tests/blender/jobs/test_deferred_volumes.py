@@ -7,6 +7,9 @@ import time
 
 import bpy
 import pytest
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
+from blender_primdiffusion.scene.pending import pending_of, pending_volumes, write_all_pending, write_pending
+from blender_primdiffusion.scene.surface import primitives_of
 from deferred_volumes_stage import COUNT, advance, check_complete, generated, on_disk, paths_of
 from human_files import folder_of, person_file
 
@@ -14,13 +17,10 @@ import blender_primdiffusion
 from blender_primdiffusion.engine.gpu.overlay import overlay
 from blender_primdiffusion.jobs import deferred_volumes as module
 from blender_primdiffusion.jobs import windows
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import humans, volumes_of
-from blender_primdiffusion.scene.pending import pending_of, pending_volumes, write_all_pending, write_pending
-from blender_primdiffusion.scene.surface import primitives_of
 from blender_primdiffusion.scene.volumes import person_memory
 
 ops = bpy.ops.primdiffusion

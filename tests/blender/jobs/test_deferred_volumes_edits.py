@@ -6,11 +6,11 @@ import shutil
 
 import bpy
 import pytest
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from deferred_volumes_stage import advance, check_complete, on_disk, paths_of
 from human_files import copy_of, press_x
 from jobs_driven import drive
 
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.human import humans, volumes_of
 

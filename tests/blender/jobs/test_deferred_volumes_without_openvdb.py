@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import bpy
 import pytest
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, open_after_loading
 from deferred_volumes_stage import COUNT, on_disk
 from human_files import person_file
 from support.errors import refused
 
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, open_after_loading
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.human import humans, volumes_of
 from blender_primdiffusion.scene.volumes import Memory, person_memory

@@ -8,11 +8,11 @@ from pathlib import Path
 import bpy
 import pytest
 import synthetic_shape
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from human_files import folder_of, paths_of, person_file, remove_human
 from jobs_driven import drive, error_of, notice_of
 
 from blender_primdiffusion.jobs import follow as follow_module
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob

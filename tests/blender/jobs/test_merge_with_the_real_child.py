@@ -7,10 +7,10 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
+from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from human_files import sequence_files, volume_path
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.merged import merged_of
 

@@ -9,16 +9,16 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from blender_primdiffusion.scene.attachment import IN_VIEWPORT, attachment_of, set_attachment
+from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of, primitives_of
 from human_files import copy_of, folder_of
 from human_stage import strong_pose
 from oracle import Z_UP, blended_frames, blended_vertices, evaluated_matrices, world_from_model
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import IN_VIEWPORT, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import body_of, humans, volumes_of
-from blender_primdiffusion.scene.surface import GROUP_NAME, carrier_of, primitives_of
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from blender_primdiffusion.scene.attachment import MODES, set_attachment
 from scene_stage import render
 
 from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.engine.solids import scene_solids
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import MODES, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.merged import MergedGrid, MergedState, merged_folder, publish, show_merged, write_grid

@@ -9,6 +9,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 from human_files import folder_of
 from human_stage import strong_pose
 from mathutils import Vector
@@ -22,7 +23,6 @@ from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
 from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
 from blender_primdiffusion.scene.payload import forget_session_files, session_folder
-from blender_primdiffusion.scene.pending import open_humans, write_all_pending
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 

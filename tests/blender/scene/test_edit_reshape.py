@@ -9,18 +9,18 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from blender_primdiffusion.scene.attachment import set_attachment
+from blender_primdiffusion.scene.surface import build_surface
 from human_stage import make_earlier
 from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
 from scene_stage import replace
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import BETAS, MARK, ORIGIN, body_of, humans, parts_of
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape
-from blender_primdiffusion.scene.surface import build_surface
 
 pytestmark = pytest.mark.usefixtures("volumes_shown")
 

@@ -11,10 +11,10 @@ import pytest
 import synthetic
 from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.formats.requests import DENSITY_GAIN
+from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from human_files import copy_of, folder_of, sequence_files, volume_path
 from support.errors import refused
 
-from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import parts_of
 from blender_primdiffusion.scene.material import (

@@ -7,11 +7,11 @@ import shutil
 
 import bpy
 import pytest
+from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from human_files import folder_of, lose_data, person_file
 from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.scene.human import BODY_MARK, body_of, humans, is_human, parts_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD, forget_session_files, session_file, session_folder
 

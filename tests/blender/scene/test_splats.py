@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
+from blender_primdiffusion.scene.pending import pending_volumes
+from blender_primdiffusion.scene.surface import set_node_input
 from human_files import press_x
 from human_stage import strong_pose
 from oracle import Z_UP, blended_vertices, world_from_model
@@ -19,15 +22,12 @@ from blender_primdiffusion.engine.boxes import boxes_of
 from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import body_of, humans, volumes_of
 from blender_primdiffusion.scene.parts import complete_humans
-from blender_primdiffusion.scene.pending import pending_volumes
 from blender_primdiffusion.scene.splat_nodes import GROUP_NAME
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE, WIDTH, cells_of, cloud_of
-from blender_primdiffusion.scene.surface import set_node_input
 
 pytestmark = [
     pytest.mark.usefixtures("splats"),

@@ -10,6 +10,7 @@ import sys
 import bpy
 import numpy as np
 import pytest
+from blender_primdiffusion.scene.surface import primitives_of
 from human_files import copy_of
 from human_stage import build_posed, named, whole
 
@@ -17,7 +18,6 @@ import blender_primdiffusion
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import body_of, parts_of
 from blender_primdiffusion.scene.stand_in import STAND_IN
-from blender_primdiffusion.scene.surface import primitives_of
 
 WITHOUT = """
 import json, sys

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import synthetic
 from backend_python import use_this_python
+from blender_primdiffusion.scene.surface import primitives_of
 from human_files import lose_data
 from support.fake_child import FAKE_CHILD
 
@@ -21,7 +22,6 @@ from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.human import BETAS, humans
 from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.proxy import proxy_of
-from blender_primdiffusion.scene.surface import primitives_of
 from blender_primdiffusion.ui.export_operators import PRIMDIFFUSION_OT_export
 from blender_primdiffusion.ui.export_panel import draw_as_mesh
 

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
+from blender_primdiffusion.scene.attachment import attachment_of, show_in_viewport
 from human_files import folder_of, remove_human, sequence_files, volume_path
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
@@ -17,7 +18,6 @@ from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of, show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import MARK, humans
 from blender_primdiffusion.scene.merged import merged_of, merged_state

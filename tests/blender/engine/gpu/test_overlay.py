@@ -10,6 +10,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic_shape
+from blender_primdiffusion.scene.surface import primitives_of
 from engine_stage import cube
 from human_files import lose_data
 from mathutils import Matrix
@@ -23,7 +24,6 @@ from blender_primdiffusion.engine.view import NO_SURFACE_M
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import body_of
-from blender_primdiffusion.scene.surface import primitives_of
 from blender_primdiffusion.ui import viewport_humans
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
