@@ -26,7 +26,10 @@ NAME_LENGTH = 40
 """Characters of a new human's name; names of its parts are longer, and Blender allows 63."""
 
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
-_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials", "images", "pointclouds")
+_KINDS = (
+    "collections", "objects", "volumes", "meshes", "armatures", "actions", "materials", "images", "pointclouds",
+    "node_groups",
+)  # fmt: skip
 
 
 def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human") -> bpy.types.Object:

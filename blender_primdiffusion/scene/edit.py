@@ -22,9 +22,6 @@ from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
 from .splats import replace_splats
 from .volume_nodes import set_folder
 
-_FLOOR_TOLERANCE = 1e-3
-"""Metres the soles may be off the floor and still count as on it."""
-
 
 def check_shapeable(person: bpy.types.Object) -> None:
     """Raises ValueError for a human whose bones or mesh cannot follow a shape now."""
@@ -68,39 +65,20 @@ def apply_rest(person: bpy.types.Object, rest: Rest, betas: NDArray) -> str:
     """Move bones and body mesh, which volumes and splats follow, to `rest`; returns a warning as `reshape` does."""
     body = body_of(person)
     bones = own_data(person, person)
-    vertices, on_floor = points_to_blender(rest.vertices), ORIGIN in bones
-    origin = floor_below(vertices) if on_floor else np.zeros(3)
+    vertices = points_to_blender(rest.vertices)
+    origin = floor_below(vertices)
     vertices += origin
     mesh = None if body is None else own_data(body, person)
     unchanged = mesh is not None and len(mesh.vertices) == len(vertices) and mesh.shape_keys is None
-    lowest = float(_heights(mesh).min()) if unchanged else None
     move_rest_joints(bones, points_to_blender(rest.joints) + origin)
-    if on_floor:
-        bones[ORIGIN] = origin.tolist()
-        bones.update_tag()
+    bones[ORIGIN] = origin.tolist()
+    bones.update_tag()
     person[BETAS] = betas.tolist()
     person.update_tag()
-    if lowest is not None:
-        if not on_floor:
-            _keep_on_floor(person, lowest, float(vertices[:, 2].min()))
+    if unchanged:
         mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
         mesh.update()
     return "" if body is None or unchanged else f"the mesh {body.name!r} was changed by hand and keeps its shape"
-
-
-def _heights(mesh: bpy.types.Mesh) -> NDArray[np.float32]:
-    flat = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", flat)
-    return flat[2::3]
-
-
-def _keep_on_floor(armature: bpy.types.Object, before: float, after: float) -> None:
-    """For humans of earlier versions: lift an upright armature, whose lowest rest point, at height `before` in its
-    space, was on z = 0, so that a point at `after` is."""
-    matrix = np.array(armature.matrix_basis)
-    upright = np.abs(matrix[2, :2]).max() < 1e-4 * abs(matrix[2, 2])
-    if armature.parent is None and upright and abs(matrix[2, 3] + matrix[2, 2] * before) < _FLOOR_TOLERANCE:
-        armature.location.z = -matrix[2, 2] * after
 
 
 @dataclasses.dataclass(frozen=True)

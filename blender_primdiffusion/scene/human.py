@@ -26,8 +26,7 @@ BETAS = "primdiffusion_betas"
 """Custom property of a human: the body's shape, which the engine draws and which may be animated."""
 ORIGIN = "primdiffusion_origin"
 """Custom property of a human's bones (the armature's data): the origin of the body model in the armature's space [3],
-metres, z up. The armature's own origin is on the floor, at the feet. In humans of earlier versions, which lack the
-property, the two are one."""
+metres, z up. The armature's own origin is on the floor, at the feet."""
 BETA_COUNT = 10
 """Numbers in a shape."""
 LARGEST_BETA = 5.0

@@ -27,8 +27,6 @@ from blender_primdiffusion.ui.shape_panel import (
     PRIMDIFFUSION_PT_shape,
 )
 
-pytestmark = pytest.mark.usefixtures("volumes_shown")
-
 ops = bpy.ops.primdiffusion
 TALL = [2.0] + [0.0] * 9
 
