@@ -93,7 +93,7 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     )
     view: bpy.props.EnumProperty(
         name="View",
-        description="What is drawn of humans",
+        description="What renders show of humans; 3D views show Colour",
         items=(
             ("COLOUR", "Colour", "Humans as they look"),
             ("DEPTH", "Depth", "Near is bright"),

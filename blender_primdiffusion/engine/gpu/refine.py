@@ -13,10 +13,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..refine import FLUENT_S, REST_S
 from ..view import PinholeView
 
 SLICE_S = 0.1
+FLUENT_S = 0.05
+"""Time for a picture while the scene moves: what is marched in full then is what takes no longer."""
+REST_S = 0.12
+"""A finer picture is begun when nothing has moved for this long."""
 SKETCH = 4
 """Coarseness of a sketch, which is sharp, and less true than any marched picture."""
 SKETCHED_S = FLUENT_S / 2

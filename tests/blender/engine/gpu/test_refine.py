@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from blender_primdiffusion.engine.gpu.refine import (
+    REST_S,
     REVEAL_S,
     SAMPLES,
     SKETCH,
@@ -18,7 +19,6 @@ from blender_primdiffusion.engine.gpu.refine import (
     MarchRequest,
     jittered,
 )
-from blender_primdiffusion.engine.refine import REST_S
 from blender_primdiffusion.engine.view import PinholeView
 
 pytestmark = pytest.mark.any_blender
