@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import weakref
 
 import bpy
@@ -10,10 +11,10 @@ import numpy as np
 from gpu_extras.presets import draw_texture_2d
 
 from .gpu.composite import PictureTextures
+from .gpu.march import gpu_marcher
 from .gpu.picture import GpuPicture, GpuScene, GpuSolids
 from .gpu.refine import GpuRefinement, MarchRequest
 from .gpu.scene_reading import gpu_humans
-from .gpu.start import gpu_start
 from .picture import SceneContent, scene_content
 from .solids import SceneSolids, changed_by, scene_solids
 from .view import PinholeView, camera_frame, view_from_matrices
@@ -96,12 +97,12 @@ class Viewport:
     @property
     def resting(self) -> bool:
         """Whether no new picture is expected."""
-        return self._idle or (self._refinement.resting and not gpu_start.working)
+        return self._idle or self._refinement.resting
 
     @property
     def due(self) -> bool:
         """Whether there is something to march, which is done while drawing."""
-        return not self._idle and self._refinement.due and not gpu_start.working
+        return not self._idle and self._refinement.due
 
     @property
     def _idle(self) -> bool:
@@ -110,15 +111,11 @@ class Viewport:
     def _march(self, content: SceneContent, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """March for a moment. Raises ValueError or OSError for a human who cannot be drawn, RuntimeError without a GPU
         that can."""
-        marcher = gpu_start.marcher()
-        if gpu_start.fault:
-            raise RuntimeError(gpu_start.fault)
-        scene, view = self._scene_on_gpu(content), _view(content, context)
+        marcher, scene, view = gpu_marcher(), self._scene_on_gpu(content), _view(content, context)
         part = _border(context, depsgraph, (view.width, view.height))
         key = (scene, repr(view.params()), part)
-        begin = None if marcher is None else lambda view: GpuPicture(marcher, scene, view)
-        shown_view = view if part is None else view.part(part)
-        self._refinement.want(MarchRequest(key, shown_view, lambda view: GpuPicture(None, scene, view), begin))
+        view = view if part is None else view.part(part)
+        self._refinement.want(MarchRequest(key, view, functools.partial(GpuPicture, marcher, scene)))
         before = self._refinement.shown
         if self._refinement.advance() and self._refinement.shown is not before:
             shown = self._refinement.shown
@@ -219,8 +216,7 @@ def stop() -> None:
 
 
 def _tick() -> float | None:
-    ready = gpu_start.advance()
-    if ready or any(viewport.due for viewport in _viewports):
+    if any(viewport.due for viewport in _viewports):
         _redraw()
     return TICK_S if any(not viewport.resting for viewport in _viewports) else None
 

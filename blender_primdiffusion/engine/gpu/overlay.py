@@ -18,17 +18,13 @@ from numpy.typing import NDArray
 
 from ...scene.convention import points_to_backend
 from ..boxes import Boxes, seen_part
-from ..view import NO_SURFACE_M, PinholeView, camera_frame, view_from_matrices
+from ..view import NO_SURFACE_M, camera_frame, view_from_matrices
 from .composite import NO_PLANES, Part, PictureTextures, ViewLook, draw_picture, keep_bones
-from .march import GpuMarch, GpuMarcher
+from .march import GpuMarch, gpu_marcher
 from .refine import REVEAL_S, GpuRefinement, MarchRequest
-from .relief import ReliefPicture
 from .scene_reading import SceneReader, SceneReading, ViewContent, concerns_humans
-from .start import gpu_start
 
 TICK_S = 0.02
-START_S = 0.3
-"""After the last picture of a moving view the shaders that march are compiled, which stalls the window."""
 REDRAWS = 3.0
 """Of a window's time, a redraw takes at most one part in so many more, while a picture comes."""
 REGIONS_KEPT = 8
@@ -47,13 +43,12 @@ class Overlay:
         self._reader = SceneReader()
         self._readings: dict[ViewContent, SceneReading] = {}
         """Since the scene has changed."""
-        self._drawn_at = 0.0
         self.undrawn = False
         """There are pictures that the windows have not drawn."""
         self._fault = ""
         """Why the GPU can draw nothing."""
         self.error = ""
-        """Why humans are not drawn, or not all of them, or roughly."""
+        """Why humans are not drawn, or not all of them."""
 
     def scene_changed(self, changed: Iterable[bpy.types.ID] | None = None) -> None:
         """Read the scene again for the next picture, if one of these data (None: any) may concern humans."""
@@ -62,48 +57,21 @@ class Overlay:
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the humans into the region that Blender draws now."""
-        marcher = self.prepare()
+        try:
+            if not self._fault:
+                self._draw(context)
+        except RuntimeError as error:
+            self._fail(error)
         if self._fault:
             self.error = f"{self._fault}: show the volumes instead (Advanced > Attachment > Volumes in Viewport)"
-            return
-        try:
-            self._draw_or_sketch(context, marcher)
-        except RuntimeError as error:
-            self._fault = str(error)
-            self._regions.clear()
 
-    def prepare(self) -> GpuMarcher | None:
-        """The marcher; None until its shaders are compiled, which a timer does, and where the GPU cannot march.
-
-        For draw handlers. Called before the first human stands, it saves them the wait.
-        """
-        marcher = gpu_start.marcher()
-        if gpu_start.working:
-            follow()
-        return marcher
-
-    def _draw_or_sketch(self, context: bpy.types.Context, marcher: GpuMarcher | None) -> None:
-        """After an error of the GPU while it marches, only sketches are drawn. Raises RuntimeError if they fail too."""
-        if marcher is not None:
-            try:
-                self._draw(context, marcher)
-                return
-            except RuntimeError as error:
-                self._marching_failed(error)
-        self._draw(context, None)
-
-    def _marching_failed(self, error: RuntimeError) -> None:
-        gpu_start.failed(str(error))
-        self._regions.clear()
-
-    def _draw(self, context: bpy.types.Context, marcher: GpuMarcher | None) -> None:
+    def _draw(self, context: bpy.types.Context) -> None:
         reading = self.reading(context)
-        self.error = reading.error or (gpu_start.fault and f"{gpu_start.fault}: humans are drawn roughly")
+        self.error = reading.error
         if not reading.humans:
             return
-        self._drawn_at = time.monotonic()
         window, to_view = (np.array(matrix, np.float64) for matrix in _matrices(context))
-        picture, request = self._picture_of(context.region), _request(context, reading, marcher)
+        picture, request = self._picture_of(context.region), _request(context, reading)
         picture.want(request)
         if picture.fresh:
             picture.advance()
@@ -115,16 +83,19 @@ class Overlay:
         for part, drawn in _parts(picture, seen_part(boxes, request.view)):
             draw_picture(drawn, look, part)
 
+    def _fail(self, error: RuntimeError) -> None:
+        """Draw nothing any more."""
+        self._fault = str(error)
+        self._regions.clear()
+
     def advance(self) -> bool:
         """Do some work that does not need the window; True when it must be drawn again."""
-        if gpu_start.working:
-            return time.monotonic() - self._drawn_at >= START_S and gpu_start.advance()
         news = False
         try:
             for picture in self._regions.values():
                 news = (not picture.fresh and picture.advance()) or news
         except RuntimeError as error:
-            self._marching_failed(error)
+            self._fail(error)
             news = True
         unread = [key for key, reading in self._readings.items() if not reading.complete]
         for key in unread:
@@ -140,8 +111,7 @@ class Overlay:
     def resting(self) -> bool:
         """Whether every region shows its finest picture."""
         complete = all(reading.complete for reading in self._readings.values())
-        at_rest = complete and all(picture.resting for picture in self._regions.values())
-        return at_rest and not gpu_start.working and not self.undrawn
+        return complete and all(picture.resting for picture in self._regions.values()) and not self.undrawn
 
     def object_at(self, context: bpy.types.Context, x: int, y: int) -> bpy.types.Object | None:
         """The object whose human is under a pixel of the region; None where another object is in front."""
@@ -183,24 +153,19 @@ class Overlay:
 overlay = Overlay()
 
 
-def _request(context: bpy.types.Context, reading: SceneReading, marcher: GpuMarcher | None) -> MarchRequest:
-    """The picture that a region shows."""
+def _request(context: bpy.types.Context, reading: SceneReading) -> MarchRequest:
+    """The picture that a region shows. Raises as `gpu_marcher`."""
     region, step = context.region, context.scene.primdiffusion_render.step
     size, (window, to_view) = (region.width, region.height), (np.array(m, np.float64) for m in _matrices(context))
     humans = list(reading.humans.values())
     subject = np.mean([human.pose.pelvis for human in humans], 0)
     view = view_from_matrices(window, to_view, _clip(window), size, subject)
     key = (tuple(reading.humans), window.tobytes(), to_view.tobytes(), size, step)
-    placed = [human.placed for human in humans]
-    reliefs = [(payload.relief, boxes) for payload, boxes in placed]
-
-    def begin(view: PinholeView) -> GpuMarch:
-        return marcher.march(placed, view, step * max(round(size[0] / view.width), 1))
-
-    return MarchRequest(key, view, lambda view: ReliefPicture(reliefs, view), None if marcher is None else begin)
+    placed, marcher = [human.placed for human in humans], gpu_marcher()
+    return MarchRequest(key, view, lambda view, coarseness: marcher.march(placed, view, step * coarseness))
 
 
-def _parts(picture: GpuRefinement, seen: Part) -> Iterator[tuple[Part, GpuMarch | ReliefPicture]]:
+def _parts(picture: GpuRefinement, seen: Part) -> Iterator[tuple[Part, GpuMarch]]:
     """Parts of the region to draw, and the picture for each: what has come of a finer one, then the shown one."""
     left, bottom, right, top = seen
     edge = top
