@@ -41,7 +41,6 @@ def unregister() -> None:
         if handler in getattr(bpy.app.handlers, name):
             getattr(bpy.app.handlers, name).remove(handler)
     overlay.stop()
-    viewport.stop()
     drawing_child.close()
     _reset_scenes()
     del bpy.types.Scene.primdiffusion_render

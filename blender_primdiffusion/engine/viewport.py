@@ -17,9 +17,8 @@ from .gpu.refine import GpuRefinement, MarchRequest
 from .gpu.scene_reading import gpu_humans
 from .picture import SceneContent, scene_content
 from .solids import SceneSolids, changed_by, scene_solids
-from .view import PinholeView, camera_frame, view_from_matrices
+from .view import camera_frame, region_view
 
-TICK_S = 1 / 60
 Region = tuple[int, int, int, int]
 """A part of a window's region [x, y, width, height], pixels from the left and the bottom."""
 _viewports: weakref.WeakSet[Viewport] = weakref.WeakSet()
@@ -80,7 +79,7 @@ class Viewport:
             except RuntimeError as error:
                 status = self._fault = str(error)
         if not self.resting:
-            follow()
+            engine.tag_redraw()
         if self._texture is not None:
             self._draw_texture(engine, context, depsgraph, *self._texture)
         engine.update_stats("", f"PrimDiffusion: {status}" if status else "")
@@ -97,21 +96,12 @@ class Viewport:
     @property
     def resting(self) -> bool:
         """Whether no new picture is expected."""
-        return self._idle or self._refinement.resting
-
-    @property
-    def due(self) -> bool:
-        """Whether there is something to march, which is done while drawing."""
-        return not self._idle and self._refinement.due
-
-    @property
-    def _idle(self) -> bool:
-        return self._content is None or bool(self._fault)
+        return self._content is None or bool(self._fault) or self._refinement.resting
 
     def _march(self, content: SceneContent, context: bpy.types.Context, depsgraph: bpy.types.Depsgraph) -> None:
         """March for a moment. Raises ValueError or OSError for a human who cannot be drawn, RuntimeError without a GPU
         that can."""
-        marcher, scene, view = gpu_marcher(), self._scene_on_gpu(content), _view(content, context)
+        marcher, scene, view = gpu_marcher(), self._scene_on_gpu(content), region_view(context, content.subject)
         part = _border(context, depsgraph, (view.width, view.height))
         key = (scene, repr(view.params()), part)
         view = view if part is None else view.part(part)
@@ -157,22 +147,6 @@ def _shown_otherwise(scene: bpy.types.Scene) -> str:
     return f"3D views show Colour; render the image to see {name}"
 
 
-def _view(content: SceneContent, context: bpy.types.Context) -> PinholeView:
-    region, around = context.region, context.region_data
-    projection, to_view = np.array(around.window_matrix), np.array(around.view_matrix)
-    clip, size = _clip(around, context.space_data), (region.width, region.height)
-    return view_from_matrices(projection, to_view, clip, size, content.subject)
-
-
-def _clip(around: bpy.types.RegionView3D, space: bpy.types.SpaceView3D) -> tuple[float, float]:
-    camera = space.camera
-    if around.view_perspective == "CAMERA" and camera is not None and camera.type == "CAMERA":
-        return camera.data.clip_start, camera.data.clip_end
-    if around.is_perspective:
-        return space.clip_start, space.clip_end
-    return -space.clip_end / 2, space.clip_end / 2  # as Blender clips its own parallel views
-
-
 def _border(context: bpy.types.Context, depsgraph: bpy.types.Depsgraph, size: tuple[int, int]) -> Region | None:
     """The render border of the view or of the camera looked through, in pixels of the region; None without one."""
     around, space, render = context.region_data, context.space_data, depsgraph.scene.render
@@ -201,28 +175,3 @@ def picture_above_overlays(context: bpy.types.Context) -> PictureTextures | None
     address = context.region.as_pointer()
     viewport = next((viewport for viewport in _viewports if viewport.region == address), None)
     return None if viewport is None else viewport.picture_above_overlays(context)
-
-
-def follow() -> None:
-    """March until every viewport rests."""
-    if not bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
-
-
-def stop() -> None:
-    """Stop marching."""
-    if bpy.app.timers.is_registered(_tick):
-        bpy.app.timers.unregister(_tick)
-
-
-def _tick() -> float | None:
-    if any(viewport.due for viewport in _viewports):
-        _redraw()
-    return TICK_S if any(not viewport.resting for viewport in _viewports) else None
-
-
-def _redraw() -> None:
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type == "VIEW_3D" and area.spaces.active.shading.type == "RENDERED":
-                area.tag_redraw()

@@ -13,12 +13,12 @@ from collections.abc import Iterable, Iterator
 import blf
 import bpy
 import numpy as np
-from mathutils import Matrix, Vector
+from mathutils import Vector
 from numpy.typing import NDArray
 
 from ...scene.convention import points_to_backend
 from ..boxes import Boxes, seen_part
-from ..view import NO_SURFACE_M, camera_frame, view_from_matrices
+from ..view import NO_SURFACE_M, camera_frame, clip_of, region_view
 from .composite import NO_PLANES, Part, PictureTextures, ViewLook, draw_picture, keep_bones
 from .march import GpuMarch, gpu_marcher
 from .refine import REVEAL_S, GpuRefinement, MarchRequest
@@ -70,7 +70,6 @@ class Overlay:
         self.error = reading.error
         if not reading.humans:
             return
-        window, to_view = (np.array(matrix, np.float64) for matrix in _matrices(context))
         picture, request = self._picture_of(context.region), _request(context, reading)
         picture.want(request)
         if picture.fresh:
@@ -78,8 +77,7 @@ class Overlay:
         if not (picture.resting and reading.complete):
             follow()
         keep_bones_in_front(context, reading.bones)
-        look = _look(context, window, to_view)
-        boxes = [human.placed[1] for human in reading.humans.values()]
+        look, boxes = _look(context), [human.placed[1] for human in reading.humans.values()]
         for part, drawn in _parts(picture, seen_part(boxes, request.view)):
             draw_picture(drawn, look, part)
 
@@ -124,7 +122,7 @@ class Overlay:
         if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]) or depth[row, column] >= NO_SURFACE_M:
             return None
         point = _point(context, x, y, float(depth[row, column]))
-        origin = _point(context, x, y, max(_clip(np.array(context.region_data.window_matrix))[0], -1e3))
+        origin = _point(context, x, y, max(clip_of(np.array(context.region_data.window_matrix))[0], -1e3))
         ray = Vector(point - origin)
         hit = context.scene.ray_cast(context.evaluated_depsgraph_get(), origin, ray.normalized(), distance=ray.length)
         if hit[0] and not context.space_data.shading.show_xray:
@@ -155,12 +153,9 @@ overlay = Overlay()
 
 def _request(context: bpy.types.Context, reading: SceneReading) -> MarchRequest:
     """The picture that a region shows. Raises as `gpu_marcher`."""
-    region, step = context.region, context.scene.primdiffusion_render.step
-    size, (window, to_view) = (region.width, region.height), (np.array(m, np.float64) for m in _matrices(context))
-    humans = list(reading.humans.values())
-    subject = np.mean([human.pose.pelvis for human in humans], 0)
-    view = view_from_matrices(window, to_view, _clip(window), size, subject)
-    key = (tuple(reading.humans), window.tobytes(), to_view.tobytes(), size, step)
+    humans, step = list(reading.humans.values()), context.scene.primdiffusion_render.step
+    view = region_view(context, np.mean([human.pose.pelvis for human in humans], 0))
+    key = (tuple(reading.humans), repr(view.params()), step)
     placed, marcher = [human.placed for human in humans], gpu_marcher()
     return MarchRequest(key, view, lambda view, coarseness: marcher.march(placed, view, step * coarseness))
 
@@ -173,11 +168,6 @@ def _parts(picture: GpuRefinement, seen: Part) -> Iterator[tuple[Part, GpuMarch]
         edge = min(max(1.0 - coming.done, bottom), top)
         yield (left, edge, right, top), coming
     yield (left, bottom, right, edge), picture.shown.picture
-
-
-def _matrices(context: bpy.types.Context) -> tuple[Matrix, Matrix]:
-    """The region's matrices: to the window, and to the view."""
-    return context.region_data.window_matrix, context.region_data.view_matrix
 
 
 def keep_bones_in_front(context: bpy.types.Context, bones: NDArray) -> None:
@@ -266,14 +256,7 @@ def _distance(boxes: Boxes, point: NDArray) -> float:
     return float(np.linalg.norm(boxes.position - points_to_backend(point), axis=1).min())
 
 
-def _clip(window: NDArray) -> tuple[float, float]:
-    """Start and end of what a projection shows, along the optical axis."""
-    if window[3, 2] == 0:
-        return (window[2, 3] + 1) / window[2, 2], (window[2, 3] - 1) / window[2, 2]
-    return window[2, 3] / (window[2, 2] - 1), window[2, 3] / min(window[2, 2] + 1, -1e-9)
-
-
-def _look(context: bpy.types.Context, window: NDArray, to_view: NDArray) -> ViewLook:
+def _look(context: bpy.types.Context) -> ViewLook:
     around, shading = context.region_data, context.space_data.shading
     opacity, xray = 1.0, False
     if shading.type == "SOLID" and shading.show_xray:
@@ -282,8 +265,9 @@ def _look(context: bpy.types.Context, window: NDArray, to_view: NDArray) -> View
         opacity, xray = max(shading.xray_alpha_wireframe, WIREFRAME_OPACITY), True
     planes = NO_PLANES
     if around.use_clip_planes:
-        planes = np.array(around.clip_planes, np.float64) @ np.linalg.inv(to_view)
-    look, space = ViewLook(window, opacity, xray, planes), context.space_data
+        planes = np.array(around.clip_planes, np.float64) @ np.linalg.inv(np.array(around.view_matrix, np.float64))
+    window, space = np.array(around.window_matrix, np.float64), context.space_data
+    look = ViewLook(window, opacity, xray, planes)
     camera = space.camera if around.view_perspective == "CAMERA" and space.overlay.show_overlays else None
     if camera is None or camera.type != "CAMERA" or not camera.data.show_passepartout:
         return look

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
 from types import SimpleNamespace
 
 import bpy
@@ -10,31 +12,40 @@ import pytest
 
 from blender_primdiffusion.engine import viewport
 from blender_primdiffusion.engine.viewport import Viewport
+from blender_primdiffusion.scene.build import build_human
 
-pytestmark = pytest.mark.any_blender
+SIZE = (48, 64)
+SAMPLE = Path(viewport.__file__).parents[1] / "gallery" / "Sample.human"
 
 
 class Engine:
     """Stands in for Blender's side of a view."""
 
     def __init__(self):
-        self.stats = []
+        self.stats, self.redraws = [], 0
+
+    def tag_redraw(self) -> None:
+        self.redraws += 1
 
     def update_stats(self, _: str, text: str) -> None:
         self.stats.append(text)
 
+    def bind_display_space_shader(self, _scene: object) -> None:
+        pass
+
+    def unbind_display_space_shader(self) -> None:
+        pass
+
 
 @pytest.fixture
-def drawn(addon, monkeypatch):
-    """Draws a view of an empty scene, at each call; what it then says. `follow` would let Blender march on."""
-    followed = []
-    monkeypatch.setattr(viewport, "follow", lambda: followed.append(True))
-    view, engine, matrix = Viewport(), Engine(), np.diag([1.0, 1.0, -0.01, 1.0])
-    space = SimpleNamespace(local_view=None, clip_start=0.1, clip_end=100.0, camera=None, use_render_border=False)
-    around = SimpleNamespace(window_matrix=matrix, view_matrix=np.eye(4), is_perspective=True, view_perspective="PERSP")
-    context = SimpleNamespace(
-        region=SimpleNamespace(as_pointer=lambda: 7, width=8, height=8), region_data=around, space_data=space
-    )
+def drawn(addon):
+    """Draws the scene, looking along y in parallel, at each call; what the view then says."""
+    view, engine, matrix = Viewport(), Engine(), np.diag([1.0, 0.75, -0.01, 1.0])
+    space = SimpleNamespace(local_view=None, camera=None, use_render_border=False)
+    to_view = np.array([[1.0, 0, 0, 0], [0, 0, 1, -1.0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    around = SimpleNamespace(window_matrix=matrix, view_matrix=to_view, view_perspective="PERSP")
+    region = SimpleNamespace(as_pointer=lambda: 7, width=SIZE[0], height=SIZE[1])
+    context = SimpleNamespace(region=region, region_data=around, space_data=space)
 
     def draw() -> str:
         depsgraph = bpy.context.evaluated_depsgraph_get()
@@ -42,7 +53,7 @@ def drawn(addon, monkeypatch):
         view.draw(engine, context, depsgraph)
         return engine.stats[-1]
 
-    return SimpleNamespace(view=view, draw=draw, followed=followed, scene=bpy.context.scene)
+    return SimpleNamespace(view=view, draw=draw, engine=engine, space=space, scene=bpy.context.scene)
 
 
 def test_a_gpu_that_cannot_draw_is_one_sentence_and_not_asked_again(drawn, monkeypatch):
@@ -57,7 +68,7 @@ def test_a_gpu_that_cannot_draw_is_one_sentence_and_not_asked_again(drawn, monke
     assert drawn.draw() == "PrimDiffusion: this GPU has no compute shaders"
     assert len(asked) == 1
     assert drawn.view.resting
-    assert drawn.followed == []
+    assert drawn.engine.redraws == 0
 
 
 def test_a_human_that_cannot_be_drawn_is_named_until_the_scene_changes(drawn, monkeypatch):
@@ -76,6 +87,37 @@ def test_a_view_says_where_renders_show_something_else(drawn, monkeypatch):
     assert drawn.draw() == ""
     drawn.scene.primdiffusion_render.view = "BOXES"
     assert drawn.draw() == "PrimDiffusion: 3D views show Colour; render the image to see Primitives"
+
+
+def refined(drawn) -> np.ndarray:
+    """The picture [h, w, 4], from the bottom, once the view rests; drawn as often as the engine asks for it."""
+    for draws in range(1, 500):
+        assert drawn.draw() == ""
+        if drawn.engine.redraws < draws:
+            break
+        time.sleep(0.01)
+    drawn.engine.redraws = 0
+    texture, _ = drawn.view._texture
+    return np.array(texture.read()).reshape(texture.height, texture.width, 4)
+
+
+def test_a_view_is_refined_to_the_end_whole_and_in_part(marcher, drawn):
+    drawn.scene.render.film_transparent = True
+    human = build_human(bpy.context, SAMPLE)
+    bpy.context.view_layer.update()
+    whole = refined(drawn)
+    assert whole.shape == (SIZE[1], SIZE[0], 4)
+    assert drawn.view._refinement.shown.coarseness == 1
+    assert drawn.view._refinement.shown.sample > 0
+    assert 0.05 < (whole[..., 3] > 0.99).mean() < 0.3
+    drawn.space.use_render_border = True
+    drawn.space.render_border_min_x, drawn.space.render_border_max_x = 0.25, 0.75
+    drawn.space.render_border_min_y, drawn.space.render_border_max_y = 0.5, 1.0
+    assert np.abs(refined(drawn) - whole[32:, 12:36]).mean() < 0.01
+    drawn.space.use_render_border = False
+    human.location.x = 5.0
+    bpy.context.view_layer.update()
+    assert not refined(drawn).any()
 
 
 def view_of(address: int, transform: str = "Standard", exposure: float = 0.0) -> SimpleNamespace:

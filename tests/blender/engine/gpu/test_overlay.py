@@ -17,7 +17,7 @@ from blender_primdiffusion.engine.boxes import Boxes
 from blender_primdiffusion.engine.gpu import overlay as module
 from blender_primdiffusion.engine.gpu import scene_reading
 from blender_primdiffusion.engine.gpu.overlay import Overlay
-from blender_primdiffusion.engine.view import NO_SURFACE_M
+from blender_primdiffusion.engine.view import NO_SURFACE_M, clip_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import body_of
@@ -226,8 +226,8 @@ def test_a_pixel_at_a_depth_is_a_point_of_the_world(matrix):
 
 
 def test_clip_planes_follow_from_the_projection():
-    assert module._clip(PERSPECTIVE) == pytest.approx((0.1, 1000), rel=0.01)
-    assert module._clip(PARALLEL) == pytest.approx((-500, 500))
+    assert clip_of(PERSPECTIVE) == pytest.approx((0.1, 1000), rel=0.01)
+    assert clip_of(PARALLEL) == pytest.approx((-500, 500))
 
 
 def clickable(people, matrix=PERSPECTIVE) -> SimpleNamespace:
