@@ -106,8 +106,7 @@ class Viewport:
         key = (scene, repr(view.params()), part)
         view = view if part is None else view.part(part)
         self._refinement.want(MarchRequest(key, view, functools.partial(GpuPicture, marcher, scene)))
-        before = self._refinement.shown
-        if self._refinement.advance() and self._refinement.shown is not before:
+        if self._refinement.advance():
             shown = self._refinement.shown
             mean = self._texture[0] if shown.sample else None
             self._texture = shown.picture.compose(mean, shown.sample), shown.request.key[-1]

@@ -165,12 +165,6 @@ class GpuMarch:
             self._done += rows
         return self._done >= self._rows
 
-    @property
-    def done(self) -> float:
-        """The part of the picture's height, from the top, where it can be shown: smoothing reads half a row more."""
-        height = self._size[1]
-        return 1.0 if self._done >= self._rows else max(self._done * TILE - 0.5, 0.0) / height
-
     def wait(self) -> None:
         """Return when the GPU has finished what it was given."""
         frame = gpu.types.GPUFrameBuffer(color_slots=self.colour)

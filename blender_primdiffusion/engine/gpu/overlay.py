@@ -7,7 +7,6 @@ ones in slices when nothing has changed for a while. Nothing is marched otherwis
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Iterable, Iterator
 
 import blf
@@ -19,14 +18,12 @@ from numpy.typing import NDArray
 from ...scene.convention import points_to_backend
 from ..boxes import Boxes, seen_part
 from ..view import NO_SURFACE_M, camera_frame, clip_of, region_view
-from .composite import NO_PLANES, Part, PictureTextures, ViewLook, draw_picture, keep_bones
-from .march import GpuMarch, gpu_marcher
-from .refine import REVEAL_S, GpuRefinement, MarchRequest
+from .composite import NO_PLANES, PictureTextures, ViewLook, draw_picture, keep_bones
+from .march import gpu_marcher
+from .refine import GpuRefinement, MarchRequest
 from .scene_reading import SceneReader, SceneReading, ViewContent, concerns_humans
 
 TICK_S = 0.02
-REDRAWS = 3.0
-"""Of a window's time, a redraw takes at most one part in so many more, while a picture comes."""
 REGIONS_KEPT = 8
 WIREFRAME_OPACITY = 0.5
 """At least: without it, humans would be invisible, since they have no wires."""
@@ -77,9 +74,8 @@ class Overlay:
         if not (picture.resting and reading.complete):
             follow()
         keep_bones_in_front(context, reading.bones)
-        look, boxes = _look(context), [human.placed[1] for human in reading.humans.values()]
-        for part, drawn in _parts(picture, seen_part(boxes, request.view)):
-            draw_picture(drawn, look, part)
+        boxes = [human.placed[1] for human in reading.humans.values()]
+        draw_picture(picture.shown.picture, _look(context), seen_part(boxes, request.view))
 
     def _fail(self, error: RuntimeError) -> None:
         """Draw nothing any more."""
@@ -99,11 +95,6 @@ class Overlay:
         for key in unread:
             del self._readings[key]
         return news or bool(unread)
-
-    def redrawn_in(self, seconds: float) -> None:
-        """Say how long the windows take to draw."""
-        for picture in self._regions.values():
-            picture.reveal_s = max(REVEAL_S, REDRAWS * seconds)
 
     @property
     def resting(self) -> bool:
@@ -160,16 +151,6 @@ def _request(context: bpy.types.Context, reading: SceneReading) -> MarchRequest:
     return MarchRequest(key, view, lambda view, coarseness: marcher.march(placed, view, step * coarseness))
 
 
-def _parts(picture: GpuRefinement, seen: Part) -> Iterator[tuple[Part, GpuMarch]]:
-    """Parts of the region to draw, and the picture for each: what has come of a finer one, then the shown one."""
-    left, bottom, right, top = seen
-    edge = top
-    if (coming := picture.coming) is not None:
-        edge = min(max(1.0 - coming.done, bottom), top)
-        yield (left, edge, right, top), coming
-    yield (left, bottom, right, edge), picture.shown.picture
-
-
 def keep_bones_in_front(context: bpy.types.Context, bones: NDArray) -> None:
     """Let these bones [N, 2, 3], if the view shows bones, stay above the picture that is drawn next."""
     overlays, around, region = context.space_data.overlay, context.region_data, context.region
@@ -213,13 +194,12 @@ def _march_and_draw() -> Iterator[float]:
         if overlay.advance():
             overlay.undrawn = True
             yield 0.0
-            overlay.undrawn, began = False, time.monotonic()
+            overlay.undrawn = False
             for window in bpy.context.window_manager.windows:
                 for area in window.screen.areas:
                     if area.type == "VIEW_3D":
                         area.tag_redraw()
             yield 0.0
-            overlay.redrawn_in(time.monotonic() - began)
         yield TICK_S
 
 

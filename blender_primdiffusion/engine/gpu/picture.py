@@ -126,11 +126,6 @@ class GpuPicture:
         self.humans = marcher.march(scene.humans, view, scene.step * coarseness, ends)
         """The humans alone."""
 
-    @property
-    def done(self) -> float:
-        """As `GpuMarch.done`."""
-        return self.humans.done
-
     def advance(self, work: float = np.inf) -> bool:
         """As `GpuMarch.advance`."""
         return self.humans.advance(work)

@@ -22,8 +22,6 @@ REST_S = 0.12
 """A finer picture is begun when nothing has moved for this long."""
 COARSENESS = (8, 4, 2, 1)
 """Pixels of the window per marched pixel along a side, in the order of marching."""
-REVEAL_S = 0.4
-"""Between redraws that show how far a picture has come."""
 SAMPLES = 8
 """Pictures that are averaged when nothing moves, each with its rays elsewhere in the pixels."""
 SLOW_S, SLOW_SAMPLES = 0.5, 4
@@ -34,11 +32,6 @@ _GROWTH = 4.0
 
 class Pass(Protocol):
     """One picture that is being marched, such as a `GpuMarch`."""
-
-    @property
-    def done(self) -> float:
-        """The part of its height that is complete, from the top."""
-        ...
 
     def advance(self, work: float) -> bool:
         """March for about this work, in pixels times boxes; True when the picture is complete."""
@@ -81,14 +74,12 @@ class GpuRefinement:
         """A refinement of `samples` pictures at rest."""
         self._clock, self._samples = clock, samples
         self._request: MarchRequest | None = None
-        self._changed_at = self._revealed_at = 0.0
+        self._changed_at = 0.0
         self._pending: ShownMarch | None = None
         self._seconds, self._pixel_seconds = 0.0, np.inf
         """Seconds for the pending picture so far, and for a pixel of the last one."""
         self._work = _FIRST_WORK
         self.shown: ShownMarch | None = None
-        self.reveal_s = REVEAL_S
-        """As the constant: a slow window redraws less often."""
 
     def want(self, request: MarchRequest) -> None:
         """Set the newest request; an equal one changes nothing."""
@@ -111,14 +102,8 @@ class GpuRefinement:
         rested = self._clock() - self._changed_at >= REST_S
         return self.fresh or self._pending is not None or (rested and self._next() is not None)
 
-    @property
-    def coming(self) -> Pass | None:
-        """A finer picture than the shown one that is complete above its lower end (see `Pass.done`)."""
-        pending = self._pending
-        return None if pending is None or pending.sample or not pending.picture.done else pending.picture
-
     def advance(self) -> bool:
-        """Make a first picture, or march for about SLICE_S; True when there is more to show. Raises what `begin` and
+        """Make a first picture, or march for about SLICE_S; True when there is a new picture. Raises what `begin` and
         what it starts raise."""
         if self.fresh:
             self.shown = self._at_once(self._request)
@@ -129,9 +114,6 @@ class GpuRefinement:
             if self._march(self._pending):
                 self.shown, self._pending = self._pending, None
                 return True
-        if self.coming is not None and self._clock() - self._revealed_at >= self.reveal_s:
-            self._revealed_at = self._clock()
-            return True
         return False
 
     def _at_once(self, request: MarchRequest) -> ShownMarch:
@@ -161,7 +143,7 @@ class GpuRefinement:
 
     def _begin(self, request: MarchRequest, coarseness: int, sample: int) -> ShownMarch:
         view = jittered(_coarser(request.view, coarseness), sample)
-        began = self._revealed_at = self._clock()
+        began = self._clock()
         begun = ShownMarch(request, coarseness, sample, request.begin(view, coarseness))
         self._seconds = self._clock() - began
         return begun

@@ -180,15 +180,6 @@ def test_slices_and_larger_tiles_give_the_same_picture(marcher, backend, payload
     assert np.array_equal(read(larger.depth, view), depth)
 
 
-def test_the_upper_part_of_a_march_can_be_shown_before_the_end(marcher, backend, payload):
-    fields = placed(backend)
-    view = pinhole(fields["position"].mean(0), (0.0, 0.3, 3.0), size=(160, 240))
-    march = marcher.march([(payload, boxes_of(fields))], view, STEP)
-    assert march.done == 0.0
-    assert not march.advance(1.0)
-    assert march.done == 7.5 / 240, "eight rows, of which the last is mixed with the next where they are smoothed"
-
-
 @pytest.mark.parametrize("coarseness", COARSENESS[:-1])
 def test_a_coarse_picture_shows_what_the_fine_one_does(marcher, backend, payload, coarseness):
     fields = placed(backend)

@@ -331,8 +331,6 @@ def drawing(monkeypatch, march) -> list[tuple]:
 class Marched:
     """A picture that is complete at once."""
 
-    done = 1.0
-
     def __init__(self, _humans, view, step):
         self.view, self.step = view, step
 
@@ -385,13 +383,3 @@ def test_each_redraw_of_a_moving_view_shows_all_of_the_new_one(people, monkeypat
     assert len(turns) == 5
     step, (first, _) = bpy.context.scene.primdiffusion_render.step, drawn[0]
     assert (first.view.width, first.step) == (SIZE[0] // 8, 8 * step)
-
-
-def test_a_picture_that_comes_is_drawn_above_the_one_that_is_there(people):
-    picture = SimpleNamespace(coming=SimpleNamespace(done=0.25), shown=SimpleNamespace(picture="coarse"))
-    assert list(module._parts(picture, (0.1, 0.2, 0.6, 0.9))) == [
-        ((0.1, 0.75, 0.6, 0.9), picture.coming),
-        ((0.1, 0.2, 0.6, 0.75), "coarse"),
-    ]
-    picture.coming = None
-    assert list(module._parts(picture, (0.1, 0.2, 0.6, 0.9))) == [((0.1, 0.2, 0.6, 0.9), "coarse")]
