@@ -7,7 +7,7 @@ ones in slices when nothing has changed for a while. Nothing is marched otherwis
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import blf
 import bpy
@@ -168,9 +168,7 @@ def draw_above_overlays(context: bpy.types.Context, picture: PictureTextures) ->
 
 def follow() -> None:
     """March finer pictures until every region shows its finest."""
-    global _steps
     if not bpy.app.timers.is_registered(_tick):
-        _steps = _march_and_draw()
         bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
 
 
@@ -181,26 +179,18 @@ def stop() -> None:
     overlay.undrawn = False
 
 
-_steps: Iterator[float] = iter(())
-
-
 def _tick() -> float | None:
-    return next(_steps, None)
-
-
-def _march_and_draw() -> Iterator[float]:
-    """Yields seconds to wait: marching and drawing both block the windows, and between them Blender handles input."""
-    while not overlay.resting:
-        if overlay.advance():
-            overlay.undrawn = True
-            yield 0.0
-            overlay.undrawn = False
-            for window in bpy.context.window_manager.windows:
-                for area in window.screen.areas:
-                    if area.type == "VIEW_3D":
-                        area.tag_redraw()
-            yield 0.0
-        yield TICK_S
+    """Seconds to wait: marching and drawing both block the windows, and between them Blender handles input."""
+    if overlay.undrawn:
+        overlay.undrawn = False
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                if area.type == "VIEW_3D":
+                    area.tag_redraw()
+    elif overlay.advance():
+        overlay.undrawn = True
+        return 0.0
+    return None if overlay.resting else TICK_S
 
 
 def draw_error(context: bpy.types.Context) -> None:

@@ -160,22 +160,18 @@ def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
 
 
 def test_marching_and_drawing_are_steps_of_their_own(monkeypatch):
-    own, news = Overlay(), [False, True, False]
+    own, news = Overlay(), [False, True, True]
     pictures = SimpleNamespace(resting=False, fresh=False, advance=lambda: news.pop(0))
     own._regions[0] = pictures
     monkeypatch.setattr(module, "overlay", own)
-    steps, seen = module._march_and_draw(), []
-    for seconds in steps:
+    seen = []
+    for _ in range(5):
+        seconds = module._tick()
         pictures.resting = not news
-        seen.append((seconds, own.undrawn, own.resting))
+        seen.append((seconds, own.undrawn))
     march, at_once = module.TICK_S, 0.0
-    assert seen == [
-        (march, False, False),
-        (at_once, True, False),
-        (at_once, False, False),
-        (march, False, False),
-        (march, False, True),
-    ]
+    assert seen == [(march, False), (at_once, True), (march, False), (at_once, True), (None, False)]
+    assert own.resting
 
 
 def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
