@@ -1,23 +1,20 @@
-"""The picture that the child draws and Blender shows, in a file in shared memory that both map: nothing is copied."""
+"""The picture that the child draws and Blender shows, in a temporary file that both map: no pixels are sent."""
 
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import tempfile
 from pathlib import Path
 
+import bpy
 import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.regular_files import remove_file, remove_folder
-from ..formats.whole_files import has_ended, writer
 
-SHARED_MEMORY = Path("/dev/shm")
 CHANNELS = 5
 """Combined (4) and depth."""
-_PREFIX = "primdiffusion_"
 
 
 class Frame:
@@ -43,19 +40,17 @@ class Frame:
 
 
 class SharedFrames:
-    """A folder in shared memory for the frame and other files that the child reads; `close` removes it."""
+    """A folder among Blender's temporary files for the frame and what else the child reads; `close` removes it."""
 
     def __init__(self) -> None:
         self._folder: Path | None = None
         self._frame: Frame | None = None
-        self._numbers = itertools.count(1)
 
     @property
     def folder(self) -> Path:
         """Made at first use."""
-        if self._folder is None or not self._folder.is_dir():
-            _sweep()
-            self._folder = _new_folder(SHARED_MEMORY if os.access(SHARED_MEMORY, os.W_OK) else None)
+        self._folder = self._folder or Path(bpy.app.tempdir) / "primdiffusion_frames"
+        self._folder.mkdir(parents=True, exist_ok=True)
         return self._folder
 
     def take(self, width: int, height: int) -> Frame:
@@ -67,7 +62,8 @@ class SharedFrames:
                 old, frame = frame.path, None
                 with contextlib.suppress(PermissionError):  # its last user still maps it: it goes with the folder
                     remove_file(old, old.parent)
-            frame = self._frame = Frame(self._allocate(width * height * CHANNELS * 4), width, height)
+            path = _allocated(self.folder, width * height * CHANNELS * 4)
+            frame = self._frame = Frame(path, width, height)
         return frame
 
     def close(self) -> None:
@@ -76,26 +72,10 @@ class SharedFrames:
         if folder is not None:
             remove_folder(folder, folder.parent)
 
-    def _allocate(self, size: int) -> Path:
-        """A file of `size` allocated bytes: otherwise a full memory file system would crash the process later."""
-        name = f"{next(self._numbers)}.frame"
-        try:
-            return _reserve(self.folder / name, size)
-        except OSError:
-            if self.folder.parent != SHARED_MEMORY:
-                raise
-        self.close()
-        self._folder = _new_folder(None)
-        return _reserve(self._folder / name, size)
 
-
-def _new_folder(within: Path | None) -> Path:
-    return Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{writer()}_", dir=within))
-
-
-def _reserve(path: Path, size: int) -> Path:
-    remove_file(path, path.parent)
-    descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)  # follows no link
+def _allocated(folder: Path, size: int) -> Path:
+    """A new file of `size` allocated bytes: on a full disk, writing into a mapped one would crash the process."""
+    descriptor, path = tempfile.mkstemp(".frame", dir=folder)
     try:
         if hasattr(os, "posix_fallocate"):
             os.posix_fallocate(descriptor, 0, size)
@@ -103,18 +83,10 @@ def _reserve(path: Path, size: int) -> Path:
             os.ftruncate(descriptor, size)
     except OSError:
         os.close(descriptor)
-        remove_file(path, path.parent)
+        os.unlink(path)
         raise
     os.close(descriptor)
-    return path
-
-
-def _sweep() -> None:
-    """Remove what a killed Blender left in shared memory, which would otherwise stay until a restart."""
-    for folder in SHARED_MEMORY.glob(f"{_PREFIX}*_*"):
-        if has_ended(folder.name):
-            with contextlib.suppress(OSError):
-                remove_folder(folder, folder.parent)
+    return Path(path)
 
 
 frames = SharedFrames()
