@@ -202,7 +202,7 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     sections = [
         (draw_section(layout, "show_as", text="Show As", page=page, section="show-as"), _draw_representation),
         (draw_section(layout, "look", text="Look in Cycles", page=page, section="look-in-cycles"), _draw_cycles_look),
-        (draw_section(layout, "facts", text="Facts", page=page, section="facts"), _draw_facts),
+        (draw_section(layout, "facts", text="Facts"), _draw_facts),
     ]
     if backend_is_named():
         merge = draw_section(layout, "merge", text="Merge for Cycles", page=page, section="merge-for-cycles")

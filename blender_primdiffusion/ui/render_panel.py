@@ -179,7 +179,7 @@ def _plain_colours(scene: bpy.types.Scene) -> None:
 
 EXACT = "Renders humans exactly, other objects with simple shading"
 APPROXIMATE = "Renders humans approximately, with light and shadows"
-UNLIT = "Renders humans approximately, with light and shadows; 3D views need Volumes in Viewport for that"
+UNLIT = "Renders humans approximately, with light and shadows; 3D views need Show Volumes in Viewport for that"
 OTHER_ENGINE = "Renders humans blurred: choose an engine above"
 
 

@@ -192,7 +192,7 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
     assert "'" in panel
     details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
     made = ("Seed: 0", "Steps: 5", "Sex: female", "Not followed: hair (shows long)", "Edit: vary", "amount 0.5")
-    for text in (*made, "Volumes: 12", "Files: 0 MB"):
+    for text in (*made, "Volumes: up to"):
         assert text in details
 
 
