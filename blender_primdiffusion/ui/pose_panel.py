@@ -11,10 +11,7 @@ from bpy.utils import previews
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..formats.picture_files import write_png
 from ..formats.poses.rotation import to_axis_angle
-from ..formats.poses.skeleton import joint_positions
-from ..jobs.assets import clay_figure
 from ..motion.pose_library import (
     apply_pose,
     builtin_poses,
@@ -63,12 +60,6 @@ def pose_items(_self, _context: bpy.types.Context) -> list[tuple[str, str, str, 
             for name in wanted[len(LIBRARY) :]
         ]
     return _items
-
-
-def draw_picture(pose: Path, rotations: NDArray) -> None:
-    """Draw the picture of a saved pose, joint rotations [24, 3, 3], beside its file. Raises OSError."""
-    picture = clay_figure(joint_positions(np.asarray(rotations)))[::-1]  # PNG files begin with the top row
-    write_png(picture_of(pose), np.round(np.clip(picture, 0, 1) * 255).astype(np.uint8))
 
 
 def reload_poses() -> None:
@@ -273,11 +264,7 @@ class PRIMDIFFUSION_OT_save_pose(OnArmature, bpy.types.Operator):
             raise ValueError(f"{name!r} is a built-in pose: give yours another name")
         joints_from_handles(context, armature)
         rotations, translation = current_pose(armature)
-        path = save_pose(poses_folder(), name, to_axis_angle(rotations), translation)
-        try:
-            draw_picture(path, rotations)
-        except OSError as error:
-            self.report({"WARNING"}, f"The pose {name!r} has no picture: {error}")
+        save_pose(poses_folder(), name, to_axis_angle(rotations), translation)
         reload_poses()
         context.scene.primdiffusion_motion.pose = name
         self.report({"INFO"}, f"The pose {name!r} is in the library")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from types import SimpleNamespace
 from unittest.mock import MagicMock
 
@@ -16,7 +15,6 @@ from blender_primdiffusion.formats.poses.skeleton import joint_positions
 from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
-from blender_primdiffusion.jobs.assets import clay_figure, picture_of_file
 from blender_primdiffusion.motion.pose_library import (
     apply_pose,
     builtin_poses,
@@ -136,53 +134,6 @@ def test_a_saved_pose_is_in_the_library_and_comes_back_exactly(addon, armature, 
     assert not list((tmp_path / "eigene Dateien").rglob("*.*"))
     with refused(RuntimeError, "Kniend, müde"):
         ops.apply_pose(pose_name="Kniend, müde")
-
-
-def previews_of(name: str) -> set[str]:
-    """Without a window all icons are 0."""
-    return {key for key in pose_panel._collections[0] if f"{name}.pose.png" in key}
-
-
-def test_a_saved_pose_has_a_picture_of_itself_at_once(addon, armature, tmp_path):
-    folder = tmp_path / "eigene Dateien" / "poses"
-    ops.apply_pose(pose_name="Sitting")
-    data = {kind: len(getattr(bpy.data, kind)) for kind in ("images", "objects", "meshes")}
-    began = time.thread_time()  # of this thread: other programs may be at work
-    ops.save_pose(pose_name="mine")
-    assert time.thread_time() - began < 0.3
-    assert {kind: len(getattr(bpy.data, kind)) for kind in data} == data
-    (picture,) = folder.glob("*.png")
-    rotations = from_axis_angle(builtin_poses()["Sitting"])
-    drawn = np.round(clay_figure(joint_positions(rotations)) * 255) / 255
-    assert np.abs(picture_of_file(picture) - drawn).max() < 0.02
-    assert not [path for path in folder.iterdir() if "part" in path.name]
-    items = {item[0]: item for item in pose_panel.pose_items(None, addon)}
-    assert previews_of("mine")
-    ops.save_pose(pose_name="another, before it")
-    assert {item[0]: item for item in pose_panel.pose_items(None, addon)}["mine"][4] == items["mine"][4]
-    ops.save_pose(delete=True, pose_name="mine")
-    assert not picture.exists()
-
-
-def test_another_pose_of_the_same_name_has_another_picture(addon, armature):
-    for pose in ("Sitting", "Dancing"):
-        ops.apply_pose(pose_name=pose)
-        ops.save_pose(pose_name="mine")
-        pose_panel.pose_items(None, addon)
-        ops.save_pose(delete=True, pose_name="mine")
-    assert len(previews_of("mine")) == 2
-
-
-def test_a_pose_whose_picture_cannot_be_written_or_is_missing_is_in_the_library_all_the_same(
-    addon, armature, monkeypatch, capfd
-):
-    def full(*_):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("blender_primdiffusion.ui.pose_panel.write_png", full)
-    assert ops.save_pose(pose_name="mine") == {"FINISHED"}
-    assert "The pose 'mine' has no picture: [Errno 28] No space left" in capfd.readouterr().out
-    assert "mine" in [item[0] for item in pose_panel.pose_items(None, addon)]
 
 
 @pytest.mark.parametrize("name", ["T", "", "../x", "a" * 61, "."])
