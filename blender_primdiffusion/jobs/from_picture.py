@@ -19,7 +19,7 @@ from ..formats.answers import FitPostureAnswer, ReconstructAnswer
 from ..formats.camera_rig import View
 from ..formats.json_files import read_json
 from ..formats.regular_files import as_file_error
-from ..motion.pose_library import check_posable, take_world_posture, world_posture
+from ..motion.posture import check_posable, take_world_posture, world_posture
 from ..scene.attachment import parts_by_mode
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
