@@ -131,6 +131,14 @@ def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
     assert world_posture(armature)[1] == pytest.approx(translation, abs=1e-5)
 
 
+def test_handles_are_baked_before_a_human_is_fitted(chosen):
+    person = a_human()
+    assert bpy.ops.primdiffusion.add_handles(person=person.name) == {"FINISHED"}
+    for only_fit in (True, False):
+        with refused(RuntimeError, person.name, "IK handles"):
+            bpy.ops.primdiffusion.human_from_picture(only_fit=only_fit, human=person.name)
+
+
 def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, picture, tmp_path):
     mask = tmp_path / "mask.png"
     write_png(mask, np.full((HEIGHT, WIDTH), 255, np.uint8))
