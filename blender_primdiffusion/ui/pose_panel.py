@@ -69,8 +69,9 @@ class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
     def draw(self, context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
         if context.mode == "POSE":
-            shelf = layout.row()
-            shelf.prop(
+            row = layout.row()
+            row.use_property_split = False  # a button over the whole width
+            row.prop(
                 context.space_data, "show_region_asset_shelf", text="Show Poses", toggle=True, icon="ASSET_MANAGER"
             )
             draw_lines(layout, "Click a pose to apply it, drag to blend, right-click to flip it", "INFO")

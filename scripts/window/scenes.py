@@ -146,6 +146,7 @@ def human(module: str, python: str) -> Steps:
     yield "human_details"
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
     press("object.posemode_toggle")
+    yield 1.0  # until it is drawn in Pose Mode, the view has no asset shelf
     view()[1].spaces.active.show_region_asset_shelf = True
     pose(bpy.context.active_object, "Waving")
     yield 6.0
