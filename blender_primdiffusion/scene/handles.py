@@ -86,7 +86,7 @@ def bake_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None
         middle, end = (armature.pose.bones[name] for name in (limb.middle, limb.end))
         for name in ("ik_stiffness_y", "ik_stiffness_z"):
             middle.property_unset(name)
-        for constraint in [one for one in end.constraints if _is_ours(one, limb)]:
+        for constraint in [one for one in end.constraints if getattr(one, "subtarget", "") == limb.handle]:
             end.constraints.remove(constraint)
     _remove_curves(armature, _CONTROL_KEYS)
     _pose_on(armature, frames, [partial(_turn_joints, armature, pose) for pose in poses], _JOINT_KEYS)
@@ -148,10 +148,6 @@ def _constrain(armature: bpy.types.Object, limb: Limb) -> None:
 def _bend_axis(armature: bpy.types.Object, limb: Limb) -> Vector:
     """See `Limb.bend_axis`."""
     return Vector(limb.bend_axis(np.array(armature.data.bones[limb.root].matrix_local.to_3x3())))
-
-
-def _is_ours(constraint: bpy.types.Constraint, limb: Limb) -> bool:
-    return getattr(constraint, "subtarget", "") == limb.handle
 
 
 def _shown_on(context: bpy.types.Context, armature: bpy.types.Object, frames: range) -> Iterator[bpy.types.Object]:

@@ -11,6 +11,7 @@ from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain
 from blender_primdiffusion.motion.adjust import rounds_of
 from blender_primdiffusion.motion.poses import FLOOR
 from blender_primdiffusion.ui.motion_panel import built_in_motion
+from scripts.bake_poses import motions
 
 pytestmark = pytest.mark.any_blender
 
@@ -24,6 +25,14 @@ def turns(motion) -> np.ndarray:
     """Degrees of each joint from frame to frame."""
     between = np.swapaxes(motion.rotations[:-1], -1, -2) @ motion.rotations[1:]
     return np.degrees(np.linalg.norm(to_axis_angle(between), axis=-1))
+
+
+@pytest.mark.parametrize("name", SECONDS)
+def test_the_file_is_what_the_script_makes(name):
+    motion, made = built_in_motion(name), getattr(motions, name.lower())()
+    np.testing.assert_allclose(motion.rotations, made.rotations, atol=1e-6)
+    np.testing.assert_allclose(motion.translations, made.translations, atol=1e-6)
+    assert motion.fps == made.fps
 
 
 @pytest.mark.parametrize("name", ["WALK", "IDLE", "WAVE"])

@@ -21,6 +21,7 @@ from support.errors import refused
 
 from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.motion.poses import FLOOR, built_in_poses, pick_poses
+from scripts.bake_poses.poses import BUILT_IN
 
 pytestmark = pytest.mark.any_blender
 
@@ -119,6 +120,12 @@ def test_there_are_twenty_built_in_poses_and_the_first_is_nearly_a_t():
     assert (arms[:, 1] < rest[:, 1] - 0.03).all()  # a little below the horizontal
     turned = np.linalg.norm(motion.axis_angle()[0], axis=-1)
     assert np.degrees(turned).max() < 12
+
+
+def test_the_file_of_poses_is_what_the_script_makes():
+    assert list(built_in_vectors()) == list(BUILT_IN)
+    for name, vectors in built_in_vectors().items():
+        np.testing.assert_allclose(from_axis_angle(vectors), BUILT_IN[name].rotations(), atol=1e-5)
 
 
 def test_built_in_poses_differ_from_each_other():
