@@ -18,7 +18,7 @@ from ..formats.poses.rotation import nearest
 from ..formats.poses.skeleton import unchain
 from ..formats.regular_files import exists_in_its_folder, remove_file
 from ..formats.whole_files import written_whole
-from ..motion.pose_library import rest_joints
+from ..motion.posture import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import link_part

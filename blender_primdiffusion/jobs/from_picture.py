@@ -19,10 +19,10 @@ from ..formats.answers import FitPostureAnswer, ReconstructAnswer
 from ..formats.camera_rig import View
 from ..formats.json_files import read_json
 from ..formats.regular_files import as_file_error
-from ..motion.pose_library import check_posable, take_world_posture, world_posture
+from ..motion.posture import check_posable, take_world_posture, world_posture
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
-from ..scene.handles import handles_from_joints, joints_from_handles
+from ..scene.handles import check_no_handles
 from ..scene.human import humans
 from ..scene.payload import BODY
 from ..scene.representation import parts_by_representation
@@ -72,7 +72,7 @@ class PictureTask:
                     f"the human {person.name!r} is on a body of your own files: pose one of the default body"
                 )
             check_posable(person)
-            joints_from_handles(context, person)
+            check_no_handles(person)
             pose, translation = world_posture(person)
             posed = {
                 "pose": [pose.ravel().tolist()],
@@ -155,10 +155,9 @@ class FitPictureJob(Job):
         fitted, person = read_fitted(result.posture, self.task.size), self.target.found()
         check_shapeable(person)
         check_posable(person)
+        check_no_handles(person)
         reshape(person, fitted.betas)
         take_world_posture(person, fitted.pose, fitted.translation)
-        context.view_layer.update()
-        handles_from_joints(context, person)
         if (camera := self.task.camera_now()) is not None:
             aim_at_picture(camera, fitted.view)
         return " ".join([f"Fitted in {result.seconds:.1f} s.", *map(sentence, result.warnings)])
