@@ -20,12 +20,12 @@ from ..formats.camera_rig import View
 from ..formats.json_files import read_json
 from ..formats.regular_files import as_file_error
 from ..motion.posture import check_posable, take_world_posture, world_posture
-from ..scene.attachment import parts_by_mode
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
 from ..scene.handles import check_no_handles
 from ..scene.human import humans
 from ..scene.payload import BODY
+from ..scene.representation import parts_by_representation
 from ..scene.shape import betas_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
@@ -199,7 +199,7 @@ class PictureJob(Job):
             _stand_at_origin(context, armature, camera)
         for other in humans(context.scene):
             if other.session_uid == self.posed_over:
-                for hidden in (other, *filter(None, parts_by_mode(other).values())):
+                for hidden in (other, *filter(None, parts_by_representation(other).values())):
                     hidden.hide_viewport = hidden.hide_render = True
         return notice
 

@@ -215,19 +215,13 @@ def motion(module: str, python: str) -> Steps:
 
 
 def render(module: str, python: str) -> Steps:
-    """Engine and Cycles, attachment, merging, gain, memory."""
+    """Engine and Cycles, what shows the human, merging, gain."""
     yield from with_people(module, python, FIRST_SEED)
-    names = ("render", *(f"advanced/{section}" for section in ("attachment", "merge", "look", "memory")))
-    writing = import_module(f"{module}.jobs.deferred_volumes")._tick
-    yield from wait(lambda: not bpy.app.timers.is_registered(writing), 120)
+    names = ("render", *(f"advanced/{section}" for section in ("show_as", "merge", "look", "facts")))
     yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
     press("primdiffusion.set_up_engine", engine="CYCLES")
     yield "render_cycles"
-    press("primdiffusion.set_attachment", mode="SURFACE")
-    yield 1.0
-    yield "render_surface"
     queue = queue_of(module)
-    press("primdiffusion.merge")
     yield 3.0
     yield "render_merging"
     yield from wait(lambda: not queue.busy, 240)
