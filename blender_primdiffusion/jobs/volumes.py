@@ -13,11 +13,11 @@ from bpy.app.handlers import persistent
 
 from ..engine.engine import ENGINE
 from ..formats.regular_files import printable
-from ..scene.human import humans
+from ..scene.human import all_humans
 from ..scene.payload import session_file
-from ..scene.representation import representation_of, show_in_viewport
+from ..scene.representation import show_in_viewport
 from ..scene.volume_files import open_humans, write_volumes, writing
-from ..scene.volume_nodes import set_folder
+from ..scene.volume_nodes import set_folder, volumes_of
 from .export import show, shown
 from .queue import Job
 from .target import HumanTarget
@@ -109,9 +109,10 @@ def write_before_rendering(scene: bpy.types.Scene, *_: object) -> None:
     if scene.render.engine == ENGINE:
         return
     faults.text = ""
-    for person in humans(scene):
+    for person in all_humans():  # scenes may hold instances of them alone
         try:
-            if representation_of(person) == "VOLUMES":
+            volumes = volumes_of(person)
+            if volumes is not None and not volumes.hide_render:
                 write_volumes(person)
         except (OSError, ValueError) as error:
             faults.report(str(error))

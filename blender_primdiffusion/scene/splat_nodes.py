@@ -10,8 +10,13 @@ GROUP_NAME = "PrimDiffusion Splats on Body"
 CELL = "cell"
 """Attribute of splats: the index of their primitive. Their `position` is in its axes T, B, N, metres."""
 BODY, CELLS = "Body", "Cells"
-SIZE, DETAIL = "Size", "Detail"
+SIZE, DETAIL, SHADING, SUN = "Size", "Detail", "Shading", "Sun"
 """Inputs of the group."""
+C0 = 0.28209479177387814
+"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
+_IN_SHADOW = 0.3
+"""Share of the light that reaches skin which is turned away from the sun."""
+_GAMMA = 2.2
 
 
 def splat_group() -> bpy.types.NodeTree:
@@ -30,6 +35,9 @@ def _build(group: NodeGroup) -> bpy.types.NodeTree:
     ):
         item = group.socket(name, "INPUT", "NodeSocketFloat", description)
         item.default_value, item.min_value, item.max_value = 1.0, 0.01, most
+    item = group.socket(SHADING, "INPUT", "NodeSocketFloat", "How much the sun shades the human; 0: as generated")
+    item.subtype, item.min_value, item.max_value = "FACTOR", 0.0, 1.0
+    group.socket(SUN, "INPUT", "NodeSocketObject", "A sun lamp; without one the light comes from above")
     node, vector, scalar = group.node, group.vector, group.scalar
     inputs = node("NodeGroupInput").outputs
     body, cells = group.geometry_of(inputs[BODY]), group.geometry_of(inputs[CELLS])
@@ -75,6 +83,20 @@ def _build(group: NodeGroup) -> bpy.types.NodeTree:
         operation="SCALE",
     ).outputs[0]
     points = stored(points, "scale", "FLOAT_VECTOR", scale)
+    up = (0.0, 0.0, 1.0)
+    sun = node("GeometryNodeObjectInfo", {"Object": inputs[SUN]}, transform_space="RELATIVE").outputs["Rotation"]
+    to_sun, normal = (node("FunctionNodeRotateVector", {0: up, 1: by}).outputs[0] for by in (sun, turn))
+    lit = scalar("MAXIMUM", vector("DOT_PRODUCT", normal, to_sun), 0.0)
+    dimmed = scalar("MULTIPLY", scalar("SUBTRACT", 1.0, lit), scalar("MULTIPLY", inputs[SHADING], 1 - _IN_SHADOW))
+    factor = scalar("POWER", scalar("SUBTRACT", 1.0, dimmed), 1 / _GAMMA)  # of encoded colours
+    radiance = group.attribute("radiance:base", "FLOAT_COLOR")
+    encoded = vector("MULTIPLY_ADD", radiance, (C0,) * 3, (0.5,) * 3)
+    shaded = node("ShaderNodeVectorMath", {0: encoded, "Scale": factor}, operation="SCALE").outputs[0]
+    channels = node("ShaderNodeSeparateXYZ", {0: vector("MULTIPLY_ADD", shaded, (1 / C0,) * 3, (-0.5 / C0,) * 3)})
+    colour = dict(zip(("Red", "Green", "Blue"), channels.outputs, strict=True))
+    opacity = node("FunctionNodeSeparateColor", {0: radiance}).outputs["Alpha"]
+    shown = node("FunctionNodeCombineColor", {**colour, "Alpha": opacity}).outputs[0]
+    points = stored(points, "radiance:base", "FLOAT_COLOR", shown)
     points = node("GeometryNodeSetPosition", {"Geometry": points, "Position": place}).outputs["Geometry"]
     group.put(node("NodeGroupOutput").inputs["Splats"], points)
     return group.tree

@@ -17,7 +17,7 @@ from .human import body_of, link_part, own_data, parts_of
 from .payload import session_file
 from .rest_human import RestHuman, read_human
 from .shape import betas_of, generated_betas
-from .splat_nodes import BODY, CELL, CELLS, splat_group
+from .splat_nodes import BODY, C0, CELL, CELLS, splat_group
 from .volumes import WINDOW_EXPONENT
 
 SPLATS_MARK, CELLS_MARK = "primdiffusion_splats", "primdiffusion_cells"
@@ -40,8 +40,6 @@ FAINTEST = 0.02
 LEAST = 0.004
 """Opacity of a voxel along the normal below which it makes none."""
 MOST_OPAQUE = 0.995
-C0 = 0.28209479177387814
-"""The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.scene.parts import complete_humans
 from blender_primdiffusion.scene.representation import representation_of, set_representation
-from blender_primdiffusion.scene.splat_nodes import GROUP_NAME
+from blender_primdiffusion.scene.splat_nodes import C0, GROUP_NAME
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE, WIDTH, cells_of, cloud_of
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 
@@ -202,3 +202,33 @@ def test_detail_and_size_are_inputs_of_the_group(person):
     after = drawn(human, "scale")
     assert len(after) == math.ceil(len(before) / 8)
     np.testing.assert_allclose(after, 1.5 * 2 * before[: len(after)], rtol=1e-5)
+
+
+def colours(human) -> np.ndarray:
+    """Encoded colours and opacity [n, 4] as Blender draws them."""
+    bpy.context.view_layer.update()
+    attribute = cloud_of(human).evaluated_get(bpy.context.evaluated_depsgraph_get()).data.attributes["radiance:base"]
+    values = np.empty((len(attribute.data), 4), np.float32)
+    attribute.data.foreach_get("color", values.ravel())
+    return np.c_[0.5 + C0 * values[:, :3], values[:, 3]]
+
+
+def test_shading_darkens_what_is_turned_away_from_the_sun_and_leaves_opacity(person):
+    human, _ = person
+    stored = np.empty((len(cloud_of(human).data.points), 4), np.float32)
+    cloud_of(human).data.attributes["radiance:base"].data.foreach_get("vector", stored.ravel())
+    as_made = colours(human)
+    np.testing.assert_allclose(as_made, np.c_[0.5 + C0 * stored[:, :3], stored[:, 3]], atol=1e-6)
+    sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    bpy.context.scene.collection.objects.link(sun)
+    sun.rotation_euler = (math.pi / 2, 0, 0)  # shines along +y, upon the face
+    modifier = cloud_of(human).modifiers[0]
+    set_input(modifier, "Sun", sun)
+    set_input(modifier, "Shading", 1.0)
+    cloud_of(human).update_tag()
+    shaded, turn = colours(human), drawn(human, "rotation")
+    w, x, y, z = turn.T
+    facing = -2 * (y * z - w * x)  # the normals' part along -y
+    wanted = (0.3 + 0.7 * facing.clip(0, None)) ** (1 / 2.2)
+    np.testing.assert_allclose(shaded[:, :3], as_made[:, :3] * wanted[:, None], atol=1e-5)
+    np.testing.assert_array_equal(shaded[:, 3], as_made[:, 3])
