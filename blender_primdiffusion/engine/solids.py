@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ..formats.regular_files import remove_file
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
-from ..scene.place import is_solid, triangles_of
+from ..scene.place import is_solid
 
 UNRELATED_TYPES = frozenset({"ARMATURE", "CAMERA", "VOLUME", "POINTCLOUD", "LIGHT", "LIGHT_PROBE", "SPEAKER"})
 """Types of objects that are no solids; their children report changes of their own."""
@@ -139,7 +139,7 @@ def _parts(
 
 def _triangles(obj: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Corners [F, 3, 3] in the object's space and colours [F, 3] of an evaluated object."""
-    vertices, triangles, slots = triangles_of(obj)
+    vertices, triangles, slots = _triangles_of(obj)
     if len(triangles) == 0:
         return np.zeros((0, 3, 3)), np.zeros((0, 3), np.float32)
     colours = [
@@ -147,3 +147,22 @@ def _triangles(obj: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray[np.f
     ] or [tuple(obj.color)[:3]]
     palette = np.array(colours, np.float32)
     return vertices[triangles].astype(np.float64), palette[np.minimum(slots, len(palette) - 1)]
+
+
+def _triangles_of(obj: bpy.types.Object) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.int32]]:
+    """Vertices [V, 3] in the object's space, triangles [F, 3] and their material slots [F], where `is_solid`."""
+    mesh = obj.data if obj.type == "MESH" else obj.to_mesh()
+    if mesh is None:
+        return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros(0, np.int32)
+    try:
+        mesh.calc_loop_triangles()
+        vertices = np.empty((len(mesh.vertices), 3), np.float32)
+        mesh.vertices.foreach_get("co", vertices.ravel())
+        triangles = np.empty((len(mesh.loop_triangles), 3), np.int32)
+        mesh.loop_triangles.foreach_get("vertices", triangles.ravel())
+        slots = np.empty(len(triangles), np.int32)
+        mesh.loop_triangles.foreach_get("material_index", slots)
+    finally:
+        if obj.type != "MESH":
+            obj.to_mesh_clear()
+    return vertices, triangles, slots

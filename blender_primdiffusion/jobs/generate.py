@@ -19,7 +19,7 @@ from ..scene.edit import select_human
 from ..scene.human import humans
 from ..scene.place import stand_at_cursor
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
-from .views import bring_into_view, eye
+from .views import bring_into_view
 
 FIRST_HUMAN_SHARE = 0.25
 """Of a view's height: a scene's first human is framed where no view shows it taller."""
@@ -34,11 +34,10 @@ def build_person(
     """
     began = time.monotonic()
     person = build_human(context, result.person, name)
-    stand_at_cursor(context, person, eye())
+    stand_at_cursor(context, person)
     if context.mode == "OBJECT":  # else the user is posing or painting
         select_human(context, person)
-        others = [human for human in humans(context.scene) if human != person]
-        bring_into_view(person, 0.0 if others else FIRST_HUMAN_SHARE, others)
+        bring_into_view(person, 0.0 if len(humans(context.scene)) > 1 else FIRST_HUMAN_SHARE)
     warnings = list(result.warnings)
     if overlap := overlap_warning_in(context.scene, person):
         warnings.append(overlap)

@@ -60,8 +60,7 @@ def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
     for seed in (7, 8):
         bpy.ops.primdiffusion.generate(seed=seed, steps=1)
     first, second = humans(addon.scene)
-    bones = [human for human in (first, second)]
-    assert asked == [(bones[0], generate.FIRST_HUMAN_SHARE, []), (bones[1], 0.0, bones[:1])]
+    assert asked == [(first, generate.FIRST_HUMAN_SHARE), (second, 0.0)]
 
 
 def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):
