@@ -18,6 +18,16 @@ from primdiffusion.capture.poses import choose_poses
 from primdiffusion.device import best_device
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.evaluation.images import (
+    HEAD,
+    JOINTS,
+    SIDE,
+    TestImage,
+    folder_images,
+    folder_pictures,
+    human_images,
+    mesh_images,
+)
 from primdiffusion.evaluation.onnx_networks import (
     DepthValues,
     Normalisation,
@@ -32,16 +42,6 @@ from primdiffusion.evaluation.pretrained_networks import (
     load_clip_vision,
     load_inception,
 )
-from primdiffusion.evaluation.shots import (
-    HEAD,
-    JOINTS,
-    SIDE,
-    Shot,
-    folder_pictures,
-    folder_shots,
-    human_shots,
-    mesh_shots,
-)
 from primdiffusion.evaluation.tables import (
     Cell,
     Networks,
@@ -49,7 +49,7 @@ from primdiffusion.evaluation.tables import (
     check_counts,
     compare_pictures,
     evaluate,
-    floor_cells,
+    reference_cells,
     remarks,
     table,
 )
@@ -136,20 +136,20 @@ def measure(options: TableOptions, generated: Generated, assets: Path | None) ->
     if model is not None:
         first = generate(model, generated.first_seed, generated.steps)
         fps, resolution = frames_per_second(first, settings), resolution_of(first)
-        fakes = _model_shots(model, generated, poses, options.views, settings)
+        fakes = _model_images(model, generated, poses, options.views, settings)
     else:
         assert options.fake is not None
-        fakes = folder_shots(options.fake)
+        fakes = folder_images(options.fake)
     if meshes is not None:
-        reals = _mesh_shots(meshes, options, generated.count, poses)
+        reals = _mesh_images(meshes, options, generated.count, poses)
     else:
         assert options.real is not None
-        reals = folder_shots(options.real)
+        reals = folder_images(options.real)
     fake, real = _evaluated(fakes, networks, "generated"), _evaluated(reals, networks, "real")
     rows = compare_pictures(fake, real, options.kid_subsets, options.kid_subset_size, options.kid_seed)
     if fps is not None:
         rows["generated"]["fps"] = fps
-    rows["floor"] = floor_cells(networks.own.card)
+    rows["floor"] = reference_cells(networks.own.card)
     choices = _choices(options, generated, fake, real, settings)
     record = {
         "version": __version__,
@@ -176,28 +176,28 @@ def _open_networks(options: TableOptions) -> Networks:
     )
 
 
-def _model_shots(
+def _model_images(
     model: DiffusionModel, generated: Generated, poses: BodyPose, views: int, settings: MarchSettings
-) -> Iterator[Shot]:
+) -> Iterator[TestImage]:
     for seed in range(generated.first_seed, generated.first_seed + generated.count):
         human = generate(model, seed, generated.steps)
-        yield from human_shots(human, poses, views, f"{seed:06d}", settings, best_device())
+        yield from human_images(human, poses, views, f"{seed:06d}", settings, best_device())
 
 
-def _mesh_shots(assets: Assets, options: TableOptions, count: int, poses: BodyPose) -> Iterator[Shot]:
+def _mesh_images(assets: Assets, options: TableOptions, count: int, poses: BodyPose) -> Iterator[TestImage]:
     base = load_base_mesh()
     yaws = [[2 * math.pi * view / options.views for view in range(options.views)]] * options.poses
     for seed in range(options.real_seed, options.real_seed + count):
-        yield from mesh_shots(make_person(assets, base, seed), poses, yaws, f"{seed:08d}", SIDE)
+        yield from mesh_images(make_person(assets, base, seed), poses, yaws, f"{seed:08d}", SIDE)
 
 
-def _evaluated(shots: Iterator[Shot], networks: Networks, what: str) -> Scores:
+def _evaluated(images: Iterator[TestImage], networks: Networks, what: str) -> Scores:
     with tqdm(unit="picture", desc=what, disable=None) as bar:
 
         def report(done: int) -> None:
             bar.update(done - bar.n)
 
-        return evaluate(shots, networks, report)
+        return evaluate(images, networks, report)
 
 
 def frames_per_second(human: Human, settings: MarchSettings) -> Cell:

@@ -12,8 +12,8 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-ENOUGH = 10
-"""Samples per feature; with fewer, the bias of a Frechet distance is not small beside differences between models."""
+MIN_SAMPLES_PER_DIMENSION = 10
+"""With fewer samples per feature, the bias of a Frechet distance is not small beside differences between models."""
 NEIGHBOURS = 3
 """k of precision and recall (Kynkäänniemi et al. 2019)."""
 ROWS_AT_ONCE = 512
@@ -38,12 +38,13 @@ def frechet_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) 
 
 
 def too_few_samples(first: int, second: int, features: int) -> str | None:
-    """What to know of a Frechet distance between sets of these sizes; None for sets that are large enough."""
-    if min(first, second) >= ENOUGH * features:
+    """Warning for sample sizes that bias the Frechet distance; None for sets that are large enough."""
+    fewest = MIN_SAMPLES_PER_DIMENSION * features
+    if min(first, second) >= fewest:
         return None
     return (
-        f"{min(first, second)} samples for {features} features are fewer than {ENOUGH} each ({ENOUGH * features}): the "
-        "distance is biased, so compare it only with those of sets of the same sizes"
+        f"{min(first, second)} samples for {features} features are fewer than {MIN_SAMPLES_PER_DIMENSION} each "
+        f"({fewest}): the distance is biased, so compare it only with those of sets of the same sizes"
     )
 
 

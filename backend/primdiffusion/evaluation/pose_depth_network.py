@@ -20,7 +20,7 @@ from torch.nn import functional
 
 from primdiffusion import tensor_file
 from primdiffusion.evaluation.attribute_network import AttributeSpace, detail_energies
-from primdiffusion.evaluation.shots import JOINTS
+from primdiffusion.evaluation.images import JOINTS
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import write_atomically

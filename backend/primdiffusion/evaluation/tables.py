@@ -16,6 +16,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
+from primdiffusion.evaluation.images import TestImage
 from primdiffusion.evaluation.onnx_networks import DepthNetwork, PoseNetwork
 from primdiffusion.evaluation.pose_depth_network import (
     PoseDepthNetwork,
@@ -27,7 +28,6 @@ from primdiffusion.evaluation.pose_depth_network import (
     shrunk,
 )
 from primdiffusion.evaluation.pretrained_networks import ClipVision, Inception
-from primdiffusion.evaluation.shots import Shot
 
 BATCH = 16
 SMALLEST = 8
@@ -53,7 +53,7 @@ class Cell(NamedTuple):
     value: float | None
     spread: float | None = None
     """What stands after +-: the standard deviation over KID's subsets, or over pictures."""
-    why: str | None = None
+    reason: str | None = None
     """Why there is no value."""
     note: str | None = None
     """What to know before the value is compared with others."""
@@ -72,42 +72,46 @@ class Scores:
     """Depth error of each picture with known depth, by network: "depth" and "own"."""
 
 
-def evaluate(shots: Iterable[Shot], networks: Networks, report: Callable[[int], None] = lambda done: None) -> Scores:
+def evaluate(
+    images: Iterable[TestImage], networks: Networks, report: Callable[[int], None] = lambda done: None
+) -> Scores:
     """Look at every picture once. A picture in which a network finds no human has no correct joint.
 
-    Raises ValueError for a network that does not fit, and what `shots` raises.
+    Raises ValueError for a network that does not fit, and what `images` raises.
     """
     features: dict[str, list[Tensor]] = {"own": [], "detail": []}
     correct: dict[str, list[float]] = {"own": [], "pose": []}
     depth: dict[str, list[float]] = {"own": [], "depth": []}
     count = 0
-    iterator = iter(shots)
+    iterator = iter(images)
     while batch := list(itertools.islice(iterator, BATCH)):
         with torch.inference_mode():
-            seen = networks.own(torch.stack([shrunk(shot.rgb) for shot in batch]).float() / 255)
+            seen = networks.own(torch.stack([shrunk(image.rgb) for image in batch]).float() / 255)
             features["own"].append(seen.features)
-            features["detail"].append(torch.stack([detail_of(shot.rgb, shot.mask) for shot in batch]))
-            pictures = torch.stack([shot.rgb for shot in batch]).float() / 255
+            features["detail"].append(torch.stack([detail_of(image.rgb, image.mask) for image in batch]))
+            pictures = torch.stack([image.rgb for image in batch]).float() / 255
             for name, network in (("inception", networks.inception), ("clip", networks.clip)):
                 if network is not None:
                     features.setdefault(name, []).append(network(pictures))
         found = joint_positions(seen.heatmaps)
-        for number, shot in enumerate(batch):
-            side = shot.rgb.shape[0]
-            if shot.joints is not None and shot.head_size is not None:
+        for number, image in enumerate(batch):
+            side = image.rgb.shape[0]
+            if image.joints is not None and image.head_size is not None:
                 joints: dict[str, Tensor | None] = {"own": found[number] * side}
                 if networks.pose is not None:
-                    joints["pose"] = networks.pose.joints(shot)
+                    joints["pose"] = networks.pose.joints(image)
                 for name, own in joints.items():
                     right = (
-                        0.0 if own is None else float(correct_joints(own, shot.joints, shot.head_size).double().mean())
+                        0.0
+                        if own is None
+                        else float(correct_joints(own, image.joints, image.head_size).double().mean())
                     )
                     correct[name].append(right)
-            if shot.depth is not None:
-                cells = cell_means(torch.where(shot.mask, 1 / shot.depth, 0.0), shot.mask)
+            if image.depth is not None:
+                cells = cell_means(torch.where(image.mask, 1 / image.depth, 0.0), image.mask)
                 errors = {"own": depth_error(seen.depth[number], 1 / cells, cells > 0)}
                 if networks.depth is not None:
-                    errors["depth"] = depth_error(networks.depth.inverted(shot), shot.depth, shot.mask)
+                    errors["depth"] = depth_error(networks.depth.inverted(image), image.depth, image.mask)
                 for name, error in errors.items():
                     if error is not None:
                         depth[name].append(error)
@@ -144,21 +148,21 @@ def compare_pictures(
     rows["generated"]["fid"] = _frechet(fake, real, "inception", "--inception")
     rows["generated"]["kid"] = _kid(fake, real, kid_subsets, kid_subset_size, seed)
     rows["real"] |= dict.fromkeys(
-        ("fid_clip", "fid", "kid"), Cell(None, why="the real pictures are what is compared with")
+        ("fid_clip", "fid", "kid"), Cell(None, reason="the real pictures are what is compared with")
     )
-    for row, judged in (("generated", fake), ("real", real)):
-        rows[row]["pckh"] = _mean(judged.correct["pose"], bool(judged.correct["own"]), "joints", "--pose", 100)
-        rows[row]["depth"] = _mean(judged.depth["depth"], bool(judged.depth["own"]), "depth", "--depth", 100)
-        rows[row]["fps"] = Cell(None, why="pictures of a folder or of meshes have no frame rate")
-        rows[row]["own_pckh"] = _mean(judged.correct["own"], bool(judged.correct["own"]), "joints", None, 100)
-        rows[row]["own_depth"] = _mean(judged.depth["own"], bool(judged.depth["own"]), "depth", None, 100)
+    for row, result in (("generated", fake), ("real", real)):
+        rows[row]["pckh"] = _mean(result.correct["pose"], bool(result.correct["own"]), "joints", "--pose", 100)
+        rows[row]["depth"] = _mean(result.depth["depth"], bool(result.depth["own"]), "depth", "--depth", 100)
+        rows[row]["fps"] = Cell(None, reason="pictures of a folder or of meshes have no frame rate")
+        rows[row]["own_pckh"] = _mean(result.correct["own"], bool(result.correct["own"]), "joints", None, 100)
+        rows[row]["own_depth"] = _mean(result.depth["own"], bool(result.depth["own"]), "depth", None, 100)
     rows["generated"]["own_distance"], rows["real"]["own_distance"] = generated, own
     return rows
 
 
 def _frechet(fake: Scores, real: Scores, name: str, option: str) -> Cell:
     if name not in fake.features:
-        return Cell(None, why=f"no weights file: name one with {option}")
+        return Cell(None, reason=f"no weights file: name one with {option}")
     return _distance(fake.features[name], real.features[name])
 
 
@@ -168,11 +172,11 @@ def _distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> Cell
 
 def _kid(fake: Scores, real: Scores, subsets: int, size: int, seed: int) -> Cell:
     if "inception" not in fake.features:
-        return Cell(None, why="no weights file: name one with --inception")
+        return Cell(None, reason="no weights file: name one with --inception")
     if min(fake.pictures, real.pictures) < size:
         return Cell(
             None,
-            why=f"subsets of {size} need as many pictures, there are {fake.pictures} generated and {real.pictures} "
+            reason=f"subsets of {size} need as many pictures, there are {fake.pictures} generated and {real.pictures} "
             "real: raise --count or lower --kid-subset-size",
         )
     found = kernel_distance_of_subsets(fake.features["inception"], real.features["inception"], subsets, size, seed)
@@ -183,10 +187,11 @@ def _mean(values: Sequence[float], has_truth: bool, truth: str, option: str | No
     """Mean over pictures and its standard deviation."""
     if not has_truth:
         return Cell(
-            None, why=f"the {truth} of these pictures are not known: docs/design/evaluation.md says where to put them"
+            None,
+            reason=f"the {truth} of these pictures are not known: docs/design/evaluation.md says where to put them",
         )
     if not values:
-        return Cell(None, why=f"no weights file: name one with {option}")
+        return Cell(None, reason=f"no weights file: name one with {option}")
     found = factor * torch.tensor(values, dtype=torch.float64)
     return Cell(float(found.mean()), float(found.std(correction=0)))
 
@@ -253,7 +258,7 @@ def remarks(rows: Mapping[str, Mapping[str, Cell]]) -> list[str]:
     return found
 
 
-def floor_cells(card: Mapping[str, Any]) -> dict[str, Cell]:
+def reference_cells(card: Mapping[str, Any]) -> dict[str, Cell]:
     """The own network's errors on renders of held-out meshes, from its card: no model can be expected to have less."""
     errors = card["errors"]
     return {"own_pckh": Cell(errors["pckh"]), "own_depth": Cell(errors["depth"])}
@@ -273,9 +278,9 @@ def table(
     said = remarks({row: {name: cells[name] for name in columns if name in cells} for row, cells in rows.items()})
     lines += ["", *said] if said else []
     first = next(iter(rows.values()))
-    missing = {COLUMNS[column]: first[column].why for column in columns if first[column].value is None}
+    missing = {COLUMNS[column]: first[column].reason for column in columns if first[column].value is None}
     if missing:
-        lines += ["", *(f"{name} is empty: {why}." for name, why in missing.items())]
+        lines += ["", *(f"{name} is empty: {reason}." for name, reason in missing.items())]
     return "\n".join(lines)
 
 

@@ -54,7 +54,7 @@ DEPTH_FOLDER = "depth"
 
 
 @dataclasses.dataclass(frozen=True)
-class Shot:
+class TestImage:
     """A picture of one human over white, and its truth where that is known."""
 
     name: str
@@ -78,30 +78,30 @@ def body_camera(vertices: Float[Tensor, "V 3"], yaw: float, side: int = SIDE) ->
     return look_at(middle + distance * towards, middle, vertical_fov=VERTICAL_FOV, width=side, height=side)
 
 
-def human_shots(
+def human_images(
     human: Human, poses: BodyPose, views: int, name: str, settings: MarchSettings, device: torch.device
-) -> Iterator[Shot]:
+) -> Iterator[TestImage]:
     """A human in all poses [F] from all views, drawn by the marcher on `device`."""
     body, anchors = body_of(human)
     for number in range(len(poses.joint_rotation)):
         posed = pose_body(human.betas, poses.map(lambda t, n=number: t[n]), body)
         primitives = Primitives.place(attach(anchors, posed.vertices, body.faces), human.payload).to(device)
-        yield from primitive_shots(primitives, posed, views, f"{name}_{number:02d}", settings)
+        yield from primitive_images(primitives, posed, views, f"{name}_{number:02d}", settings)
 
 
-def primitive_shots(
+def primitive_images(
     primitives: Primitives, posed: PosedBody, views: int, name: str, settings: MarchSettings
-) -> Iterator[Shot]:
+) -> Iterator[TestImage]:
     """Primitives from all views around a body, drawn by the marcher on their device."""
     for view in range(views):
         camera = body_camera(posed.vertices, 2 * math.pi * view / views)
         seen = march(primitives, camera.to(primitives.position.device), settings).to("cpu")
-        yield _shot(f"{name}_{view:02d}", seen.rgb, seen.alpha, seen.depth, posed.joints, camera)
+        yield _test_image(f"{name}_{view:02d}", seen.rgb, seen.alpha, seen.depth, posed.joints, camera)
 
 
-def mesh_shots(
+def mesh_images(
     person: Person, poses: BodyPose, yaws: Sequence[Sequence[float]], name: str, side: int
-) -> Iterator[Shot]:
+) -> Iterator[TestImage]:
     """A dressed mesh in poses [F], each from its own yaws, rasterised with SUPERSAMPLE^2 samples a pixel."""
     shaped = default_body().shape(torch.from_numpy(person.betas).float())
     for number, of_pose in enumerate(yaws):
@@ -111,17 +111,17 @@ def mesh_shots(
             camera = body_camera(posed.vertices, yaw, side)
             seen = rasterise(mesh, camera, SUPERSAMPLE)
             rgb, alpha, depth = (torch.from_numpy(array) for array in (seen.rgb, seen.alpha, seen.depth))
-            yield _shot(f"{name}_{number:02d}_{view:02d}", rgb, alpha, depth, posed.joints, camera)
+            yield _test_image(f"{name}_{number:02d}_{view:02d}", rgb, alpha, depth, posed.joints, camera)
 
 
-def _shot(
+def _test_image(
     name: str,
     rgb: Float[Tensor, "h w 3"],
     alpha: Float[Tensor, "h w"],
     distance: Float[Tensor, "h w"],
     joints: Float[Tensor, "24 4 4"],
     camera: Camera,
-) -> Shot:
+) -> TestImage:
     pixels, _ = camera.project(joints[:, :3, 3])
     own = pixels[[JOINT_NAMES.index(joint) for joint in JOINTS]]
     neck, head = (pixels[JOINT_NAMES.index(joint)] for joint in HEAD)
@@ -129,7 +129,7 @@ def _shot(
     mask = alpha >= 0.5
     cosine = camera.rays()[1] @ camera.world_to_camera[2, :3]  # distances are along rays
     depth = torch.where(mask, distance * cosine, torch.inf)
-    return Shot(name, (white * 255).round().to(torch.uint8), mask, own, float((neck - head).norm()), depth)
+    return TestImage(name, (white * 255).round().to(torch.uint8), mask, own, float((neck - head).norm()), depth)
 
 
 def folder_pictures(folder: Path) -> list[Path]:
@@ -140,7 +140,7 @@ def folder_pictures(folder: Path) -> list[Path]:
     return found
 
 
-def folder_shots(folder: Path) -> Iterator[Shot]:
+def folder_images(folder: Path) -> Iterator[TestImage]:
     """The pictures of a folder, resized to 512 x 512 and composited over white.
 
     `joints.json`, if there, maps a picture's name to the pixels of SMPL's 24 joints [24, 2], and `depth/NAME.npy` is
@@ -158,7 +158,7 @@ def folder_shots(folder: Path) -> Iterator[Shot]:
         mask = shrunk[..., 3] >= 0.5 if has_alpha else (rgb * 255 < 255 - WHITE_DISTANCE).any(-1)
         joints, head_size = _joints(truth.get(path.name), size, folder / JOINTS_FILE, path.name)
         depth = _depth(folder / DEPTH_FOLDER / f"{path.stem}.npy", size)
-        yield Shot(path.name, (rgb * 255).round().to(torch.uint8), mask, joints, head_size, depth)
+        yield TestImage(path.name, (rgb * 255).round().to(torch.uint8), mask, joints, head_size, depth)
 
 
 def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], int, bool]:
