@@ -1,11 +1,12 @@
 """Quality, novelty and speed of generated humans, beside one Gaussian and the paper's voxel baseline.
 
 `python benchmarks/diffusion.py --assets DIR --people DIR --reference DIR --old F --json F --table F` compares --count
-samples of each set with renders of held-out meshes. The --reference folder caches portraits and the feature network,
-which take some minutes to compute. Distances are Frechet distances of features; `distance_floor` is that of other
-meshes, the best that a model can reach; `from_mesh`, `payload` and `codec` are what stored humans lose before any
-network. `attribute_read_*` is the feature network's accuracy on renders of held-out meshes. Figures that need an
-omitted option are null. Times are of two threads. --quick takes few samples of each.
+samples of each set with renders of held-out meshes. The --reference folder has the feature network of
+`python -m scripts.train_attribute_network --reference DIR --assets DIR`; portraits are kept there. Distances are
+Frechet distances of features; `distance_floor` is that of other meshes, the best that a model can reach; `from_mesh`,
+`payload` and `codec` are what stored humans lose before any network. `attribute_read_*` is the feature network's
+accuracy on renders of held-out meshes. Figures that need an omitted option are null. Times are of two threads.
+--quick takes few samples of each.
 
 `python benchmarks/diffusion.py pictures --people DIR --neighbours docs/pictures/neighbours.png` renders humans from
 consecutive seeds, not hand-picked, each beside the nearest human by latents in the folder, with distances (1 is the
@@ -134,7 +135,7 @@ def main() -> None:
         reference = open_reference_set(
             mesh_sources(assets, seeds_of(arguments.meshes, REAL_SEED), COLOURINGS),
             mesh_sources(assets, seeds_of(arguments.meshes // 2, HELD_SEED), COLOURINGS),
-            arguments.reference, progress("portraits"), epoch,
+            arguments.reference, progress("portraits"),
         )  # fmt: skip
         rows = comparisons(reference, model, assets, arguments)
     if arguments.people is not None:
@@ -263,7 +264,7 @@ def quality_figures(rows: Mapping[str, Comparison], reference: ReferenceSet | No
         figures[f"nearest_neighbour_ratio{suffix}"] = None if row is None else round(row.nearest_ratio, 4)
         figures[f"precision{suffix}"] = None if row is None else round(row.precision, 4)
         figures[f"recall{suffix}"] = None if row is None else round(row.recall, 4)
-    accuracy = {} if reference is None else reference.held_accuracies
+    accuracy = {} if reference is None else reference.network.card.get("accuracy", {})
     figures |= {f"attribute_read_{name}": round(accuracy[name], 4) if name in accuracy else None for name in ATTRIBUTES}
     for name, gallery in (("train", reference and reference.train), ("held", reference and reference.held)):
         figures[f"people_{name}"] = None if gallery is None else len(gallery.pictures)
@@ -274,7 +275,7 @@ def table_of(rows: Mapping[str, Comparison], reference: ReferenceSet | None) -> 
     """Distances, and the accuracy of the feature network."""
     if reference is None:
         return "No assets were given (--assets): distances are not measured."
-    accuracy = reference.held_accuracies
+    accuracy = reference.network.card.get("accuracy", {})
     return "\n".join(
         [
             table({TITLES[name]: row for name, row in rows.items()}),
@@ -296,10 +297,6 @@ def progress(what: str) -> Callable[[int, int], None]:
             print(what, done, "of", total, flush=True)
 
     return report
-
-
-def epoch(number: int, loss: float) -> None:
-    print("features, epoch", number, f"loss {loss:.3f}", flush=True)
 
 
 def pictures() -> None:

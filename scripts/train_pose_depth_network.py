@@ -1,6 +1,6 @@
 """Train the network of joints, depth and attributes that `primdiffusion evaluate generation --table` judges with.
 
-    python scripts/train_pose_depth_network.py --assets DIR --out backend/primdiffusion/weights/pose_depth.safetensors
+    python -m scripts.train_pose_depth_network --assets DIR --out backend/primdiffusion/weights/pose_depth.safetensors
 
 Renders MakeHuman meshes (CC0) of seeds that no diffusion model is trained on, in random poses from random sides. Takes
 minutes on one core. The card in the file states the errors on meshes of other seeds: the floor of the tables.
@@ -9,6 +9,7 @@ minutes on one core. The card in the file states the errors on meshes of other s
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,9 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float, UInt8
+from primdiffusion import tensor_file
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.evaluation.attribute_network import attribute_loss, attribute_space
 from primdiffusion.evaluation.images import JOINTS, mesh_images
 from primdiffusion.evaluation.pose_depth_network import (
     CELLS,
@@ -29,15 +30,17 @@ from primdiffusion.evaluation.pose_depth_network import (
     cell_means,
     joint_positions,
     load_pose_depth_network,
-    save_pose_depth_network,
     shrunk,
 )
+from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.rotation import axis_angle_to_matrix, matrix_to_axis_angle
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person
 from torch import Tensor
 from torch.nn import functional
+
+from scripts.train_attribute_network import attribute_loss, labels_of, predicted_attributes, visible_vocabulary
 
 JITTER = 0.15
 """Standard deviation of random rotations added to each joint of a pose, radians."""
@@ -115,12 +118,12 @@ def fit_pose_depth_network(
     report: Callable[[int, float], None] = lambda epoch, loss: None,
 ) -> PoseDepthNetwork:
     """Train a network; `report` receives each epoch and its mean loss. Deterministic for a seed and device."""
-    space = attribute_space(images.attributes)
-    labels = space.labels(images.attributes)
+    vocabulary = visible_vocabulary(images.attributes)
+    labels = labels_of(vocabulary, images.attributes)
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = PoseDepthNetwork(space).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        network = PoseDepthNetwork(vocabulary).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         optimiser = torch.optim.AdamW(network.parameters(), lr=learning_rate, weight_decay=0.02)
         steps = epochs * -(-len(images.pictures) // batch)
         scheduler = torch.optim.lr_scheduler.OneCycleLR(optimiser, learning_rate, total_steps=steps + 1, pct_start=0.1)
@@ -131,7 +134,7 @@ def fit_pose_depth_network(
                 seen = network(pictures.contiguous(memory_format=torch.channels_last))
                 own = {name: values[chosen] for name, values in labels.items()}
                 loss = joint_loss(seen.heatmaps, joints) + 2 * inverted_depth_loss(seen.depth, inverted)
-                loss = loss + 0.1 * attribute_loss(network.predict(seen.features), own, space)
+                loss = loss + 0.1 * attribute_loss(predicted_attributes(network.heads, seen.features), own, vocabulary)
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
@@ -202,6 +205,13 @@ def held_out_errors(network: PoseDepthNetwork, images: TrainingImages, share: fl
         "joint_error": 100 * float(distance.mean()),
         "depth": 100 * float(depth),
     }
+
+
+def save_pose_depth_network(path: Path, network: PoseDepthNetwork) -> None:
+    """Write the network in half precision with its card, atomically."""
+    tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
+    metadata = {"space": json.dumps(network.vocabulary.to_json()), "card": json.dumps(network.card)}
+    write_atomically(path, tensor_file.save(tensors, metadata=metadata))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,6 +21,7 @@ from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import NEIGHBOURS, too_few_samples
 from primdiffusion.evaluation.gallery import (
     COLOURINGS,
+    Source,
     made_gallery,
     mesh_sources,
     payload_sources,
@@ -106,7 +107,7 @@ class EvaluateGeneration:
     people: Path | None = None
     """Folder of the payloads that the model was trained on, those held out among them."""
     reference: Path | None = None
-    """Folder for portraits and feature network; what is missing is computed, which takes minutes."""
+    """Folder of the feature network that scripts/train_attribute_network.py trains; portraits are kept there."""
     assets: Path | None = None
     """MakeHuman's assets, if the training set was made from them: the reference is then renders of the meshes, so that
     detail which payloads lack counts too. Without them it is renders of the payloads."""
@@ -146,14 +147,8 @@ class EvaluateGeneration:
             raise ValueError(
                 f"count is {self.count}: ask for more than {NEIGHBOURS} humans, or nothing can be compared"
             )
-        train, held = split_people(find_people(self.people), self.holdout, self.seed)
+        real = real_sources(self.people, self.assets, self.holdout, self.seed)
         model = load_checkpoint(self.checkpoint, best_device())
-        if self.assets is None:
-            real = (payload_sources(train, read_person), payload_sources(held, read_person))
-        else:
-            assets = open_assets(self.assets)
-            trained_on, others = ([read_seed(path) for path in paths] for paths in (train, held))
-            real = (mesh_sources(assets, trained_on, COLOURINGS), mesh_sources(assets, others, COLOURINGS))
         with tqdm(unit="human", disable=None) as bar:
 
             def report(done: int, total: int) -> None:
@@ -171,13 +166,27 @@ class EvaluateGeneration:
                 "version": __version__,
                 "checkpoint": dict(model.card),
                 "people": {name: dataclasses.asdict(row) for name, row in rows.items()},
-                "feature_accuracy": reference.held_accuracies,
+                "feature_accuracy": reference.network.card.get("accuracy", {}),
             }
             _write(self.json, record)
         print(generation.table(rows))
         note = too_few_samples(self.count, *reference.held_features.shape)
         if note is not None:
             print(f"\nFrechet distance: {note}.")
+
+
+def real_sources(people: Path, assets: Path | None, holdout: float, seed: int) -> tuple[list[Source], list[Source]]:
+    """Portraits of the people that a model was trained on, and of those held out: of payloads, or of `assets`' meshes.
+
+    Raises ValueError and FileNotFoundError for people or assets that are missing or unreadable.
+    """
+    split = split_people(find_people(people), holdout, seed)
+    if assets is None:
+        train, held = (payload_sources(paths, read_person) for paths in split)
+        return train, held
+    opened = open_assets(assets)
+    train, held = (mesh_sources(opened, [read_seed(path) for path in paths], COLOURINGS) for paths in split)
+    return train, held
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ the same way: no model can be expected to come closer.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -16,11 +16,8 @@ from torch import Tensor
 
 from primdiffusion.evaluation.attribute_network import (
     AttributeNetwork,
-    accuracies,
     features_of,
-    fit_attribute_network,
     load_attribute_network,
-    save_attribute_network,
 )
 from primdiffusion.evaluation.distances import Nearest, frechet_distance, kernel_distance, nearest, precision_recall
 from primdiffusion.evaluation.gallery import Gallery, Report, Source, open_gallery, silent
@@ -41,29 +38,16 @@ class ReferenceSet:
     train_features: Float[Tensor, "n f"]
     held_features: Float[Tensor, "m f"]
 
-    @property
-    def held_accuracies(self) -> dict[str, float]:
-        """Accuracy of the network's attributes on held-out samples."""
-        return accuracies(self.network, self.held_features, self.held.attributes)
-
 
 def open_reference_set(
-    train: Sequence[Source],
-    held: Sequence[Source],
-    folder: Path,
-    report: Report = silent,
-    report_epoch: Callable[[int, float], None] = lambda epoch, loss: None,
+    train: Sequence[Source], held: Sequence[Source], folder: Path, report: Report = silent
 ) -> ReferenceSet:
-    """Load portraits and network from `folder`; missing ones are rendered or trained first, which takes minutes.
+    """Load the network and portraits from `folder`; missing portraits are rendered first, which takes minutes.
 
-    Raises ValueError and FileNotFoundError for unreadable files.
+    Raises ValueError and FileNotFoundError for missing or unreadable files.
     """
+    network = load_attribute_network(folder / NETWORK_FILE)
     drawn, others = (open_gallery(sources, folder / PORTRAITS_FOLDER, report) for sources in (train, held))
-    stored = folder / NETWORK_FILE
-    if not stored.is_file():
-        network = fit_attribute_network(drawn.pictures, drawn.attributes, report=report_epoch)
-        save_attribute_network(stored, network)
-    network = load_attribute_network(stored)
     train_features, held_features = (features_of(network, gallery.pictures) for gallery in (drawn, others))
     return ReferenceSet(network, drawn, others, train_features, held_features)
 

@@ -12,7 +12,6 @@ from primdiffusion.evaluation.pose_depth_network import (
     cell_means,
     joint_positions,
     load_pose_depth_network,
-    save_pose_depth_network,
 )
 from primdiffusion.people.assets import open_assets
 
@@ -24,6 +23,7 @@ from scripts.train_pose_depth_network import (
     held_out_errors,
     inverted_depth_loss,
     joint_loss,
+    save_pose_depth_network,
     training_images,
 )
 
