@@ -97,7 +97,7 @@ def training_images(
             assert image.head_size is not None
             assert image.depth is not None
             side = image.rgb.shape[0]
-            pictures.append(shrunk(image.rgb))
+            pictures.append(shrunk(image.pixels))
             joints.append(image.joints / side)
             sizes.append(image.head_size / side)
             depths.append(cell_means(torch.where(image.mask, 1 / image.depth, 0.0), image.mask))

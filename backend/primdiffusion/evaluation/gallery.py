@@ -16,12 +16,13 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from primdiffusion.evaluation.images import image_over
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
+from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
@@ -69,23 +70,19 @@ def camera_of(portrait: Portrait, side: int = SIDE) -> Camera:
 
 
 def portraits(primitives: Primitives) -> UInt8[Tensor, "v h w 4"]:
-    """Render all views: sRGB-encoded colour premultiplied by alpha, and alpha."""
-    seen = (march(primitives, camera_of(portrait), SETTINGS) for portrait in PORTRAITS)
-    return torch.stack([_encoded(view.rgb, view.alpha) for view in seen])
+    """All views drawn by the marcher: sRGB-encoded colour over black, and alpha."""
+    seen = [march(primitives, camera_of(portrait), SETTINGS) for portrait in PORTRAITS]
+    return torch.stack([image_over(0, "", one.rgb, one.alpha, 0, view).rgba for view, one in enumerate(seen)])
 
 
 def mesh_portraits(colourings: Sequence[TexturedMesh]) -> UInt8[Tensor, "n v h w 4"]:
     """Portraits of meshes in T pose that differ only in their textures, as `portraits` of boxes."""
-    views = []
-    for portrait in PORTRAITS:
-        (seen,) = rasterise_colourings(colourings, [camera_of(portrait)], SUPERSAMPLE)
-        views.append([_encoded(torch.from_numpy(view.rgb), torch.from_numpy(view.alpha)) for view in seen])
+    seen = rasterise_colourings(colourings, [camera_of(portrait) for portrait in PORTRAITS], SUPERSAMPLE)
+    views = [
+        [image_over(0, "", torch.from_numpy(one.rgb), torch.from_numpy(one.alpha), 0, view).rgba for one in images]
+        for view, images in enumerate(seen)
+    ]
     return torch.stack([torch.stack(own) for own in zip(*views, strict=True)])
-
-
-def _encoded(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w 4"]:
-    rgba = torch.cat([encode_srgb(rgb.clamp(0, 1)), alpha[..., None]], dim=-1)
-    return (rgba.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 class StoredPerson(Protocol):

@@ -21,6 +21,7 @@ from primdiffusion.evaluation.attribute_network import (
 )
 from primdiffusion.evaluation.distances import Nearest, frechet_distance, kernel_distance, nearest, precision_recall
 from primdiffusion.evaluation.gallery import Gallery, Report, Source, open_gallery, silent
+from primdiffusion.evaluation.markdown import markdown_table
 
 NETWORK_FILE = "features.safetensors"
 PORTRAITS_FOLDER = "portraits"
@@ -110,16 +111,17 @@ def nearest_other(features: Float[Tensor, "n d"], geometry: Int[Tensor, "n"]) ->
     return Nearest(torch.cat(distances), torch.cat(indices))
 
 
-COLUMNS = ("people", "frechet", "kernel", "precision", "recall", "nearest_ratio")
+COLUMNS = {
+    "people": "number",
+    "frechet": "Frechet distance",
+    "kernel": "kernel distance",
+    "precision": "precision",
+    "recall": "recall",
+    "nearest_ratio": "nearest training person",
+}
 
 
 def table(rows: Mapping[str, Comparison]) -> str:
     """Format as a Markdown table, a row a set."""
-    lines = [
-        "| people | number | Frechet distance | kernel distance | precision | recall | nearest training person |",
-        "|---" * 7 + "|",
-    ]
-    for name, row in rows.items():
-        values = [f"{getattr(row, column):.4g}" for column in COLUMNS]
-        lines.append(f"| {name} | {' | '.join(values)} |")
-    return "\n".join(lines)
+    texts = [[name, *(f"{getattr(row, column):.4g}" for column in COLUMNS)] for name, row in rows.items()]
+    return markdown_table(["people", *COLUMNS.values()], texts)

@@ -116,7 +116,7 @@ def _crop(image: TestImage, corner: Tensor, scale: float, height: int, width: in
     x = (corner[0] + scale * (torch.arange(width) + 0.5)) / image.rgb.shape[1] * 2 - 1
     y = (corner[1] + scale * (torch.arange(height) + 0.5)) / image.rgb.shape[0] * 2 - 1
     grid = torch.stack([x.expand(height, width), y[:, None].expand(height, width)], -1)
-    dark = 1 - image.rgb.movedim(-1, 0)[None].float() / 255  # outside the picture is white
+    dark = 1 - image.pixels.movedim(-1, 0)[None].float() / 255  # outside the picture is white
     return 1 - functional.grid_sample(dark, grid[None], align_corners=False)[0]
 
 
@@ -158,7 +158,11 @@ class DepthNetwork:
         """Inverted depth up to scale and offset, of the picture's size. Raises ValueError."""
         size = (self.network.height, self.network.width)
         values = functional.interpolate(
-            image.rgb.movedim(-1, 0)[None].float() / 255, size, mode="bicubic", align_corners=False, antialias=True
+            image.pixels.movedim(-1, 0)[None].float() / 255,
+            size,
+            mode="bicubic",
+            align_corners=False,
+            antialias=True,
         )
         outputs = self.network.run(values[0].clamp(0, 1), self.normalisation)
         found = np.squeeze(outputs[0])

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
 from primdiffusion.evaluation.images import TestImage
+from primdiffusion.evaluation.markdown import markdown_table
 from primdiffusion.evaluation.onnx_networks import DepthNetwork, PoseNetwork
 from primdiffusion.evaluation.pose_depth_network import (
     PoseDepthNetwork,
@@ -85,28 +86,24 @@ def evaluate(
     count = 0
     iterator = iter(images)
     while batch := list(itertools.islice(iterator, BATCH)):
+        pictures = [image.pixels for image in batch]
         with torch.inference_mode():
-            seen = networks.own(torch.stack([shrunk(image.rgb) for image in batch]).float() / 255)
+            seen = networks.own(torch.stack([shrunk(picture) for picture in pictures]).float() / 255)
             features["own"].append(seen.features)
-            features["detail"].append(torch.stack([detail_of(image.rgb, image.mask) for image in batch]))
-            pictures = torch.stack([image.rgb for image in batch]).float() / 255
+            details = [detail_of(picture, image.mask) for picture, image in zip(pictures, batch, strict=True)]
+            features["detail"].append(torch.stack(details))
             for name, network in (("inception", networks.inception), ("clip", networks.clip)):
                 if network is not None:
-                    features.setdefault(name, []).append(network(pictures))
+                    features.setdefault(name, []).append(network(torch.stack(pictures).float() / 255))
         found = joint_positions(seen.heatmaps)
         for number, image in enumerate(batch):
-            side = image.rgb.shape[0]
             if image.joints is not None and image.head_size is not None:
-                joints: dict[str, Tensor | None] = {"own": found[number] * side}
+                joints: dict[str, Tensor | None] = {"own": found[number] * image.rgb.shape[0]}
                 if networks.pose is not None:
                     joints["pose"] = networks.pose.joints(image)
                 for name, own in joints.items():
-                    right = (
-                        0.0
-                        if own is None
-                        else float(correct_joints(own, image.joints, image.head_size).double().mean())
-                    )
-                    correct[name].append(right)
+                    right = None if own is None else correct_joints(own, image.joints, image.head_size)
+                    correct[name].append(0.0 if right is None else float(right.double().mean()))
             if image.depth is not None:
                 cells = cell_means(torch.where(image.mask, 1 / image.depth, 0.0), image.mask)
                 errors = {"own": depth_error(seen.depth[number], 1 / cells, cells > 0)}
@@ -142,21 +139,21 @@ def compare_pictures(
     for name, values in itertools.chain(fake.features.items(), real.features.items()):
         if not torch.isfinite(values).all():
             raise ValueError(f"the {name} network gives NaN or infinite features: its weights are damaged")
-    generated, own = _own_distances(fake, real)
-    rows = {"generated": {}, "real": {}}
-    rows["generated"]["fid_clip"] = _frechet(fake, real, "clip", "--clip")
-    rows["generated"]["fid"] = _frechet(fake, real, "inception", "--inception")
-    rows["generated"]["kid"] = _kid(fake, real, kid_subsets, kid_subset_size, seed)
-    rows["real"] |= dict.fromkeys(
-        ("fid_clip", "fid", "kid"), Cell(None, reason="the real pictures are what is compared with")
-    )
-    for row, result in (("generated", fake), ("real", real)):
-        rows[row]["pckh"] = _mean(result.correct["pose"], bool(result.correct["own"]), "joints", "--pose", 100)
-        rows[row]["depth"] = _mean(result.depth["depth"], bool(result.depth["own"]), "depth", "--depth", 100)
-        rows[row]["fps"] = Cell(None, reason="pictures of a folder or of meshes have no frame rate")
-        rows[row]["own_pckh"] = _mean(result.correct["own"], bool(result.correct["own"]), "joints", None, 100)
-        rows[row]["own_depth"] = _mean(result.depth["own"], bool(result.depth["own"]), "depth", None, 100)
-    rows["generated"]["own_distance"], rows["real"]["own_distance"] = generated, own
+    rows = {}
+    compared = Cell(None, reason="the real pictures are what is compared with")
+    for row, result, distance in zip(("generated", "real"), (fake, real), _own_distances(fake, real), strict=True):
+        made = row == "generated"
+        rows[row] = {
+            "fid_clip": _frechet(fake, real, "clip", "--clip") if made else compared,
+            "fid": _frechet(fake, real, "inception", "--inception") if made else compared,
+            "kid": _kid(fake, real, kid_subsets, kid_subset_size, seed) if made else compared,
+            "pckh": _mean(result.correct["pose"], result.correct["own"], "joints", "--pose"),
+            "depth": _mean(result.depth["depth"], result.depth["own"], "depth", "--depth"),
+            "fps": Cell(None, reason="pictures of a folder or of meshes have no frame rate"),
+            "own_pckh": _mean(result.correct["own"], result.correct["own"], "joints"),
+            "own_depth": _mean(result.depth["own"], result.depth["own"], "depth"),
+            "own_distance": distance,
+        }
     return rows
 
 
@@ -183,16 +180,16 @@ def _kid(fake: Scores, real: Scores, subsets: int, size: int, seed: int) -> Cell
     return Cell(100 * found.mean, 100 * found.std)
 
 
-def _mean(values: Sequence[float], has_truth: bool, truth: str, option: str | None, factor: float) -> Cell:
-    """Mean over pictures and its standard deviation."""
-    if not has_truth:
+def _mean(values: Sequence[float], known: Sequence[float], truth: str, option: str = "") -> Cell:
+    """100 times the mean over pictures, and its standard deviation; `known` is empty for pictures without truth."""
+    if not known:
         return Cell(
             None,
             reason=f"the {truth} of these pictures are not known: docs/design/evaluation.md says where to put them",
         )
     if not values:
         return Cell(None, reason=f"no weights file: name one with {option}")
-    found = factor * torch.tensor(values, dtype=torch.float64)
+    found = 100 * torch.tensor(values, dtype=torch.float64)
     return Cell(float(found.mean()), float(found.std(correction=0)))
 
 
@@ -269,11 +266,10 @@ def table(
 ) -> str:
     """Format as Markdown: the table, every choice, `remarks`, and a sentence for each empty column of the first row."""
     columns = OF_TABLE[number]
-    names = ["pictures", *(["resolution"] if number == 2 else []), *(COLUMNS[column] for column in columns)]
-    lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
-    for row, cells in rows.items():
-        texts = [row, *([(resolution or "-") if row == "generated" else "-"] if number == 2 else [])]
-        lines.append(f"| {' | '.join(texts + [_text(cells.get(column)) for column in columns])} |")
+    resolutions = {row: [(resolution or "-") if row == "generated" else "-"] if number == 2 else [] for row in rows}
+    texts = [[row, *resolutions[row], *(_text(cells.get(column)) for column in columns)] for row, cells in rows.items()]
+    headings = ["pictures", *(["resolution"] if number == 2 else []), *(COLUMNS[column] for column in columns)]
+    lines = [markdown_table(headings, texts)]
     lines += ["", *(f"{name}: {_plain(value)}" for name, value in choices.items())]
     said = remarks({row: {name: cells[name] for name in columns if name in cells} for row, cells in rows.items()})
     lines += ["", *said] if said else []

@@ -43,7 +43,7 @@ def image():
     shade = torch.linspace(20, 220, SIDE)[:, None].expand(SIDE, SIDE)
     rgb = torch.where(mask, shade, 255).round().to(torch.uint8)[..., None].expand(-1, -1, 3).contiguous()
     depth = torch.where(mask, 1 / (0.2 + rgb[..., 0] / 2000), torch.inf)
-    return Picture("one", rgb, mask, torch.zeros(12, 2), 20.0, depth)
+    return Picture("one", rgb / 255, mask.float(), joints=torch.zeros(12, 2), head_size=20.0, depth=depth)
 
 
 def crop_to_picture(x, y):
@@ -84,7 +84,7 @@ def test_a_pose_network_sees_the_human_in_the_middle(image, tmp_path):
 def test_a_picture_without_a_human_has_no_joints(image, tmp_path):
     maps = np.zeros((1, 17, 64, 48), np.float32)
     network = open_pose_network(always(tmp_path / "pose.onnx", heatmap=maps))
-    image.mask[:] = False
+    image.alpha[:] = 0
     assert network.joints(image) is None
 
 

@@ -47,14 +47,15 @@ def images(count: int, seed: int) -> list[Picture]:
         shade = torch.randint(0, 200, (SIDE, SIDE, 3), generator=generator, dtype=torch.uint8)
         depth = torch.where(mask, torch.linspace(3, 4, SIDE)[:, None], torch.inf)
         joints = torch.tensor([left, top]) + 100 * torch.rand(len(JOINTS), 2, generator=generator)
-        found.append(Picture(str(number), torch.where(mask[..., None], shade, 255), mask, joints, 30.0, depth))
+        rgb = torch.where(mask[..., None], shade, 255)
+        found.append(Picture(str(number), rgb / 255, mask.float(), joints=joints, head_size=30.0, depth=depth))
     return found
 
 
 def folder(path, count: int, seed: int):
     path.mkdir()
     for image in images(count, seed):
-        Image.fromarray(image.rgb.numpy()).save(path / f"{image.name}.png")
+        Image.fromarray(image.pixels.numpy()).save(path / f"{image.subject}.png")
     return path
 
 
@@ -146,7 +147,7 @@ def test_weights_with_nan_are_one_sentence():
 def test_joints_are_judged_against_the_truth_of_each_picture():
     network = load_pose_depth_network()
     given = images(3, 0)
-    seen = joint_positions(network(torch.stack([shrunk(image.rgb) for image in given]).float() / 255).heatmaps)
+    seen = joint_positions(network(torch.stack([shrunk(image.pixels) for image in given]).float() / 255).heatmaps)
     right = evaluate(
         [dataclasses.replace(image, joints=SIDE * own) for image, own in zip(given, seen, strict=True)],
         Networks(network),
