@@ -25,7 +25,15 @@ from primdiffusion.body.model import BodyPose, J
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.evaluation.images import SIDE, TestImage, human_images, mesh_images, primitive_images
 from primdiffusion.evaluation.pose_depth_network import load_pose_depth_network
-from primdiffusion.evaluation.tables import Cell, Networks, Scores, compare_pictures, evaluate, reference_cells, table
+from primdiffusion.evaluation.tables import (
+    Cell,
+    Networks,
+    Scores,
+    compare_pictures,
+    look_at_pictures,
+    reference_cells,
+    table,
+)
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, pose_body
 from primdiffusion.people.assets import Assets, open_assets
@@ -172,7 +180,7 @@ def judged(
         if path is not None and path.is_file():
             parts.append(json.loads(path.read_text(encoding="utf-8")))
             continue
-        one = evaluate(images(some), networks)
+        one = look_at_pictures(images(some), networks)
         features = {key: values.tolist() for key, values in one.features.items()}
         parts.append({"features": features, "own": one.correct["own"], "depth": one.depth["own"]})
         if path is not None:

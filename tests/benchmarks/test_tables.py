@@ -97,7 +97,7 @@ def test_what_was_seen_is_not_looked_at_again(tmp_path, monkeypatch):
         features = {"own": torch.tensor(seeds)[:, None].float(), "detail": torch.zeros(len(seeds), 3)}
         return Scores(len(seeds), features, {"own": [0.5] * len(seeds)}, {"own": []})
 
-    monkeypatch.setattr(tables, "evaluate", evaluate)
+    monkeypatch.setattr(tables, "look_at_pictures", evaluate)
     first = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
     again = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
     assert asked == list(range(10))

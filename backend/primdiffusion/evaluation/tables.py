@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+import statistics
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -15,8 +18,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from primdiffusion.device import best_device
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
-from primdiffusion.evaluation.images import TestImage
+from primdiffusion.evaluation.images import SIDE, TestImage
 from primdiffusion.evaluation.markdown import markdown_table
 from primdiffusion.evaluation.onnx_networks import DepthNetwork, PoseNetwork
 from primdiffusion.evaluation.pose_depth_network import (
@@ -29,10 +33,13 @@ from primdiffusion.evaluation.pose_depth_network import (
     shrunk,
 )
 from primdiffusion.evaluation.pretrained_networks import ClipVision, Inception
+from primdiffusion.human import Human, framing, place
+from primdiffusion.render.march import MarchSettings, march
 
 BATCH = 16
 SMALLEST = 8
 """Fewest pictures of each set: fewer fit no Gaussian worth comparing."""
+FRAMES_TIMED = 10
 DETAIL_FLOOR = 0.05
 """Smallest standard deviation of fine detail among real pictures, as in `attribute_network`."""
 
@@ -73,7 +80,7 @@ class Scores:
     """Depth error of each picture with known depth, by network: "depth" and "own"."""
 
 
-def evaluate(
+def look_at_pictures(
     images: Iterable[TestImage], networks: Networks, report: Callable[[int], None] = lambda done: None
 ) -> Scores:
     """Look at every picture once. A picture in which a network finds no human has no correct joint.
@@ -206,6 +213,32 @@ def _own_distances(fake: Scores, real: Scores) -> tuple[Cell, Cell]:
     spread = torch.linspace(0, len(made) - 1, count).long()
     second = true[-count:]
     return _distance(made[spread], second), _distance(true[:count], second)
+
+
+def frames_per_second(human: Human, settings: MarchSettings) -> Cell:
+    """Frames of 512 x 512 that the marcher draws of a generated human in a second: the median, after one not timed.
+
+    Boxes are placed once; the spread is over frames.
+    """
+    device = best_device()
+    primitives = place(human).to(device)
+    seconds = []
+    for number in range(FRAMES_TIMED + 1):
+        camera = framing(primitives, 360 * number / FRAMES_TIMED, SIDE, SIDE)
+        start = time.perf_counter()
+        march(primitives, camera, settings)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    rates = [1 / one for one in seconds[1:]]
+    return Cell(statistics.median(rates), statistics.pstdev(rates))
+
+
+def resolution_of(human: Human) -> str:
+    """The paper's way to state it: all boxes side by side, e.g. 256 x 256 x 8 for 32 x 32 boxes of 8^3 voxels."""
+    boxes, side = human.payload.density.shape[-4], human.payload.density.shape[-1]
+    across = math.isqrt(boxes) * side
+    return f"{across} x {across} x {side}" if math.isqrt(boxes) ** 2 == boxes else f"{boxes} x {side}^3"
 
 
 COLUMNS = {

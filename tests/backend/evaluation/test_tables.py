@@ -8,7 +8,6 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.commands import evaluate as command
-from primdiffusion.commands import evaluate_tables
 from primdiffusion.evaluation.images import JOINTS, SIDE
 from primdiffusion.evaluation.images import TestImage as Picture
 from primdiffusion.evaluation.pose_depth_network import joint_positions, load_pose_depth_network, shrunk
@@ -20,7 +19,7 @@ from primdiffusion.evaluation.tables import (
     Scores,
     check_counts,
     compare_pictures,
-    evaluate,
+    look_at_pictures,
     remarks,
     table,
 )
@@ -148,16 +147,16 @@ def test_joints_are_judged_against_the_truth_of_each_picture():
     network = load_pose_depth_network()
     given = images(3, 0)
     seen = joint_positions(network(torch.stack([shrunk(image.pixels) for image in given]).float() / 255).heatmaps)
-    right = evaluate(
+    right = look_at_pictures(
         [dataclasses.replace(image, joints=SIDE * own) for image, own in zip(given, seen, strict=True)],
         Networks(network),
     )
     assert right.correct["own"] == [1.0] * 3
-    first = evaluate(given, Networks(network))
+    first = look_at_pictures(given, Networks(network))
     assert first.pictures == len(first.correct["own"]) == len(first.depth["own"]) == 3
     assert (len(first.correct["pose"]), len(first.depth["depth"])) == (0, 0)
     assert first.features["own"].shape == (3, 64)
-    assert torch.equal(evaluate(given, Networks(network)).features["own"], first.features["own"])
+    assert torch.equal(look_at_pictures(given, Networks(network)).features["own"], first.features["own"])
 
 
 def test_folders_are_compared_twice_with_the_same_bits(tmp_path, capsys):
@@ -177,7 +176,7 @@ def test_folders_are_compared_twice_with_the_same_bits(tmp_path, capsys):
 
 
 def test_a_model_has_all_of_our_own_measures_and_a_frame_rate(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(evaluate_tables, "load_checkpoint", lambda path, device: tiny_model())
+    monkeypatch.setattr(command, "load_checkpoint", lambda path, device: tiny_model())
     real = folder(tmp_path / "real", 8, 1)
     line = ["generation", "--table", "1", "--real", str(real), "--count", "2", "--poses", "2", "--views", "2"]
     records = []
