@@ -51,7 +51,6 @@ from primdiffusion.evaluation.gallery import (
     camera_of,
     made_gallery,
     mesh_sources,
-    payload_of,
 )
 from primdiffusion.evaluation.generation import (
     Comparison,
@@ -243,7 +242,7 @@ def latent_ratio(model: DiffusionModel, train: list[Path], held: list[Path]) -> 
         return model.encode(payload)  # pyright: ignore[reportArgumentType]
 
     made = [encode(human.payload).flatten() for human in generated(model, seeds_of(len(held)))]
-    real = [encode(payload_of(read_person(path), 0)).flatten() for path in held]
+    real = [encode(read_person(path).payload(0)).flatten() for path in held]
     found = nearest_stored(torch.stack([*made, *real]), train, read_person, encode, progress("latents"))
     return float(found.distance[: len(made)].median() / found.distance[len(made) :].median())
 
@@ -330,7 +329,7 @@ def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path
         return model.encode(payload)
 
     people = list(generated(model, seeds_of(count)))
-    references = [payload_of(read_person(path), 0) for path in held[:: max(len(held) // 32, 1)]]
+    references = [read_person(path).payload(0) for path in held[:: max(len(held) // 32, 1)]]
     queries = torch.stack([encode(payload).flatten() for payload in (*(h.payload for h in people), *references)])
     found = nearest_stored(queries, train, read_person, encode, progress("latents"))
     new = found.distance[count:].median()
@@ -344,7 +343,7 @@ def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path
 
 def stored_one(path: Path, colouring: int) -> Primitives:
     person = read_person(path)
-    return Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, colouring))
+    return Primitives.place(rest_frames(person.betas.numpy()), person.payload(colouring))
 
 
 def comparison(

@@ -165,9 +165,9 @@ class TableOptions:
     depth_normalisation: Normalisation = "imagenet"
     """Normalisation of the depth network's input; DPT needs `half`."""
     depth_values: DepthValues = "inverted"
-    """What the depth network predicts."""
+    """Output of the depth network: inverted depth, or depth."""
     resize: Resize = "torch-fidelity"
-    """How pictures reach the size of Inception and CLIP."""
+    """Resizing of pictures for Inception and CLIP."""
     kid_subsets: Count = 100
     """Number of random subsets for KID."""
     kid_subset_size: Count = 1000

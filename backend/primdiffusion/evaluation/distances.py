@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 MIN_SAMPLES_PER_DIMENSION = 10
@@ -133,11 +133,20 @@ class Nearest(NamedTuple):
     index: Int[Tensor, "q"]
 
 
-def nearest(queries: Float[Tensor, "q d"], among: Float[Tensor, "n d"]) -> Nearest:
-    """Find Euclidean nearest neighbours. Raises ValueError for an empty set or features of different widths."""
+def nearest(
+    queries: Float[Tensor, "q d"], among: Float[Tensor, "n d"], left_out: Bool[Tensor, "q n"] | None = None
+) -> Nearest:
+    """Find Euclidean nearest neighbours, except pairs `left_out`.
+
+    Raises ValueError for an empty set or features of different widths.
+    """
     if queries.shape[-1] != among.shape[-1] or not len(among):
         raise ValueError(f"queries {tuple(queries.shape)} do not match the set {tuple(among.shape)}: same width, n > 0")
-    found = [torch.cdist(part.double(), among.double()).min(1) for part in queries.split(ROWS_AT_ONCE)]
+    found = []
+    for first in range(0, len(queries), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        table = torch.cdist(queries[rows].double(), among.double())
+        found.append((table if left_out is None else table.masked_fill(left_out[rows], torch.inf)).min(1))
     return Nearest(torch.cat([part.values for part in found]), torch.cat([part.indices for part in found]))
 
 

@@ -22,7 +22,6 @@ from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
@@ -86,7 +85,7 @@ def mesh_portraits(colourings: Sequence[TexturedMesh]) -> UInt8[Tensor, "n v h w
 
 
 class StoredPerson(Protocol):
-    """One geometry in n colourings, as `training.latents.read_person` returns it (evaluation imports no training)."""
+    """One geometry in n colourings: `training.stored_people.PersonVariants` (evaluation imports no training)."""
 
     @property
     def voxels(self) -> UInt8[Tensor, "n k 8 8 8 4"]:
@@ -94,18 +93,12 @@ class StoredPerson(Protocol):
         ...
 
     @property
-    def delta_scale(self) -> Float[Tensor, "n k 3"]:
-        """Factors on the boxes' rest extents."""
-        ...
-
-    @property
     def betas(self) -> Float[Tensor, "10"]:
         """Body shape."""
         ...
 
-    @property
-    def full_density(self) -> float:
-        """Density that 255 encodes, 1/m."""
+    def payload(self, variant: int) -> Payload:
+        """Return one colouring."""
         ...
 
 
@@ -115,7 +108,7 @@ Report = Callable[[int, int], None]
 
 
 COLOURINGS = 2
-"""Of each mesh in a gallery."""
+"""Colourings of each mesh in a gallery."""
 
 
 def silent(done: int, total: int) -> None:
@@ -130,12 +123,6 @@ class Gallery:
     geometry: Int[Tensor, "n"]
     """Index of each sample's file; ascending."""
     attributes: tuple[dict[str, Any], ...]
-
-
-def payload_of(person: StoredPerson, colouring: int) -> Payload:
-    """Decode one colouring to linear colour and density in 1/m."""
-    voxels = person.voxels[colouring].movedim(-1, -4).float() / 255
-    return Payload(decode_srgb(voxels[:, :3]), voxels[:, 3] * person.full_density, person.delta_scale[colouring])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -156,7 +143,7 @@ def payload_sources(paths: Sequence[Path], read: ReadPerson) -> list[Source]:
         person = read(path)
         frames = rest_frames(person.betas.numpy())
         return torch.stack(
-            [portraits(Primitives.place(frames, payload_of(person, number))) for number in range(len(person.voxels))]
+            [portraits(Primitives.place(frames, person.payload(number))) for number in range(len(person.voxels))]
         )
 
     return [

@@ -101,14 +101,7 @@ def real_vs_real(reference: ReferenceSet, count: int) -> Comparison:
 
 def nearest_other(features: Float[Tensor, "n d"], geometry: Int[Tensor, "n"]) -> Nearest:
     """Nearest sample of another geometry: recoloured clothes do not make another human."""
-    distances, indices = [], []
-    for rows, own in zip(features.split(512), geometry.split(512), strict=True):
-        table = torch.cdist(rows.double(), features.double())
-        table[own[:, None] == geometry] = torch.inf
-        found = table.min(1)
-        distances.append(found.values)
-        indices.append(found.indices)
-    return Nearest(torch.cat(distances), torch.cat(indices))
+    return nearest(features, features, geometry[:, None] == geometry)
 
 
 COLUMNS = {

@@ -224,12 +224,6 @@ def _resized(values: Float[Tensor, "h w c"], size: tuple[int, int]) -> Float[Ten
     return functional.interpolate(values.movedim(-1, 0)[None], size, mode="bicubic", antialias=True)[0].movedim(0, -1)
 
 
-def _nearest(values: Float[Tensor, "h w"]) -> Float[Tensor, "s s"]:
-    if values.shape == (SIDE, SIDE):
-        return values
-    return functional.interpolate(values[None, None], (SIDE, SIDE), mode="nearest")[0, 0]
-
-
 def _joints(given: Any, size: int, source: Path, name: str) -> dict[str, Any]:
     if given is None:
         return {}
@@ -250,4 +244,4 @@ def _depth(path: Path, size: int) -> Float[Tensor, "s s"] | None:
     if depth.shape != (size, size):
         raise ValueError(f"{path} has shape {tuple(depth.shape)}, its picture {size} x {size} pixels: give one size")
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.inf)
-    return _nearest(depth)
+    return depth if size == SIDE else functional.interpolate(depth[None, None], (SIDE, SIDE), mode="nearest")[0, 0]

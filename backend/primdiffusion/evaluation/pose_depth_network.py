@@ -42,7 +42,7 @@ FLAT = 1e-9
 
 
 class Seen(NamedTuple):
-    """What the network reads from pictures."""
+    """Outputs of the network for n pictures."""
 
     heatmaps: Float[Tensor, "n 12 32 32"]
     """Logits of each joint's cell."""

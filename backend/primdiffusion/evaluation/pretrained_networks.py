@@ -147,7 +147,7 @@ def load_matching(network: nn.Module, weights: Mapping[str, Tensor], what: str, 
 
 
 Resize = Literal["torch-fidelity", "antialiased"]
-"""How pictures reach the size that a network sees: bilinear between the two nearest pixels from the corner of each, as
+"""Ways to resize pictures for a network: bilinear between the two nearest pixels from the corner of each, as
 TensorFlow 1 and torch-fidelity do, or bicubic with antialiasing, as CLIP and clean-fid do."""
 
 

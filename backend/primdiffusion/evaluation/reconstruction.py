@@ -46,7 +46,7 @@ class Reconstructor(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationSettings(Checked):
-    """Which images are compared, and the input of the encoder."""
+    """The images that are compared, and the input of the encoder."""
 
     subjects: tuple[str, ...] = ()
     """Names; empty: all."""
@@ -177,15 +177,12 @@ def image_metrics(image: TestImage, target: TestImage, lpips: Lpips | None = Non
 
 def summary(scores: Iterable[PictureScore]) -> dict[str, Means]:
     """Average over each of the `SPLITS`."""
-    held = list(scores)
-    parts = {
-        "all": held,
-        "given_views_given_pose": [score for score in held if score.given_view and score.given_pose],
-        "novel_views_given_pose": [score for score in held if not score.given_view and score.given_pose],
-        "given_views_novel_poses": [score for score in held if score.given_view and not score.given_pose],
-        "novel_views_novel_poses": [score for score in held if not score.given_view and not score.given_pose],
-    }
-    return {name: _means([score.likeness for score in part]) for name, part in parts.items()}
+    parts: dict[str, list[ImageMetrics]] = {name: [] for name in SPLITS}
+    for score in scores:
+        views = "given_views" if score.given_view else "novel_views"
+        for name in ("all", f"{views}_given_pose" if score.given_pose else f"{views}_novel_poses"):
+            parts[name].append(score.likeness)
+    return {name: _means(part) for name, part in parts.items()}
 
 
 def _means(metrics: list[ImageMetrics]) -> Means:

@@ -60,16 +60,16 @@ class Cell(NamedTuple):
 
     value: float | None
     spread: float | None = None
-    """What stands after +-: the standard deviation over KID's subsets, or over pictures."""
+    """Standard deviation over KID's subsets, or over pictures."""
     reason: str | None = None
     """Why there is no value."""
     note: str | None = None
-    """What to know before the value is compared with others."""
+    """Warning about comparing the value with others."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """What the networks found in one set of pictures."""
+    """Features and errors that the networks found in one set of pictures."""
 
     pictures: int
     features: Mapping[str, Float[Tensor, "n d"]]

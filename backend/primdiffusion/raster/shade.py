@@ -1,4 +1,4 @@
-"""What a view sees of a mesh and in which colours: unlit, two-sided, textured, with an alpha test.
+"""Visible surfaces of a mesh and their colours: unlit, two-sided, textured, with an alpha test.
 
 `draw` finds the triangle at each sample by the z-buffer, `shade` its colours. A triangle's edge functions, scaled to
 its corners' depths, are linear in the pixel and proportional to its perspective-correct barycentric coordinates, so

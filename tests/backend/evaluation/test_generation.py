@@ -15,7 +15,6 @@ from primdiffusion.evaluation.gallery import (
     made_gallery,
     mesh_sources,
     open_gallery,
-    payload_of,
     payload_sources,
     read_seed,
 )
@@ -98,7 +97,7 @@ def test_damaged_portraits_are_drawn_again(people, tmp_path):
 def test_stored_portraits_are_of_the_stored_payload(people, tmp_path):
     path = find_people(people)[3]
     person = read_person(path)
-    drawn = made_gallery([Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, 1))])
+    drawn = made_gallery([Primitives.place(rest_frames(person.betas.numpy()), person.payload(1))])
     assert torch.equal(open_gallery(payload_sources([path], read_person), tmp_path).pictures[1], drawn[0])
     assert int((drawn[..., 3] > 128).sum()) > 500
 
