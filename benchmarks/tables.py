@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from diffusion_sets import TOGETHER, generated, seeds_of
 from latent_baseline import sample_people
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.evaluation.images import SIDE, TestImage, human_images, mesh_images, primitive_images
+from primdiffusion.evaluation.images import TestImage, human_images, mesh_images_of_seeds, primitive_images
 from primdiffusion.evaluation.pose_depth_network import load_pose_depth_network
 from primdiffusion.evaluation.tables import (
     Cell,
@@ -37,8 +36,6 @@ from primdiffusion.evaluation.tables import (
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, pose_body
 from primdiffusion.people.assets import Assets, open_assets
-from primdiffusion.people.base_mesh import load_base_mesh
-from primdiffusion.people.person import make_person
 from primdiffusion.render.march import MarchSettings
 from record import command_line, report
 from voxel_baseline import VoxelModel, load_voxel_model
@@ -141,13 +138,6 @@ def voxel_images(model: VoxelModel, seeds: Sequence[int], views: int) -> Iterato
         yield from primitive_images(model.primitives(person.grid), posed, views, f"{seed:06d}", MARCH)
 
 
-def real_images(assets: Assets, seeds: Sequence[int], views: int) -> Iterator[TestImage]:
-    """Renders of meshes."""
-    base, yaws = load_base_mesh(), [[2 * math.pi * view / views for view in range(views)]]
-    for seed in seeds:
-        yield from mesh_images(make_person(assets, base, seed), REST, yaws, f"{seed:08d}", SIDE)
-
-
 def judged_rows(
     models: Mapping[str, Model], assets: Assets, count: int, views: int, found: Path | None = None
 ) -> dict[str, dict[str, Cell]]:
@@ -155,7 +145,9 @@ def judged_rows(
     networks = Networks(load_pose_depth_network())
     found = None if found is None else found / f"{views}_views"
     seeds_of_real = seeds_of(REAL_EACH * count, REAL_SEED)
-    real = judged("real", lambda seeds: real_images(assets, seeds, views), seeds_of_real, networks, found)
+    real = judged(
+        "real", lambda seeds: mesh_images_of_seeds(assets, seeds, REST, views), seeds_of_real, networks, found
+    )
     rows: dict[str, dict[str, Cell]] = {}
     own: dict[str, Cell] = {}
     for name, model in models.items():

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -40,7 +39,7 @@ from primdiffusion.evaluation.images import (
     folder_images,
     folder_pictures,
     human_images,
-    mesh_images,
+    mesh_images_of_seeds,
 )
 from primdiffusion.evaluation.onnx_networks import DepthValues, Normalisation, open_depth_network, open_pose_network
 from primdiffusion.evaluation.pose_depth_network import PCK_SHARE, load_pose_depth_network
@@ -69,9 +68,7 @@ from primdiffusion.formats.requests import Count, Sampling
 from primdiffusion.formats.schema import Range, check
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.human import generate, place
-from primdiffusion.people.assets import Assets, open_assets
-from primdiffusion.people.base_mesh import load_base_mesh
-from primdiffusion.people.person import make_person
+from primdiffusion.people.assets import open_assets
 from primdiffusion.pose_file import read_motion
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.training.latents import split_people
@@ -265,7 +262,11 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
     poses = choose_poses([read_motion(path) for path in options.motion], options.poses, 0)
     grid = command.count * options.poses * options.views
     check_counts(*(len(folder_pictures(path)) if path is not None else grid for path in (options.fake, options.real)))
-    assets = open_assets(command.assets) if options.real is None else None
+    if options.real is not None:
+        reals = folder_images(options.real)
+    else:
+        seeds = range(options.real_seed, options.real_seed + command.count)
+        reals = mesh_images_of_seeds(open_assets(command.assets), seeds, poses, options.views)
     networks = Networks(
         load_pose_depth_network(),
         None if options.inception is None else load_inception(options.inception, options.resize),
@@ -280,15 +281,11 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
         model = load_checkpoint(command.checkpoint, best_device())
         first = generate(model, command.first_seed, command.steps)
         fps, resolution = frames_per_second(first, MARCH), resolution_of(first)
-        images = _model_images(model, command, poses)
+        fakes = _model_images(model, command, poses)
     else:
-        images = folder_images(options.fake)
-    fake = _scores(images, networks, "generated")
-    real = _scores(
-        folder_images(options.real) if options.real is not None else _mesh_images(assets, command, poses),
-        networks,
-        "real",
-    )
+        fakes = folder_images(options.fake)
+    fake = _scores(fakes, networks, "generated")
+    real = _scores(reals, networks, "real")
     rows = compare_pictures(fake, real, options.kid_subsets, options.kid_subset_size, options.kid_seed)
     if fps is not None:
         rows["generated"]["fps"] = fps
@@ -311,14 +308,6 @@ def _model_images(model: DiffusionModel, command: EvaluateGeneration, poses: Bod
     for seed in range(command.first_seed, command.first_seed + command.count):
         human = generate(model, seed, command.steps)
         yield from human_images(human, poses, command.tables.views, f"{seed:06d}", MARCH, best_device())
-
-
-def _mesh_images(assets: Assets | None, command: EvaluateGeneration, poses: BodyPose) -> Iterator[TestImage]:
-    assert assets is not None
-    base, options = load_base_mesh(), command.tables
-    yaws = [[2 * math.pi * view / options.views for view in range(options.views)]] * options.poses
-    for seed in range(options.real_seed, options.real_seed + command.count):
-        yield from mesh_images(make_person(assets, base, seed), poses, yaws, f"{seed:08d}", SIDE)
 
 
 def _scores(images: Iterator[TestImage], networks: Networks, what: str) -> Scores:

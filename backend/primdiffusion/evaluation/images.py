@@ -24,7 +24,9 @@ from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.pictures import opened_picture, strips
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
-from primdiffusion.people.person import Person
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.base_mesh import load_base_mesh
+from primdiffusion.people.person import Person, make_person
 from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import rasterise
@@ -140,6 +142,14 @@ def mesh_images(
             seen = rasterise(mesh, camera, SUPERSAMPLE)
             image = image_over(1, subject, torch.from_numpy(seen.rgb), torch.from_numpy(seen.alpha), frame, view)
             yield _with_truth(image, torch.from_numpy(seen.depth), posed.joints, camera)
+
+
+def mesh_images_of_seeds(assets: Assets, seeds: Sequence[int], poses: BodyPose, views: int) -> Iterator[TestImage]:
+    """Meshes of MakeHuman samples in all poses [F] from all views, evenly around them. Raises as `make_person`."""
+    base = load_base_mesh()
+    yaws = [[2 * math.pi * view / views for view in range(views)]] * len(poses.joint_rotation)
+    for seed in seeds:
+        yield from mesh_images(make_person(assets, base, seed), poses, yaws, f"{seed:08d}", SIDE)
 
 
 def _with_truth(
