@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import bpy
 
-from ..jobs.deferred_volumes import keep_writing
 from ..jobs.follow import redraw
 from ..jobs.queue import queue
 from ..places import EXTENSION
@@ -13,18 +12,6 @@ from .drawing import DATA
 WIDTH = 90
 """Characters in a line of the preferences window at its default size."""
 NOTHING_TO_CANCEL = "nothing is being set up"
-_VOLUMES = (
-    ("ALWAYS", "Always", "Volumes are written as soon as the human stands, so that any renderer has them"),
-    (
-        "WHEN_RENDERING",
-        "When Rendering",
-        "Volumes are written when another engine than PrimDiffusion renders for the first time",
-    ),
-)
-
-
-def _keep_writing(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
-    keep_writing()
 
 
 def _redraw(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
@@ -62,13 +49,6 @@ class CommonPreferences:
         soft_max=120,
     )
 
-    volumes: bpy.props.EnumProperty(
-        name="Write Volumes",
-        description="When the volumes that Cycles and EEVEE draw are written; 25 MB a human",
-        items=_VOLUMES,
-        update=_keep_writing,
-    )
-
     captures: bpy.props.BoolProperty(
         name="Captures",
         description=f"Show the tab {DATA} in the sidebar: training data from scans, and humans from images",
@@ -79,5 +59,5 @@ class CommonPreferences:
         """All properties that need no more than a field."""
         layout.use_property_split = True
         layout.use_property_decorate = False
-        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "volumes", "captures"):
+        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "captures"):
             layout.prop(self, name)

@@ -1,5 +1,5 @@
 """Which humans a 3D view shows over what Blender draws, read from the scene as the view shows it; and their payloads
-and reliefs on the GPU, uploaded once."""
+on the GPU, uploaded once."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ...scene.human import BODY_MARK, human_of
 from ...scene.human_file import FileVersion, file_version, read_payload
 from ...scene.proxy import PROXY_MARK
 from ...scene.splats import SPLATS_MARK
+from ...scene.volume_nodes import VOLUMES_MARK
 from ..boxes import Boxes, boxes_of
 from ..picture import PosedHuman, human_armatures, pose_of
 from ..solids import visible_instances
@@ -49,8 +50,7 @@ class GpuHumans:
         payload = self._payloads.pop(version, None)
         if payload is None:
             tensors = read_payload(human.file)
-            thickness = 2 * boxes.half_extent[:, 2] * boxes.density_scale
-            payload = GpuPayload(tensors.rgb, tensors.density, thickness)
+            payload = GpuPayload(tensors.rgb, tensors.density)
         self._payloads[version] = payload
         return payload, boxes
 
@@ -170,6 +170,7 @@ def concerns_humans(changed: bpy.types.ID) -> bool:
             changed.type in ("ARMATURE", "EMPTY", "VOLUME", "POINTCLOUD")
             or BODY_MARK in changed
             or PROXY_MARK in changed
+            or VOLUMES_MARK in changed
         )
     return not isinstance(changed, _UNRELATED)
 

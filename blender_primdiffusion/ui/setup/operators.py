@@ -13,7 +13,7 @@ from ...backend import environment, setup
 from ...backend.packages import read_lock
 from ...backend.requests import sentence
 from ...backend.setup import Steps
-from ...engine import studio
+from ...engine import drawing_child
 from ...jobs.queue import queue
 from ...places import CACHE_VARIABLE, backend_module_path, cache_folder, preference, set_up_folder
 from ..declared import SKIP
@@ -168,7 +168,7 @@ def _release_environment() -> None:
     if queue.busy:
         raise ValueError("The backend is at work; wait until it is done, or press Cancel")
     queue.close()
-    studio.close()
+    drawing_child.close()
 
 
 def being_set_up() -> bool:

@@ -12,22 +12,22 @@ import synthetic
 import synthetic_shape
 from human_files import press_x
 from human_stage import strong_pose
-from oracle import Z_UP, blended_vertices, world_from_model
+from oracle import Z_UP, blended_vertices, evaluated_matrices, world_from_model
 from support.errors import refused
 
 from blender_primdiffusion.engine.boxes import boxes_of
 from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.cells import set_input
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.human import body_of, humans, volumes_of
+from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.scene.parts import complete_humans
-from blender_primdiffusion.scene.pending import pending_volumes
-from blender_primdiffusion.scene.splat_nodes import GROUP_NAME
+from blender_primdiffusion.scene.representation import representation_of, set_representation
+from blender_primdiffusion.scene.splat_nodes import C0, GROUP_NAME
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE, WIDTH, cells_of, cloud_of
-from blender_primdiffusion.scene.surface import set_node_input
+from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 pytestmark = [
     pytest.mark.usefixtures("splats"),
@@ -113,24 +113,22 @@ def test_splats_of_the_sample_stretch_with_the_skin_as_the_engines_boxes_do(save
 
 def test_volumes_are_made_only_when_splats_no_longer_show_the_human(person):
     human, _ = person
-    assert attachment_of(human) == "SPLATS"
-    assert not bpy.data.volumes
-    assert not pending_volumes()
+    assert representation_of(human) == "SPLATS"
+    assert volumes_of(human) is None
     assert not cloud_of(human).hide_render
-    set_attachment(human, "SURFACE")
-    assert len(volumes_of(human)) == COUNT
-    assert len(pending_volumes()) == 1
+    set_representation(human, "VOLUMES")
+    assert len(evaluated_matrices(human)) == COUNT
     assert cloud_of(human).hide_render
-    set_attachment(human, "SPLATS")
-    assert not pending_volumes()
+    set_representation(human, "SPLATS")
+    assert volumes_of(human).hide_render
     assert not cloud_of(human).hide_viewport
 
 
 def test_a_human_of_volumes_gets_splats_when_they_are_asked_for(person):
     human, arrays = person
-    set_attachment(human, "ARMATURE")
+    set_representation(human, "VOLUMES")
     bpy.data.batch_remove([cloud_of(human), cells_of(human)])
-    set_attachment(human, "SPLATS")
+    set_representation(human, "SPLATS")
     pose = strong_pose(1)
     pose_from_joint_rotations(human, *pose)
     np.testing.assert_allclose(drawn(human), expected(human, arrays, *pose), atol=2e-5)
@@ -191,18 +189,46 @@ def test_a_human_without_body_mesh_cannot_have_splats(person):
     human, _ = person
     bpy.data.batch_remove([cloud_of(human), body_of(human)])
     with refused(ValueError, "deleted"):
-        set_attachment(human, "SPLATS")
+        set_representation(human, "SPLATS")
 
 
 def test_detail_and_size_are_inputs_of_the_group(person):
     human, _ = person
     before = drawn(human, "scale")
-    items = bpy.data.node_groups[GROUP_NAME].interface.items_tree
-    names = {item.name: item.identifier for item in items if item.in_out == "INPUT"}
     modifier = cloud_of(human).modifiers[0]
-    set_node_input(modifier, names["Size"], 1.5)
-    set_node_input(modifier, names["Detail"], 0.125)
+    set_input(modifier, "Size", 1.5)
+    set_input(modifier, "Detail", 0.125)
     cloud_of(human).update_tag()
     after = drawn(human, "scale")
     assert len(after) == math.ceil(len(before) / 8)
     np.testing.assert_allclose(after, 1.5 * 2 * before[: len(after)], rtol=1e-5)
+
+
+def colours(human) -> np.ndarray:
+    """Encoded colours and opacity [n, 4] as Blender draws them."""
+    bpy.context.view_layer.update()
+    attribute = cloud_of(human).evaluated_get(bpy.context.evaluated_depsgraph_get()).data.attributes["radiance:base"]
+    values = np.empty((len(attribute.data), 4), np.float32)
+    attribute.data.foreach_get("color", values.ravel())
+    return np.c_[0.5 + C0 * values[:, :3], values[:, 3]]
+
+
+def test_shading_darkens_what_is_turned_away_from_the_sun_and_leaves_opacity(person):
+    human, _ = person
+    stored = np.empty((len(cloud_of(human).data.points), 4), np.float32)
+    cloud_of(human).data.attributes["radiance:base"].data.foreach_get("vector", stored.ravel())
+    as_made = colours(human)
+    np.testing.assert_allclose(as_made, np.c_[0.5 + C0 * stored[:, :3], stored[:, 3]], atol=1e-6)
+    sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    bpy.context.scene.collection.objects.link(sun)
+    sun.rotation_euler = (math.pi / 2, 0, 0)  # shines along +y, upon the face
+    modifier = cloud_of(human).modifiers[0]
+    set_input(modifier, "Sun", sun)
+    set_input(modifier, "Shading", 1.0)
+    cloud_of(human).update_tag()
+    shaded, turn = colours(human), drawn(human, "rotation")
+    w, x, y, z = turn.T
+    facing = -2 * (y * z - w * x)  # the normals' part along -y
+    wanted = (0.3 + 0.7 * facing.clip(0, None)) ** (1 / 2.2)
+    np.testing.assert_allclose(shaded[:, :3], as_made[:, :3] * wanted[:, None], atol=1e-5)
+    np.testing.assert_array_equal(shaded[:, 3], as_made[:, 3])
