@@ -1,11 +1,12 @@
 """Quality, novelty and speed of generated humans, beside one Gaussian and the paper's voxel baseline.
 
 `python benchmarks/diffusion.py --assets DIR --people DIR --reference DIR --old F --json F --table F` compares --count
-samples of each set with renders of held-out meshes. The --reference folder caches portraits and the feature network,
-which take some minutes to compute. Distances are Frechet distances of features; `distance_floor` is that of other
-meshes, the best that a model can reach; `from_mesh`, `payload` and `codec` are what stored humans lose before any
-network. `attribute_read_*` is the feature network's accuracy on renders of held-out meshes. Figures that need an
-omitted option are null. Times are of two threads. --quick takes few samples of each.
+samples of each set with renders of held-out meshes. The --reference folder has the feature network of
+`python -m scripts.train_attribute_network --reference DIR --assets DIR`; portraits are kept there. Distances are
+Frechet distances of features; `distance_floor` is that of other meshes, the best that a model can reach; `from_mesh`,
+`payload` and `codec` are what stored humans lose before any network. `attribute_read_*` is the feature network's
+accuracy on renders of held-out meshes. Figures that need an omitted option are null. Times are of two threads.
+--quick takes few samples of each.
 
 `python benchmarks/diffusion.py pictures --people DIR --neighbours docs/pictures/neighbours.png` renders humans from
 consecutive seeds, not hand-picked, each beside the nearest human by latents in the folder, with distances (1 is the
@@ -50,7 +51,6 @@ from primdiffusion.evaluation.gallery import (
     camera_of,
     made_gallery,
     mesh_sources,
-    payload_of,
 )
 from primdiffusion.evaluation.generation import (
     Comparison,
@@ -134,7 +134,7 @@ def main() -> None:
         reference = open_reference_set(
             mesh_sources(assets, seeds_of(arguments.meshes, REAL_SEED), COLOURINGS),
             mesh_sources(assets, seeds_of(arguments.meshes // 2, HELD_SEED), COLOURINGS),
-            arguments.reference, progress("portraits"), epoch,
+            arguments.reference, progress("portraits"),
         )  # fmt: skip
         rows = comparisons(reference, model, assets, arguments)
     if arguments.people is not None:
@@ -242,7 +242,7 @@ def latent_ratio(model: DiffusionModel, train: list[Path], held: list[Path]) -> 
         return model.encode(payload)  # pyright: ignore[reportArgumentType]
 
     made = [encode(human.payload).flatten() for human in generated(model, seeds_of(len(held)))]
-    real = [encode(payload_of(read_person(path), 0)).flatten() for path in held]
+    real = [encode(read_person(path).payload(0)).flatten() for path in held]
     found = nearest_stored(torch.stack([*made, *real]), train, read_person, encode, progress("latents"))
     return float(found.distance[: len(made)].median() / found.distance[len(made) :].median())
 
@@ -263,7 +263,7 @@ def quality_figures(rows: Mapping[str, Comparison], reference: ReferenceSet | No
         figures[f"nearest_neighbour_ratio{suffix}"] = None if row is None else round(row.nearest_ratio, 4)
         figures[f"precision{suffix}"] = None if row is None else round(row.precision, 4)
         figures[f"recall{suffix}"] = None if row is None else round(row.recall, 4)
-    accuracy = {} if reference is None else reference.held_accuracies
+    accuracy = {} if reference is None else reference.network.card.get("accuracy", {})
     figures |= {f"attribute_read_{name}": round(accuracy[name], 4) if name in accuracy else None for name in ATTRIBUTES}
     for name, gallery in (("train", reference and reference.train), ("held", reference and reference.held)):
         figures[f"people_{name}"] = None if gallery is None else len(gallery.pictures)
@@ -274,7 +274,7 @@ def table_of(rows: Mapping[str, Comparison], reference: ReferenceSet | None) -> 
     """Distances, and the accuracy of the feature network."""
     if reference is None:
         return "No assets were given (--assets): distances are not measured."
-    accuracy = reference.held_accuracies
+    accuracy = reference.network.card.get("accuracy", {})
     return "\n".join(
         [
             table({TITLES[name]: row for name, row in rows.items()}),
@@ -296,10 +296,6 @@ def progress(what: str) -> Callable[[int, int], None]:
             print(what, done, "of", total, flush=True)
 
     return report
-
-
-def epoch(number: int, loss: float) -> None:
-    print("features, epoch", number, f"loss {loss:.3f}", flush=True)
 
 
 def pictures() -> None:
@@ -333,7 +329,7 @@ def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path
         return model.encode(payload)
 
     people = list(generated(model, seeds_of(count)))
-    references = [payload_of(read_person(path), 0) for path in held[:: max(len(held) // 32, 1)]]
+    references = [read_person(path).payload(0) for path in held[:: max(len(held) // 32, 1)]]
     queries = torch.stack([encode(payload).flatten() for payload in (*(h.payload for h in people), *references)])
     found = nearest_stored(queries, train, read_person, encode, progress("latents"))
     new = found.distance[count:].median()
@@ -347,7 +343,7 @@ def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path
 
 def stored_one(path: Path, colouring: int) -> Primitives:
     person = read_person(path)
-    return Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, colouring))
+    return Primitives.place(rest_frames(person.betas.numpy()), person.payload(colouring))
 
 
 def comparison(

@@ -9,7 +9,7 @@ from pathlib import Path
 import torch
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, seeded
-from primdiffusion.evaluation.gallery import PORTRAITS, camera_of, payload_of
+from primdiffusion.evaluation.gallery import PORTRAITS, camera_of
 from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate_batch, place
@@ -79,7 +79,7 @@ def decoded(model: DiffusionModel, paths: Sequence[Path], colourings: int | None
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
         for number in range(len(person.voxels))[:colourings]:
-            yield Primitives.place(frames, plain(model.decode(model.encode(payload_of(person, number)))))
+            yield Primitives.place(frames, plain(model.decode(model.encode(person.payload(number)))))
 
 
 def plain(payload: Payload) -> Payload:
@@ -93,7 +93,7 @@ def stored(paths: Sequence[Path], colourings: int | None = None) -> Iterator[Pri
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
         for number in range(len(person.voxels))[:colourings]:
-            yield Primitives.place(frames, payload_of(person, number))
+            yield Primitives.place(frames, person.payload(number))
 
 
 def stored_voxels(
@@ -104,7 +104,7 @@ def stored_voxels(
         person = read_person(path)
         frames = rest_frames(person.betas.numpy())
         for number in range(len(person.voxels))[:colourings]:
-            grid = voxelise_payload(frames, payload_of(person, number), person.full_density)
+            grid = voxelise_payload(frames, person.payload(number), person.full_density)
             shown = grid.float() / 255 if model is None else model.codec.decode(model.codec.encode(grid))
             yield primitives_of(shown, person.full_density)
 

@@ -55,7 +55,6 @@ from primdiffusion.evaluation.reconstruction import (
     Means,
     PictureScore,
     evaluate,
-    picture,
     summary,
     table,
 )
@@ -446,7 +445,7 @@ def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) ->
         seen = conditioning_views(captures, name, frame, [camera], SIZE)
         primitives = model.place(payload, betas, seen.pose)
         view = seen.camera.map(lambda tensor: tensor[0])
-        drawn, target = picture(march(primitives, view)), seen.image[0].float() / 255
+        drawn, target = encode_srgb(march(primitives, view).rgb.clamp(0, 1)), seen.image[0].float() / 255
         for image in (target, drawn) if number == 0 else (drawn, target):
             yield cropped(image, seen.mask[0])
     for look in ("depth", "boxes"):

@@ -25,9 +25,10 @@ mean wall time of a reconstruction from one view. Run nothing else in the two mi
 `python benchmarks/from_pictures.py distance --assets DIR --json F` adds how real the sides look that the view does not
 show: their kernel distance to those sides of the humans' own meshes, over that of generated humans' sides to held-out
 meshes'. Back and left portraits in T pose are compared, in the feature space of `primdiffusion.evaluation`, by a
-network fitted to these two. Distances of some 30 humans to other people depend more on who they are than on how real
-they look; that to their own meshes does not (`distance_in_pairs`), and generated humans are many. Portraits of meshes
-stay in the folder --reference, which benchmarks/diffusion.py uses as well.
+network of these two (`python -m scripts.train_attribute_network --reference DIR --assets DIR --only back left`).
+Distances of some 30 humans to other people depend more on who they are than on how real they look; that to their own
+meshes does not (`distance_in_pairs`), and generated humans are many. Portraits of meshes stay in the folder
+--reference, which benchmarks/diffusion.py uses as well.
 
     one_view_unseen_distance_ratio          of reconstructions, whose unseen sides are the most probable ones
     one_view_drawn_unseen_distance_ratio    of those with a seed, whose unseen sides are drawn
@@ -60,7 +61,7 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.evaluation.attribute_network import features_of, fit_attribute_network
+from primdiffusion.evaluation.attribute_network import features_of, load_attribute_network
 from primdiffusion.evaluation.distances import cubic_kernel, kernel_distance
 from primdiffusion.evaluation.gallery import COLOURINGS, PORTRAITS, made_gallery, mesh_sources, open_gallery
 from primdiffusion.evaluation.generation import PORTRAITS_FOLDER
@@ -171,17 +172,16 @@ def seconds() -> None:
 def distance() -> None:
     parser = options(people=32)
     parser.add_argument("--reference", type=Path, default=Path("runs/reference"), help="folder for portraits of meshes")
-    parser.add_argument("--meshes", type=int, default=160, help="geometries of the reference; half as many held out")
+    parser.add_argument("--meshes", type=int, default=160, help="geometries of the network; half as many are held out")
     parser.add_argument("--generated", type=int, default=128, help="generated humans")
     arguments = parser.parse_args()
     model = load_checkpoint(arguments.checkpoint)
     assets = open_assets(arguments.assets, required_meshes())
-    seeds = ((0, arguments.meshes, COLOURINGS), (HELD_SEED, arguments.meshes // 2, COLOURINGS))
-    train, held, own = (
+    held, own = (
         open_gallery(mesh_sources(assets, range(first, first + count), each), arguments.reference / PORTRAITS_FOLDER)
-        for first, count, each in (*seeds, (SEED, arguments.people, 1))
+        for first, count, each in ((HELD_SEED, arguments.meshes // 2, COLOURINGS), (SEED, arguments.people, 1))
     )
-    network = fit_attribute_network(unseen_sides(train.pictures), train.attributes)
+    network = load_attribute_network(arguments.reference / "features_back_left.safetensors")
 
     def features(pictures: UInt8[Tensor, "n v h w 4"]) -> Float[Tensor, "n f"]:
         return features_of(network, unseen_sides(pictures))

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from primdiffusion.evaluation.gallery import ReadPerson, Report, payload_of, silent
+from primdiffusion.evaluation.gallery import ReadPerson, Report, silent
 from primdiffusion.primitives.primitives import Payload
 from torch import Tensor
 
@@ -48,4 +48,4 @@ def nearest_stored(
 def encoded_person(path: Path, read: ReadPerson, encode: Encode) -> Float[Tensor, "n d"]:
     """Flattened latents of all colourings in a file."""
     person = read(path)
-    return torch.stack([encode(payload_of(person, one)).flatten().cpu() for one in range(len(person.voxels))])
+    return torch.stack([encode(person.payload(one)).flatten().cpu() for one in range(len(person.voxels))])

@@ -35,7 +35,8 @@ from primdiffusion.people.person import Person, make_person
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.raster.rasterise import RasterImage, TriangleSoup, draw, flatten, rasterise, shade
+from primdiffusion.raster.rasterise import RasterImage, rasterise
+from primdiffusion.raster.shade import TriangleSoup, draw, flatten, shade
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
 from record import command_line, report, run
@@ -212,7 +213,7 @@ def sheet_picture(mesh: TexturedMesh, width: int, height: int, heads: bool, lit:
     camera, direction = view_of(mesh, width * SUPERSAMPLE, height * SUPERSAMPLE, heads)
     soup = flatten(mesh)
     fragments = draw(soup, camera)
-    rgb = shade(soup, fragments)
+    rgb, _ = shade(fragments, soup.textures, camera.height, camera.width)
     if lit:
         normal = np.einsum("hwk,hwkc->hwc", fragments.barycentric, normals(soup)[soup.faces[fragments.face]])
         rgb = rgb * light(normal, direction)[..., None]

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,14 +22,20 @@ from diffusion_sets import TOGETHER, generated, seeds_of
 from latent_baseline import sample_people
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.evaluation.images import TestImage, human_images, mesh_images_of_seeds, primitive_images
 from primdiffusion.evaluation.pose_depth_network import load_pose_depth_network
-from primdiffusion.evaluation.shots import SIDE, Shot, human_shots, mesh_shots, primitive_shots
-from primdiffusion.evaluation.tables import Cell, Networks, Scores, compare_pictures, evaluate, floor_cells, table
+from primdiffusion.evaluation.tables import (
+    Cell,
+    Networks,
+    Scores,
+    compare_pictures,
+    look_at_pictures,
+    reference_cells,
+    table,
+)
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, pose_body
 from primdiffusion.people.assets import Assets, open_assets
-from primdiffusion.people.base_mesh import load_base_mesh
-from primdiffusion.people.person import make_person
 from primdiffusion.render.march import MarchSettings
 from record import command_line, report
 from voxel_baseline import VoxelModel, load_voxel_model
@@ -52,7 +57,7 @@ class Model(NamedTuple):
     """One of the models that are compared."""
 
     card: Mapping[str, Any]
-    shots: Callable[[Sequence[int], int], Iterator[Shot]]
+    images: Callable[[Sequence[int], int], Iterator[TestImage]]
     """Pictures of the humans of these seeds from so many sides."""
 
 
@@ -98,16 +103,16 @@ def read_models(folder: Path, without_default: bool = False) -> dict[str, Model]
     voxels = load_voxel_model(folder / "voxels" / "voxel.safetensors")
 
     models = {
-        "ours": Model(ours.card, lambda seeds, views: shots_of(generated(ours, seeds), seeds, views)),
+        "ours": Model(ours.card, lambda seeds, views: images_of(generated(ours, seeds), seeds, views)),
         "latents": Model(
-            latents.card, lambda seeds, views: shots_of(iter(sample_people(latents, seeds)), seeds, views)
+            latents.card, lambda seeds, views: images_of(iter(sample_people(latents, seeds)), seeds, views)
         ),
-        "voxels": Model(voxels.card, lambda seeds, views: voxel_shots(voxels, seeds, views)),
+        "voxels": Model(voxels.card, lambda seeds, views: voxel_images(voxels, seeds, views)),
     }
     check_equal({name: model.card for name, model in models.items()})
     if not without_default:
         default = load_checkpoint()
-        models["default"] = Model(default.card, lambda seeds, views: shots_of(generated(default, seeds), seeds, views))
+        models["default"] = Model(default.card, lambda seeds, views: images_of(generated(default, seeds), seeds, views))
     return models
 
 
@@ -120,24 +125,17 @@ def check_equal(cards: Mapping[str, Mapping[str, Any]]) -> None:
         raise ValueError(f"the models were not trained equally ({trained}): train them again")
 
 
-def shots_of(humans: Iterator[Human], seeds: Sequence[int], views: int) -> Iterator[Shot]:
+def images_of(humans: Iterator[Human], seeds: Sequence[int], views: int) -> Iterator[TestImage]:
     """Pictures of humans of these seeds."""
     for seed, human in zip(seeds, humans, strict=True):
-        yield from human_shots(human, REST, views, f"{seed:06d}", MARCH, torch.device("cpu"))
+        yield from human_images(human, REST, views, f"{seed:06d}", MARCH, torch.device("cpu"))
 
 
-def voxel_shots(model: VoxelModel, seeds: Sequence[int], views: int) -> Iterator[Shot]:
+def voxel_images(model: VoxelModel, seeds: Sequence[int], views: int) -> Iterator[TestImage]:
     """Pictures of grids around the bodies that were sampled with them."""
     for seed, person in zip(seeds, model.sample(seeds), strict=True):
         posed = pose_body(person.betas, REST.map(lambda t: t[0]))
-        yield from primitive_shots(model.primitives(person.grid), posed, views, f"{seed:06d}", MARCH)
-
-
-def real_shots(assets: Assets, seeds: Sequence[int], views: int) -> Iterator[Shot]:
-    """Renders of meshes."""
-    base, yaws = load_base_mesh(), [[2 * math.pi * view / views for view in range(views)]]
-    for seed in seeds:
-        yield from mesh_shots(make_person(assets, base, seed), REST, yaws, f"{seed:08d}", SIDE)
+        yield from primitive_images(model.primitives(person.grid), posed, views, f"{seed:06d}", MARCH)
 
 
 def judged_rows(
@@ -147,19 +145,21 @@ def judged_rows(
     networks = Networks(load_pose_depth_network())
     found = None if found is None else found / f"{views}_views"
     seeds_of_real = seeds_of(REAL_EACH * count, REAL_SEED)
-    real = judged("real", lambda seeds: real_shots(assets, seeds, views), seeds_of_real, networks, found)
+    real = judged(
+        "real", lambda seeds: mesh_images_of_seeds(assets, seeds, REST, views), seeds_of_real, networks, found
+    )
     rows: dict[str, dict[str, Cell]] = {}
     own: dict[str, Cell] = {}
     for name, model in models.items():
-        fake = judged(name, lambda seeds, m=model: m.shots(seeds, views), seeds_of(count), networks, found)
+        fake = judged(name, lambda seeds, m=model: m.images(seeds, views), seeds_of(count), networks, found)
         cells = compare_pictures(fake, real, 100, 1000, 2020)
         rows[name], own = cells["generated"], cells["real"]
-    return {**rows, "real": own, "floor": floor_cells(networks.own.card)}
+    return {**rows, "real": own, "floor": reference_cells(networks.own.card)}
 
 
 def judged(
     name: str,
-    shots: Callable[[Sequence[int]], Iterator[Shot]],
+    images: Callable[[Sequence[int]], Iterator[TestImage]],
     seeds: Sequence[int],
     networks: Networks,
     found: Path | None = None,
@@ -172,7 +172,7 @@ def judged(
         if path is not None and path.is_file():
             parts.append(json.loads(path.read_text(encoding="utf-8")))
             continue
-        one = evaluate(shots(some), networks)
+        one = look_at_pictures(images(some), networks)
         features = {key: values.tolist() for key, values in one.features.items()}
         parts.append({"features": features, "own": one.correct["own"], "depth": one.depth["own"]})
         if path is not None:

@@ -1,6 +1,6 @@
 """Train the network of joints, depth and attributes that `primdiffusion evaluate generation --table` judges with.
 
-    python scripts/train_pose_depth_network.py --assets DIR --out backend/primdiffusion/weights/pose_depth.safetensors
+    python -m scripts.train_pose_depth_network --assets DIR --out backend/primdiffusion/weights/pose_depth.safetensors
 
 Renders MakeHuman meshes (CC0) of seeds that no diffusion model is trained on, in random poses from random sides. Takes
 minutes on one core. The card in the file states the errors on meshes of other seeds: the floor of the tables.
@@ -9,6 +9,7 @@ minutes on one core. The card in the file states the errors on meshes of other s
 from __future__ import annotations
 
 import dataclasses
+import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,10 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float, UInt8
+from primdiffusion import tensor_file
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.evaluation.attribute_network import attribute_loss, attribute_space
+from primdiffusion.evaluation.images import JOINTS, mesh_images
 from primdiffusion.evaluation.pose_depth_network import (
     CELLS,
     INPUT,
@@ -28,16 +30,17 @@ from primdiffusion.evaluation.pose_depth_network import (
     cell_means,
     joint_positions,
     load_pose_depth_network,
-    save_pose_depth_network,
     shrunk,
 )
-from primdiffusion.evaluation.shots import JOINTS, mesh_shots
+from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.rotation import axis_angle_to_matrix, matrix_to_axis_angle
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.person import make_person
 from torch import Tensor
 from torch.nn import functional
+
+from scripts.train_attribute_network import attribute_loss, labels_of, predicted_attributes, visible_vocabulary
 
 JITTER = 0.15
 """Standard deviation of random rotations added to each joint of a pose, radians."""
@@ -52,7 +55,7 @@ FIRST_TRAINED, FIRST_HELD = 2_000_000, 3_000_000
 
 
 @dataclasses.dataclass(frozen=True)
-class TrainingShots:
+class TrainingImages:
     """Pictures and their truth."""
 
     pictures: UInt8[Tensor, "n 3 128 128"]
@@ -75,12 +78,12 @@ def random_poses(count: int, generator: torch.Generator) -> BodyPose:
     return BodyPose(axis_angle_to_matrix(mixed), torch.zeros(count, 3))
 
 
-def training_shots(
+def training_images(
     assets: Assets,
     seeds: Sequence[int],
     pictures_each: int,
     report: Callable[[int, int], None] = lambda done, total: None,
-) -> TrainingShots:
+) -> TrainingImages:
     """Render meshes of `seeds`, each in `pictures_each` random poses from random sides; deterministic in the seeds."""
     base = load_base_mesh()
     pictures, joints, sizes, depths, attributes = [], [], [], [], []
@@ -89,24 +92,24 @@ def training_shots(
         generator = torch.Generator().manual_seed(seed)
         poses = random_poses(pictures_each, generator)
         yaws = (2 * np.pi * torch.rand(pictures_each, 1, generator=generator)).tolist()
-        for shot in mesh_shots(person, poses, yaws, str(seed), 2 * INPUT):
-            assert shot.joints is not None
-            assert shot.head_size is not None
-            assert shot.depth is not None
-            side = shot.rgb.shape[0]
-            pictures.append(shrunk(shot.rgb))
-            joints.append(shot.joints / side)
-            sizes.append(shot.head_size / side)
-            depths.append(cell_means(torch.where(shot.mask, 1 / shot.depth, 0.0), shot.mask))
+        for image in mesh_images(person, poses, yaws, str(seed), 2 * INPUT):
+            assert image.joints is not None
+            assert image.head_size is not None
+            assert image.depth is not None
+            side = image.rgb.shape[0]
+            pictures.append(shrunk(image.pixels))
+            joints.append(image.joints / side)
+            sizes.append(image.head_size / side)
+            depths.append(cell_means(torch.where(image.mask, 1 / image.depth, 0.0), image.mask))
             attributes.append(person.attributes)
         report(number + 1, len(seeds))
-    return TrainingShots(
+    return TrainingImages(
         torch.stack(pictures), torch.stack(joints), torch.tensor(sizes), torch.stack(depths), tuple(attributes)
     )
 
 
 def fit_pose_depth_network(
-    shots: TrainingShots,
+    images: TrainingImages,
     *,
     epochs: int,
     batch: int = 16,
@@ -115,23 +118,23 @@ def fit_pose_depth_network(
     report: Callable[[int, float], None] = lambda epoch, loss: None,
 ) -> PoseDepthNetwork:
     """Train a network; `report` receives each epoch and its mean loss. Deterministic for a seed and device."""
-    space = attribute_space(shots.attributes)
-    labels = space.labels(shots.attributes)
+    vocabulary = visible_vocabulary(images.attributes)
+    labels = labels_of(vocabulary, images.attributes)
     generator = torch.Generator().manual_seed(seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        network = PoseDepthNetwork(space).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+        network = PoseDepthNetwork(vocabulary).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
         optimiser = torch.optim.AdamW(network.parameters(), lr=learning_rate, weight_decay=0.02)
-        steps = epochs * -(-len(shots.pictures) // batch)
+        steps = epochs * -(-len(images.pictures) // batch)
         scheduler = torch.optim.lr_scheduler.OneCycleLR(optimiser, learning_rate, total_steps=steps + 1, pct_start=0.1)
         for epoch in range(epochs):
             losses = []
-            for chosen in torch.randperm(len(shots.pictures), generator=generator).split(batch):
-                pictures, joints, inverted = augmented(shots, chosen, generator)
+            for chosen in torch.randperm(len(images.pictures), generator=generator).split(batch):
+                pictures, joints, inverted = augmented(images, chosen, generator)
                 seen = network(pictures.contiguous(memory_format=torch.channels_last))
                 own = {name: values[chosen] for name, values in labels.items()}
                 loss = joint_loss(seen.heatmaps, joints) + 2 * inverted_depth_loss(seen.depth, inverted)
-                loss = loss + 0.1 * attribute_loss(network.predict(seen.features), own, space)
+                loss = loss + 0.1 * attribute_loss(predicted_attributes(network.heads, seen.features), own, vocabulary)
                 optimiser.zero_grad()
                 loss.backward()
                 optimiser.step()
@@ -142,12 +145,12 @@ def fit_pose_depth_network(
 
 
 def augmented(
-    shots: TrainingShots, chosen: Tensor, generator: torch.Generator
+    images: TrainingImages, chosen: Tensor, generator: torch.Generator
 ) -> tuple[Float[Tensor, "b 3 128 128"], Float[Tensor, "b 12 2"], Float[Tensor, "b 32 32"]]:
     """A batch mirrored, shrunk, shifted, blurred and in other light, as generated pictures may be."""
     count = len(chosen)
-    pictures = shots.pictures[chosen].float() / 255
-    joints, inverted = shots.joints[chosen], shots.inverted[chosen]
+    pictures = images.pictures[chosen].float() / 255
+    joints, inverted = images.joints[chosen], images.inverted[chosen]
     if float(torch.rand((), generator=generator)) < 0.5:
         pictures, inverted = pictures.flip(-1), inverted.flip(-1)
         joints = torch.stack([1 - joints[..., 0], joints[..., 1]], -1)[:, SWAPPED]
@@ -190,18 +193,25 @@ def inverted_depth_loss(predicted: Float[Tensor, "b 32 32"], inverted: Float[Ten
     return (difference.square().sum((1, 2), keepdim=True) / count).mean()
 
 
-def held_out_errors(network: PoseDepthNetwork, shots: TrainingShots, share: float) -> dict[str, float]:
+def held_out_errors(network: PoseDepthNetwork, images: TrainingImages, share: float) -> dict[str, float]:
     """PCKh (percent), joint error (percent of the side) and depth error x 100 on cells, of renders not trained on."""
     with torch.inference_mode():
-        seen = [network(part.float() / 255) for part in shots.pictures.split(64)]
+        seen = [network(part.float() / 255) for part in images.pictures.split(64)]
     found = torch.cat([joint_positions(one.heatmaps) for one in seen])
-    distance = (found - shots.joints).norm(dim=-1)
-    depth = inverted_depth_loss(torch.cat([one.depth for one in seen]), shots.inverted)
+    distance = (found - images.joints).norm(dim=-1)
+    depth = inverted_depth_loss(torch.cat([one.depth for one in seen]), images.inverted)
     return {
-        "pckh": 100 * float((distance <= share * shots.head_size[:, None]).double().mean()),
+        "pckh": 100 * float((distance <= share * images.head_size[:, None]).double().mean()),
         "joint_error": 100 * float(distance.mean()),
         "depth": 100 * float(depth),
     }
+
+
+def save_pose_depth_network(path: Path, network: PoseDepthNetwork) -> None:
+    """Write the network in half precision with its card, atomically."""
+    tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
+    metadata = {"space": json.dumps(network.vocabulary.to_json()), "card": json.dumps(network.card)}
+    write_atomically(path, tensor_file.save(tensors, metadata=metadata))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -230,14 +240,14 @@ class Training:
         def report(done: int, total: int) -> None:
             print(f"rendered {done} of {total} meshes", flush=True)
 
-        shots = training_shots(assets, seeds, self.pictures, report)
+        images = training_images(assets, seeds, self.pictures, report)
         network = fit_pose_depth_network(
-            shots,
+            images,
             epochs=self.epochs,
             seed=self.seed,
             report=lambda epoch, loss: print(f"epoch {epoch}: loss {loss:.4f}", flush=True),
         )
-        held = training_shots(assets, held_seeds, self.pictures // 2, report)
+        held = training_images(assets, held_seeds, self.pictures // 2, report)
         network.card = {
             "trained_on": f"{self.people} MakeHuman meshes (CC0), seeds {seeds[0]} to {seeds[-1]}, {self.pictures} "
             "random poses and views each",

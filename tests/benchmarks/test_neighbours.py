@@ -4,7 +4,6 @@ import pytest
 import torch
 from diffusion_people import write_people
 from neighbours import nearest_stored
-from primdiffusion.evaluation.gallery import payload_of
 from primdiffusion.training.stored_people import find_people, read_person
 from support.errors import refused
 from tiny_model import tiny_model
@@ -13,7 +12,7 @@ from tiny_model import tiny_model
 def test_nearest_stored_person_of_a_stored_person_is_that_person(tmp_path):
     write_people(tmp_path, 6)
     paths, model = find_people(tmp_path), tiny_model()
-    queries = torch.stack([model.encode(payload_of(read_person(paths[number]), 1)).flatten() for number in (4, 2)])
+    queries = torch.stack([model.encode(read_person(paths[number]).payload(1)).flatten() for number in (4, 2)])
     found = nearest_stored(queries, paths, read_person, model.encode)
     assert found.file.tolist() == [4, 2]
     assert found.colouring.tolist() == [1, 1]

@@ -76,11 +76,11 @@ def test_unequal_models_are_not_compared():
 
 
 def test_figures_name_model_and_measure():
-    def shots(seeds, views):
+    def images(seeds, views):
         return iter(())
 
     rows = {"ours": {"own_distance": Cell(1.2345)}, "floor": {"own_pckh": Cell(30.0), "own_depth": Cell(90.0)}}
-    figures = figures_of(rows, dict.fromkeys(("ours", "latents", "voxels"), Model(CARD, shots)))
+    figures = figures_of(rows, dict.fromkeys(("ours", "latents", "voxels"), Model(CARD, images)))
     assert figures["distance_ours"] == 1.234
     assert figures["pckh_floor"] == 30.0
     assert figures["depth_error_latents"] is None
@@ -91,13 +91,13 @@ def test_figures_name_model_and_measure():
 def test_what_was_seen_is_not_looked_at_again(tmp_path, monkeypatch):
     asked = []
 
-    def evaluate(shots, networks):
-        seeds = list(shots)
+    def evaluate(images, networks):
+        seeds = list(images)
         asked.extend(seeds)
         features = {"own": torch.tensor(seeds)[:, None].float(), "detail": torch.zeros(len(seeds), 3)}
         return Scores(len(seeds), features, {"own": [0.5] * len(seeds)}, {"own": []})
 
-    monkeypatch.setattr(tables, "evaluate", evaluate)
+    monkeypatch.setattr(tables, "look_at_pictures", evaluate)
     first = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
     again = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
     assert asked == list(range(10))

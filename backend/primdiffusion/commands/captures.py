@@ -23,7 +23,7 @@ from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.capture.sheet import draw_sheet
 from primdiffusion.captured_humans import PASSES as PASSES_OF_VOLUMES
 from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_of
-from primdiffusion.evaluation.shots import folder_pictures
+from primdiffusion.evaluation.images import folder_pictures
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify

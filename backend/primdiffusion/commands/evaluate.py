@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import tyro
 from tqdm import tqdm
 
+from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.commands.evaluate_tables import Generated, TableOptions, measure
 from primdiffusion.device import best_device
 from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.evaluation import generation, reconstruction
 from primdiffusion.evaluation.attribute_network import features_of
 from primdiffusion.evaluation.distances import NEIGHBOURS, too_few_samples
 from primdiffusion.evaluation.gallery import (
     COLOURINGS,
+    Source,
     made_gallery,
     mesh_sources,
     payload_sources,
@@ -28,17 +31,52 @@ from primdiffusion.evaluation.gallery import (
 )
 from primdiffusion.evaluation.generation import compare, open_reference_set, real_vs_real
 from primdiffusion.evaluation.image_metrics import load_lpips
+from primdiffusion.evaluation.images import (
+    HEAD,
+    JOINTS,
+    SIDE,
+    TestImage,
+    folder_images,
+    folder_pictures,
+    human_images,
+    mesh_images_of_seeds,
+)
+from primdiffusion.evaluation.onnx_networks import DepthValues, Normalisation, open_depth_network, open_pose_network
+from primdiffusion.evaluation.pose_depth_network import PCK_SHARE, load_pose_depth_network
+from primdiffusion.evaluation.pretrained_networks import (
+    ClipVision,
+    Inception,
+    Resize,
+    load_clip_vision,
+    load_inception,
+)
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, evaluate, summary
+from primdiffusion.evaluation.tables import (
+    FRAMES_TIMED,
+    Networks,
+    Scores,
+    check_counts,
+    compare_pictures,
+    frames_per_second,
+    look_at_pictures,
+    reference_cells,
+    remarks,
+    resolution_of,
+    table,
+)
 from primdiffusion.formats.requests import Count, Sampling
 from primdiffusion.formats.schema import Range, check
 from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.human import generate, place
 from primdiffusion.people.assets import open_assets
+from primdiffusion.pose_file import read_motion
+from primdiffusion.render.march import MarchSettings
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
 from primdiffusion.version import __version__
 
 DESCRIPTION = "Measure the quality of trained models."
+MARCH = MarchSettings()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -96,6 +134,46 @@ class EvaluateReconstruction:
 
 
 @dataclasses.dataclass(frozen=True)
+class TableOptions:
+    """The paper's tables; weights files are of the networks that publish them."""
+
+    table: Literal["1", "2"] | None = None
+    """Measure what this table of the paper has, at 512 x 512, and the same by our own network. Needs no --people."""
+    fake: Path | None = None
+    """Folder of generated pictures of anybody, instead of a checkpoint's: square, over white or with alpha."""
+    real: Path | None = None
+    """Folder of real pictures; without it, renders of the meshes of MakeHuman's --assets."""
+    poses: Count = 5
+    """Number of poses of each human: near T, then those of --motion, or built-in ones."""
+    views: Count = 4
+    """Number of views of each pose, evenly around the human."""
+    motion: tuple[Path, ...] = ()
+    """Pose files (AMASS and others) to choose poses from."""
+    real_seed: int = 3_000_000
+    """Seed of the first mesh; as many are rendered as humans are generated."""
+    inception: Path | None = None
+    """Weights of FID's Inception-V3, pt_inception-2015-12-05-6726825d.pth or torch-fidelity's file."""
+    clip: Path | None = None
+    """Weights of CLIP's ViT-B/32, under OpenAI's names."""
+    pose: Path | None = None
+    """ONNX file of a 2D pose network of COCO's 17 keypoints."""
+    depth: Path | None = None
+    """ONNX file of a monocular depth network."""
+    depth_normalisation: Normalisation = "imagenet"
+    """Normalisation of the depth network's input; DPT needs `half`."""
+    depth_values: DepthValues = "inverted"
+    """Output of the depth network: inverted depth, or depth."""
+    resize: Resize = "torch-fidelity"
+    """Resizing of pictures for Inception and CLIP."""
+    kid_subsets: Count = 100
+    """Number of random subsets for KID."""
+    kid_subset_size: Count = 1000
+    """Pictures of each subset."""
+    kid_seed: int = 2020
+    """Seed of the subsets; torch-fidelity's default."""
+
+
+@dataclasses.dataclass(frozen=True)
 class EvaluateGeneration:
     """Compare generated humans with ones held out from training, in a feature space of human attributes.
 
@@ -106,7 +184,7 @@ class EvaluateGeneration:
     people: Path | None = None
     """Folder of the payloads that the model was trained on, those held out among them."""
     reference: Path | None = None
-    """Folder for portraits and feature network; what is missing is computed, which takes minutes."""
+    """Folder of the feature network that scripts/train_attribute_network.py trains; portraits are kept there."""
     assets: Path | None = None
     """MakeHuman's assets, if the training set was made from them: the reference is then renders of the meshes, so that
     detail which payloads lack counts too. Without them it is renders of the payloads."""
@@ -134,8 +212,7 @@ class EvaluateGeneration:
         """
         check(self)
         if self.tables.table is not None:
-            generated = Generated(self.checkpoint, self.first_seed, self.count, self.steps)
-            record, text = measure(self.tables, generated, self.assets)
+            record, text = measure(self)
             if self.json is not None:
                 _write(self.json, record)
             print(text)
@@ -146,14 +223,8 @@ class EvaluateGeneration:
             raise ValueError(
                 f"count is {self.count}: ask for more than {NEIGHBOURS} humans, or nothing can be compared"
             )
-        train, held = split_people(find_people(self.people), self.holdout, self.seed)
+        real = real_sources(self.people, self.assets, self.holdout, self.seed)
         model = load_checkpoint(self.checkpoint, best_device())
-        if self.assets is None:
-            real = (payload_sources(train, read_person), payload_sources(held, read_person))
-        else:
-            assets = open_assets(self.assets)
-            trained_on, others = ([read_seed(path) for path in paths] for paths in (train, held))
-            real = (mesh_sources(assets, trained_on, COLOURINGS), mesh_sources(assets, others, COLOURINGS))
         with tqdm(unit="human", disable=None) as bar:
 
             def report(done: int, total: int) -> None:
@@ -171,13 +242,131 @@ class EvaluateGeneration:
                 "version": __version__,
                 "checkpoint": dict(model.card),
                 "people": {name: dataclasses.asdict(row) for name, row in rows.items()},
-                "feature_accuracy": reference.held_accuracies,
+                "feature_accuracy": reference.network.card.get("accuracy", {}),
             }
             _write(self.json, record)
         print(generation.table(rows))
         note = too_few_samples(self.count, *reference.held_features.shape)
         if note is not None:
             print(f"\nFrechet distance: {note}.")
+
+
+def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
+    """The record of a table, and the table as Markdown.
+
+    Raises:
+        ValueError, FileNotFoundError: files are missing, damaged or of other networks, or there are too few pictures.
+        ImportError: an ONNX file is named and onnxruntime is not installed.
+    """
+    options, number = command.tables, int(command.tables.table or 1)
+    poses = choose_poses([read_motion(path) for path in options.motion], options.poses, 0)
+    grid = command.count * options.poses * options.views
+    check_counts(*(len(folder_pictures(path)) if path is not None else grid for path in (options.fake, options.real)))
+    if options.real is not None:
+        reals = folder_images(options.real)
+    else:
+        seeds = range(options.real_seed, options.real_seed + command.count)
+        reals = mesh_images_of_seeds(open_assets(command.assets), seeds, poses, options.views)
+    networks = Networks(
+        load_pose_depth_network(),
+        None if options.inception is None else load_inception(options.inception, options.resize),
+        None if options.clip is None else load_clip_vision(options.clip, options.resize),
+        None if options.pose is None else open_pose_network(options.pose),
+        None
+        if options.depth is None
+        else open_depth_network(options.depth, options.depth_normalisation, options.depth_values),
+    )
+    model, fps, resolution = None, None, None
+    if options.fake is None:
+        model = load_checkpoint(command.checkpoint, best_device())
+        first = generate(model, command.first_seed, command.steps)
+        fps, resolution = frames_per_second(first, MARCH), resolution_of(first)
+        fakes = _model_images(model, command, poses)
+    else:
+        fakes = folder_images(options.fake)
+    fake = _scores(fakes, networks, "generated")
+    real = _scores(reals, networks, "real")
+    rows = compare_pictures(fake, real, options.kid_subsets, options.kid_subset_size, options.kid_seed)
+    if fps is not None:
+        rows["generated"]["fps"] = fps
+    rows["floor"] = reference_cells(networks.own.card)
+    choices = _choices(command, fake, real)
+    record = {
+        "version": __version__,
+        "table": number,
+        "checkpoint": None if model is None else dict(model.card),
+        "choices": choices,
+        "resolution": resolution,
+        "rows": {row: {name: cell._asdict() for name, cell in cells.items()} for row, cells in rows.items()},
+        "remarks": remarks(rows),
+        "own_network": networks.own.card,
+    }
+    return record, table(number, rows, choices, resolution)
+
+
+def _model_images(model: DiffusionModel, command: EvaluateGeneration, poses: BodyPose) -> Iterator[TestImage]:
+    for seed in range(command.first_seed, command.first_seed + command.count):
+        human = generate(model, seed, command.steps)
+        yield from human_images(human, poses, command.tables.views, f"{seed:06d}", MARCH, best_device())
+
+
+def _scores(images: Iterator[TestImage], networks: Networks, what: str) -> Scores:
+    with tqdm(unit="picture", desc=what, disable=None) as bar:
+
+        def report(done: int) -> None:
+            bar.update(done - bar.n)
+
+        return look_at_pictures(images, networks, report)
+
+
+def _choices(command: EvaluateGeneration, fake: Scores, real: Scores) -> dict[str, Any]:
+    """Every choice on which the figures depend."""
+    options = command.tables
+    rendered = options.fake is None or options.real is None
+    grid = f"{options.poses} poses x {options.views} views"
+    seeds = f"seeds {command.first_seed} to {command.first_seed + command.count - 1}, {command.steps} steps"
+    meshes_seeds = f"meshes of seeds {options.real_seed} to {options.real_seed + command.count - 1}"
+    poses = [str(path) for path in options.motion] or "built-in"
+    return {
+        "picture": f"{SIDE} x {SIDE} pixels over white, sRGB bytes",
+        "generated pictures": f"{fake.pictures}: {options.fake or f'{command.count} humans ({seeds}) in {grid}'}",
+        "real pictures": f"{real.pictures}: {options.real or f'{meshes_seeds} in {grid}'}",
+        "poses": poses if rendered else "of the pictures",
+        "marcher step (m)": MARCH.step if options.fake is None else None,
+        "resize": f"{options.resize}, to {Inception.SIDE} for Inception and {ClipVision.SIDE} for CLIP",
+        "inception": f"pool3, 2048 features, {options.inception}" if options.inception else None,
+        "clip": f"image embedding of ViT-B/32, 512 features, {options.clip}" if options.clip else None,
+        "KID": f"{options.kid_subsets} subsets of {options.kid_subset_size}, seed {options.kid_seed}, cubic kernel",
+        "PCKh": f"within {PCK_SHARE} of the distance {HEAD[0]}-{HEAD[1]} in the picture, occluded joints included; "
+        f"{', '.join(JOINTS)}",
+        "pose network": f"{options.pose}" if options.pose else None,
+        "depth error": "inverted depths inside the human, means and standard deviations aligned, mean squared "
+        "difference x 100",
+        "depth network": f"{options.depth}, {options.depth_normalisation} normalisation, predicts "
+        f"{options.depth_values}"
+        if options.depth
+        else None,
+        "FPS": f"median of {FRAMES_TIMED} frames of one placed human on {best_device()}"
+        if options.fake is None
+        else None,
+        "own distance": f"Frechet, {min(fake.pictures, real.pictures // 2)} pictures against as many real ones; "
+        "row real: the other real ones",
+        "own floor": "PCKh and depth error of our network on renders of meshes held out from its training",
+    }
+
+
+def real_sources(people: Path, assets: Path | None, holdout: float, seed: int) -> tuple[list[Source], list[Source]]:
+    """Portraits of the people that a model was trained on, and of those held out: of payloads, or of `assets`' meshes.
+
+    Raises ValueError and FileNotFoundError for people or assets that are missing or unreadable.
+    """
+    split = split_people(find_people(people), holdout, seed)
+    if assets is None:
+        train, held = (payload_sources(paths, read_person) for paths in split)
+        return train, held
+    opened = open_assets(assets)
+    train, held = (mesh_sources(opened, [read_seed(path) for path in paths], COLOURINGS) for paths in split)
+    return train, held
 
 
 def _write(path: Path, record: Mapping[str, Any]) -> None:

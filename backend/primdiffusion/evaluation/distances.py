@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-ENOUGH = 10
-"""Samples per feature; with fewer, the bias of a Frechet distance is not small beside differences between models."""
+MIN_SAMPLES_PER_DIMENSION = 10
+"""With fewer samples per feature, the bias of a Frechet distance is not small beside differences between models."""
 NEIGHBOURS = 3
 """k of precision and recall (Kynkäänniemi et al. 2019)."""
 ROWS_AT_ONCE = 512
@@ -38,12 +38,13 @@ def frechet_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) 
 
 
 def too_few_samples(first: int, second: int, features: int) -> str | None:
-    """What to know of a Frechet distance between sets of these sizes; None for sets that are large enough."""
-    if min(first, second) >= ENOUGH * features:
+    """Warning for sample sizes that bias the Frechet distance; None for sets that are large enough."""
+    fewest = MIN_SAMPLES_PER_DIMENSION * features
+    if min(first, second) >= fewest:
         return None
     return (
-        f"{min(first, second)} samples for {features} features are fewer than {ENOUGH} each ({ENOUGH * features}): the "
-        "distance is biased, so compare it only with those of sets of the same sizes"
+        f"{min(first, second)} samples for {features} features are fewer than {MIN_SAMPLES_PER_DIMENSION} each "
+        f"({fewest}): the distance is biased, so compare it only with those of sets of the same sizes"
     )
 
 
@@ -132,11 +133,20 @@ class Nearest(NamedTuple):
     index: Int[Tensor, "q"]
 
 
-def nearest(queries: Float[Tensor, "q d"], among: Float[Tensor, "n d"]) -> Nearest:
-    """Find Euclidean nearest neighbours. Raises ValueError for an empty set or features of different widths."""
+def nearest(
+    queries: Float[Tensor, "q d"], among: Float[Tensor, "n d"], left_out: Bool[Tensor, "q n"] | None = None
+) -> Nearest:
+    """Find Euclidean nearest neighbours, except pairs `left_out`.
+
+    Raises ValueError for an empty set or features of different widths.
+    """
     if queries.shape[-1] != among.shape[-1] or not len(among):
         raise ValueError(f"queries {tuple(queries.shape)} do not match the set {tuple(among.shape)}: same width, n > 0")
-    found = [torch.cdist(part.double(), among.double()).min(1) for part in queries.split(ROWS_AT_ONCE)]
+    found = []
+    for first in range(0, len(queries), ROWS_AT_ONCE):
+        rows = slice(first, first + ROWS_AT_ONCE)
+        table = torch.cdist(queries[rows].double(), among.double())
+        found.append((table if left_out is None else table.masked_fill(left_out[rows], torch.inf)).min(1))
     return Nearest(torch.cat([part.values for part in found]), torch.cat([part.indices for part in found]))
 
 

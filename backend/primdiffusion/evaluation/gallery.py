@@ -16,12 +16,12 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from primdiffusion.evaluation.images import image_over
 from primdiffusion.formats.arrays import read_arrays
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
@@ -69,27 +69,23 @@ def camera_of(portrait: Portrait, side: int = SIDE) -> Camera:
 
 
 def portraits(primitives: Primitives) -> UInt8[Tensor, "v h w 4"]:
-    """Render all views: sRGB-encoded colour premultiplied by alpha, and alpha."""
-    seen = (march(primitives, camera_of(portrait), SETTINGS) for portrait in PORTRAITS)
-    return torch.stack([_encoded(view.rgb, view.alpha) for view in seen])
+    """All views drawn by the marcher: sRGB-encoded colour over black, and alpha."""
+    seen = [march(primitives, camera_of(portrait), SETTINGS) for portrait in PORTRAITS]
+    return torch.stack([image_over(0, "", one.rgb, one.alpha, 0, view).rgba for view, one in enumerate(seen)])
 
 
 def mesh_portraits(colourings: Sequence[TexturedMesh]) -> UInt8[Tensor, "n v h w 4"]:
     """Portraits of meshes in T pose that differ only in their textures, as `portraits` of boxes."""
-    views = []
-    for portrait in PORTRAITS:
-        (seen,) = rasterise_colourings(colourings, [camera_of(portrait)], SUPERSAMPLE)
-        views.append([_encoded(torch.from_numpy(view.rgb), torch.from_numpy(view.alpha)) for view in seen])
+    seen = rasterise_colourings(colourings, [camera_of(portrait) for portrait in PORTRAITS], SUPERSAMPLE)
+    views = [
+        [image_over(0, "", torch.from_numpy(one.rgb), torch.from_numpy(one.alpha), 0, view).rgba for one in images]
+        for view, images in enumerate(seen)
+    ]
     return torch.stack([torch.stack(own) for own in zip(*views, strict=True)])
 
 
-def _encoded(rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"]) -> UInt8[Tensor, "h w 4"]:
-    rgba = torch.cat([encode_srgb(rgb.clamp(0, 1)), alpha[..., None]], dim=-1)
-    return (rgba.clamp(0, 1) * 255).round().to(torch.uint8)
-
-
 class StoredPerson(Protocol):
-    """One geometry in n colourings, as `training.latents.read_person` returns it (evaluation imports no training)."""
+    """One geometry in n colourings: `training.stored_people.PersonVariants` (evaluation imports no training)."""
 
     @property
     def voxels(self) -> UInt8[Tensor, "n k 8 8 8 4"]:
@@ -97,18 +93,12 @@ class StoredPerson(Protocol):
         ...
 
     @property
-    def delta_scale(self) -> Float[Tensor, "n k 3"]:
-        """Factors on the boxes' rest extents."""
-        ...
-
-    @property
     def betas(self) -> Float[Tensor, "10"]:
         """Body shape."""
         ...
 
-    @property
-    def full_density(self) -> float:
-        """Density that 255 encodes, 1/m."""
+    def payload(self, variant: int) -> Payload:
+        """Return one colouring."""
         ...
 
 
@@ -118,7 +108,7 @@ Report = Callable[[int, int], None]
 
 
 COLOURINGS = 2
-"""Of each mesh in a gallery."""
+"""Colourings of each mesh in a gallery."""
 
 
 def silent(done: int, total: int) -> None:
@@ -133,12 +123,6 @@ class Gallery:
     geometry: Int[Tensor, "n"]
     """Index of each sample's file; ascending."""
     attributes: tuple[dict[str, Any], ...]
-
-
-def payload_of(person: StoredPerson, colouring: int) -> Payload:
-    """Decode one colouring to linear colour and density in 1/m."""
-    voxels = person.voxels[colouring].movedim(-1, -4).float() / 255
-    return Payload(decode_srgb(voxels[:, :3]), voxels[:, 3] * person.full_density, person.delta_scale[colouring])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +143,7 @@ def payload_sources(paths: Sequence[Path], read: ReadPerson) -> list[Source]:
         person = read(path)
         frames = rest_frames(person.betas.numpy())
         return torch.stack(
-            [portraits(Primitives.place(frames, payload_of(person, number))) for number in range(len(person.voxels))]
+            [portraits(Primitives.place(frames, person.payload(number))) for number in range(len(person.voxels))]
         )
 
     return [

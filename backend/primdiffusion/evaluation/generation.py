@@ -7,7 +7,7 @@ the same way: no model can be expected to come closer.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import torch
@@ -16,14 +16,12 @@ from torch import Tensor
 
 from primdiffusion.evaluation.attribute_network import (
     AttributeNetwork,
-    accuracies,
     features_of,
-    fit_attribute_network,
     load_attribute_network,
-    save_attribute_network,
 )
 from primdiffusion.evaluation.distances import Nearest, frechet_distance, kernel_distance, nearest, precision_recall
 from primdiffusion.evaluation.gallery import Gallery, Report, Source, open_gallery, silent
+from primdiffusion.evaluation.markdown import markdown_table
 
 NETWORK_FILE = "features.safetensors"
 PORTRAITS_FOLDER = "portraits"
@@ -41,29 +39,16 @@ class ReferenceSet:
     train_features: Float[Tensor, "n f"]
     held_features: Float[Tensor, "m f"]
 
-    @property
-    def held_accuracies(self) -> dict[str, float]:
-        """Accuracy of the network's attributes on held-out samples."""
-        return accuracies(self.network, self.held_features, self.held.attributes)
-
 
 def open_reference_set(
-    train: Sequence[Source],
-    held: Sequence[Source],
-    folder: Path,
-    report: Report = silent,
-    report_epoch: Callable[[int, float], None] = lambda epoch, loss: None,
+    train: Sequence[Source], held: Sequence[Source], folder: Path, report: Report = silent
 ) -> ReferenceSet:
-    """Load portraits and network from `folder`; missing ones are rendered or trained first, which takes minutes.
+    """Load the network and portraits from `folder`; missing portraits are rendered first, which takes minutes.
 
-    Raises ValueError and FileNotFoundError for unreadable files.
+    Raises ValueError and FileNotFoundError for missing or unreadable files.
     """
+    network = load_attribute_network(folder / NETWORK_FILE)
     drawn, others = (open_gallery(sources, folder / PORTRAITS_FOLDER, report) for sources in (train, held))
-    stored = folder / NETWORK_FILE
-    if not stored.is_file():
-        network = fit_attribute_network(drawn.pictures, drawn.attributes, report=report_epoch)
-        save_attribute_network(stored, network)
-    network = load_attribute_network(stored)
     train_features, held_features = (features_of(network, gallery.pictures) for gallery in (drawn, others))
     return ReferenceSet(network, drawn, others, train_features, held_features)
 
@@ -116,26 +101,20 @@ def real_vs_real(reference: ReferenceSet, count: int) -> Comparison:
 
 def nearest_other(features: Float[Tensor, "n d"], geometry: Int[Tensor, "n"]) -> Nearest:
     """Nearest sample of another geometry: recoloured clothes do not make another human."""
-    distances, indices = [], []
-    for rows, own in zip(features.split(512), geometry.split(512), strict=True):
-        table = torch.cdist(rows.double(), features.double())
-        table[own[:, None] == geometry] = torch.inf
-        found = table.min(1)
-        distances.append(found.values)
-        indices.append(found.indices)
-    return Nearest(torch.cat(distances), torch.cat(indices))
+    return nearest(features, features, geometry[:, None] == geometry)
 
 
-COLUMNS = ("people", "frechet", "kernel", "precision", "recall", "nearest_ratio")
+COLUMNS = {
+    "people": "number",
+    "frechet": "Frechet distance",
+    "kernel": "kernel distance",
+    "precision": "precision",
+    "recall": "recall",
+    "nearest_ratio": "nearest training person",
+}
 
 
 def table(rows: Mapping[str, Comparison]) -> str:
     """Format as a Markdown table, a row a set."""
-    lines = [
-        "| people | number | Frechet distance | kernel distance | precision | recall | nearest training person |",
-        "|---" * 7 + "|",
-    ]
-    for name, row in rows.items():
-        values = [f"{getattr(row, column):.4g}" for column in COLUMNS]
-        lines.append(f"| {name} | {' | '.join(values)} |")
-    return "\n".join(lines)
+    texts = [[name, *(f"{getattr(row, column):.4g}" for column in COLUMNS)] for name, row in rows.items()]
+    return markdown_table(["people", *COLUMNS.values()], texts)

@@ -15,7 +15,7 @@ from primdiffusion.evaluation.pretrained_networks import (
     VGG16,
     Architecture,
     PictureFeatures,
-    fill,
+    load_matching,
     read_weights,
 )
 from primdiffusion.failures import optional_package
@@ -159,7 +159,7 @@ def load_lpips(paths: Sequence[Path | str]) -> Lpips:
     if first is None:
         raise FileError(source or "an empty list", "has no backbone weights", f"give {what}")
     lpips = Lpips(ALEXNET if tuple(first.shape[-2:]) == (11, 11) else VGG16)
-    fill(lpips, weights, what, source)
+    load_matching(lpips, weights, what, source)
     return lpips
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
 
-from primdiffusion.evaluation.shots import SIDE, Shot
+from primdiffusion.evaluation.images import SIDE, TestImage
 from primdiffusion.failures import optional_package
 
 Normalisation = Literal["imagenet", "half"]
@@ -31,7 +31,7 @@ POSE_SIZE, DEPTH_SIZE = (256, 192), (384, 384)
 LARGEST_SIZE = 2048
 """Height and width of a network's input, pixels."""
 COCO_FIRST, COCO_LAST = 5, 17
-"""COCO's keypoints from the left shoulder to the right ankle, in the order of `shots.JOINTS`."""
+"""COCO's keypoints from the left shoulder to the right ankle, in the order of `images.JOINTS`."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -90,18 +90,18 @@ class PoseNetwork:
 
     network: OnnxNetwork
 
-    def joints(self, shot: Shot) -> Float[Tensor, "12 2"] | None:
-        """The joints `shots.JOINTS` in pixels; None for a picture without a human. Raises ValueError."""
-        if not shot.mask.any():
+    def joints(self, image: TestImage) -> Float[Tensor, "12 2"] | None:
+        """The joints `images.JOINTS` in pixels; None for a picture without a human. Raises ValueError."""
+        if not image.mask.any():
             return None
         height, width = self.network.height, self.network.width
-        rows, columns = (shot.mask.any(1 - axis).nonzero()[:, 0] for axis in (0, 1))
+        rows, columns = (image.mask.any(1 - axis).nonzero()[:, 0] for axis in (0, 1))
         low = torch.tensor([float(columns[0]), float(rows[0])])
         high = torch.tensor([float(columns[-1]) + 1, float(rows[-1]) + 1])
         extent = BOX_PADDING * (high - low)
         scale = torch.maximum(extent[0] / width, extent[1] / height)  # pixels of the picture per pixel of the crop
         corner = (low + high) / 2 - scale * torch.tensor([width, height]) / 2
-        crop = _crop(shot, corner, float(scale), height, width)
+        crop = _crop(image, corner, float(scale), height, width)
         outputs = self.network.run(crop, "imagenet")
         found = _decoded(outputs, height, width, self.network.path)[COCO_FIRST:COCO_LAST]
         return corner + found * scale
@@ -112,11 +112,11 @@ def open_pose_network(path: Path) -> PoseNetwork:
     return PoseNetwork(open_onnx(path, POSE_SIZE))
 
 
-def _crop(shot: Shot, corner: Tensor, scale: float, height: int, width: int) -> Float[Tensor, "3 h w"]:
-    x = (corner[0] + scale * (torch.arange(width) + 0.5)) / shot.rgb.shape[1] * 2 - 1
-    y = (corner[1] + scale * (torch.arange(height) + 0.5)) / shot.rgb.shape[0] * 2 - 1
+def _crop(image: TestImage, corner: Tensor, scale: float, height: int, width: int) -> Float[Tensor, "3 h w"]:
+    x = (corner[0] + scale * (torch.arange(width) + 0.5)) / image.rgb.shape[1] * 2 - 1
+    y = (corner[1] + scale * (torch.arange(height) + 0.5)) / image.rgb.shape[0] * 2 - 1
     grid = torch.stack([x.expand(height, width), y[:, None].expand(height, width)], -1)
-    dark = 1 - shot.rgb.movedim(-1, 0)[None].float() / 255  # outside the picture is white
+    dark = 1 - image.pixels.movedim(-1, 0)[None].float() / 255  # outside the picture is white
     return 1 - functional.grid_sample(dark, grid[None], align_corners=False)[0]
 
 
@@ -154,11 +154,15 @@ class DepthNetwork:
     normalisation: Normalisation
     values: DepthValues
 
-    def inverted(self, shot: Shot) -> Float[Tensor, "h w"]:
+    def inverted(self, image: TestImage) -> Float[Tensor, "h w"]:
         """Inverted depth up to scale and offset, of the picture's size. Raises ValueError."""
         size = (self.network.height, self.network.width)
         values = functional.interpolate(
-            shot.rgb.movedim(-1, 0)[None].float() / 255, size, mode="bicubic", align_corners=False, antialias=True
+            image.pixels.movedim(-1, 0)[None].float() / 255,
+            size,
+            mode="bicubic",
+            align_corners=False,
+            antialias=True,
         )
         outputs = self.network.run(values[0].clamp(0, 1), self.normalisation)
         found = np.squeeze(outputs[0])

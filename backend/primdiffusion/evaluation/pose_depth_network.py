@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import importlib.resources
 import itertools
-import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,11 +18,11 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from primdiffusion import tensor_file
-from primdiffusion.evaluation.attribute_network import AttributeSpace, detail_energies
-from primdiffusion.evaluation.shots import JOINTS
+from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.evaluation.attribute_network import attribute_heads, detail_energies
+from primdiffusion.evaluation.images import JOINTS
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
-from primdiffusion.formats.whole_files import write_atomically
 
 INPUT = 128
 """Width and height of what the network sees, pixels: pictures are averaged down to it."""
@@ -43,7 +42,7 @@ FLAT = 1e-9
 
 
 class Seen(NamedTuple):
-    """What the network reads from pictures."""
+    """Outputs of the network for n pictures."""
 
     heatmaps: Float[Tensor, "n 12 32 32"]
     """Logits of each joint's cell."""
@@ -72,9 +71,9 @@ class Stage(nn.Module):
 class PoseDepthNetwork(nn.Module):
     """A U-Net from 128 x 128 pictures to 32 x 32 cells, with attributes predicted from its coarsest stages."""
 
-    def __init__(self, space: AttributeSpace) -> None:
+    def __init__(self, vocabulary: AttributeVocabulary) -> None:
         super().__init__()
-        self.space = space
+        self.vocabulary = vocabulary
         self.card: dict[str, Any] = {}
         self.down = nn.ModuleList(
             Stage(before, out, count) for before, out, count in zip((3, *WIDTHS), WIDTHS, (1, 1, 2, 2, 2), strict=False)
@@ -89,8 +88,7 @@ class PoseDepthNetwork(nn.Module):
         self.features = nn.Sequential(
             nn.Dropout(0.2), nn.Linear((WIDTHS[3] + WIDTHS[4]) * 4, FEATURES), nn.BatchNorm1d(FEATURES, affine=False)
         )
-        sizes = {name: len(values) for name, values in space.categories.items()} | dict.fromkeys(space.scalars, 1)
-        self.heads = nn.ModuleDict({name: nn.Linear(FEATURES, size) for name, size in sizes.items()})
+        self.heads = attribute_heads(vocabulary, FEATURES)
 
     def forward(self, pictures: Float[Tensor, "n 3 128 128"]) -> Seen:
         """Read sRGB-encoded pictures in [0, 1]."""
@@ -103,11 +101,6 @@ class PoseDepthNetwork(nn.Module):
             x = up(functional.interpolate(lateral(x), scale_factor=2.0, mode="nearest") + skip)
         cells = self.cells(x)
         return Seen(cells[:, :-1], cells[:, -1], self.features(torch.cat(pooled, 1)))
-
-    def predict(self, features: Float[Tensor, "n 64"]) -> dict[str, Tensor]:
-        """Logits of each category and standardised scalars."""
-        active = functional.relu(features)
-        return {name: head(active) for name, head in self.heads.items()}
 
 
 def shrunk(rgb: UInt8[Tensor, "h w 3"]) -> UInt8[Tensor, "3 128 128"]:
@@ -143,13 +136,6 @@ def cell_means(values: Float[Tensor, "h w"], mask: Tensor) -> Float[Tensor, "32 
     return torch.where(share >= 0.5, means / share.clamp_min(1e-6), 0.0)
 
 
-def save_pose_depth_network(path: Path, network: PoseDepthNetwork) -> None:
-    """Write the network in half precision with its card, atomically."""
-    tensors = {k: v.half() if v.is_floating_point() else v for k, v in network.state_dict().items()}
-    metadata = {"space": network.space.to_json(), "card": json.dumps(network.card)}
-    write_atomically(path, tensor_file.save(tensors, metadata=metadata))
-
-
 def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
     """Load the network that ships with the package, or another file.
 
@@ -164,8 +150,8 @@ def load_pose_depth_network(path: Path | None = None) -> PoseDepthNetwork:
     reason = "is not a network of joints and depth of this version"
     with as_file_error(path, reason, "install the package again", OSError, RuntimeError):
         tensors, metadata = tensor_file.read(path)
-        space = AttributeSpace.from_json(metadata["space"])
-        network = tensor_file.load_network(lambda: PoseDepthNetwork(space), tensors)
+        vocabulary = AttributeVocabulary.from_json(parse_json(metadata["space"]))
+        network = tensor_file.load_network(lambda: PoseDepthNetwork(vocabulary), tensors)
         network.card = dict(parse_json(metadata["card"]))
     return network.eval().requires_grad_(False)
 

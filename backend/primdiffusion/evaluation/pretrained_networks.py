@@ -128,7 +128,7 @@ def read_weights(path: Path | str) -> dict[str, Tensor]:
     return dict(content)
 
 
-def fill(network: nn.Module, weights: Mapping[str, Tensor], what: str, source: str) -> None:
+def load_matching(network: nn.Module, weights: Mapping[str, Tensor], what: str, source: str) -> None:
     """Load the weights that `network` has; extra ones, such as a classifier's, are ignored.
 
     `what` and `source` name the network and the file in messages. Raises FileError if a name is missing, a shape
@@ -147,7 +147,7 @@ def fill(network: nn.Module, weights: Mapping[str, Tensor], what: str, source: s
 
 
 Resize = Literal["torch-fidelity", "antialiased"]
-"""How pictures reach the size that a network sees: bilinear between the two nearest pixels from the corner of each, as
+"""Ways to resize pictures for a network: bilinear between the two nearest pixels from the corner of each, as
 TensorFlow 1 and torch-fidelity do, or bicubic with antialiasing, as CLIP and clean-fid do."""
 
 
@@ -291,7 +291,7 @@ def load_inception(path: Path | str, resize: Resize = "torch-fidelity") -> Incep
     network = Inception(resize)
     # Older files lack num_batches_tracked, which evaluation mode does not use.
     own = {name: value for name, value in network.state_dict().items() if name.endswith("num_batches_tracked")}
-    fill(network, {**own, **read_weights(path)}, "Inception-V3 as FID uses it", str(path))
+    load_matching(network, {**own, **read_weights(path)}, "Inception-V3 as FID uses it", str(path))
     return network
 
 
@@ -359,5 +359,5 @@ def load_clip_vision(path: Path | str, resize: Resize = "antialiased") -> ClipVi
             name = name.replace(f".{theirs}.", f".{ours}.")
         weights[name] = value.float()
     network = ClipVision(resize)
-    fill(network, weights, "CLIP's ViT-B/32", str(path))
+    load_matching(network, weights, "CLIP's ViT-B/32", str(path))
     return network

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from typing import Annotated, Protocol
 
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, BodyPose
@@ -19,11 +19,12 @@ from primdiffusion.capture.conditioning import body_betas, conditioning_views, s
 from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.reader import Captures
 from primdiffusion.evaluation.image_metrics import Lpips, bounding_box, overlap, psnr, ssim
+from primdiffusion.evaluation.images import TestImage, image_over
+from primdiffusion.evaluation.markdown import markdown_table
 from primdiffusion.formats.requests import Count
 from primdiffusion.formats.schema import Checked, Range
-from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.render.march import MarchSettings, march
 
 
 class Reconstructor(Protocol):
@@ -45,7 +46,7 @@ class Reconstructor(Protocol):
 
 @dataclasses.dataclass(frozen=True)
 class EvaluationSettings(Checked):
-    """Which images are compared, and the input of the encoder."""
+    """The images that are compared, and the input of the encoder."""
 
     subjects: tuple[str, ...] = ()
     """Names; empty: all."""
@@ -145,48 +146,43 @@ def evaluate(
             primitives = model.place(payload.to("cpu"), betas, targets.pose).to(device)
             for index, camera in enumerate(cameras):
                 view = targets.camera.map(lambda tensor, index=index: tensor[index])
-                rendering = march(primitives, view.to(device), settings.march)
+                drawn = march(primitives, view.to(device), settings.march)
+                image = image_over(0, name, drawn.rgb, drawn.alpha, frame, camera)
+                rgba = targets.rgba[index].to(device).to(image.rgb.dtype) / 255
+                target = TestImage(name, rgba[..., :3], rgba[..., 3], frame, camera)
                 yield PictureScore(
                     subject=name,
                     frame=frame,
                     camera=camera,
                     given_view=camera in given,
                     given_pose=frame == settings.given_frame,
-                    likeness=image_metrics(rendering, targets.rgba[index].to(device), lpips),
+                    likeness=image_metrics(image, target, lpips),
                 )
 
 
-def image_metrics(rendering: Rendering, rgba: UInt8[Tensor, "H W 4"], lpips: Lpips | None = None) -> ImageMetrics:
-    """Compare a render with a captured image (sRGB-encoded over black, and its mask)."""
-    image, target = picture(rendering), rgba[..., :3].to(rendering.rgb.dtype) / 255
-    mask = rgba[..., 3] >= 128
-    box = bounding_box(rgba[..., 3] > 0)
+def image_metrics(image: TestImage, target: TestImage, lpips: Lpips | None = None) -> ImageMetrics:
+    """Compare a picture with the true one; both over black."""
+    pair = image.rgb, target.rgb
+    box = bounding_box(target.alpha > 0)
+    cut = None if box is None else (box.cut(image.rgb), box.cut(target.rgb))
     return ImageMetrics(
-        psnr=float(psnr(image, target)),
-        ssim=float(ssim(image, target)),
-        psnr_box=None if box is None else float(psnr(box.cut(image), box.cut(target))),
-        ssim_box=None if box is None else float(ssim(box.cut(image), box.cut(target))),
-        mask_iou=overlap(rendering.alpha >= 0.5, mask),
-        lpips=None if lpips is None else float(lpips(image, target)),
+        psnr=float(psnr(*pair)),
+        ssim=float(ssim(*pair)),
+        psnr_box=None if cut is None else float(psnr(*cut)),
+        ssim_box=None if cut is None else float(ssim(*cut)),
+        mask_iou=overlap(image.mask, target.mask),
+        lpips=None if lpips is None else float(lpips(*pair)),
     )
-
-
-def picture(rendering: Rendering) -> Float[Tensor, "*b H W 3"]:
-    """The render over black, sRGB-encoded in [0, 1]."""
-    return encode_srgb(rendering.rgb.clamp(0, 1))
 
 
 def summary(scores: Iterable[PictureScore]) -> dict[str, Means]:
     """Average over each of the `SPLITS`."""
-    held = list(scores)
-    parts = {
-        "all": held,
-        "given_views_given_pose": [score for score in held if score.given_view and score.given_pose],
-        "novel_views_given_pose": [score for score in held if not score.given_view and score.given_pose],
-        "given_views_novel_poses": [score for score in held if score.given_view and not score.given_pose],
-        "novel_views_novel_poses": [score for score in held if not score.given_view and not score.given_pose],
-    }
-    return {name: _means([score.likeness for score in part]) for name, part in parts.items()}
+    parts: dict[str, list[ImageMetrics]] = {name: [] for name in SPLITS}
+    for score in scores:
+        views = "given_views" if score.given_view else "novel_views"
+        for name in ("all", f"{views}_given_pose" if score.given_pose else f"{views}_novel_poses"):
+            parts[name].append(score.likeness)
+    return {name: _means(part) for name, part in parts.items()}
 
 
 def _means(metrics: list[ImageMetrics]) -> Means:
@@ -199,10 +195,9 @@ def _means(metrics: list[ImageMetrics]) -> Means:
 
 def table(means: Mapping[str, Means]) -> str:
     """Format the summary as a Markdown table, a row a subset."""
-    lines = ["| pictures of | number | PSNR | SSIM | PSNR in box | SSIM in box | mask IoU | LPIPS |", "|---" * 8 + "|"]
-    formats = {"psnr": ".2f", "ssim": ".4f", "psnr_box": ".2f", "ssim_box": ".4f", "mask_iou": ".4f", "lpips": ".4f"}
+    texts = []
     for name, part in means.items():
-        figures = [getattr(part, figure) for figure in formats]
-        cells = ["-" if v is None else format(v, f) for v, f in zip(figures, formats.values(), strict=True)]
-        lines.append(f"| {SPLITS[name]} | {part.pictures} | {' | '.join(cells)} |")
-    return "\n".join(lines)
+        figures = [(getattr(part, figure), ".2f" if figure.startswith("psnr") else ".4f") for figure in FIGURES]
+        texts.append([SPLITS[name], str(part.pictures), *("-" if v is None else format(v, f) for v, f in figures)])
+    headings = ("pictures of", "number", "PSNR", "SSIM", "PSNR in box", "SSIM in box", "mask IoU", "LPIPS")
+    return markdown_table(headings, texts)

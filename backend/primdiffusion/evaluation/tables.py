@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+import math
+import statistics
+import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -15,7 +18,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from primdiffusion.device import best_device
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
+from primdiffusion.evaluation.images import SIDE, TestImage
+from primdiffusion.evaluation.markdown import markdown_table
 from primdiffusion.evaluation.onnx_networks import DepthNetwork, PoseNetwork
 from primdiffusion.evaluation.pose_depth_network import (
     PoseDepthNetwork,
@@ -27,11 +33,13 @@ from primdiffusion.evaluation.pose_depth_network import (
     shrunk,
 )
 from primdiffusion.evaluation.pretrained_networks import ClipVision, Inception
-from primdiffusion.evaluation.shots import Shot
+from primdiffusion.human import Human, framing, place
+from primdiffusion.render.march import MarchSettings, march
 
 BATCH = 16
 SMALLEST = 8
 """Fewest pictures of each set: fewer fit no Gaussian worth comparing."""
+FRAMES_TIMED = 10
 DETAIL_FLOOR = 0.05
 """Smallest standard deviation of fine detail among real pictures, as in `attribute_network`."""
 
@@ -52,16 +60,16 @@ class Cell(NamedTuple):
 
     value: float | None
     spread: float | None = None
-    """What stands after +-: the standard deviation over KID's subsets, or over pictures."""
-    why: str | None = None
+    """Standard deviation over KID's subsets, or over pictures."""
+    reason: str | None = None
     """Why there is no value."""
     note: str | None = None
-    """What to know before the value is compared with others."""
+    """Warning about comparing the value with others."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Scores:
-    """What the networks found in one set of pictures."""
+    """Features and errors that the networks found in one set of pictures."""
 
     pictures: int
     features: Mapping[str, Float[Tensor, "n d"]]
@@ -72,42 +80,42 @@ class Scores:
     """Depth error of each picture with known depth, by network: "depth" and "own"."""
 
 
-def evaluate(shots: Iterable[Shot], networks: Networks, report: Callable[[int], None] = lambda done: None) -> Scores:
+def look_at_pictures(
+    images: Iterable[TestImage], networks: Networks, report: Callable[[int], None] = lambda done: None
+) -> Scores:
     """Look at every picture once. A picture in which a network finds no human has no correct joint.
 
-    Raises ValueError for a network that does not fit, and what `shots` raises.
+    Raises ValueError for a network that does not fit, and what `images` raises.
     """
     features: dict[str, list[Tensor]] = {"own": [], "detail": []}
     correct: dict[str, list[float]] = {"own": [], "pose": []}
     depth: dict[str, list[float]] = {"own": [], "depth": []}
     count = 0
-    iterator = iter(shots)
+    iterator = iter(images)
     while batch := list(itertools.islice(iterator, BATCH)):
+        pictures = [image.pixels for image in batch]
         with torch.inference_mode():
-            seen = networks.own(torch.stack([shrunk(shot.rgb) for shot in batch]).float() / 255)
+            seen = networks.own(torch.stack([shrunk(picture) for picture in pictures]).float() / 255)
             features["own"].append(seen.features)
-            features["detail"].append(torch.stack([detail_of(shot.rgb, shot.mask) for shot in batch]))
-            pictures = torch.stack([shot.rgb for shot in batch]).float() / 255
+            details = [detail_of(picture, image.mask) for picture, image in zip(pictures, batch, strict=True)]
+            features["detail"].append(torch.stack(details))
             for name, network in (("inception", networks.inception), ("clip", networks.clip)):
                 if network is not None:
-                    features.setdefault(name, []).append(network(pictures))
+                    features.setdefault(name, []).append(network(torch.stack(pictures).float() / 255))
         found = joint_positions(seen.heatmaps)
-        for number, shot in enumerate(batch):
-            side = shot.rgb.shape[0]
-            if shot.joints is not None and shot.head_size is not None:
-                joints: dict[str, Tensor | None] = {"own": found[number] * side}
+        for number, image in enumerate(batch):
+            if image.joints is not None and image.head_size is not None:
+                joints: dict[str, Tensor | None] = {"own": found[number] * image.rgb.shape[0]}
                 if networks.pose is not None:
-                    joints["pose"] = networks.pose.joints(shot)
+                    joints["pose"] = networks.pose.joints(image)
                 for name, own in joints.items():
-                    right = (
-                        0.0 if own is None else float(correct_joints(own, shot.joints, shot.head_size).double().mean())
-                    )
-                    correct[name].append(right)
-            if shot.depth is not None:
-                cells = cell_means(torch.where(shot.mask, 1 / shot.depth, 0.0), shot.mask)
+                    right = None if own is None else correct_joints(own, image.joints, image.head_size)
+                    correct[name].append(0.0 if right is None else float(right.double().mean()))
+            if image.depth is not None:
+                cells = cell_means(torch.where(image.mask, 1 / image.depth, 0.0), image.mask)
                 errors = {"own": depth_error(seen.depth[number], 1 / cells, cells > 0)}
                 if networks.depth is not None:
-                    errors["depth"] = depth_error(networks.depth.inverted(shot), shot.depth, shot.mask)
+                    errors["depth"] = depth_error(networks.depth.inverted(image), image.depth, image.mask)
                 for name, error in errors.items():
                     if error is not None:
                         depth[name].append(error)
@@ -138,27 +146,27 @@ def compare_pictures(
     for name, values in itertools.chain(fake.features.items(), real.features.items()):
         if not torch.isfinite(values).all():
             raise ValueError(f"the {name} network gives NaN or infinite features: its weights are damaged")
-    generated, own = _own_distances(fake, real)
-    rows = {"generated": {}, "real": {}}
-    rows["generated"]["fid_clip"] = _frechet(fake, real, "clip", "--clip")
-    rows["generated"]["fid"] = _frechet(fake, real, "inception", "--inception")
-    rows["generated"]["kid"] = _kid(fake, real, kid_subsets, kid_subset_size, seed)
-    rows["real"] |= dict.fromkeys(
-        ("fid_clip", "fid", "kid"), Cell(None, why="the real pictures are what is compared with")
-    )
-    for row, judged in (("generated", fake), ("real", real)):
-        rows[row]["pckh"] = _mean(judged.correct["pose"], bool(judged.correct["own"]), "joints", "--pose", 100)
-        rows[row]["depth"] = _mean(judged.depth["depth"], bool(judged.depth["own"]), "depth", "--depth", 100)
-        rows[row]["fps"] = Cell(None, why="pictures of a folder or of meshes have no frame rate")
-        rows[row]["own_pckh"] = _mean(judged.correct["own"], bool(judged.correct["own"]), "joints", None, 100)
-        rows[row]["own_depth"] = _mean(judged.depth["own"], bool(judged.depth["own"]), "depth", None, 100)
-    rows["generated"]["own_distance"], rows["real"]["own_distance"] = generated, own
+    rows = {}
+    compared = Cell(None, reason="the real pictures are what is compared with")
+    for row, result, distance in zip(("generated", "real"), (fake, real), _own_distances(fake, real), strict=True):
+        made = row == "generated"
+        rows[row] = {
+            "fid_clip": _frechet(fake, real, "clip", "--clip") if made else compared,
+            "fid": _frechet(fake, real, "inception", "--inception") if made else compared,
+            "kid": _kid(fake, real, kid_subsets, kid_subset_size, seed) if made else compared,
+            "pckh": _mean(result.correct["pose"], result.correct["own"], "joints", "--pose"),
+            "depth": _mean(result.depth["depth"], result.depth["own"], "depth", "--depth"),
+            "fps": Cell(None, reason="pictures of a folder or of meshes have no frame rate"),
+            "own_pckh": _mean(result.correct["own"], result.correct["own"], "joints"),
+            "own_depth": _mean(result.depth["own"], result.depth["own"], "depth"),
+            "own_distance": distance,
+        }
     return rows
 
 
 def _frechet(fake: Scores, real: Scores, name: str, option: str) -> Cell:
     if name not in fake.features:
-        return Cell(None, why=f"no weights file: name one with {option}")
+        return Cell(None, reason=f"no weights file: name one with {option}")
     return _distance(fake.features[name], real.features[name])
 
 
@@ -168,26 +176,27 @@ def _distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> Cell
 
 def _kid(fake: Scores, real: Scores, subsets: int, size: int, seed: int) -> Cell:
     if "inception" not in fake.features:
-        return Cell(None, why="no weights file: name one with --inception")
+        return Cell(None, reason="no weights file: name one with --inception")
     if min(fake.pictures, real.pictures) < size:
         return Cell(
             None,
-            why=f"subsets of {size} need as many pictures, there are {fake.pictures} generated and {real.pictures} "
+            reason=f"subsets of {size} need as many pictures, there are {fake.pictures} generated and {real.pictures} "
             "real: raise --count or lower --kid-subset-size",
         )
     found = kernel_distance_of_subsets(fake.features["inception"], real.features["inception"], subsets, size, seed)
     return Cell(100 * found.mean, 100 * found.std)
 
 
-def _mean(values: Sequence[float], has_truth: bool, truth: str, option: str | None, factor: float) -> Cell:
-    """Mean over pictures and its standard deviation."""
-    if not has_truth:
+def _mean(values: Sequence[float], known: Sequence[float], truth: str, option: str = "") -> Cell:
+    """100 times the mean over pictures, and its standard deviation; `known` is empty for pictures without truth."""
+    if not known:
         return Cell(
-            None, why=f"the {truth} of these pictures are not known: docs/design/evaluation.md says where to put them"
+            None,
+            reason=f"the {truth} of these pictures are not known: docs/design/evaluation.md says where to put them",
         )
     if not values:
-        return Cell(None, why=f"no weights file: name one with {option}")
-    found = factor * torch.tensor(values, dtype=torch.float64)
+        return Cell(None, reason=f"no weights file: name one with {option}")
+    found = 100 * torch.tensor(values, dtype=torch.float64)
     return Cell(float(found.mean()), float(found.std(correction=0)))
 
 
@@ -204,6 +213,32 @@ def _own_distances(fake: Scores, real: Scores) -> tuple[Cell, Cell]:
     spread = torch.linspace(0, len(made) - 1, count).long()
     second = true[-count:]
     return _distance(made[spread], second), _distance(true[:count], second)
+
+
+def frames_per_second(human: Human, settings: MarchSettings) -> Cell:
+    """Frames of 512 x 512 that the marcher draws of a generated human in a second: the median, after one not timed.
+
+    Boxes are placed once; the spread is over frames.
+    """
+    device = best_device()
+    primitives = place(human).to(device)
+    seconds = []
+    for number in range(FRAMES_TIMED + 1):
+        camera = framing(primitives, 360 * number / FRAMES_TIMED, SIDE, SIDE)
+        start = time.perf_counter()
+        march(primitives, camera, settings)
+        if device.type == "cuda":
+            torch.cuda.synchronize()
+        seconds.append(time.perf_counter() - start)
+    rates = [1 / one for one in seconds[1:]]
+    return Cell(statistics.median(rates), statistics.pstdev(rates))
+
+
+def resolution_of(human: Human) -> str:
+    """The paper's way to state it: all boxes side by side, e.g. 256 x 256 x 8 for 32 x 32 boxes of 8^3 voxels."""
+    boxes, side = human.payload.density.shape[-4], human.payload.density.shape[-1]
+    across = math.isqrt(boxes) * side
+    return f"{across} x {across} x {side}" if math.isqrt(boxes) ** 2 == boxes else f"{boxes} x {side}^3"
 
 
 COLUMNS = {
@@ -253,7 +288,7 @@ def remarks(rows: Mapping[str, Mapping[str, Cell]]) -> list[str]:
     return found
 
 
-def floor_cells(card: Mapping[str, Any]) -> dict[str, Cell]:
+def reference_cells(card: Mapping[str, Any]) -> dict[str, Cell]:
     """The own network's errors on renders of held-out meshes, from its card: no model can be expected to have less."""
     errors = card["errors"]
     return {"own_pckh": Cell(errors["pckh"]), "own_depth": Cell(errors["depth"])}
@@ -264,18 +299,17 @@ def table(
 ) -> str:
     """Format as Markdown: the table, every choice, `remarks`, and a sentence for each empty column of the first row."""
     columns = OF_TABLE[number]
-    names = ["pictures", *(["resolution"] if number == 2 else []), *(COLUMNS[column] for column in columns)]
-    lines = [f"| {' | '.join(names)} |", "|---" * len(names) + "|"]
-    for row, cells in rows.items():
-        texts = [row, *([(resolution or "-") if row == "generated" else "-"] if number == 2 else [])]
-        lines.append(f"| {' | '.join(texts + [_text(cells.get(column)) for column in columns])} |")
+    resolutions = {row: [(resolution or "-") if row == "generated" else "-"] if number == 2 else [] for row in rows}
+    texts = [[row, *resolutions[row], *(_text(cells.get(column)) for column in columns)] for row, cells in rows.items()]
+    headings = ["pictures", *(["resolution"] if number == 2 else []), *(COLUMNS[column] for column in columns)]
+    lines = [markdown_table(headings, texts)]
     lines += ["", *(f"{name}: {_plain(value)}" for name, value in choices.items())]
     said = remarks({row: {name: cells[name] for name in columns if name in cells} for row, cells in rows.items()})
     lines += ["", *said] if said else []
     first = next(iter(rows.values()))
-    missing = {COLUMNS[column]: first[column].why for column in columns if first[column].value is None}
+    missing = {COLUMNS[column]: first[column].reason for column in columns if first[column].value is None}
     if missing:
-        lines += ["", *(f"{name} is empty: {why}." for name, why in missing.items())]
+        lines += ["", *(f"{name} is empty: {reason}." for name, reason in missing.items())]
     return "\n".join(lines)
 
 

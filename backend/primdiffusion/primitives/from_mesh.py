@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float32, Float64, Int32
 
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.primitives.primitives import Frames, Payload, S
-from primdiffusion.raster.rasterise import Fragments, OrthographicView, TriangleSoup, draw, flatten, view_along
+from primdiffusion.raster.shade import Fragments, OrthographicView, TriangleSoup, draw, flatten, view_along
 from primdiffusion.raster.textures import mip_levels
 
 DIRECTIONS = (

@@ -24,26 +24,7 @@ BYTE_OF_LINEAR = np.round(encode_srgb(np.arange(BYTE_STEPS) / (BYTE_STEPS - 1)) 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Textures:
-    """The textures of all parts of a mesh, row after row, in one array."""
-
-    rgba: UInt8[np.ndarray, "texels 4"]
-    """sRGB-encoded colour and straight alpha."""
-    start: Int64[np.ndarray, "P"]
-    """First texel of each part."""
-    size: Int32[np.ndarray, "P 2"]
-    """Rows and columns."""
-    cut_out: Bool[np.ndarray, "P"]
-    """Whether any texel may fail the alpha test."""
-
-
-NO_TEXTURES = Textures(
-    np.zeros((0, 4), np.uint8), np.zeros(0, np.int64), np.zeros((0, 2), np.int32), np.zeros(0, np.bool_)
-)
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class TexturePyramid:
-    """The textures of all parts at all levels, row after row, in one array."""
+    """The textures of all parts of a mesh at all levels, row after row, in one array."""
 
     rgba: UInt8[np.ndarray, "texels 4"]
     """sRGB-encoded colour and straight alpha."""
@@ -56,27 +37,14 @@ class TexturePyramid:
     cut_out: Bool[np.ndarray, "P"]
     """Whether any texel is not fully opaque."""
 
-    @property
-    def full_size(self) -> Textures:
-        """The textures themselves, without their halvings."""
-        start, size = np.ascontiguousarray(self.start[:, 0]), np.ascontiguousarray(self.size[:, 0])
-        return Textures(self.rgba, start, size, self.cut_out)
+
+NO_TEXTURES = Textures(
+    np.zeros((0, 4), np.uint8), np.zeros((0, LEVELS), np.int64), np.zeros((0, LEVELS, 2), np.int32),
+    np.zeros(0, np.int32), np.zeros(0, np.bool_),
+)  # fmt: skip
 
 
 def gather_textures(mesh: TexturedMesh) -> Textures:
-    """The textures of a mesh, one after the other. Raises ValueError if one is empty."""
-    _check_textures(mesh)
-    textures, which = _distinct(mesh)
-    flat = [np.ascontiguousarray(texture).reshape(-1, 4) for texture in textures]
-    return Textures(
-        rgba=np.concatenate(flat),
-        start=np.cumsum([0] + [len(texels) for texels in flat])[:-1].astype(np.int64)[which],
-        size=np.array([texture.shape[:2] for texture in textures], np.int32)[which],
-        cut_out=np.array([bool(texels[:, 3].min() < ALPHA_TEST) for texels in flat])[which],
-    )
-
-
-def texture_pyramid(mesh: TexturedMesh) -> TexturePyramid:
     """Each part's texture and its halvings, averaged in linear colour weighted by alpha so that holes tint nothing.
 
     Raises ValueError if a texture is empty.
@@ -98,7 +66,7 @@ def texture_pyramid(mesh: TexturedMesh) -> TexturePyramid:
             texels += rows * columns
     last = np.array([len(levels) - 1 for levels in sizes], np.int32)
     cut_out = np.array([bool(texture[..., 3].min() < 255) for texture in textures])
-    return TexturePyramid(rgba, start[which], size[which], last[which], cut_out[which])
+    return Textures(rgba, start[which], size[which], last[which], cut_out[which])
 
 
 def _distinct(mesh: TexturedMesh) -> tuple[list[UInt8[np.ndarray, "H W 4"]], Int64[np.ndarray, "P"]]:
@@ -142,12 +110,8 @@ def _check_textures(mesh: TexturedMesh) -> None:
 
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
-def alpha_at(u, v, rgba, start, rows, columns, bilinear):
+def alpha_at(u, v, rgba, start, rows, columns):
     """Alpha (of 255) of a texture at (u, v), which wrap around; v up."""
-    if not bilinear:
-        row = min(int((1.0 - (v - np.floor(v))) * rows), rows - 1)
-        column = min(int((u - np.floor(u)) * columns), columns - 1)
-        return np.float32(rgba[start + row * columns + column, 3])
     x0, x1, y0, y1, wx, wy = texels_around(u, v, rows, columns)
     above, below, one = start + y0 * columns, start + y1 * columns, np.float32(1)
     upper = np.float32(rgba[above + x0, 3]) * (one - wx) + np.float32(rgba[above + x1, 3]) * wx

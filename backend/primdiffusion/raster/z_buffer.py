@@ -45,8 +45,7 @@ class AlphaTest:
     part: Int32[ndarray, "f"]
     """Index of a triangle's texture."""
     textures: Textures
-    bilinear: bool = False
-    """Interpolate alpha between texels instead of taking that of the nearest."""
+    """Alpha is interpolated between texels."""
 
 
 NO_TEST = AlphaTest(np.zeros((0, 3, 2), np.float32), np.zeros(0, np.int32), NO_TEXTURES)
@@ -103,8 +102,7 @@ def z_buffer(
     textures = alpha_test.textures
     _rasterise(
         points, faces, float(clip[0]), float(clip[1]), parallel, slack, alpha_test.corner_uv, alpha_test.part,
-        textures.rgba, textures.start, textures.size, textures.cut_out, alpha_test.bilinear,
-        nearest.triangle, nearest.depth,
+        textures.rgba, textures.start, textures.size, textures.cut_out, nearest.triangle, nearest.depth,
     )  # fmt: skip
     return nearest
 
@@ -124,7 +122,7 @@ def barycentrics(
 
 @numba.njit(cache=True, nogil=True, error_model="numpy")
 def _rasterise(
-    points, faces, near, far, parallel, slack, corner_uv, part, rgba, start, size, cut_out, bilinear, triangle, depth
+    points, faces, near, far, parallel, slack, corner_uv, part, rgba, start, size, cut_out, triangle, depth
 ):  # fmt: skip
     height, width = triangle.shape
     for f in range(len(faces)):
@@ -156,7 +154,7 @@ def _rasterise(
                     u = a * corner_uv[f, 0, 0] + b * corner_uv[f, 1, 0] + c * corner_uv[f, 2, 0]
                     v = a * corner_uv[f, 0, 1] + b * corner_uv[f, 1, 1] + c * corner_uv[f, 2, 1]
                     n = part[f]
-                    if alpha_at(u, v, rgba, start[n], size[n, 0], size[n, 1], bilinear) < 127.5:
+                    if alpha_at(u, v, rgba, start[n, 0], size[n, 0, 0], size[n, 0, 1]) < 127.5:
                         continue
                 depth[row, column] = z
                 triangle[row, column] = f

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from primdiffusion.evaluation.pretrained_networks import VGG19, PictureFeatures, fill, read_weights
+from primdiffusion.evaluation.pretrained_networks import VGG19, PictureFeatures, load_matching, read_weights
 from primdiffusion.training.fit_config import LossConfig
 
 RESIDUAL = 255 / 16
@@ -130,5 +130,5 @@ def load_perceptual(
         ValueError: as `PerceptualLoss`.
     """
     loss = PerceptualLoss(layers, weights)
-    fill(loss.network, read_weights(path), "torchvision's VGG19", str(path))
+    load_matching(loss.network, read_weights(path), "torchvision's VGG19", str(path))
     return loss

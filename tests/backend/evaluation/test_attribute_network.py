@@ -1,11 +1,21 @@
-"""Detail in portraits: what blur takes away, and what it does not depend on."""
+"""The feature space of attributes: what is learned and stored, and detail in portraits, which blur takes away."""
 
 import pytest
 import torch
-from primdiffusion.evaluation.attribute_network import BANDS, detail_energies, features_of, fit_attribute_network
+from primdiffusion.evaluation.attribute_network import BANDS, detail_energies, features_of, load_attribute_network
 from primdiffusion.evaluation.distances import frechet_distance
 from primdiffusion.evaluation.gallery import PORTRAITS
 from torch.nn import functional
+
+from scripts.train_attribute_network import (
+    UNKNOWN,
+    accuracies,
+    category,
+    fit_attribute_network,
+    labels_of,
+    save_attribute_network,
+    visible_vocabulary,
+)
 
 SIDE = 96
 
@@ -51,3 +61,66 @@ def test_blurred_figures_are_far_from_sharp_ones_in_feature_space():
     network = fit_attribute_network(sharp, attributes, epochs=1)
     real, same, soft = (features_of(network, pictures) for pictures in (sharp, others, blurred(others)))
     assert frechet_distance(soft, real) > 5 * frechet_distance(same, real)
+
+
+def test_categories_are_what_can_be_seen():
+    person = {"pattern": "solid, bands", "hair": "none", "hair_colour": "red", "sex": "female"}
+    assert category(person, "pattern") == "bands"
+    assert category({"pattern": "solid"}, "pattern") == "solid"
+    assert category(person, "hair_colour") is None
+    assert category(person, "shoes") is None
+
+
+def test_values_that_no_training_person_has_are_unknown():
+    known = visible_vocabulary([{"sex": "male", "height": 1.6}, {"sex": "female", "height": 1.8}])
+    labels = labels_of(known, [{"sex": "other", "height": 1.9}, {"sex": "female"}])
+    assert labels["sex"].tolist() == [UNKNOWN, known.categories["sex"].index("female")]
+    assert float(labels["height"][0]) == pytest.approx(2.0, rel=1e-5)
+    assert labels["height"][1].isnan()
+
+
+def painted(count: int, seed: int) -> tuple[torch.Tensor, list[dict[str, object]]]:
+    """Pictures that are red or blue, as bright as the person is tall."""
+    generator = torch.Generator().manual_seed(seed)
+    sex, height = torch.randint(2, (count,), generator=generator), 1.5 + 0.5 * torch.rand(count, generator=generator)
+    pictures = torch.zeros(count, 4, 32, 32, 4, dtype=torch.uint8)
+    for number in range(count):
+        pictures[number, :, 8:24, 8:24, 2 * int(sex[number])] = round(255 * (float(height[number]) - 1.3))
+    people = [{"sex": "fm"[int(s)], "height": float(h)} for s, h in zip(sex, height, strict=True)]
+    return pictures, people
+
+
+@pytest.fixture(scope="module")
+def trained():
+    pictures, people = painted(64, 0)
+    return fit_attribute_network(pictures, people, epochs=20, batch=16)
+
+
+def test_network_learns_what_can_be_seen(trained):
+    pictures, people = painted(32, 1)
+    right = accuracies(trained, features_of(trained, pictures), people)
+    assert right["sex"] == 1.0
+    assert right["height"] > 0.5
+
+
+def test_features_vary_by_one_over_the_people_they_were_trained_on(trained):
+    pictures, _ = painted(64, 0)
+    assert float(features_of(trained, pictures).std(0).median()) == pytest.approx(1, abs=0.3)
+
+
+def test_network_is_the_same_for_a_seed_and_leaves_torchs_random_state():
+    pictures, people = painted(16, 0)
+    before = torch.get_rng_state()
+    first, second = (fit_attribute_network(pictures, people, epochs=1, batch=8) for _ in range(2))
+    assert torch.equal(before, torch.get_rng_state())
+    assert torch.equal(features_of(first, pictures), features_of(second, pictures))
+
+
+def test_network_is_stored_with_its_attributes(trained, tmp_path):
+    trained.card = {"accuracy": {"sex": 1.0}}
+    save_attribute_network(tmp_path / "new" / "features.safetensors", trained)
+    again = load_attribute_network(tmp_path / "new" / "features.safetensors")
+    assert (again.vocabulary, again.card) == (trained.vocabulary, trained.card)
+    pictures, _ = painted(4, 2)
+    near = features_of(trained, pictures)
+    assert torch.allclose(features_of(again, pictures), near, atol=2e-2 * float(near.abs().max()))

@@ -1,4 +1,4 @@
-"""Distances of sets of people, the feature space they are taken in, and the nearest training people."""
+"""Distances of sets of people, and the nearest training people."""
 
 import itertools
 import math
@@ -7,16 +7,6 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from primdiffusion.evaluation.attribute_network import (
-    UNKNOWN,
-    accuracies,
-    attribute_space,
-    category,
-    features_of,
-    fit_attribute_network,
-    load_attribute_network,
-    save_attribute_network,
-)
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance, nearest, precision_recall
 from primdiffusion.evaluation.generation import nearest_other
 from support.errors import refused
@@ -107,65 +97,3 @@ def test_sets_that_cannot_be_compared_are_named(first, second):
 def test_precision_needs_more_people_than_neighbours():
     with refused(ValueError, "3 neighbours"):
         precision_recall(draws(3, 2, 0), draws(9, 2, 1))
-
-
-def test_categories_are_what_can_be_seen():
-    person = {"pattern": "solid, bands", "hair": "none", "hair_colour": "red", "sex": "female"}
-    assert category(person, "pattern") == "bands"
-    assert category({"pattern": "solid"}, "pattern") == "solid"
-    assert category(person, "hair_colour") is None
-    assert category(person, "shoes") is None
-
-
-def test_values_that_no_training_person_has_are_unknown():
-    space = attribute_space([{"sex": "male", "height": 1.6}, {"sex": "female", "height": 1.8}])
-    labels = space.labels([{"sex": "other", "height": 1.9}, {"sex": "female"}])
-    assert labels["sex"].tolist() == [UNKNOWN, space.categories["sex"].index("female")]
-    assert float(labels["height"][0]) == pytest.approx(2.0, rel=1e-5)
-    assert labels["height"][1].isnan()
-
-
-def painted(count: int, seed: int) -> tuple[torch.Tensor, list[dict[str, object]]]:
-    """Pictures that are red or blue, as bright as the person is tall."""
-    generator = torch.Generator().manual_seed(seed)
-    sex, height = torch.randint(2, (count,), generator=generator), 1.5 + 0.5 * torch.rand(count, generator=generator)
-    pictures = torch.zeros(count, 4, 32, 32, 4, dtype=torch.uint8)
-    for number in range(count):
-        pictures[number, :, 8:24, 8:24, 2 * int(sex[number])] = round(255 * (float(height[number]) - 1.3))
-    people = [{"sex": "fm"[int(s)], "height": float(h)} for s, h in zip(sex, height, strict=True)]
-    return pictures, people
-
-
-@pytest.fixture(scope="module")
-def trained():
-    pictures, people = painted(64, 0)
-    return fit_attribute_network(pictures, people, epochs=20, batch=16)
-
-
-def test_network_learns_what_can_be_seen(trained):
-    pictures, people = painted(32, 1)
-    right = accuracies(trained, features_of(trained, pictures), people)
-    assert right["sex"] == 1.0
-    assert right["height"] > 0.5
-
-
-def test_features_vary_by_one_over_the_people_they_were_trained_on(trained):
-    pictures, _ = painted(64, 0)
-    assert float(features_of(trained, pictures).std(0).median()) == pytest.approx(1, abs=0.3)
-
-
-def test_network_is_the_same_for_a_seed_and_leaves_torchs_random_state():
-    pictures, people = painted(16, 0)
-    before = torch.get_rng_state()
-    first, second = (fit_attribute_network(pictures, people, epochs=1, batch=8) for _ in range(2))
-    assert torch.equal(before, torch.get_rng_state())
-    assert torch.equal(features_of(first, pictures), features_of(second, pictures))
-
-
-def test_network_is_stored_with_its_attributes(trained, tmp_path):
-    save_attribute_network(tmp_path / "new" / "features.safetensors", trained)
-    again = load_attribute_network(tmp_path / "new" / "features.safetensors")
-    assert again.space == trained.space
-    pictures, _ = painted(4, 2)
-    near = features_of(trained, pictures)
-    assert torch.allclose(features_of(again, pictures), near, atol=2e-2 * float(near.abs().max()))

@@ -15,7 +15,6 @@ from primdiffusion.evaluation.gallery import (
     made_gallery,
     mesh_sources,
     open_gallery,
-    payload_of,
     payload_sources,
     read_seed,
 )
@@ -28,6 +27,8 @@ from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
 from support.errors import refused
 from tiny_model import tiny_model
+
+from scripts.train_attribute_network import accuracies, train_reference
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -55,7 +56,9 @@ def reference_folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def reference(people, reference_folder):
     train, held = split_people(find_people(people), 0.34, 0)
-    return open_reference_set(payload_sources(train, read_person), payload_sources(held, read_person), reference_folder)
+    sources = [payload_sources(paths, read_person) for paths in (train, held)]
+    train_reference(*sources, reference_folder)
+    return open_reference_set(*sources, reference_folder)
 
 
 def test_cameras_see_the_parts_they_are_named_for():
@@ -94,7 +97,7 @@ def test_damaged_portraits_are_drawn_again(people, tmp_path):
 def test_stored_portraits_are_of_the_stored_payload(people, tmp_path):
     path = find_people(people)[3]
     person = read_person(path)
-    drawn = made_gallery([Primitives.place(rest_frames(person.betas.numpy()), payload_of(person, 1))])
+    drawn = made_gallery([Primitives.place(rest_frames(person.betas.numpy()), person.payload(1))])
     assert torch.equal(open_gallery(payload_sources([path], read_person), tmp_path).pictures[1], drawn[0])
     assert int((drawn[..., 3] > 128).sum()) > 500
 
@@ -164,7 +167,15 @@ def test_command_compares_generated_people_and_writes_figures(people, reference,
     figures = json.loads((tmp_path / "new" / "figures.json").read_text())
     assert set(figures["people"]) == {"generated", "trained on"}
     assert set(figures["people"]["generated"]) == set(COLUMNS)
-    assert figures["feature_accuracy"] == reference.held_accuracies
+    held = accuracies(reference.network, reference.held_features, reference.held.attributes)
+    assert figures["feature_accuracy"] == held
+
+
+def test_command_names_the_script_that_trains_a_missing_network(people, tmp_path):
+    line = ["generation", "--people", str(people), "--reference", str(tmp_path), "--holdout", "0.34", "--count", "5"]
+    with refused(FileNotFoundError, "scripts/train_attribute_network.py"):
+        command.run(line)
+    assert not list(tmp_path.iterdir())
 
 
 def test_command_rejects_too_few_people_before_it_works(people, tmp_path):

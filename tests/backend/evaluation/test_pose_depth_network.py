@@ -4,6 +4,7 @@ import importlib.resources
 
 import pytest
 import torch
+from primdiffusion.evaluation.images import JOINTS
 from primdiffusion.evaluation.pose_depth_network import (
     CELLS,
     INPUT,
@@ -11,24 +12,23 @@ from primdiffusion.evaluation.pose_depth_network import (
     cell_means,
     joint_positions,
     load_pose_depth_network,
-    save_pose_depth_network,
 )
-from primdiffusion.evaluation.shots import JOINTS
 from primdiffusion.people.assets import open_assets
 
 from scripts.train_pose_depth_network import (
     SWAPPED,
-    TrainingShots,
+    TrainingImages,
     augmented,
     fit_pose_depth_network,
     held_out_errors,
     inverted_depth_loss,
     joint_loss,
-    training_shots,
+    save_pose_depth_network,
+    training_images,
 )
 
 
-def dots(count: int) -> TrainingShots:
+def dots(count: int) -> TrainingImages:
     """Pictures of dark squares around the first joint."""
     generator = torch.Generator().manual_seed(0)
     joints = 0.3 + 0.4 * torch.rand(count, 12, 2, generator=generator)
@@ -38,7 +38,7 @@ def dots(count: int) -> TrainingShots:
         pictures[number, :, y - 8 : y + 8, x - 8 : x + 8] = 40
         inverted[number, y // 4 - 2 : y // 4 + 2, x // 4 - 2 : x // 4 + 2] = 0.25 + 0.01 * torch.rand(4, 4)
     attributes = tuple({"sex": ("male", "female")[number % 2], "height": 1.6 + number / 100} for number in range(count))
-    return TrainingShots(pictures, joints, torch.full((count,), 0.05), inverted, attributes)
+    return TrainingImages(pictures, joints, torch.full((count,), 0.05), inverted, attributes)
 
 
 def test_joints_are_read_between_cells():
@@ -73,10 +73,10 @@ def test_cells_are_means_of_what_shows_the_human():
 
 
 def test_mirrored_and_moved_pictures_keep_their_joints():
-    shots = dots(4)
+    images = dots(4)
     assert [JOINTS[number] for number in SWAPPED[:2]] == ["right_shoulder", "left_shoulder"]
     for seed in range(4):
-        pictures, joints, inverted = augmented(shots, torch.arange(4), torch.Generator().manual_seed(seed))
+        pictures, joints, inverted = augmented(images, torch.arange(4), torch.Generator().manual_seed(seed))
         for picture, own, depth in zip(pictures, joints, inverted, strict=True):
             row, column = (picture.mean(0) < 0.6).nonzero().float().mean(0)
             middle = torch.stack([column + 0.5, row + 0.5]) / INPUT
@@ -87,10 +87,10 @@ def test_mirrored_and_moved_pictures_keep_their_joints():
 
 
 def test_training_is_deterministic_and_survives_its_file(tmp_path):
-    shots = dots(8)
+    images = dots(8)
     losses = []
     networks = [
-        fit_pose_depth_network(shots, epochs=2, batch=8, report=lambda _, loss: losses.append(loss)) for _ in range(2)
+        fit_pose_depth_network(images, epochs=2, batch=8, report=lambda _, loss: losses.append(loss)) for _ in range(2)
     ]
     assert losses[:2] == losses[2:]
     first, second = (network.state_dict() for network in networks)
@@ -99,7 +99,7 @@ def test_training_is_deterministic_and_survives_its_file(tmp_path):
     save_pose_depth_network(tmp_path / "own.safetensors", networks[0])
     loaded = load_pose_depth_network(tmp_path / "own.safetensors")
     assert loaded.card == {"errors": {"pckh": 50.0}}
-    pictures = shots.pictures.float() / 255
+    pictures = images.pictures.float() / 255
     expected, found = networks[0](pictures), loaded(pictures)
     assert torch.allclose(expected.heatmaps, found.heatmaps, atol=0.05)
 
@@ -113,6 +113,6 @@ def test_the_weights_that_ship_are_small_and_as_good_as_their_card_says():
         assets = open_assets()
     except FileNotFoundError as error:
         pytest.skip(str(error))
-    errors = held_out_errors(network, training_shots(assets, [3_100_000, 3_100_001], 16), PCK_SHARE)
+    errors = held_out_errors(network, training_images(assets, [3_100_000, 3_100_001], 16), PCK_SHARE)
     assert errors["pckh"] > stated["pckh"] - 20
     assert errors["depth"] < 2 * stated["depth"]

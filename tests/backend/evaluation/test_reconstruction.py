@@ -1,6 +1,5 @@
 """Evaluation of reconstructions, by a model that needs no training: grey boxes on the body."""
 
-import dataclasses
 import json
 
 import pytest
@@ -10,6 +9,8 @@ from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.conditioning import spread_cameras
 from primdiffusion.capture.reader import open_captures
+from primdiffusion.evaluation.images import TestImage as Picture
+from primdiffusion.evaluation.images import image_over
 from primdiffusion.evaluation.reconstruction import (
     SPLITS,
     EvaluationSettings,
@@ -17,15 +18,14 @@ from primdiffusion.evaluation.reconstruction import (
     PictureScore,
     evaluate,
     image_metrics,
-    picture,
     summary,
     table,
 )
-from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import pose_body
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.primitives import K, Payload, Primitives
-from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.render.march import MarchSettings, march
 from support.errors import refused
 from tiny_encoder import save_tiny_encoder
 
@@ -101,7 +101,7 @@ def test_scores_are_those_of_the_drawn_pictures(scored, captures):
     seen = captures.view(score.subject, score.frame, score.camera)
     model = Grey()
     primitives = model.place(model.encode(None, None), seen.betas, seen.pose)
-    image = picture(march(primitives, seen.camera, COARSE))
+    image = encode_srgb(march(primitives, seen.camera, COARSE).rgb.clamp(0, 1))
     error = (image - seen.image / 255).square().mean()
     assert score.likeness.psnr == pytest.approx(float(-10 * error.log10()), abs=1e-3)
 
@@ -138,15 +138,19 @@ def test_impossible_settings_are_rejected(name, value):
         EvaluationSettings(**{name: value})
 
 
-def rendered(rgba):
-    """A rendering that looks like a captured picture."""
-    zeros = torch.zeros(rgba.shape[:2])
-    return Rendering(decode_srgb(rgba[..., :3].float() / 255), rgba[..., 3].float() / 255, zeros, zeros)
+def captured_image(rgba):
+    """A captured picture."""
+    return Picture("a", rgba[..., :3] / 255, rgba[..., 3] / 255)
+
+
+def drawn_image(rgba):
+    """A render that looks like a captured picture."""
+    return image_over(0, "a", decode_srgb(rgba[..., :3].float() / 255), rgba[..., 3].float() / 255, 0, 0)
 
 
 def test_a_picture_is_most_like_itself():
     rgba = torch.randint(0, 256, (24, 20, 4), dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
-    metrics = image_metrics(rendered(rgba), rgba)
+    metrics = image_metrics(drawn_image(rgba), captured_image(rgba))
     assert metrics.psnr > 90
     assert metrics.ssim == pytest.approx(1, abs=1e-5)
     assert metrics.mask_iou == 1
@@ -157,7 +161,7 @@ def test_the_box_leaves_out_what_is_black_around_the_person():
     rgba[10:30, 5:25] = 255
     other = rgba.clone()
     other[10:20, 5:25, 0] = 128
-    metrics = image_metrics(rendered(other), rgba)
+    metrics = image_metrics(drawn_image(other), captured_image(rgba))
     quarter = 20 * 20 / 40**2
     assert metrics.psnr_box == pytest.approx(metrics.psnr + 10 * torch.tensor(quarter).log10().item(), abs=1e-3)
     assert metrics.ssim_box < metrics.ssim
@@ -165,14 +169,14 @@ def test_the_box_leaves_out_what_is_black_around_the_person():
 
 def test_an_empty_picture_has_no_box():
     rgba = torch.zeros(16, 16, 4, dtype=torch.uint8)
-    metrics = image_metrics(rendered(rgba), rgba)
+    metrics = image_metrics(drawn_image(rgba), captured_image(rgba))
     assert (metrics.psnr_box, metrics.ssim_box, metrics.mask_iou) == (None, None, 1)
 
 
 def test_colours_beyond_white_are_white():
     rgba = torch.full((12, 12, 4), 255, dtype=torch.uint8)
-    bright = dataclasses.replace(rendered(rgba), rgb=torch.full((12, 12, 3), 7.0))
-    assert image_metrics(bright, rgba).psnr == 100
+    bright = image_over(0, "a", torch.full((12, 12, 3), 7.0), torch.ones(12, 12), 0, 0)
+    assert image_metrics(bright, captured_image(rgba)).psnr == 100
 
 
 def score(psnr, given_view, given_pose, box=None):

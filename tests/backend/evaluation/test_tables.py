@@ -8,9 +8,9 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.commands import evaluate as command
-from primdiffusion.commands import evaluate_tables
+from primdiffusion.evaluation.images import JOINTS, SIDE
+from primdiffusion.evaluation.images import TestImage as Picture
 from primdiffusion.evaluation.pose_depth_network import joint_positions, load_pose_depth_network, shrunk
-from primdiffusion.evaluation.shots import JOINTS, SIDE, Shot
 from primdiffusion.evaluation.tables import (
     COLUMNS,
     OF_TABLE,
@@ -19,7 +19,7 @@ from primdiffusion.evaluation.tables import (
     Scores,
     check_counts,
     compare_pictures,
-    evaluate,
+    look_at_pictures,
     remarks,
     table,
 )
@@ -35,7 +35,7 @@ def judged(count: int, seed: int, shift: float = 0.0, **lists: list[float]) -> S
     return Scores(count, features, values, values)
 
 
-def shots(count: int, seed: int) -> list[Shot]:
+def images(count: int, seed: int) -> list[Picture]:
     """Boxes in random places; a plane of depth."""
     generator = torch.Generator().manual_seed(seed)
     found = []
@@ -46,14 +46,15 @@ def shots(count: int, seed: int) -> list[Shot]:
         shade = torch.randint(0, 200, (SIDE, SIDE, 3), generator=generator, dtype=torch.uint8)
         depth = torch.where(mask, torch.linspace(3, 4, SIDE)[:, None], torch.inf)
         joints = torch.tensor([left, top]) + 100 * torch.rand(len(JOINTS), 2, generator=generator)
-        found.append(Shot(str(number), torch.where(mask[..., None], shade, 255), mask, joints, 30.0, depth))
+        rgb = torch.where(mask[..., None], shade, 255)
+        found.append(Picture(str(number), rgb / 255, mask.float(), joints=joints, head_size=30.0, depth=depth))
     return found
 
 
 def folder(path, count: int, seed: int):
     path.mkdir()
-    for shot in shots(count, seed):
-        Image.fromarray(shot.rgb.numpy()).save(path / f"{shot.name}.png")
+    for image in images(count, seed):
+        Image.fromarray(image.pixels.numpy()).save(path / f"{image.subject}.png")
     return path
 
 
@@ -84,12 +85,12 @@ def test_empty_columns_say_why():
     bare = Scores(10, {name: fake.features[name] for name in ("own", "detail")}, fake.correct, fake.depth)
     cells = compare_pictures(bare, bare, 5, 8, 0)["generated"]
     assert all(cells[column].value is None for column in OF_TABLE[1] if column != "own_distance")
-    assert "--inception" in cells["fid"].why
-    assert "--clip" in cells["fid_clip"].why
-    assert "joints" in cells["pckh"].why
-    assert "100 need" in compare_pictures(fake, fake, 5, 100, 0)["generated"]["kid"].why
+    assert "--inception" in cells["fid"].reason
+    assert "--clip" in cells["fid_clip"].reason
+    assert "joints" in cells["pckh"].reason
+    assert "100 need" in compare_pictures(fake, fake, 5, 100, 0)["generated"]["kid"].reason
     text = table(1, {"generated": cells}, {"poses": ["a", "b"], "FPS": None})
-    assert f"FID is empty: {cells['fid'].why}." in text
+    assert f"FID is empty: {cells['fid'].reason}." in text
     assert "poses: a, b" in text
 
 
@@ -97,7 +98,7 @@ def test_scores_that_real_pictures_do_not_win_are_said_not_to_discriminate():
     """Figures of docs/results/tables_table.md: no ranking can be read from a score that renders of meshes lose."""
 
     def row(joints: float | None, depth: float | None) -> dict[str, Cell]:
-        return {"own_pckh": Cell(joints), "own_depth": Cell(depth), "pckh": Cell(None, why="no weights file")}
+        return {"own_pckh": Cell(joints), "own_depth": Cell(depth), "pckh": Cell(None, reason="no weights file")}
 
     rows = {
         "ours": row(49.28, 133.5),
@@ -114,7 +115,7 @@ def test_scores_that_real_pictures_do_not_win_are_said_not_to_discriminate():
 
 def empty(number: int) -> dict[str, Cell]:
     return {
-        name: Cell(None, why="it was not asked for")
+        name: Cell(None, reason="it was not asked for")
         for name in OF_TABLE[number]
         if name not in ("own_pckh", "own_depth")
     }
@@ -144,17 +145,18 @@ def test_weights_with_nan_are_one_sentence():
 
 def test_joints_are_judged_against_the_truth_of_each_picture():
     network = load_pose_depth_network()
-    given = shots(3, 0)
-    seen = joint_positions(network(torch.stack([shrunk(shot.rgb) for shot in given]).float() / 255).heatmaps)
-    right = evaluate(
-        [dataclasses.replace(shot, joints=SIDE * own) for shot, own in zip(given, seen, strict=True)], Networks(network)
+    given = images(3, 0)
+    seen = joint_positions(network(torch.stack([shrunk(image.pixels) for image in given]).float() / 255).heatmaps)
+    right = look_at_pictures(
+        [dataclasses.replace(image, joints=SIDE * own) for image, own in zip(given, seen, strict=True)],
+        Networks(network),
     )
     assert right.correct["own"] == [1.0] * 3
-    first = evaluate(given, Networks(network))
+    first = look_at_pictures(given, Networks(network))
     assert first.pictures == len(first.correct["own"]) == len(first.depth["own"]) == 3
     assert (len(first.correct["pose"]), len(first.depth["depth"])) == (0, 0)
     assert first.features["own"].shape == (3, 64)
-    assert torch.equal(evaluate(given, Networks(network)).features["own"], first.features["own"])
+    assert torch.equal(look_at_pictures(given, Networks(network)).features["own"], first.features["own"])
 
 
 def test_folders_are_compared_twice_with_the_same_bits(tmp_path, capsys):
@@ -174,7 +176,7 @@ def test_folders_are_compared_twice_with_the_same_bits(tmp_path, capsys):
 
 
 def test_a_model_has_all_of_our_own_measures_and_a_frame_rate(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(evaluate_tables, "load_checkpoint", lambda path, device: tiny_model())
+    monkeypatch.setattr(command, "load_checkpoint", lambda path, device: tiny_model())
     real = folder(tmp_path / "real", 8, 1)
     line = ["generation", "--table", "1", "--real", str(real), "--count", "2", "--poses", "2", "--views", "2"]
     records = []

@@ -7,8 +7,8 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.capture.poses import choose_poses
-from primdiffusion.evaluation import shots
-from primdiffusion.evaluation.shots import JOINTS, SIDE, body_camera, folder_shots, human_shots, mesh_shots
+from primdiffusion.evaluation import images
+from primdiffusion.evaluation.images import JOINTS, SIDE, body_camera, folder_images, human_images, mesh_images
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.human import generate, pose_body
 from primdiffusion.people.assets import open_assets
@@ -24,9 +24,9 @@ def human():
 
 
 @pytest.fixture(scope="module")
-def shot(human):
+def image(human):
     """The left side of a human, which has views at 0, 90, 180 and 270 degrees."""
-    drawn = human_shots(human, choose_poses([], 1, 0), 4, "person", MarchSettings(step=0.02), torch.device("cpu"))
+    drawn = human_images(human, choose_poses([], 1, 0), 4, "person", MarchSettings(step=0.02), torch.device("cpu"))
     return [next(drawn), next(drawn)][1]
 
 
@@ -38,38 +38,38 @@ def test_a_camera_holds_the_body_from_every_side(human):
         assert depth.min() > 1
 
 
-def test_depth_is_along_the_optical_axis_and_joints_are_of_the_view(human, shot):
+def test_depth_is_along_the_optical_axis_and_joints_are_of_the_view(human, image):
     vertices = pose_body(human.betas, choose_poses([], 1, 0).map(lambda t: t[0])).vertices
     _, depth = body_camera(vertices, np.pi / 2).project(vertices)
-    inside = shot.mask & torch.isfinite(shot.depth)
+    inside = image.mask & torch.isfinite(image.depth)
     assert inside.sum() > 1000
-    assert float(depth.min()) - 0.2 < float(shot.depth[inside].min()) < float(shot.depth[inside].max())
-    assert float(shot.depth[inside].max()) < float(depth.max()) + 0.2
-    assert not torch.isfinite(shot.depth[~shot.mask]).any()
+    assert float(depth.min()) - 0.2 < float(image.depth[inside].min()) < float(image.depth[inside].max())
+    assert float(image.depth[inside].max()) < float(depth.max()) + 0.2
+    assert not torch.isfinite(image.depth[~image.mask]).any()
     # From the left, the face looks to the left of the picture and both hips coincide.
-    left, right = (shot.joints[JOINTS.index(f"{side}_hip")] for side in ("left", "right"))
+    left, right = (image.joints[JOINTS.index(f"{side}_hip")] for side in ("left", "right"))
     assert (left - right).norm() < 12
-    assert 8 < shot.head_size < 60
+    assert 8 < image.head_size < 60
 
 
-def test_a_folder_gives_what_was_drawn(shot, tmp_path):
+def test_a_folder_gives_what_was_drawn(image, tmp_path):
     (tmp_path / "depth").mkdir()
-    Image.fromarray(shot.rgb.numpy()).save(tmp_path / "one.png")
-    alpha = (255 * shot.mask).to(torch.uint8)[..., None]
-    Image.fromarray(torch.cat([shot.rgb, alpha], -1).numpy()).save(tmp_path / "two.png")
-    np.save(tmp_path / "depth" / "two.npy", shot.depth.numpy())
+    rgb, alpha = image.pixels, (255 * image.mask).to(torch.uint8)[..., None]
+    Image.fromarray(rgb.numpy()).save(tmp_path / "one.png")
+    Image.fromarray(torch.cat([rgb, alpha], -1).numpy()).save(tmp_path / "two.png")
+    np.save(tmp_path / "depth" / "two.npy", image.depth.numpy())
     joints = np.zeros((24, 2))
-    joints[[JOINT_NAMES.index(name) for name in JOINTS]] = shot.joints.numpy()
-    joints[JOINT_NAMES.index("head")] = (0, shot.head_size)
+    joints[[JOINT_NAMES.index(name) for name in JOINTS]] = image.joints.numpy()
+    joints[JOINT_NAMES.index("head")] = (0, image.head_size)
     (tmp_path / "joints.json").write_text(json.dumps({"two.png": joints.tolist()}))
-    one, two = folder_shots(tmp_path)
-    assert torch.equal(one.rgb, shot.rgb)
+    one, two = folder_images(tmp_path)
+    assert torch.equal(one.pixels, rgb)
     assert (one.joints, one.head_size, one.depth) == (None, None, None)
-    assert torch.equal(two.mask, shot.mask)
-    assert torch.equal(two.depth, shot.depth)
-    assert torch.allclose(two.joints, shot.joints)
-    assert two.head_size == pytest.approx(shot.head_size)
-    assert (two.rgb[~two.mask] == 255).all()
+    assert torch.equal(two.mask, image.mask)
+    assert torch.equal(two.depth, image.depth)
+    assert torch.allclose(two.joints, image.joints)
+    assert two.head_size == pytest.approx(image.head_size)
+    assert (two.rgb[~two.mask] == 1).all()
 
 
 def test_pictures_of_other_sizes_are_resized_with_their_truth(tmp_path):
@@ -77,10 +77,10 @@ def test_pictures_of_other_sizes_are_resized_with_their_truth(tmp_path):
     (tmp_path / "depth").mkdir()
     np.save(tmp_path / "depth" / "a.npy", np.pad(np.full((128, 256), 3, np.float32), ((0, 128), (0, 0))))
     (tmp_path / "joints.json").write_text(json.dumps({"a.png": [[100, 50]] * 23 + [[128, 128]]}))
-    (shot,) = folder_shots(tmp_path)
-    assert shot.rgb.shape == (SIDE, SIDE, 3)
-    assert shot.joints[0].tolist() == [200, 100]
-    assert torch.isfinite(shot.depth).sum() == SIDE * SIDE / 2
+    (image,) = folder_images(tmp_path)
+    assert image.rgb.shape == (SIDE, SIDE, 3)
+    assert image.joints[0].tolist() == [200, 100]
+    assert torch.isfinite(image.depth).sum() == SIDE * SIDE / 2
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_a_folder_that_does_not_fit_is_one_sentence(tmp_path, spoil, words):
     Image.new("RGB", (8, 8)).save(tmp_path / "a.png")
     spoil(tmp_path)
     with pytest.raises(ValueError, match=words):
-        list(folder_shots(tmp_path))
+        list(folder_images(tmp_path))
 
 
 def test_meshes_are_drawn_around_their_joints():
@@ -107,20 +107,20 @@ def test_meshes_are_drawn_around_their_joints():
     except FileNotFoundError as error:
         pytest.skip(str(error))
     person = make_person(assets, load_base_mesh(), 7)
-    (shot,) = mesh_shots(person, choose_poses([], 1, 0), [[0.0]], "7", 256)
-    column, row = shot.joints.round().long().unbind(-1)
-    assert shot.mask[row, column].all()
+    (image,) = mesh_images(person, choose_poses([], 1, 0), [[0.0]], "7", 256)
+    column, row = image.joints.round().long().unbind(-1)
+    assert image.mask[row, column].all()
     side = [JOINTS.index(f"{side}_shoulder") for side in ("left", "right")]
-    assert shot.joints[side[0], 0] > shot.joints[side[1], 0] + 20  # seen from the front
+    assert image.joints[side[0], 0] > image.joints[side[1], 0] + 20  # seen from the front
 
 
 @pytest.mark.parametrize("mode", ["RGB", "RGBA"])
 def test_pictures_resized_in_strips_are_those_resized_whole(tmp_path, monkeypatch, mode):
     noise = np.random.default_rng(0).integers(0, 256, (701, 701, 4), dtype=np.uint8)
     Image.fromarray(noise).convert(mode).save(tmp_path / "a.png")
-    monkeypatch.setattr(shots, "STRIP_PIXELS", 10**9)
-    whole = next(folder_shots(tmp_path))
-    monkeypatch.setattr(shots, "STRIP_PIXELS", 7000)
-    in_strips = next(folder_shots(tmp_path))
-    assert int((whole.rgb.int() - in_strips.rgb.int()).abs().max()) <= 1
+    monkeypatch.setattr(images, "STRIP_PIXELS", 10**9)
+    whole = next(folder_images(tmp_path))
+    monkeypatch.setattr(images, "STRIP_PIXELS", 7000)
+    in_strips = next(folder_images(tmp_path))
+    assert int((whole.rgba.int() - in_strips.rgba.int())[..., :3].abs().max()) <= 1
     assert bool((whole.mask == in_strips.mask).float().mean() > 0.9999)

@@ -24,7 +24,9 @@ from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.pictures import opened_picture, strips
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
-from primdiffusion.people.person import Person
+from primdiffusion.people.assets import Assets
+from primdiffusion.people.base_mesh import load_base_mesh
+from primdiffusion.people.person import Person, make_person
 from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import rasterise
@@ -54,19 +56,46 @@ DEPTH_FOLDER = "depth"
 
 
 @dataclasses.dataclass(frozen=True)
-class Shot:
-    """A picture of one human over white, and its truth where that is known."""
+class TestImage:
+    """A picture of one human: where it comes from, and its truth where that is known."""
 
-    name: str
-    rgb: UInt8[Tensor, "h w 3"]
-    mask: Bool[Tensor, "h w"]
-    """Pixels of the human."""
-    joints: Float[Tensor, "12 2"] | None
+    subject: str
+    """The human, or the file."""
+    rgb: Float[Tensor, "h w 3"]
+    """sRGB-encoded in [0, 1], over white or black."""
+    alpha: Float[Tensor, "h w"]
+    frame: int = 0
+    """Index of the pose."""
+    view: int = 0
+    """Index of the camera."""
+    joints: Float[Tensor, "12 2"] | None = None
     """JOINTS in pixels."""
-    head_size: float | None
+    head_size: float | None = None
     """Pixels between the joints HEAD."""
-    depth: Float[Tensor, "h w"] | None
+    depth: Float[Tensor, "h w"] | None = None
     """Metres along the optical axis; inf for background."""
+
+    @property
+    def mask(self) -> Bool[Tensor, "h w"]:
+        """Pixels of the human."""
+        return self.alpha >= 0.5
+
+    @property
+    def pixels(self) -> UInt8[Tensor, "h w 3"]:
+        """The colours as a file stores them."""
+        return _bytes(self.rgb)
+
+    @property
+    def rgba(self) -> UInt8[Tensor, "h w 4"]:
+        """Colours over the same background, and alpha, as a file stores them."""
+        return torch.cat([self.pixels, _bytes(self.alpha)[..., None]], -1)
+
+
+def image_over(
+    background: float, subject: str, rgb: Float[Tensor, "h w 3"], alpha: Float[Tensor, "h w"], frame: int, view: int
+) -> TestImage:
+    """A render (linear, premultiplied) over black (0) or white (1)."""
+    return TestImage(subject, encode_srgb((rgb + background * (1 - alpha[..., None])).clamp(0, 1)), alpha, frame, view)
 
 
 def body_camera(vertices: Float[Tensor, "V 3"], yaw: float, side: int = SIDE) -> Camera:
@@ -78,58 +107,65 @@ def body_camera(vertices: Float[Tensor, "V 3"], yaw: float, side: int = SIDE) ->
     return look_at(middle + distance * towards, middle, vertical_fov=VERTICAL_FOV, width=side, height=side)
 
 
-def human_shots(
-    human: Human, poses: BodyPose, views: int, name: str, settings: MarchSettings, device: torch.device
-) -> Iterator[Shot]:
+def human_images(
+    human: Human, poses: BodyPose, views: int, subject: str, settings: MarchSettings, device: torch.device
+) -> Iterator[TestImage]:
     """A human in all poses [F] from all views, drawn by the marcher on `device`."""
     body, anchors = body_of(human)
-    for number in range(len(poses.joint_rotation)):
-        posed = pose_body(human.betas, poses.map(lambda t, n=number: t[n]), body)
+    for frame in range(len(poses.joint_rotation)):
+        posed = pose_body(human.betas, poses.map(lambda t, n=frame: t[n]), body)
         primitives = Primitives.place(attach(anchors, posed.vertices, body.faces), human.payload).to(device)
-        yield from primitive_shots(primitives, posed, views, f"{name}_{number:02d}", settings)
+        yield from primitive_images(primitives, posed, views, subject, settings, frame)
 
 
-def primitive_shots(
-    primitives: Primitives, posed: PosedBody, views: int, name: str, settings: MarchSettings
-) -> Iterator[Shot]:
+def primitive_images(
+    primitives: Primitives, posed: PosedBody, views: int, subject: str, settings: MarchSettings, frame: int = 0
+) -> Iterator[TestImage]:
     """Primitives from all views around a body, drawn by the marcher on their device."""
     for view in range(views):
         camera = body_camera(posed.vertices, 2 * math.pi * view / views)
         seen = march(primitives, camera.to(primitives.position.device), settings).to("cpu")
-        yield _shot(f"{name}_{view:02d}", seen.rgb, seen.alpha, seen.depth, posed.joints, camera)
+        image = image_over(1, subject, seen.rgb, seen.alpha, frame, view)
+        yield _with_truth(image, seen.depth, posed.joints, camera)
 
 
-def mesh_shots(
-    person: Person, poses: BodyPose, yaws: Sequence[Sequence[float]], name: str, side: int
-) -> Iterator[Shot]:
+def mesh_images(
+    person: Person, poses: BodyPose, yaws: Sequence[Sequence[float]], subject: str, side: int
+) -> Iterator[TestImage]:
     """A dressed mesh in poses [F], each from its own yaws, rasterised with SUPERSAMPLE^2 samples a pixel."""
     shaped = default_body().shape(torch.from_numpy(person.betas).float())
-    for number, of_pose in enumerate(yaws):
-        posed = shaped.pose(poses.map(lambda t, n=number: t[n]))
+    for frame, of_pose in enumerate(yaws):
+        posed = shaped.pose(poses.map(lambda t, n=frame: t[n]))
         mesh = person.mesh.posed(posed.skinning.double().numpy())
         for view, yaw in enumerate(of_pose):
             camera = body_camera(posed.vertices, yaw, side)
             seen = rasterise(mesh, camera, SUPERSAMPLE)
-            rgb, alpha, depth = (torch.from_numpy(array) for array in (seen.rgb, seen.alpha, seen.depth))
-            yield _shot(f"{name}_{number:02d}_{view:02d}", rgb, alpha, depth, posed.joints, camera)
+            image = image_over(1, subject, torch.from_numpy(seen.rgb), torch.from_numpy(seen.alpha), frame, view)
+            yield _with_truth(image, torch.from_numpy(seen.depth), posed.joints, camera)
 
 
-def _shot(
-    name: str,
-    rgb: Float[Tensor, "h w 3"],
-    alpha: Float[Tensor, "h w"],
-    distance: Float[Tensor, "h w"],
-    joints: Float[Tensor, "24 4 4"],
-    camera: Camera,
-) -> Shot:
-    pixels, _ = camera.project(joints[:, :3, 3])
-    own = pixels[[JOINT_NAMES.index(joint) for joint in JOINTS]]
-    neck, head = (pixels[JOINT_NAMES.index(joint)] for joint in HEAD)
-    white = encode_srgb((rgb + (1 - alpha[..., None])).clamp(0, 1))
-    mask = alpha >= 0.5
+def mesh_images_of_seeds(assets: Assets, seeds: Sequence[int], poses: BodyPose, views: int) -> Iterator[TestImage]:
+    """Meshes of MakeHuman samples in all poses [F] from all views, evenly around them. Raises as `make_person`."""
+    base = load_base_mesh()
+    yaws = [[2 * math.pi * view / views for view in range(views)]] * len(poses.joint_rotation)
+    for seed in seeds:
+        yield from mesh_images(make_person(assets, base, seed), poses, yaws, f"{seed:08d}", SIDE)
+
+
+def _with_truth(
+    image: TestImage, distance: Float[Tensor, "h w"], joints: Float[Tensor, "24 4 4"], camera: Camera
+) -> TestImage:
     cosine = camera.rays()[1] @ camera.world_to_camera[2, :3]  # distances are along rays
-    depth = torch.where(mask, distance * cosine, torch.inf)
-    return Shot(name, (white * 255).round().to(torch.uint8), mask, own, float((neck - head).norm()), depth)
+    depth = torch.where(image.mask, distance * cosine, torch.inf)
+    pixels, _ = camera.project(joints[:, :3, 3])
+    return dataclasses.replace(image, depth=depth, **_known_joints(pixels))
+
+
+def _known_joints(pixels: Float[Tensor, "24 2"]) -> dict[str, Any]:
+    """The fields `joints` and `head_size` of a picture, from SMPL's joints in its pixels."""
+    neck, head = (pixels[JOINT_NAMES.index(joint)] for joint in HEAD)
+    own = pixels[[JOINT_NAMES.index(joint) for joint in JOINTS]]
+    return {"joints": own, "head_size": float((neck - head).norm())}
 
 
 def folder_pictures(folder: Path) -> list[Path]:
@@ -140,7 +176,7 @@ def folder_pictures(folder: Path) -> list[Path]:
     return found
 
 
-def folder_shots(folder: Path) -> Iterator[Shot]:
+def folder_images(folder: Path) -> Iterator[TestImage]:
     """The pictures of a folder, resized to 512 x 512 and composited over white.
 
     `joints.json`, if there, maps a picture's name to the pixels of SMPL's 24 joints [24, 2], and `depth/NAME.npy` is
@@ -155,10 +191,10 @@ def folder_shots(folder: Path) -> Iterator[Shot]:
     for path in paths:
         shrunk, size, has_alpha = _read_picture(path)
         rgb = shrunk[..., :3]
-        mask = shrunk[..., 3] >= 0.5 if has_alpha else (rgb * 255 < 255 - WHITE_DISTANCE).any(-1)
-        joints, head_size = _joints(truth.get(path.name), size, folder / JOINTS_FILE, path.name)
+        alpha = shrunk[..., 3] if has_alpha else (rgb * 255 < 255 - WHITE_DISTANCE).any(-1).float()
+        joints = _joints(truth.get(path.name), size, folder / JOINTS_FILE, path.name)
         depth = _depth(folder / DEPTH_FOLDER / f"{path.stem}.npy", size)
-        yield Shot(path.name, (rgb * 255).round().to(torch.uint8), mask, joints, head_size, depth)
+        yield TestImage(path.name, rgb, alpha, depth=depth, **joints)
 
 
 def _read_picture(path: Path) -> tuple[Float[Tensor, "s s 4"], int, bool]:
@@ -188,29 +224,26 @@ def _over_white(picture: Image.Image) -> tuple[Float[Tensor, "s s 4"], bool]:
     return _resized(narrow, (SIDE, SIDE)).clamp(0, 1), has_alpha
 
 
+def _bytes(values: Float[Tensor, "*s"]) -> UInt8[Tensor, "*s"]:
+    return (values.clamp(0, 1) * 255).round().to(torch.uint8)
+
+
 def _resized(values: Float[Tensor, "h w c"], size: tuple[int, int]) -> Float[Tensor, "h2 w2 c"]:
     if values.shape[:2] == size:
         return values
     return functional.interpolate(values.movedim(-1, 0)[None], size, mode="bicubic", antialias=True)[0].movedim(0, -1)
 
 
-def _nearest(values: Float[Tensor, "h w"]) -> Float[Tensor, "s s"]:
-    if values.shape == (SIDE, SIDE):
-        return values
-    return functional.interpolate(values[None, None], (SIDE, SIDE), mode="nearest")[0, 0]
-
-
-def _joints(given: Any, size: int, source: Path, name: str) -> tuple[Tensor | None, float | None]:
+def _joints(given: Any, size: int, source: Path, name: str) -> dict[str, Any]:
     if given is None:
-        return None, None
+        return {}
     with as_file_error(source, f"has joints of {name} that are not numbers", "give 24 rows x, y"):
         pixels = torch.tensor(given, dtype=torch.float32) * (SIDE / size)
     if pixels.shape != (len(JOINT_NAMES), 2) or not torch.isfinite(pixels).all():
         raise ValueError(f"{source}: the joints of {name} have shape {tuple(pixels.shape)}: give 24 finite rows x, y")
     if pixels.abs().max() > FAR_OUTSIDE * SIDE:
         raise ValueError(f"{source}: joints of {name} are not in its picture or near it: give them in pixels")
-    neck, head = (pixels[JOINT_NAMES.index(joint)] for joint in HEAD)
-    return pixels[[JOINT_NAMES.index(joint) for joint in JOINTS]], float((neck - head).norm())
+    return _known_joints(pixels)
 
 
 def _depth(path: Path, size: int) -> Float[Tensor, "s s"] | None:
@@ -221,4 +254,4 @@ def _depth(path: Path, size: int) -> Float[Tensor, "s s"] | None:
     if depth.shape != (size, size):
         raise ValueError(f"{path} has shape {tuple(depth.shape)}, its picture {size} x {size} pixels: give one size")
     depth = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.inf)
-    return _nearest(depth)
+    return depth if size == SIDE else functional.interpolate(depth[None, None], (SIDE, SIDE), mode="nearest")[0, 0]
