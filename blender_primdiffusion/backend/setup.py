@@ -1,4 +1,4 @@
-"""The backend's private environment: made by venv and pip, tried, removed.
+"""The backend's private environment: made by venv and pip, and tried.
 
 What takes long is a process that a generator follows: it yields how far it is while it waits, so that a timer, or a
 command, can drive it, and closing it ends the process.
@@ -20,9 +20,8 @@ import sys
 import time
 from collections.abc import Generator, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from ..formats.json_files import read_json
 from ..formats.regular_files import check_regular, remove_file, remove_folder
 from ..formats.whole_files import write_atomically
 from .client import BackendClient
@@ -30,7 +29,6 @@ from .environment import MARK, BackendPython, SetUpFolder, search, tried
 from .packages import Lock, clean_environment, followed, what_went_wrong
 from .requests import Backend, ChildRequest
 
-State = Literal["absent", "broken", "ready"]
 OFFLINE = (
     "Blender may not use the network; allow it in Preferences > System > Network > Allow Online Access, "
     "or use Install from Folder"
@@ -59,21 +57,6 @@ class Step:
 
 Steps = Generator[Step, None, str]
 """Returns a sentence on how it ended; raises RuntimeError or OSError."""
-
-
-def state_of(folder: SetUpFolder) -> tuple[State, dict[str, Any]]:
-    """How far the environment is, and what its mark says of it. Takes a few file system calls.
-
-    broken: never finished, or the Python that it was made with is gone (another Blender was put in its place).
-    """
-    if not folder.environment.is_dir():
-        return "absent", {}
-    try:
-        about = read_json(folder.environment / MARK)
-        made_with = Path(about["base"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return "broken", {}
-    return ("ready" if folder.python.exists() and made_with.exists() else "broken"), about
 
 
 def set_up(
@@ -118,29 +101,6 @@ def set_up(
     for leftover in (folder.downloads, folder.temporary):
         remove_folder(leftover, leftover.parent)
     return _ready(about)
-
-
-def self_test(folder: SetUpFolder, python: Path | None, module_path: Path, cache: Path) -> Steps:
-    """Make a human in a few steps with the environment, or with another `python`."""
-    folder.temporary.mkdir(parents=True, exist_ok=True)
-    about = yield from _trial(python or folder.python, module_path, cache, folder.temporary)
-    return _ready(about)
-
-
-def remove(folder: SetUpFolder, cache: Path | None) -> Steps:
-    """Environment, downloads and `cache`, where it is not shared, are gone; nothing else in the folder is touched."""
-    _, about = state_of(folder)
-    _check_own(folder)
-    remove_file(folder.environment / MARK, folder.environment)
-    going = [folder.environment, folder.downloads, folder.temporary, *([cache] if cache is not None else ())]
-    program = "import shutil, sys; [shutil.rmtree(path) for path in sys.argv[1:]]"
-    command = [sys.executable, "-I", "-c", program, *(str(path) for path in going if path.exists())]
-    environment = clean_environment(folder.root, folder.downloads)
-    yield Step("Removing the environment", 0.0)
-    for _ in followed(command, folder.log, environment, _in_use):
-        yield Step("Removing the environment", 0.5)
-    freed = f"; {about['bytes'] / 1e6:.0f} MB are free again" if "bytes" in about else ""
-    return f"The backend was removed{freed}"
 
 
 def _check_own(folder: SetUpFolder) -> None:
@@ -212,11 +172,6 @@ def _no_venv(_said: str, _exit_code: int) -> str:
         f"the Python of this Blender ({sys.executable}) cannot make an environment: it lacks venv or ensurepip; "
         "install them (on Debian and Ubuntu: sudo apt install python3-venv), then try again"
     )
-
-
-def _in_use(said: str, _exit_code: int) -> str:
-    reason = said.strip().splitlines()[-1:]
-    return f"the environment cannot be removed ({' '.join(reason)}): close other Blenders, then try again"
 
 
 def _ready(about: Mapping[str, Any]) -> str:

@@ -20,10 +20,10 @@ from ..jobs.memory import device_line
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, preference
-from .backend_state import being_set_up, cancel_set_up
 from .captures_session import captures
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
+from .preferences import being_set_up, cancel_set_up
 
 TEXT = "PrimDiffusion Diagnostics"
 _LOG_LINES = 60

@@ -29,7 +29,7 @@ from blender_primdiffusion.scene.handles import add_handles
 from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.ui.drawing import DATA
 
-ELSEWHERE = {"test_backend", "set_up_backend", "make_pose_assets", "copy_diagnostics"}
+ELSEWHERE = {"set_up_backend", "make_pose_assets", "copy_diagnostics"}
 """Set up, write a library or a text: whatever is in the scene, it stays as it is."""
 
 
@@ -210,7 +210,7 @@ def anna(addon, tmp_path, monkeypatch):
 def outside(anna, monkeypatch):
     """Nothing is downloaded or installed; libraries are small and written where tests write."""
     from blender_primdiffusion.jobs import assets
-    from blender_primdiffusion.ui.setup.operators import SetUpSession
+    from blender_primdiffusion.ui.setup import SetUpSession
 
     def start(session: SetUpSession, _steps: object) -> None:
         session.notice = "as if it were done"
