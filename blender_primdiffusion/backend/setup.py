@@ -60,7 +60,7 @@ Steps = Generator[Step, None, str]
 
 
 def set_up(
-    folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path, wheels: Path | None = None
+    folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path | None, wheels: Path | None = None
 ) -> Steps:
     """Rebuild the environment from the package index, or from a folder of `wheels`; it is ready once it has generated
     a human. `compute` (cpu, cuda or apple) is for its mark. Raises RuntimeError, and OSError."""
@@ -114,8 +114,13 @@ def _pip(python: Path) -> list[str]:
     return [str(python), "-I", "-m", "pip"]
 
 
-def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Generator[Step, None, dict[str, Any]]:
-    """The real child makes a human; returns what it is and what it computes on."""
+def _trial(
+    python: Path, module_path: Path, cache: Path | None, temporary: Path
+) -> Generator[Step, None, dict[str, Any]]:
+    """The real child makes a human; returns what it is and what it computes on.
+
+    The human's previews are drawn, which compiles the marcher into `cache`: the first press does not wait for that.
+    """
     found: list[BackendPython] = []
 
     def make_client() -> Generator[None, None, BackendClient]:
@@ -127,7 +132,7 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
     try:
         request = ChildRequest(backend, "generate", {**_TRIAL, "out_dir": str(person)})
         while not request.finished:
-            yield Step(f"Testing the backend: {request.message}", _INSTALLED)
+            yield Step(f"Testing the backend, which compiles its renderer, once: {request.message}", _INSTALLED)
             request.tick()
         if request.error is not None:
             tried[python] = False
