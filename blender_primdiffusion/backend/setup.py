@@ -18,14 +18,14 @@ import mimetypes
 import os
 import sys
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
 from ..formats.regular_files import check_regular, remove_file, remove_folder
 from ..formats.whole_files import write_atomically
 from .client import BackendClient
-from .environment import MARK, BackendPython, SetUpFolder, search, tried
+from .environment import MARK, SetUpFolder, search, tried
 from .packages import Lock, clean_environment, followed, what_went_wrong
 from .requests import Backend, ChildRequest
 
@@ -69,7 +69,7 @@ def set_up(
     for path in () if wheels is None else wheels.iterdir():
         if mimetypes.guess_type(path.name)[0] == "text/html":
             raise RuntimeError(f"{path} is a web page, whose links pip would follow: remove it from the folder")
-        with contextlib.suppress(IsADirectoryError, FileNotFoundError):  # pip says so of those that it needs
+        if path.suffix == ".whl":
             check_regular(path)  # pip would wait for ever for a pipe
     folder.root.mkdir(parents=True, exist_ok=True)
     remove_file(folder.environment / MARK, folder.environment)
@@ -100,7 +100,8 @@ def set_up(
     write_atomically(folder.environment / MARK, json.dumps(marked, indent=1))
     for leftover in (folder.downloads, folder.temporary):
         remove_folder(leftover, leftover.parent)
-    return _ready(about)
+    device = about["device"] or "the CPU"
+    return f"The backend is ready: torch {about['torch']} on {device}, tested in {about['seconds']:.0f} s"
 
 
 def _check_own(folder: SetUpFolder) -> None:
@@ -121,11 +122,12 @@ def _trial(
 
     The human's previews are drawn, which compiles the marcher into `cache`: the first press does not wait for that.
     """
-    found: list[BackendPython] = []
 
     def make_client() -> Generator[None, None, BackendClient]:
-        found.append((yield from search(python, module_path=module_path, cache_dir=cache, timeout_s=TRIAL_S)))
-        return BackendClient(python, module_path, cache_dir=cache)
+        found = yield from search(python, module_path=module_path, cache_dir=cache, timeout_s=TRIAL_S)
+        client = BackendClient(found.path, module_path, cache_dir=cache)
+        client.info.update(torch=found.torch, python=found.python, version=found.version)
+        return client
 
     backend, began = Backend(make_client), time.monotonic()
     person = temporary / "person"
@@ -143,9 +145,7 @@ def _trial(
         return {
             "device": request.info.get("device_name") or "",
             "seconds": round(time.monotonic() - began, 1),
-            "torch": found[0].torch,
-            "python": found[0].python,
-            "version": found[0].version,
+            **{name: request.info[name] for name in ("torch", "python", "version")},
         }
     finally:
         backend.release()
@@ -155,9 +155,7 @@ def _trial(
 def _installing(folder: SetUpFolder, lock: Lock, said: str) -> Step:
     """How far pip is, by its files."""
     if "Installing collected packages" in said:
-        pattern = "Lib/site-packages/*.dist-info" if os.name == "nt" else "lib/python*/site-packages/*.dist-info"
-        share = min(len(list(folder.environment.glob(pattern))) / len(lock.packages), 1.0)
-        return Step(f"Installing {len(lock.packages)} packages", _DOWNLOADED + (_INSTALLED - _DOWNLOADED) * share)
+        return Step(f"Installing {len(lock.packages)} packages", _DOWNLOADED)
     total = max(lock.download_bytes, 1)
     now = min(_wheel_bytes(folder.temporary), total)
     return Step(f"Downloading, {now / 1e6:.0f} of {total / 1e6:.0f} MB", _DOWNLOADED * now / total)
@@ -176,11 +174,4 @@ def _no_venv(_said: str, _exit_code: int) -> str:
     return (
         f"the Python of this Blender ({sys.executable}) cannot make an environment: it lacks venv or ensurepip; "
         "install them (on Debian and Ubuntu: sudo apt install python3-venv), then try again"
-    )
-
-
-def _ready(about: Mapping[str, Any]) -> str:
-    return (
-        f"The backend is ready: torch {about['torch']} on {about['device'] or 'the CPU'}, "
-        f"tested in {about['seconds']:.0f} s"
     )

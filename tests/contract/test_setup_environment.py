@@ -129,6 +129,13 @@ def test_a_web_page_among_the_wheels_is_named_before_anything_is_made(place):
     assert not place.folder.root.exists()
 
 
+def test_a_folder_in_place_of_a_wheel_is_named_before_anything_is_made(place):
+    (place.wheels / "idna-3.10-py3-none-any.whl").mkdir()
+    with refused(IsADirectoryError, "idna-3.10"):
+        done(place.from_folder())
+    assert not place.folder.root.exists()
+
+
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="pipes have no names here")
 def test_a_pipe_among_the_wheels_is_named_before_anything_is_made(place):
     os.mkfifo(place.wheels / "torch-9-py3-none-any.whl")
