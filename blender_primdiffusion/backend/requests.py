@@ -204,9 +204,13 @@ class ChildRequest:
     Of a method with the parameter `steps` (a sampler's) those steps are the progress, else those of every stage.
     """
 
-    def __init__(self, backend: Backend, method: str, params: Mapping[str, Any]):
-        """Half-written files are cleared from the parameter `out_dir`, if the method has one."""
+    def __init__(self, backend: Backend, method: str, params: Mapping[str, Any], patience_s: float = CANCEL_PATIENCE_S):
+        """Half-written files are cleared from the parameter `out_dir`, if the method has one.
+
+        A child that is still at work `patience_s` after a cancel is killed.
+        """
         self.method = method
+        self._patience_s = patience_s
         self._params = dict(params)
         self._backend = backend
         self._out_dir = Path(params["out_dir"]) if "out_dir" in params else None
@@ -342,10 +346,12 @@ class ChildRequest:
             self.message = f"{self.message}: step {self.step} of {self.total}"
 
     def _lose_patience(self) -> None:
-        asked = self._cancel_asked_at
-        if self.finished or asked is None or time.monotonic() - asked < CANCEL_PATIENCE_S:
+        asked, client = self._cancel_asked_at, self._client
+        if self.finished or asked is None:
             return
-        client = self._client
+        ready = client is not None and client.alive and client.info.get("ready")
+        if time.monotonic() - asked < (self._patience_s if ready else CANCEL_PATIENCE_S):
+            return
         if client is not None and self._id is not None:
             if client.info.get("ready"):
                 self._kill()

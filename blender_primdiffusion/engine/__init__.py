@@ -7,7 +7,7 @@ from collections.abc import Callable
 import bpy
 
 from ..scene.human import any_humans
-from . import studio, viewport
+from . import drawing_child, viewport
 from .engine import ENGINE, PRIMDIFFUSION_PG_render, PRIMDIFFUSION_RenderEngine
 from .gpu import overlay
 from .who_draws import view_engine
@@ -41,8 +41,7 @@ def unregister() -> None:
         if handler in getattr(bpy.app.handlers, name):
             getattr(bpy.app.handlers, name).remove(handler)
     overlay.stop()
-    viewport.stop()
-    studio.close()
+    drawing_child.close()
     _reset_scenes()
     del bpy.types.Scene.primdiffusion_render
     for cls in reversed(CLASSES):
@@ -93,7 +92,7 @@ def _depsgraph_changed(_scene: bpy.types.Scene, depsgraph: bpy.types.Depsgraph) 
 
 
 def _check_child() -> float:
-    studio.advance()
+    drawing_child.end_when_idle()
     return CHECK_S
 
 

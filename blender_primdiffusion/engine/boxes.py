@@ -19,7 +19,7 @@ from .view import PinholeView
 JOINTS = len(JOINT_NAMES)
 SMALLEST_SCALE = 1e-6
 """The backend's `human.SMALLEST_SCALE`."""
-EDGE_PX = 4.0
+EDGE_PX = 8.0
 """Around what shows boxes: pictures with fewer pixels are drawn smoothly."""
 SHAPES_CACHED = 32
 """On one body; 1.2 MB each."""

@@ -6,17 +6,17 @@ import time
 
 import bpy
 
-from ..backend.drawing import Drawing
+from ..backend.requests import ChildRequest
 from ..formats.requests import RAY_STEP
-from . import studio
+from . import drawing_child
 from .picture import scene_content, solids_file
-from .studio import Frame
+from .shared_frames import Frame, frames
 from .view import PinholeView, blender_depth, camera_view, wanted_region
 from .viewport import Viewport
 from .who_draws import ENGINE
 
-ANSWER_S = 0.1
-"""Interval at which Blender is asked whether the user has cancelled."""
+LISTEN_S = 0.01
+"""Between two looks at the child, and at whether the user has cancelled."""
 SHOW_S = 0.2
 """Between updates of the picture in the window, each of which copies all of it."""
 
@@ -93,7 +93,7 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     )
     view: bpy.props.EnumProperty(
         name="View",
-        description="What is drawn of humans",
+        description="What renders show of humans; 3D views show Colour",
         items=(
             ("COLOUR", "Colour", "Humans as they look"),
             ("DEPTH", "Depth", "Near is bright"),
@@ -127,7 +127,7 @@ class PRIMDIFFUSION_PG_render(bpy.types.PropertyGroup):
     )
 
 
-def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph) -> Drawing:
+def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph) -> ChildRequest:
     """Draw one view layer into the engine's result; returns when it is finished or cancelled by the user.
 
     Raises ChildProcessError with the child's error, FileNotFoundError for a human without a file, and ValueError for
@@ -143,48 +143,52 @@ def render_layer(engine: bpy.types.RenderEngine, depsgraph: bpy.types.Depsgraph)
     result = engine.begin_result(0, 0, width, height, layer=depsgraph.view_layer_eval.name)
     finished = False
     try:
-        picture = scene_content(depsgraph, solids_file(depsgraph, studio.frames.folder))
+        picture = scene_content(depsgraph, solids_file(depsgraph, frames.folder))
         view = camera_view(camera, depsgraph, size, picture.subject)
-        frame = studio.frames.take("final", width, height)
+        frame = frames.take(width, height)
         if not bpy.app.background:
             frame.clear()  # rows that are not drawn yet
         params = {**picture.params(), **view.params(), "region": region, "frame": str(frame.path)}
-        drawing = studio.drawing_child().draw(params)
-        _follow(engine, drawing, result, frame, view)
-        if drawing.error is not None:
-            raise ChildProcessError(str(drawing.error))
+        request = drawing_child.draw(params)
+        _follow(engine, request, result, frame, view)
+        if request.error is not None:
+            raise ChildProcessError(str(request.error))
         _fill(result, frame, view)
         finished = True
     finally:
         engine.end_result(result, cancel=not finished, do_merge_results=finished)
-    return drawing
+    return request
 
 
 def _follow(
-    engine: bpy.types.RenderEngine, drawing: Drawing, result: bpy.types.RenderResult, frame: Frame, view: PinholeView
+    engine: bpy.types.RenderEngine,
+    request: ChildRequest,
+    result: bpy.types.RenderResult,
+    frame: Frame,
+    view: PinholeView,
 ) -> None:
     shown_rows, shown_at = 0, time.monotonic()
-    while not drawing.finished:
-        news = drawing.wait(ANSWER_S)
+    while not request.finished:
         if engine.test_break():
-            drawing.cancel()
-            if drawing.state != "drawing":
-                return  # a child may take a minute to start
-        if not news or drawing.finished:
+            request.cancel()
+        if not request.tick():
+            time.sleep(LISTEN_S)
             continue
-        engine.update_stats("", _stats(drawing, frame.height))
-        engine.update_progress(drawing.rows / frame.height)
-        if not bpy.app.background and drawing.rows > shown_rows and time.monotonic() - shown_at > SHOW_S:
+        engine.update_stats("", _stats(request))
+        engine.update_progress(request.fraction)
+        if not bpy.app.background and request.step > shown_rows and time.monotonic() - shown_at > SHOW_S:
             _fill(result, frame, view)
             engine.update_result(result)
-            shown_rows, shown_at = drawing.rows, time.monotonic()
+            shown_rows, shown_at = request.step, time.monotonic()
 
 
-def _stats(drawing: Drawing, height: int) -> str:
-    if drawing.rows == 0:
-        return "Starting the backend" if drawing.state in ("waiting", "starting") else "Drawing the first rows"
-    left = f", {drawing.eta_s:.1f} s left" if drawing.eta_s else ""
-    return f"Row {drawing.rows} of {height}{left}"
+def _stats(request: ChildRequest) -> str:
+    if request.state != "running":
+        return request.message
+    if request.step == 0:
+        return "Drawing the first rows"
+    left = f", {request.eta_s:.1f} s left" if request.eta_s else ""
+    return f"Row {request.step} of {request.total}{left}"
 
 
 def _fill(result: bpy.types.RenderResult, frame: Frame, view: PinholeView) -> None:

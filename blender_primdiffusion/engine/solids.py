@@ -29,8 +29,6 @@ _SOLID_DATA = (
     bpy.types.Scene,
 )
 """Other data that may change solids: their geometry, their colours, and what is visible."""
-_MOST_FILES = 8
-"""Queued pictures of several viewports may still need older files."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +87,7 @@ def _concerns_solids(changed: bpy.types.ID) -> bool:
 
 
 def stored(solids: SceneSolids, folder: Path) -> Path | None:
-    """Write solids to a file for the child, named by its content, and remove old files; None where there are none."""
+    """Write solids to a file for the child, named by its content, and remove older ones; None where there are none."""
     if len(solids.corners) == 0:
         return None
     digest = hashlib.sha256()
@@ -98,11 +96,11 @@ def stored(solids: SceneSolids, folder: Path) -> Path | None:
     path = folder / f"solids_{digest.hexdigest()[:16]}.npz"
     if path.exists():
         return path
-    with replacing(path) as partial:
-        np.savez(partial, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
-    for old in sorted(folder.glob("solids_*.npz"), key=lambda file: file.stat().st_mtime_ns)[:-_MOST_FILES]:
+    for old in list(folder.glob("solids_*.npz")):
         with contextlib.suppress(PermissionError):  # Windows removes no file that the child reads: next time
             remove_file(old, folder)
+    with replacing(path) as partial:
+        np.savez(partial, corners=solids.corners, colour=solids.colour, holdout=solids.holdout)
     return path
 
 

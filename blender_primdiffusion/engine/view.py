@@ -90,6 +90,20 @@ def view_from_matrices(
     return PinholeView(intrinsics, world_to_camera, clip, width, height, offset)
 
 
+def region_view(context: bpy.types.Context, subject: NDArray) -> PinholeView:
+    """What a region of a 3D view shows; `subject` as for `view_from_matrices`."""
+    region, around = context.region, context.region_data
+    projection, to_view = (np.array(matrix, np.float64) for matrix in (around.window_matrix, around.view_matrix))
+    return view_from_matrices(projection, to_view, clip_of(projection), (region.width, region.height), subject)
+
+
+def clip_of(projection: NDArray) -> tuple[float, float]:
+    """Start and end of what an OpenGL projection [4, 4] shows, along the optical axis."""
+    if projection[3, 2] == 0:
+        return (projection[2, 3] + 1) / projection[2, 2], (projection[2, 3] - 1) / projection[2, 2]
+    return projection[2, 3] / (projection[2, 2] - 1), projection[2, 3] / min(projection[2, 2] + 1, -1e-9)
+
+
 def opengl_projection(view: PinholeView) -> NDArray[np.float64]:
     """The matrix [4, 4] from the world, y up, to OpenGL's clip space."""
     near = max(view.clip[0], 1e-4)

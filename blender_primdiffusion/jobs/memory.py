@@ -7,7 +7,7 @@ import subprocess
 
 import bpy
 
-from ..engine import studio
+from ..engine import drawing_child
 from ..places import EXTENSION
 from ..scene.volumes import free_unused_grids
 from .queue import queue
@@ -75,10 +75,10 @@ def release() -> str:
         raise RuntimeError("the backend is busy: wait for it, or cancel the job first")
     if bpy.app.is_job_running("RENDER"):
         raise RuntimeError("Blender is rendering: wait for it, or cancel it first")
-    pids = [pid for pid in (queue.child_pid, studio.child_pid()) if pid is not None]
+    pids = [pid for pid in (queue.child_pid, drawing_child.child_pid()) if pid is not None]
     held = [size for size in map(resident_bytes, pids) if size is not None]
     queue.release()
-    studio.close()
+    drawing_child.close()
     before = resident_bytes(os.getpid()) or 0
     free_unused_grids()
     grids = before - (resident_bytes(os.getpid()) or before)

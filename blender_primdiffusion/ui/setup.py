@@ -17,7 +17,7 @@ from ..backend.environment import state_of
 from ..backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
 from ..backend.requests import sentence
 from ..backend.setup import Steps
-from ..engine import studio
+from ..engine import drawing_child
 from ..jobs.follow import Reporting
 from ..jobs.queue import queue
 from ..places import EXTENSION, backend_module_path, cache_folder, set_up_folder
@@ -280,7 +280,7 @@ class PRIMDIFFUSION_OT_set_up_backend(Reporting, bpy.types.Operator):
         if queue.busy:
             raise ValueError("the backend is at work; wait until it is done, or press Cancel")
         queue.close()  # children that run on the environment: their files could not be replaced
-        studio.close()
+        drawing_child.close()
         session.start(steps)
         return follow_session(self)
 

@@ -124,8 +124,8 @@ def rendered(module: str, python: str) -> Steps:
     yield "rendered_parallel"
     space.use_render_border = False
     bpy.context.scene.primdiffusion_render.view = "ALPHA"
-    yield 30.0
-    yield "rendered_by_child"
+    yield 5.0
+    yield "rendered_says_that_alpha_is_for_renders"
 
 
 def stalls(module: str, python: str) -> Steps:

@@ -3,7 +3,7 @@
 import pytest
 from primdiffusion.commands.frame_drawer import map_frame
 
-from blender_primdiffusion.engine.studio import SharedFrames
+from blender_primdiffusion.engine.shared_frames import SharedFrames
 
 
 @pytest.fixture
@@ -13,20 +13,25 @@ def frames():
     frames.close()
 
 
-def test_the_file_of_a_dropped_frame_goes_at_the_latest_when_another_is_dropped_after_its_last_user(frames):
-    old = frames.take("view", 8, 4)
+def test_a_frame_of_another_size_replaces_the_file_at_the_latest_with_the_folder(frames):
+    old = frames.take(8, 4)
     old.clear()
-    path, shown = old.path, old.combined
-    new = frames.take("view", 4, 4)
-    assert new.path != path
+    path, shown, folder = old.path, old.combined, frames.folder
+    assert frames.take(4, 4).path != path
     assert not shown.any()  # still mapped
     del old, shown
-    frames.drop("view")
+    frames.close()
+    assert not folder.exists()
+
+
+def test_the_file_of_a_frame_that_nobody_maps_goes_when_another_is_taken(frames):
+    path = frames.take(8, 4).path
+    frames.take(4, 4)
     assert not path.exists()
 
 
 def test_what_the_child_writes_is_what_blender_sees_and_the_folder_goes_with_its_users(frames):
-    frame = frames.take("view", 8, 4)
+    frame = frames.take(8, 4)
     picture = map_frame(frame.path, 8, 4)
     picture.combined[:] = 0.5
     assert (frame.combined == 0.5).all()

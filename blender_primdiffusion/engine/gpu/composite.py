@@ -10,7 +10,6 @@ from gpu_extras.batch import batch_for_shader
 from numpy.typing import NDArray
 
 from .march import GpuMarch
-from .relief import ReliefPicture
 from .shaders import cache_until_exit
 
 NO_PLANES: NDArray[np.float32] = np.zeros((1, 4), np.float32)
@@ -102,7 +101,7 @@ class PictureTextures:
     depth: gpu.types.GPUTexture
 
 
-def draw_picture(picture: GpuMarch | ReliefPicture | PictureTextures, look: ViewLook, part: Part = WHOLE) -> None:
+def draw_picture(picture: GpuMarch | PictureTextures, look: ViewLook, part: Part = WHOLE) -> None:
     """Draw a picture of the whole region, or a part of it, over the region, for handlers of the kind POST_VIEW.
 
     Blender's overlays are drawn before: their depth is in the buffer, but for those of objects in front. What is drawn

@@ -17,8 +17,7 @@ common one near the boxes. Records and lists are textures: Python gets storage b
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 
 import gpu
 import numpy as np
@@ -27,7 +26,6 @@ from numpy.typing import NDArray
 from ..boxes import Boxes
 from ..view import PinholeView
 from . import shaders
-from .relief import GpuRelief, relief_of
 from .shaders import ACROSS, BOXES_A_ROW, ENTRIES_A_ROW, TEXELS, TILE, VOXELS, WIDER, cache_until_exit
 
 STRIDES = [1, 2, 4]
@@ -51,42 +49,21 @@ _EDGES = np.array([[i, i | 1 << axis] for axis in range(3) for i in range(8) if 
 
 
 class GpuPayload:
-    """Colour and density of a human's boxes on the GPU, 4 MB for 1024 boxes; freed with the object.
+    """Colour and density of a human's boxes on the GPU, 4 MB for 1024 boxes; freed with the object."""
 
-    They are uploaded when they are first marched: the relief, by which a human is seen at once, does not wait for it.
-    """
-
-    def __init__(self, rgb: NDArray, density: NDArray, thickness: NDArray | None = None):
-        """`rgb` [K, 3, 8, 8, 8] is linear, `density` [K, 8, 8, 8] in 1/m; voxel axes N, B, T as in the backend.
-
-        `thickness` [K] of the boxes along N, in metres at natural size, is what `relief` needs.
-        """
+    def __init__(self, rgb: NDArray, density: NDArray):
+        """`rgb` [K, 3, 8, 8, 8] is linear, `density` [K, 8, 8, 8] in 1/m; voxel axes N, B, T as in the backend."""
         self.count = len(density)
         self.rows = max(-(-self.count // ACROSS), 1)
-        self._voxels: tuple[NDArray, NDArray] | None = (rgb, density)
-        """Until they are uploaded."""
-        self.relief = None if thickness is None else GpuRelief(relief_of(rgb, density, thickness))
-
-    @property
-    def texture(self) -> gpu.types.GPUTexture:
-        """A brick for each box."""
-        return self._uploaded[0]
-
-    @property
-    def bounds(self) -> NDArray[np.float64]:
-        """Bounds of the content of each box, as `_content`."""
-        return self._uploaded[1]
-
-    @functools.cached_property
-    def _uploaded(self) -> tuple[gpu.types.GPUTexture, NDArray[np.float64]]:
-        rgb, density = self._voxels
         values = np.zeros((self.rows * ACROSS, 4, VOXELS, VOXELS, VOXELS), np.float32)
         values[: self.count, :3] = rgb
         values[: self.count, 3] = np.minimum(density, _LARGEST_HALF)
         parts = values.reshape(self.rows, ACROSS, 4, VOXELS, VOXELS, VOXELS)
-        texture = _texture(parts.transpose(3, 0, 4, 1, 5, 2).reshape(VOXELS, self.rows * VOXELS, -1, 4), "RGBA16F")
-        self._voxels = None
-        return texture, _content(values[: self.count, 3] > 0)
+        bricks = parts.transpose(3, 0, 4, 1, 5, 2).reshape(VOXELS, self.rows * VOXELS, -1, 4)
+        self.texture = _texture(bricks, "RGBA16F")
+        """A brick for each box."""
+        self.bounds = _content(values[: self.count, 3] > 0)
+        """Bounds of the content of each box, as `_content`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -188,12 +165,6 @@ class GpuMarch:
             self._done += rows
         return self._done >= self._rows
 
-    @property
-    def done(self) -> float:
-        """The part of the picture's height, from the top, where it can be shown: smoothing reads half a row more."""
-        height = self._size[1]
-        return 1.0 if self._done >= self._rows else max(self._done * TILE - 0.5, 0.0) / height
-
     def wait(self) -> None:
         """Return when the GPU has finished what it was given."""
         frame = gpu.types.GPUFrameBuffer(color_slots=self.colour)
@@ -202,20 +173,15 @@ class GpuMarch:
 
 
 class GpuMarcher:
-    """The shaders, and the common atlas of the humans that were marched last. Needs a GPU context."""
+    """The shaders, and the common atlas of the humans that were marched last."""
 
     def __init__(self) -> None:
-        self._shaders: dict[str, gpu.types.GPUShader] = {}
+        """Needs a GPU context. Compiles the shaders: a second, where the driver has not kept them. Raises RuntimeError
+        where the GPU cannot march."""
+        self._shaders = {name: shader() for name, shader in _SHADERS.items()}
         self._humans: tuple[GpuPayload, ...] = ()
         self._atlas: gpu.types.GPUTexture | None = None
         self._pixels = [gpu.types.GPUTexture((1, 1), format="R32F") for _ in range(2)]
-
-    def compile(self) -> Iterator[None]:
-        """Compile the shaders, one a step; each takes a moment. Raises RuntimeError where one does not compile."""
-        for name, shader in _SHADERS.items():
-            if name not in self._shaders:
-                self._shaders[name] = shader()
-                yield
 
     def march(
         self,
@@ -228,10 +194,8 @@ class GpuMarcher:
         samples through large boxes of humans of natural size.
 
         Overlapping boxes are mixed at lattice points, also those of several humans. `ends` holds, as `GpuMarch.depth`
-        does, where each pixel's ray ends at other objects. Compiles the shaders if that was not done.
+        does, where each pixel's ray ends at other objects.
         """
-        for _ in self.compile():
-            pass
         self._rebind()
         spacing, strides = _lattice([boxes.density_scale for _, boxes in humans], step)
         size = (ACROSS * VOXELS, max([payload.rows for payload, _ in humans], default=1) * VOXELS)
@@ -421,9 +385,6 @@ def _texture(values: NDArray, format_: str) -> gpu.types.GPUTexture:
 
 
 @cache_until_exit
-def gpu_marcher() -> GpuMarcher | str:
-    """The marcher on the GPU, or why there is none. Asked for while a view is drawn."""
-    try:
-        return GpuMarcher()
-    except RuntimeError as error:
-        return str(error)
+def gpu_marcher() -> GpuMarcher:
+    """The marcher of all views, made while the first is drawn. Raises as `GpuMarcher`."""
+    return GpuMarcher()

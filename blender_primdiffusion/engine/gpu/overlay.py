@@ -7,30 +7,23 @@ ones in slices when nothing has changed for a while. Nothing is marched otherwis
 from __future__ import annotations
 
 import dataclasses
-import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 
 import blf
 import bpy
 import numpy as np
-from mathutils import Matrix, Vector
+from mathutils import Vector
 from numpy.typing import NDArray
 
 from ...scene.convention import points_to_backend
 from ..boxes import Boxes, seen_part
-from ..view import NO_SURFACE_M, PinholeView, camera_frame, view_from_matrices
-from .composite import NO_PLANES, Part, PictureTextures, ViewLook, draw_picture, keep_bones
-from .march import GpuMarch, GpuMarcher
-from .refine import REVEAL_S, GpuRefinement, MarchRequest
-from .relief import ReliefPicture
+from ..view import NO_SURFACE_M, camera_frame, clip_of, region_view
+from .composite import NO_PLANES, PictureTextures, ViewLook, draw_picture, keep_bones
+from .march import gpu_marcher
+from .refine import GpuRefinement, MarchRequest
 from .scene_reading import SceneReader, SceneReading, ViewContent, concerns_humans
-from .start import gpu_start
 
 TICK_S = 0.02
-START_S = 0.3
-"""After the last picture of a moving view the shaders that march are compiled, which stalls the window."""
-REDRAWS = 3.0
-"""Of a window's time, a redraw takes at most one part in so many more, while a picture comes."""
 REGIONS_KEPT = 8
 WIREFRAME_OPACITY = 0.5
 """At least: without it, humans would be invisible, since they have no wires."""
@@ -47,13 +40,12 @@ class Overlay:
         self._reader = SceneReader()
         self._readings: dict[ViewContent, SceneReading] = {}
         """Since the scene has changed."""
-        self._drawn_at = 0.0
         self.undrawn = False
         """There are pictures that the windows have not drawn."""
         self._fault = ""
         """Why the GPU can draw nothing."""
         self.error = ""
-        """Why humans are not drawn, or not all of them, or roughly."""
+        """Why humans are not drawn, or not all of them."""
 
     def scene_changed(self, changed: Iterable[bpy.types.ID] | None = None) -> None:
         """Read the scene again for the next picture, if one of these data (None: any) may concern humans."""
@@ -62,86 +54,53 @@ class Overlay:
 
     def draw(self, context: bpy.types.Context) -> None:
         """Draw the humans into the region that Blender draws now."""
-        marcher = self.prepare()
+        try:
+            if not self._fault:
+                self._draw(context)
+        except RuntimeError as error:
+            self._fail(error)
         if self._fault:
             self.error = f"{self._fault}: show the volumes instead (Advanced > Attachment > Volumes in Viewport)"
-            return
-        try:
-            self._draw_or_sketch(context, marcher)
-        except RuntimeError as error:
-            self._fault = str(error)
-            self._regions.clear()
 
-    def prepare(self) -> GpuMarcher | None:
-        """The marcher; None until its shaders are compiled, which a timer does, and where the GPU cannot march.
-
-        For draw handlers. Called before the first human stands, it saves them the wait.
-        """
-        marcher = gpu_start.marcher()
-        if gpu_start.working:
-            follow()
-        return marcher
-
-    def _draw_or_sketch(self, context: bpy.types.Context, marcher: GpuMarcher | None) -> None:
-        """After an error of the GPU while it marches, only sketches are drawn. Raises RuntimeError if they fail too."""
-        if marcher is not None:
-            try:
-                self._draw(context, marcher)
-                return
-            except RuntimeError as error:
-                self._marching_failed(error)
-        self._draw(context, None)
-
-    def _marching_failed(self, error: RuntimeError) -> None:
-        gpu_start.failed(str(error))
-        self._regions.clear()
-
-    def _draw(self, context: bpy.types.Context, marcher: GpuMarcher | None) -> None:
+    def _draw(self, context: bpy.types.Context) -> None:
         reading = self.reading(context)
-        self.error = reading.error or (gpu_start.fault and f"{gpu_start.fault}: humans are drawn roughly")
+        self.error = reading.error
         if not reading.humans:
             return
-        self._drawn_at = time.monotonic()
-        window, to_view = (np.array(matrix, np.float64) for matrix in _matrices(context))
-        picture, request = self._picture_of(context.region), _request(context, reading, marcher)
+        picture, request = self._picture_of(context.region), _request(context, reading)
         picture.want(request)
         if picture.fresh:
             picture.advance()
         if not (picture.resting and reading.complete):
             follow()
         keep_bones_in_front(context, reading.bones)
-        look = _look(context, window, to_view)
         boxes = [human.placed[1] for human in reading.humans.values()]
-        for part, drawn in _parts(picture, seen_part(boxes, request.view)):
-            draw_picture(drawn, look, part)
+        draw_picture(picture.shown.picture, _look(context), seen_part(boxes, request.view))
+
+    def _fail(self, error: RuntimeError) -> None:
+        """Draw nothing any more."""
+        self._fault = str(error)
+        self._regions.clear()
 
     def advance(self) -> bool:
         """Do some work that does not need the window; True when it must be drawn again."""
-        if gpu_start.working:
-            return time.monotonic() - self._drawn_at >= START_S and gpu_start.advance()
         news = False
         try:
             for picture in self._regions.values():
                 news = (not picture.fresh and picture.advance()) or news
         except RuntimeError as error:
-            self._marching_failed(error)
+            self._fail(error)
             news = True
         unread = [key for key, reading in self._readings.items() if not reading.complete]
         for key in unread:
             del self._readings[key]
         return news or bool(unread)
 
-    def redrawn_in(self, seconds: float) -> None:
-        """Say how long the windows take to draw."""
-        for picture in self._regions.values():
-            picture.reveal_s = max(REVEAL_S, REDRAWS * seconds)
-
     @property
     def resting(self) -> bool:
         """Whether every region shows its finest picture."""
         complete = all(reading.complete for reading in self._readings.values())
-        at_rest = complete and all(picture.resting for picture in self._regions.values())
-        return at_rest and not gpu_start.working and not self.undrawn
+        return complete and all(picture.resting for picture in self._regions.values()) and not self.undrawn
 
     def object_at(self, context: bpy.types.Context, x: int, y: int) -> bpy.types.Object | None:
         """The object whose human is under a pixel of the region; None where another object is in front."""
@@ -154,7 +113,7 @@ class Overlay:
         if not (0 <= row < depth.shape[0] and 0 <= column < depth.shape[1]) or depth[row, column] >= NO_SURFACE_M:
             return None
         point = _point(context, x, y, float(depth[row, column]))
-        origin = _point(context, x, y, max(_clip(np.array(context.region_data.window_matrix))[0], -1e3))
+        origin = _point(context, x, y, max(clip_of(np.array(context.region_data.window_matrix))[0], -1e3))
         ray = Vector(point - origin)
         hit = context.scene.ray_cast(context.evaluated_depsgraph_get(), origin, ray.normalized(), distance=ray.length)
         if hit[0] and not context.space_data.shading.show_xray:
@@ -183,36 +142,13 @@ class Overlay:
 overlay = Overlay()
 
 
-def _request(context: bpy.types.Context, reading: SceneReading, marcher: GpuMarcher | None) -> MarchRequest:
-    """The picture that a region shows."""
-    region, step = context.region, context.scene.primdiffusion_render.step
-    size, (window, to_view) = (region.width, region.height), (np.array(m, np.float64) for m in _matrices(context))
-    humans = list(reading.humans.values())
-    subject = np.mean([human.pose.pelvis for human in humans], 0)
-    view = view_from_matrices(window, to_view, _clip(window), size, subject)
-    key = (tuple(reading.humans), window.tobytes(), to_view.tobytes(), size, step)
-    placed = [human.placed for human in humans]
-    reliefs = [(payload.relief, boxes) for payload, boxes in placed]
-
-    def begin(view: PinholeView) -> GpuMarch:
-        return marcher.march(placed, view, step * max(round(size[0] / view.width), 1))
-
-    return MarchRequest(key, view, lambda view: ReliefPicture(reliefs, view), None if marcher is None else begin)
-
-
-def _parts(picture: GpuRefinement, seen: Part) -> Iterator[tuple[Part, GpuMarch | ReliefPicture]]:
-    """Parts of the region to draw, and the picture for each: what has come of a finer one, then the shown one."""
-    left, bottom, right, top = seen
-    edge = top
-    if (coming := picture.coming) is not None:
-        edge = min(max(1.0 - coming.done, bottom), top)
-        yield (left, edge, right, top), coming
-    yield (left, bottom, right, edge), picture.shown.picture
-
-
-def _matrices(context: bpy.types.Context) -> tuple[Matrix, Matrix]:
-    """The region's matrices: to the window, and to the view."""
-    return context.region_data.window_matrix, context.region_data.view_matrix
+def _request(context: bpy.types.Context, reading: SceneReading) -> MarchRequest:
+    """The picture that a region shows. Raises as `gpu_marcher`."""
+    humans, step = list(reading.humans.values()), context.scene.primdiffusion_render.step
+    view = region_view(context, np.mean([human.pose.pelvis for human in humans], 0))
+    key = (tuple(reading.humans), repr(view.params()), step)
+    placed, marcher = [human.placed for human in humans], gpu_marcher()
+    return MarchRequest(key, view, lambda view, coarseness: marcher.march(placed, view, step * coarseness))
 
 
 def keep_bones_in_front(context: bpy.types.Context, bones: NDArray) -> None:
@@ -232,9 +168,7 @@ def draw_above_overlays(context: bpy.types.Context, picture: PictureTextures) ->
 
 def follow() -> None:
     """March finer pictures until every region shows its finest."""
-    global _steps
     if not bpy.app.timers.is_registered(_tick):
-        _steps = _march_and_draw()
         bpy.app.timers.register(_tick, first_interval=TICK_S, persistent=True)
 
 
@@ -245,27 +179,18 @@ def stop() -> None:
     overlay.undrawn = False
 
 
-_steps: Iterator[float] = iter(())
-
-
 def _tick() -> float | None:
-    return next(_steps, None)
-
-
-def _march_and_draw() -> Iterator[float]:
-    """Yields seconds to wait: marching and drawing both block the windows, and between them Blender handles input."""
-    while not overlay.resting:
-        if overlay.advance():
-            overlay.undrawn = True
-            yield 0.0
-            overlay.undrawn, began = False, time.monotonic()
-            for window in bpy.context.window_manager.windows:
-                for area in window.screen.areas:
-                    if area.type == "VIEW_3D":
-                        area.tag_redraw()
-            yield 0.0
-            overlay.redrawn_in(time.monotonic() - began)
-        yield TICK_S
+    """Seconds to wait: marching and drawing both block the windows, and between them Blender handles input."""
+    if overlay.undrawn:
+        overlay.undrawn = False
+        for window in bpy.context.window_manager.windows:
+            for area in window.screen.areas:
+                if area.type == "VIEW_3D":
+                    area.tag_redraw()
+    elif overlay.advance():
+        overlay.undrawn = True
+        return 0.0
+    return None if overlay.resting else TICK_S
 
 
 def draw_error(context: bpy.types.Context) -> None:
@@ -301,14 +226,7 @@ def _distance(boxes: Boxes, point: NDArray) -> float:
     return float(np.linalg.norm(boxes.position - points_to_backend(point), axis=1).min())
 
 
-def _clip(window: NDArray) -> tuple[float, float]:
-    """Start and end of what a projection shows, along the optical axis."""
-    if window[3, 2] == 0:
-        return (window[2, 3] + 1) / window[2, 2], (window[2, 3] - 1) / window[2, 2]
-    return window[2, 3] / (window[2, 2] - 1), window[2, 3] / min(window[2, 2] + 1, -1e-9)
-
-
-def _look(context: bpy.types.Context, window: NDArray, to_view: NDArray) -> ViewLook:
+def _look(context: bpy.types.Context) -> ViewLook:
     around, shading = context.region_data, context.space_data.shading
     opacity, xray = 1.0, False
     if shading.type == "SOLID" and shading.show_xray:
@@ -317,8 +235,9 @@ def _look(context: bpy.types.Context, window: NDArray, to_view: NDArray) -> View
         opacity, xray = max(shading.xray_alpha_wireframe, WIREFRAME_OPACITY), True
     planes = NO_PLANES
     if around.use_clip_planes:
-        planes = np.array(around.clip_planes, np.float64) @ np.linalg.inv(to_view)
-    look, space = ViewLook(window, opacity, xray, planes), context.space_data
+        planes = np.array(around.clip_planes, np.float64) @ np.linalg.inv(np.array(around.view_matrix, np.float64))
+    window, space = np.array(around.window_matrix, np.float64), context.space_data
+    look = ViewLook(window, opacity, xray, planes)
     camera = space.camera if around.view_perspective == "CAMERA" and space.overlay.show_overlays else None
     if camera is None or camera.type != "CAMERA" or not camera.data.show_passepartout:
         return look

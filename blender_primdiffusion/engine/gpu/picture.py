@@ -16,8 +16,7 @@ from mathutils import Matrix
 from ..boxes import Boxes
 from ..solids import SceneSolids
 from ..view import NO_SURFACE_M, PinholeView, opengl_projection
-from .march import GpuMarch, GpuMarcher, GpuPayload
-from .relief import ReliefPicture
+from .march import GpuMarcher, GpuPayload
 from .shaders import TILE, cache_until_exit, compiled, shader_of
 
 _VERTEX = """
@@ -118,40 +117,30 @@ class GpuScene:
 class GpuPicture:
     """A picture that is drawn in slices; `compose` it when `advance` has returned True."""
 
-    def __init__(self, marcher: GpuMarcher | None, scene: GpuScene, view: PinholeView):
-        """Without a marcher humans are drawn by their reliefs, in full at once."""
+    def __init__(self, marcher: GpuMarcher, scene: GpuScene, view: PinholeView, coarseness: int = 1):
+        """Steps along rays are `coarseness` times as long as the scene's."""
         self._size = (view.width, view.height)
         self._background = (0.0, 0.0, 0.0, 0.0) if scene.background is None else (*scene.background, 1.0)
         self._solids = None if scene.solids is None else scene.solids.draw(view)
         ends = None if self._solids is None else self._solids[1]
-        self._march = None if marcher is None else marcher.march(scene.humans, view, scene.step, ends)
-        self._humans = self._march or ReliefPicture([(one.relief, boxes) for one, boxes in scene.humans], view, ends)
-
-    @property
-    def humans(self) -> GpuMarch | ReliefPicture:
+        self.humans = marcher.march(scene.humans, view, scene.step * coarseness, ends)
         """The humans alone."""
-        return self._humans
-
-    @property
-    def done(self) -> float:
-        """As `GpuMarch.done`."""
-        return 1.0 if self._march is None else self._march.done
 
     def advance(self, work: float = np.inf) -> bool:
         """As `GpuMarch.advance`."""
-        return self._march is None or self._march.advance(work)
+        return self.humans.advance(work)
 
     def wait(self) -> None:
         """As `GpuMarch.wait`."""
-        self._humans.wait()
+        self.humans.wait()
 
     def compose(self, before: gpu.types.GPUTexture | None = None, averaged: int = 0) -> gpu.types.GPUTexture:
         """The picture, RGBA16F, linear and premultiplied; the mean with `before`, the mean of `averaged` ones."""
         composed = gpu.types.GPUTexture(self._size, format="RGBA16F")
-        solids, ends = self._solids or (self._humans.colour, self._humans.depth)
+        solids, ends = self._solids or (self.humans.colour, self.humans.depth)
         shader = _compose_shader()
         shader.bind()
-        textures = {"humans": self._humans.colour, "solids": solids, "ends": ends, "before": before or solids}
+        textures = {"humans": self.humans.colour, "solids": solids, "ends": ends, "before": before or solids}
         for name, texture in textures.items():
             shader.uniform_sampler(name, texture)
         shader.image("composed", composed)

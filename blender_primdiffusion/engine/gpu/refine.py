@@ -1,4 +1,4 @@
-"""Which picture a view shows when: a whole one at once while anything moves, finer ones at rest, then antialiased.
+"""Which picture a view shows when: a coarse one at once while anything moves, finer ones at rest, then antialiased.
 
 Needs no Blender. `advance` is called where Blender gives a GPU context, and marches for about SLICE_S, so that a slow
 GPU does not stall the window.
@@ -13,18 +13,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..refine import FLUENT_S, REST_S
 from ..view import PinholeView
 
 SLICE_S = 0.1
-SKETCH = 4
-"""Coarseness of a sketch, which is sharp, and less true than any marched picture."""
-SKETCHED_S = FLUENT_S / 2
-"""A sketch that takes longer is followed by ones of half the resolution, until these take a fourth of it."""
-MARCHED = (2, 1)
+FLUENT_S = 0.05
+"""Time for a picture while the scene moves: the finest that takes no longer is marched, else the coarsest."""
+REST_S = 0.12
+"""A finer picture is begun when nothing has moved for this long."""
+COARSENESS = (8, 4, 2, 1)
 """Pixels of the window per marched pixel along a side, in the order of marching."""
-REVEAL_S = 0.4
-"""Between redraws that show how far a picture has come."""
 SAMPLES = 8
 """Pictures that are averaged when nothing moves, each with its rays elsewhere in the pixels."""
 SLOW_S, SLOW_SAMPLES = 0.5, 4
@@ -33,21 +30,8 @@ _FIRST_WORK = 2.0**15
 _GROWTH = 4.0
 
 
-class Sketch(Protocol):
-    """A picture that is whole at once, such as a `ReliefPicture`."""
-
-    def wait(self) -> None:
-        """Return when the GPU has finished it."""
-        ...
-
-
 class Pass(Protocol):
     """One picture that is being marched, such as a `GpuMarch`."""
-
-    @property
-    def done(self) -> float:
-        """The part of its height that is complete, from the top."""
-        ...
 
     def advance(self, work: float) -> bool:
         """March for about this work, in pixels times boxes; True when the picture is complete."""
@@ -66,11 +50,9 @@ class MarchRequest:
     """Equal for equal pictures."""
     view: PinholeView
     """At the window's resolution."""
-    sketch: Callable[[PinholeView], Sketch]
-    """Draws a picture that is whole at once, from this view, perhaps with fewer pixels."""
-    begin: Callable[[PinholeView], Pass] | None
-    """Starts a picture: from this view with fewer pixels, or with its rays elsewhere in the pixels. None while the GPU
-    cannot march: the sketch stays."""
+    begin: Callable[[PinholeView, int], Pass]
+    """Starts a picture: from this view with fewer pixels, or with its rays elsewhere in the pixels, and with steps
+    along rays that are longer by this factor."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -79,33 +61,30 @@ class ShownMarch:
 
     request: MarchRequest
     coarseness: int
-    """SKETCH, or one of MARCHED."""
+    """One of COARSENESS."""
     sample: int
     """0 for rays through the pixels' centres; picture number n of those to be averaged."""
     picture: Any
 
 
 class GpuRefinement:
-    """Sketches the newest request at once, or marches it where that is as quick; then marches it finely."""
+    """Marches the newest request at once, coarsely where the GPU is slow; then finely."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic, samples: int = SAMPLES):
         """A refinement of `samples` pictures at rest."""
         self._clock, self._samples = clock, samples
         self._request: MarchRequest | None = None
-        self._changed_at = self._revealed_at = 0.0
+        self._changed_at = 0.0
         self._pending: ShownMarch | None = None
         self._seconds, self._pixel_seconds = 0.0, np.inf
         """Seconds for the pending picture so far, and for a pixel of the last one."""
-        self._work, self._sketch_side = _FIRST_WORK, 1
+        self._work = _FIRST_WORK
         self.shown: ShownMarch | None = None
-        self.reveal_s = REVEAL_S
-        """As the constant: a slow window redraws less often."""
 
     def want(self, request: MarchRequest) -> None:
-        """Set the newest request; an equal one changes no more than whether the GPU can march."""
+        """Set the newest request; an equal one changes nothing."""
         if self._request is None or self._request.key != request.key:
-            self._changed_at, self._pending = self._clock(), None
-        self._request = request
+            self._request, self._changed_at, self._pending = request, self._clock(), None
 
     @property
     def fresh(self) -> bool:
@@ -123,69 +102,49 @@ class GpuRefinement:
         rested = self._clock() - self._changed_at >= REST_S
         return self.fresh or self._pending is not None or (rested and self._next() is not None)
 
-    @property
-    def coming(self) -> Pass | None:
-        """A finer picture than the shown one that is complete above its lower end (see `Pass.done`)."""
-        pending = self._pending
-        return None if pending is None or pending.sample or not pending.picture.done else pending.picture
-
     def advance(self) -> bool:
-        """Make a first picture, or march for about SLICE_S; True when there is more to show. Raises what `begin` and
-        `sketch` raise."""
+        """Make a first picture, or march for about SLICE_S; True when there is a new picture. Raises what `begin` and
+        what it starts raise."""
         if self.fresh:
             self.shown = self._at_once(self._request)
             return True
         end = self._clock() + SLICE_S
         while self.due and self._clock() < end:
-            self._pending = self._pending or self._begin(self._request)
+            self._pending = self._pending or self._begin(self._request, *self._next())
             if self._march(self._pending):
                 self.shown, self._pending = self._pending, None
                 return True
-        if self.coming is not None and self._clock() - self._revealed_at >= self.reveal_s:
-            self._revealed_at = self._clock()
-            return True
         return False
 
     def _at_once(self, request: MarchRequest) -> ShownMarch:
-        """The finest picture that fits into FLUENT_S by the time of the last one, or a sketch."""
-        pixels = request.view.width * request.view.height
-        for coarseness in sorted(MARCHED):
-            if request.begin is not None and pixels / coarseness**2 * self._pixel_seconds <= FLUENT_S:
-                end = self._clock() + 2 * FLUENT_S
-                marched = self._begin(request, (coarseness, 0))
-                while self._clock() < end:
-                    if self._march(marched):
-                        return marched
-                self._pixel_seconds = np.inf  # sketches, until it is measured again
-        return ShownMarch(request, SKETCH, 0, self._sketch(request))
+        coarseness = self._finest_fluent(request.view, COARSENESS)
+        picture, end = self._begin(request, coarseness, 0), self._clock() + 2 * FLUENT_S
+        while not self._march(picture):
+            if coarseness != COARSENESS[0] and self._clock() > end:  # slower than the last one
+                coarseness = COARSENESS[0]
+                picture = self._begin(request, coarseness, 0)
+        return picture
 
-    def _sketch(self, request: MarchRequest) -> Sketch:
-        began = self._clock()
-        sketch = request.sketch(_coarser(request.view, self._sketch_side))
-        sketch.wait()
-        seconds = self._clock() - began
-        if seconds > SKETCHED_S or seconds < SKETCHED_S / 4:
-            self._sketch_side = 2 if seconds > SKETCHED_S else 1
-        return sketch
+    def _finest_fluent(self, view: PinholeView, among: tuple[int, ...]) -> int:
+        """The finest that fits into FLUENT_S by the time of the last picture, or the first."""
+        seconds = view.width * view.height * self._pixel_seconds
+        return next((finer for finer in reversed(among) if seconds / finer**2 <= FLUENT_S), among[0])
 
     def _next(self) -> tuple[int, int] | None:
         """Coarseness and number of the picture after the shown one; None after the last."""
         shown, request = self.shown, self._request
-        if shown is None or request is None or request.begin is None:
+        if shown is None or request is None:
             return None
-        finer = [coarseness for coarseness in MARCHED if coarseness < shown.coarseness]
-        if finer:
-            return finer[0], 0
+        if finer := COARSENESS[COARSENESS.index(shown.coarseness) + 1 :]:
+            return self._finest_fluent(request.view, finer), 0
         slow = request.view.width * request.view.height * self._pixel_seconds > SLOW_S
         samples = min(self._samples, SLOW_SAMPLES) if slow else self._samples
         return (1, shown.sample + 1) if shown.sample + 1 < samples else None
 
-    def _begin(self, request: MarchRequest, which: tuple[int, int] | None = None) -> ShownMarch:
-        """Start the next picture, or the one of this coarseness and number."""
-        coarseness, sample = which or self._next()
-        view = _coarser(request.view, coarseness)
-        began = self._revealed_at = self._clock()
-        begun = ShownMarch(request, coarseness, sample, request.begin(jittered(view, sample)))
+    def _begin(self, request: MarchRequest, coarseness: int, sample: int) -> ShownMarch:
+        view = jittered(_coarser(request.view, coarseness), sample)
+        began = self._clock()
+        begun = ShownMarch(request, coarseness, sample, request.begin(view, coarseness))
         self._seconds = self._clock() - began
         return begun
 

@@ -1,5 +1,5 @@
 """Which humans a 3D view shows over what Blender draws, read from the scene as the view shows it; and their payloads
-and reliefs on the GPU, uploaded once."""
+on the GPU, uploaded once."""
 
 from __future__ import annotations
 
@@ -49,8 +49,7 @@ class GpuHumans:
         payload = self._payloads.pop(version, None)
         if payload is None:
             tensors = read_payload(human.file)
-            thickness = 2 * boxes.half_extent[:, 2] * boxes.density_scale
-            payload = GpuPayload(tensors.rgb, tensors.density, thickness)
+            payload = GpuPayload(tensors.rgb, tensors.density)
         self._payloads[version] = payload
         return payload, boxes
 

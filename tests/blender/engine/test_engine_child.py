@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -15,16 +15,15 @@ import bpy
 import numpy as np
 import pytest
 from backend_python import use_this_python
-from blender_primdiffusion.formats.whole_files import writer
 from engine_stage import pixels, set_up_render
 from support.errors import refused
 from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.backend.environment import BackendPython
-from blender_primdiffusion.engine import studio
+from blender_primdiffusion.engine import drawing_child
 from blender_primdiffusion.engine.engine import render_layer
-from blender_primdiffusion.engine.studio import CHANNELS, SharedFrames
+from blender_primdiffusion.engine.shared_frames import CHANNELS, SharedFrames, frames
 
 pytestmark = pytest.mark.any_blender
 
@@ -83,10 +82,10 @@ def test_the_frame_reaches_the_picture(stage):
 
 def test_a_second_picture_uses_the_same_child_and_the_same_file(stage):
     render()
-    pid, files = studio.drawing_child().pid, sorted(studio.frames.folder.iterdir())
+    pid, files = drawing_child.child_pid(), sorted(frames.folder.iterdir())
     render()
-    assert studio.drawing_child().pid == pid
-    assert sorted(studio.frames.folder.iterdir()) == files
+    assert drawing_child.child_pid() == pid
+    assert sorted(frames.folder.iterdir()) == files
 
 
 def test_progress_and_seconds_left_are_reported_band_by_band(stage, monkeypatch):
@@ -116,7 +115,39 @@ def test_a_cancel_does_not_wait_for_a_child_that_is_still_being_started(stage, m
 
     monkeypatch.setattr("blender_primdiffusion.backend.environment.search", forever)
     drawing = render_layer(Engine(stop_after_s=0.0), bpy.context.evaluated_depsgraph_get())
-    assert drawing.state in ("starting", "cancelled")
+    assert drawing.state == "cancelled"
+
+
+def test_an_animation_keeps_its_child(stage, tmp_path):
+    stage.scene.frame_end = 2
+    stage.scene.render.filepath = str(tmp_path / "frame_")
+    assert bpy.ops.render.render(animation=True) == {"FINISHED"}
+    pid = drawing_child.child_pid()
+    assert bpy.ops.render.render(animation=True) == {"FINISHED"}
+    assert len(list(tmp_path.glob("frame_*"))) == 2
+    assert drawing_child.child_pid() == pid
+
+
+def test_a_picture_that_a_defect_interrupted_does_not_block_the_next(stage):
+    class Broken(Engine):
+        def update_progress(self, fraction: float) -> None:
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        render_layer(Broken(), bpy.context.evaluated_depsgraph_get())
+    assert render() == {"FINISHED"}
+
+
+def test_closing_the_child_ends_a_picture_at_once(stage, monkeypatch):
+    monkeypatch.setenv("FAKE_STEP_S", "5")
+
+    class Closing(Engine):
+        def update_stats(self, _: str, text: str) -> None:
+            drawing_child.close()
+
+    began = time.monotonic()
+    assert render_layer(Closing(), bpy.context.evaluated_depsgraph_get()).state == "cancelled"
+    assert time.monotonic() - began < drawing_child.CANCEL_PATIENCE_S / 2
 
 
 def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
@@ -129,7 +160,7 @@ def test_waiting_leaves_other_threads_their_time(stage, monkeypatch):
 
 def test_a_child_that_dies_is_one_error_and_the_next_render_works(stage, monkeypatch):
     monkeypatch.setenv("FAKE_ORDER", "dies")
-    with refused(RuntimeError, "Render") as caught:
+    with refused(RuntimeError, "lower the resolution") as caught:
         render()
     assert str(caught.value).count("Error:") == 1
     assert not stage.out.exists()
@@ -139,11 +170,11 @@ def test_a_child_that_dies_is_one_error_and_the_next_render_works(stage, monkeyp
 
 def test_a_child_killed_between_pictures_is_replaced_silently(stage):
     render()
-    pid = studio.drawing_child().pid
+    pid = drawing_child.child_pid()
     os.kill(pid, signal.SIGKILL)
     time.sleep(0.2)
     assert render() == {"FINISHED"}
-    assert studio.drawing_child().pid != pid
+    assert drawing_child.child_pid() != pid
 
 
 def test_an_error_of_the_child_keeps_its_remedy_and_ends_an_animation(stage, monkeypatch, tmp_path):
@@ -207,7 +238,7 @@ def test_blender_itself_rejects_a_picture_without_camera_or_pixels_and_the_next_
 
 def test_unregistering_ends_the_child_removes_the_frames_and_leaves_the_scene_a_usable_engine(stage):
     render()
-    folder, pid = studio.frames.folder, studio.drawing_child().pid
+    folder, pid = frames.folder, drawing_child.child_pid()
     blender_primdiffusion.unregister()
     try:
         assert not folder.exists()
@@ -219,39 +250,41 @@ def test_unregistering_ends_the_child_removes_the_frames_and_leaves_the_scene_a_
 
 
 def test_an_idle_child_ends_by_itself_and_the_next_picture_starts_another(stage, monkeypatch):
-    monkeypatch.setattr(studio, "IDLE_S", 0.3)
+    monkeypatch.setattr(drawing_child, "IDLE_S", 0.3)
     render()
-    pid = studio.drawing_child().pid
+    pid = drawing_child.child_pid()
     end = time.monotonic() + 300
-    while studio.drawing_child().pid is not None and time.monotonic() < end:
-        studio.advance()  # a timer does
+    while drawing_child.child_pid() is not None and time.monotonic() < end:
+        drawing_child.end_when_idle()  # a timer does
         time.sleep(0.05)
-    assert studio.drawing_child().pid is None
+    assert drawing_child.child_pid() is None
     assert render() == {"FINISHED"}
-    assert studio.drawing_child().pid not in (None, pid)
+    assert drawing_child.child_pid() not in (None, pid)
 
 
 EXIT_WHILE_DRAWING = """
-import sys, os, threading, time
+import sys, os, time
 from pathlib import Path
 import bpy, blender_primdiffusion as b, pytest
 sys.path.insert(0, "tests/blender")
 from backend_python import use_this_python
 use_this_python(pytest.MonkeyPatch(), Path(sys.argv[1]))
 b.register()
-from blender_primdiffusion.engine import studio
-frame = studio.frames.take("view", 8, 8)
-drawing = studio.drawing_child().draw({"frame": str(frame.path), "region": None, "width": 8, "height": 8})
-while drawing.rows == 0:
-    drawing.wait(0.01)
-print(studio.drawing_child().pid, studio.frames.folder, flush=True)
+from blender_primdiffusion.engine import drawing_child
+from blender_primdiffusion.engine.shared_frames import frames
+frame = frames.take(8, 8)
+request = drawing_child.draw({"frame": str(frame.path), "region": None, "width": 8, "height": 8})
+while request.step == 0:
+    request.tick()
+    time.sleep(0.01)
+print(drawing_child.child_pid(), frames.folder, flush=True)
 if sys.argv[2] == "killed":
     os.kill(os.getpid(), 9)
 """
 
 
 @pytest.mark.parametrize("how", ["quit", "killed"])
-def test_ending_blender_during_a_picture_leaves_no_process_and_no_memory(how):
+def test_ending_blender_during_a_picture_leaves_no_process(how):
     command = [sys.executable, "-c", EXIT_WHILE_DRAWING, str(FAKE_CHILD), how]
     root, environment = Path(__file__).parents[3], {**os.environ, "FAKE_STEP_S": "1.0"}
     done = subprocess.run(command, cwd=root, env=environment, capture_output=True, text=True, timeout=500, check=False)
@@ -260,21 +293,20 @@ def test_ending_blender_during_a_picture_leaves_no_process_and_no_memory(how):
     while Path(f"/proc/{pid}").exists() and time.monotonic() < end:
         time.sleep(0.05)
     assert not Path(f"/proc/{pid}").exists()
-    if how == "killed":
-        frames = SharedFrames()  # nobody could: the next Blender does
-        assert frames.folder.exists()
-        frames.close()
-    assert not Path(folder).exists()
+    if how == "quit":
+        assert not Path(folder).exists()
+    else:
+        shutil.rmtree(Path(folder).parent)  # as all of a killed Blender's temporary files
 
 
 def test_a_frame_is_reused_for_its_size_and_replaced_for_another():
     frames = SharedFrames()
     try:
-        first = frames.take("a", 8, 4)
+        first = frames.take(8, 4)
         assert first.path.stat().st_size == 8 * 4 * CHANNELS * 4
         first.combined[:], first.depth[:] = 1.0, 2.0
-        assert frames.take("a", 8, 4) is first
-        second = frames.take("a", 4, 4)
+        assert frames.take(8, 4) is first
+        second = frames.take(4, 4)
         assert not first.path.exists()
         assert second.path.exists()
         assert not second.combined.any()
@@ -284,64 +316,13 @@ def test_a_frame_is_reused_for_its_size_and_replaced_for_another():
     assert not second.path.parent.exists()
 
 
-def test_threads_share_one_folder():
-    frames, folders = SharedFrames(), set()
-    threads = [threading.Thread(target=lambda: folders.add(frames.folder)) for _ in range(8)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(folders) == 1
-    frames.close()
-
-
-def test_what_a_killed_blender_left_in_memory_is_removed(tmp_path, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.engine.studio.SHARED_MEMORY", tmp_path)
-    dead = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
-    left, ours = (
-        tmp_path / f"primdiffusion_{writer().replace(str(os.getpid()), str(pid))}_x"
-        for pid in (int(dead.stdout), os.getpid())
-    )
-    for folder in (left, ours):
-        folder.mkdir()
-    frames = SharedFrames()
-    assert frames.folder.parent == tmp_path
-    assert not left.exists()
-    assert ours.exists()
-    frames.close()
-
-
-def test_a_full_memory_file_system_gives_way_to_the_disk(tmp_path, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.engine.studio.SHARED_MEMORY", tmp_path)
-
-    def fallocate(descriptor: int, _start: int, _size: int) -> None:
-        if str(tmp_path) in os.readlink(f"/proc/self/fd/{descriptor}"):
-            raise OSError(28, "No space left on device")
+def test_a_full_disk_is_an_error_that_leaves_no_file(monkeypatch):
+    def fallocate(_descriptor: int, _start: int, _size: int) -> None:
+        raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "posix_fallocate", fallocate)
     frames = SharedFrames()
-    monkeypatch.setattr("numpy.memmap", lambda *_, **__: np.zeros(8 * 4 * CHANNELS, np.float32))
-    assert tmp_path not in frames.take("a", 8, 4).path.parents
+    with pytest.raises(OSError, match="No space"):
+        frames.take(8, 4)
+    assert not list(frames.folder.iterdir())
     frames.close()
-
-
-def test_links_in_shared_memory_lose_nothing_outside(tmp_path, monkeypatch):
-    memory = tmp_path / "memory"
-    memory.mkdir()
-    monkeypatch.setattr("blender_primdiffusion.engine.studio.SHARED_MEMORY", memory)
-    (tmp_path / "outside").mkdir()
-    mine = tmp_path / "outside" / "mine"
-    mine.write_text("mine")
-    space, _, rest = writer().split("-")
-    ended = memory / f"primdiffusion_{space}-99999999-{rest}_x"
-    ended.symlink_to(mine.parent)
-    frames = SharedFrames()
-    (frames.folder / "view_1.frame").symlink_to(mine)
-    frames.take("view", 8, 8).clear()
-    frames.drop("view")
-    folder = frames.folder
-    folder.rmdir()
-    folder.symlink_to(mine.parent)
-    frames.close()
-    assert [path.name for path in mine.parent.iterdir()] == ["mine"]
-    assert mine.read_text() == "mine"

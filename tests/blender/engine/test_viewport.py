@@ -1,15 +1,123 @@
-"""Which picture of a Rendered view is drawn again, over Blender's overlays."""
+"""A Rendered view: what it says where it cannot be drawn, and which picture goes over Blender's overlays."""
 
 from __future__ import annotations
 
+import time
+from pathlib import Path
 from types import SimpleNamespace
 
+import bpy
+import numpy as np
 import pytest
 
 from blender_primdiffusion.engine import viewport
 from blender_primdiffusion.engine.viewport import Viewport
+from blender_primdiffusion.scene.build import build_human
 
-pytestmark = pytest.mark.any_blender
+SIZE = (48, 64)
+SAMPLE = Path(viewport.__file__).parents[1] / "gallery" / "Sample.human"
+
+
+class Engine:
+    """Stands in for Blender's side of a view."""
+
+    def __init__(self):
+        self.stats, self.redraws = [], 0
+
+    def tag_redraw(self) -> None:
+        self.redraws += 1
+
+    def update_stats(self, _: str, text: str) -> None:
+        self.stats.append(text)
+
+    def bind_display_space_shader(self, _scene: object) -> None:
+        pass
+
+    def unbind_display_space_shader(self) -> None:
+        pass
+
+
+@pytest.fixture
+def drawn(addon):
+    """Draws the scene, looking along y in parallel, at each call; what the view then says."""
+    view, engine, matrix = Viewport(), Engine(), np.diag([1.0, 0.75, -0.01, 1.0])
+    space = SimpleNamespace(local_view=None, camera=None, use_render_border=False)
+    to_view = np.array([[1.0, 0, 0, 0], [0, 0, 1, -1.0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    around = SimpleNamespace(window_matrix=matrix, view_matrix=to_view, view_perspective="PERSP")
+    region = SimpleNamespace(as_pointer=lambda: 7, width=SIZE[0], height=SIZE[1])
+    context = SimpleNamespace(region=region, region_data=around, space_data=space)
+
+    def draw() -> str:
+        depsgraph = bpy.context.evaluated_depsgraph_get()
+        view.update(context, depsgraph)
+        view.draw(engine, context, depsgraph)
+        return engine.stats[-1]
+
+    return SimpleNamespace(view=view, draw=draw, engine=engine, space=space, scene=bpy.context.scene)
+
+
+def test_a_gpu_that_cannot_draw_is_one_sentence_and_not_asked_again(drawn, monkeypatch):
+    asked = []
+
+    def march(*_given: object) -> None:
+        asked.append(True)
+        raise RuntimeError("this GPU has no compute shaders")
+
+    monkeypatch.setattr(drawn.view, "_march", march)
+    assert drawn.draw() == "PrimDiffusion: this GPU has no compute shaders"
+    assert drawn.draw() == "PrimDiffusion: this GPU has no compute shaders"
+    assert len(asked) == 1
+    assert drawn.view.resting
+    assert drawn.engine.redraws == 0
+
+
+def test_a_human_that_cannot_be_drawn_is_named_until_the_scene_changes(drawn, monkeypatch):
+    def march(*_given: object) -> None:
+        raise ValueError("Anna is damaged: import her again")
+
+    monkeypatch.setattr(drawn.view, "_march", march)
+    assert drawn.draw() == "PrimDiffusion: Anna is damaged: import her again"
+    assert drawn.view.resting
+    monkeypatch.setattr(drawn.view, "_march", lambda *_given: None)
+    assert drawn.draw() == ""
+
+
+def test_a_view_says_where_renders_show_something_else(drawn, monkeypatch):
+    monkeypatch.setattr(drawn.view, "_march", lambda *_given: None)
+    assert drawn.draw() == ""
+    drawn.scene.primdiffusion_render.view = "BOXES"
+    assert drawn.draw() == "PrimDiffusion: 3D views show Colour; render the image to see Primitives"
+
+
+def refined(drawn) -> np.ndarray:
+    """The picture [h, w, 4], from the bottom, once the view rests; drawn as often as the engine asks for it."""
+    for draws in range(1, 500):
+        assert drawn.draw() == ""
+        if drawn.engine.redraws < draws:
+            break
+        time.sleep(0.01)
+    drawn.engine.redraws = 0
+    texture, _ = drawn.view._texture
+    return np.array(texture.read()).reshape(texture.height, texture.width, 4)
+
+
+def test_a_view_is_refined_to_the_end_whole_and_in_part(marcher, drawn):
+    drawn.scene.render.film_transparent = True
+    human = build_human(bpy.context, SAMPLE)
+    bpy.context.view_layer.update()
+    whole = refined(drawn)
+    assert whole.shape == (SIZE[1], SIZE[0], 4)
+    assert drawn.view._refinement.shown.coarseness == 1
+    assert drawn.view._refinement.shown.sample > 0
+    assert 0.05 < (whole[..., 3] > 0.99).mean() < 0.3
+    drawn.space.use_render_border = True
+    drawn.space.render_border_min_x, drawn.space.render_border_max_x = 0.25, 0.75
+    drawn.space.render_border_min_y, drawn.space.render_border_max_y = 0.5, 1.0
+    assert np.abs(refined(drawn) - whole[32:, 12:36]).mean() < 0.01
+    drawn.space.use_render_border = False
+    human.location.x = 5.0
+    bpy.context.view_layer.update()
+    assert not refined(drawn).any()
 
 
 def view_of(address: int, transform: str = "Standard", exposure: float = 0.0) -> SimpleNamespace:
@@ -24,7 +132,7 @@ def shown():
     """A viewport of region 7 that shows a marched picture."""
     made = Viewport()
     made.region, made._texture = 7, ("mean", None)
-    made._gpu.shown = SimpleNamespace(picture=SimpleNamespace(humans=SimpleNamespace(depth="depth")))
+    made._refinement.shown = SimpleNamespace(picture=SimpleNamespace(humans=SimpleNamespace(depth="depth")))
     return made
 
 
@@ -34,10 +142,8 @@ def test_the_marched_picture_has_the_colours_that_are_shown_and_the_humans_depth
     assert viewport.picture_above_overlays(view_of(8)) is None
 
 
-def test_colours_that_a_handler_cannot_show_and_pictures_of_the_child_stay_below(shown):
+def test_colours_that_a_handler_cannot_show_stay_below(shown):
     assert viewport.picture_above_overlays(view_of(7, "AgX")) is None
     assert viewport.picture_above_overlays(view_of(7, exposure=1.0)) is None
     shown._texture = ("mean", (0, 0, 8, 8))
-    assert viewport.picture_above_overlays(view_of(7)) is None
-    shown._texture, shown._no_gpu = ("mean", None), "no compute shaders"
     assert viewport.picture_above_overlays(view_of(7)) is None

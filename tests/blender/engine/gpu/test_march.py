@@ -12,6 +12,7 @@ from gpu_stage import boxes_of, pinhole, placed, read
 
 from blender_primdiffusion.engine.gpu import march as gpu_march
 from blender_primdiffusion.engine.gpu.march import Boxes, GpuPayload
+from blender_primdiffusion.engine.gpu.refine import COARSENESS
 from blender_primdiffusion.engine.view import NO_SURFACE_M, PARALLEL_M, view_from_matrices
 from blender_primdiffusion.scene.convention import BLENDER_FROM_BACKEND
 
@@ -177,6 +178,23 @@ def test_slices_and_larger_tiles_give_the_same_picture(marcher, backend, payload
     assert larger._tile_side > gpu_march.TILE
     assert np.abs(read(larger.colour, view) - whole).max() < 1e-5
     assert np.array_equal(read(larger.depth, view), depth)
+
+
+@pytest.mark.parametrize("coarseness", COARSENESS[:-1])
+def test_a_coarse_picture_shows_what_the_fine_one_does(marcher, backend, payload, coarseness):
+    fields = placed(backend)
+    people, view = [(payload, boxes_of(fields))], pinhole(fields["position"].mean(0), (1.0, 0.3, 3.0), size=(320, 480))
+    fine, _ = marched(marcher, people, view)
+    rows, columns = 480 // coarseness, 320 // coarseness
+    mean = fine.reshape(rows, coarseness, columns, coarseness, 4).mean((1, 3))
+    march = marcher.march(people, view.scaled(columns, rows), STEP * coarseness)
+    march.advance()
+    error = np.abs(read(march.colour, view.scaled(columns, rows)) - mean)
+    inside, outside = mean[..., 3] > 0.999, mean[..., 3] == 0
+    assert inside.sum() > 0.05 * inside.size
+    assert error[inside].mean() < 0.05
+    assert error[inside][:, 3].max() < 0.1, "no holes"
+    assert error[outside].max() < 0.02
 
 
 def test_nobody_and_nobody_in_view_leave_the_picture_empty(marcher, backend, payload):

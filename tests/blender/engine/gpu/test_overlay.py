@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from types import SimpleNamespace
 
 import bpy
@@ -18,8 +17,7 @@ from blender_primdiffusion.engine.boxes import Boxes
 from blender_primdiffusion.engine.gpu import overlay as module
 from blender_primdiffusion.engine.gpu import scene_reading
 from blender_primdiffusion.engine.gpu.overlay import Overlay
-from blender_primdiffusion.engine.gpu.start import GpuStart
-from blender_primdiffusion.engine.view import NO_SURFACE_M
+from blender_primdiffusion.engine.view import NO_SURFACE_M, clip_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import body_of
@@ -161,44 +159,19 @@ def test_files_of_new_humans_are_read_one_after_the_other(people, monkeypatch):
     assert people.overlay.resting
 
 
-def test_shaders_are_compiled_in_steps_once_the_view_rests(addon, monkeypatch):
-    marcher, own, followed, start = object(), Overlay(), [], GpuStart()
-    monkeypatch.setattr(module, "gpu_start", start)
-    monkeypatch.setattr(module, "follow", lambda: followed.append(own.resting))
-
-    def compiling():
-        yield
-        yield
-        start._marcher = marcher
-
-    monkeypatch.setattr(start, "_compiling", compiling)
-    assert own.prepare() is None
-    assert followed == [False]
-    own._drawn_at = time.monotonic() + 60
-    assert [own.advance() for _ in range(5)] == [False] * 5, "the view moves"
-    own._drawn_at = 0.0
-    assert [own.advance() for _ in range(3)] == [False, False, True]
-    assert own.prepare() is marcher
-    assert own.resting
-
-
 def test_marching_and_drawing_are_steps_of_their_own(monkeypatch):
-    own, news = Overlay(), [False, True, False]
+    own, news = Overlay(), [False, True, True]
     pictures = SimpleNamespace(resting=False, fresh=False, advance=lambda: news.pop(0))
     own._regions[0] = pictures
     monkeypatch.setattr(module, "overlay", own)
-    steps, seen = module._march_and_draw(), []
-    for seconds in steps:
+    seen = []
+    for _ in range(5):
+        seconds = module._tick()
         pictures.resting = not news
-        seen.append((seconds, own.undrawn, own.resting))
+        seen.append((seconds, own.undrawn))
     march, at_once = module.TICK_S, 0.0
-    assert seen == [
-        (march, False, False),
-        (at_once, True, False),
-        (at_once, False, False),
-        (march, False, False),
-        (march, False, True),
-    ]
+    assert seen == [(march, False), (at_once, True), (march, False), (at_once, True), (None, False)]
+    assert own.resting
 
 
 def test_what_a_scene_shows_is_read_again_only_when_it_has_changed(people):
@@ -249,8 +222,8 @@ def test_a_pixel_at_a_depth_is_a_point_of_the_world(matrix):
 
 
 def test_clip_planes_follow_from_the_projection():
-    assert module._clip(PERSPECTIVE) == pytest.approx((0.1, 1000), rel=0.01)
-    assert module._clip(PARALLEL) == pytest.approx((-500, 500))
+    assert clip_of(PERSPECTIVE) == pytest.approx((0.1, 1000), rel=0.01)
+    assert clip_of(PARALLEL) == pytest.approx((-500, 500))
 
 
 def clickable(people, matrix=PERSPECTIVE) -> SimpleNamespace:
@@ -340,78 +313,69 @@ def test_a_picture_above_the_overlays_leaves_the_bones_of_the_same_reading(peopl
     assert drawn[1] == ("picture", True)
 
 
-def drawing(people, monkeypatch, march, sketch) -> list[tuple]:
-    """Let an overlay march and sketch by these functions; the parts and pictures that it draws."""
-    start, drawn = GpuStart(), []
-    start._marcher = SimpleNamespace(march=march)
-    monkeypatch.setattr(module, "gpu_start", start)
-    monkeypatch.setattr(module, "ReliefPicture", sketch)
+def drawing(monkeypatch, march) -> list[tuple]:
+    """Let an overlay march by this function; the parts and pictures that it draws."""
+    drawn = []
+    monkeypatch.setattr(module, "gpu_marcher", lambda: SimpleNamespace(march=march))
     monkeypatch.setattr(module, "keep_bones_in_front", lambda *_given: None)
     monkeypatch.setattr(module, "_look", lambda *_given: None)
     monkeypatch.setattr(module, "draw_picture", lambda picture, _look, part: drawn.append((picture, part)))
     monkeypatch.setattr(module, "follow", lambda: None)
-    monkeypatch.setattr(Uploads, "placed", lambda self, pose: (SimpleNamespace(relief=None), PLACED(self, pose)[1]))
     return drawn
 
 
-PLACED = Uploads.placed
+class Marched:
+    """A picture that is complete at once."""
+
+    def __init__(self, _humans, view, step):
+        self.view, self.step = view, step
+
+    def advance(self, _work):
+        return True
+
+    def wait(self):
+        pass
 
 
-def broken(*_given):
-    raise RuntimeError("the GPU is out of order")
-
-
-def test_a_gpu_that_fails_to_march_sketches_and_the_view_says_why(people, monkeypatch):
+def test_a_gpu_that_cannot_march_is_not_asked_again_and_the_view_says_why(people, monkeypatch):
     asked = []
 
     def march(*given):
         asked.append(given)
-        broken()
+        raise RuntimeError("the GPU is out of order")
 
-    sketch = SimpleNamespace(wait=lambda: None)
-    drawn = drawing(people, monkeypatch, march, lambda *_given: sketch)
-    people.overlay.draw(context())
-    people.overlay._regions[1]._changed_at = 0.0
-    for _ in range(3):
-        people.overlay.advance()
-        people.overlay.draw(context())
-    assert len(asked) == 1
-    assert [picture for picture, _ in drawn] == [sketch] * 4
-    assert people.overlay.error == "the GPU is out of order: humans are drawn roughly"
-    assert people.overlay.resting
-
-
-def test_a_gpu_that_can_draw_nothing_is_not_asked_again(people, monkeypatch):
-    asked = []
-
-    def sketch(*given):
-        asked.append(given)
-        broken()
-
-    assert drawing(people, monkeypatch, broken, sketch) == []
+    assert drawing(monkeypatch, march) == []
     for _ in range(4):
         people.overlay.draw(context())
-    assert len(asked) == 2, "once more when marching was given up"
+    assert len(asked) == 1
     assert people.overlay.error.startswith("the GPU is out of order: show the volumes instead")
     assert people.overlay.resting
 
 
+def test_a_gpu_that_fails_while_a_view_rests_is_noticed(people, monkeypatch):
+    drawn = drawing(monkeypatch, Marched)
+    people.overlay.draw(context())
+    people.overlay._regions[1]._changed_at = 0.0
+
+    def fail(_self, _work):
+        raise RuntimeError("the GPU is out of order")
+
+    monkeypatch.setattr(Marched, "advance", fail)
+    assert people.overlay.advance()
+    people.overlay.draw(context())
+    assert len(drawn) == 1
+    assert people.overlay.error.startswith("the GPU is out of order")
+    assert people.overlay.resting
+
+
 def test_each_redraw_of_a_moving_view_shows_all_of_the_new_one(people, monkeypatch):
-    drawn = drawing(people, monkeypatch, broken, lambda _humans, view: SimpleNamespace(view=view, wait=lambda: None))
+    drawn = drawing(monkeypatch, Marched)
     for turn in range(5):
         view = context()
         view.region_data.view_matrix = LOOK_ALONG_Y @ np.array(Matrix.Rotation(0.1 * turn, 4, "Z"))
         people.overlay.draw(view)
         assert len(drawn) == turn + 1
-    turns = {sketch.view.world_to_camera.tobytes() for sketch, _ in drawn}
+    turns = {picture.view.world_to_camera.tobytes() for picture, _ in drawn}
     assert len(turns) == 5
-
-
-def test_a_picture_that_comes_is_drawn_above_the_one_that_is_there(people):
-    picture = SimpleNamespace(coming=SimpleNamespace(done=0.25), shown=SimpleNamespace(picture="sketch"))
-    assert list(module._parts(picture, (0.1, 0.2, 0.6, 0.9))) == [
-        ((0.1, 0.75, 0.6, 0.9), picture.coming),
-        ((0.1, 0.2, 0.6, 0.75), "sketch"),
-    ]
-    picture.coming = None
-    assert list(module._parts(picture, (0.1, 0.2, 0.6, 0.9))) == [((0.1, 0.2, 0.6, 0.9), "sketch")]
+    step, (first, _) = bpy.context.scene.primdiffusion_render.step, drawn[0]
+    assert (first.view.width, first.step) == (SIZE[0] // 8, 8 * step)

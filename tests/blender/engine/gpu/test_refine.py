@@ -3,22 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from blender_primdiffusion.engine.gpu.refine import (
-    REVEAL_S,
+    COARSENESS,
+    REST_S,
     SAMPLES,
-    SKETCH,
     SLICE_S,
     SLOW_SAMPLES,
     GpuRefinement,
     MarchRequest,
     jittered,
 )
-from blender_primdiffusion.engine.refine import REST_S
 from blender_primdiffusion.engine.view import PinholeView
 
 pytestmark = pytest.mark.any_blender
@@ -31,21 +29,11 @@ class SlowGpu:
     def __init__(self, pixel_s: float, boxes: Callable[[float], int] = lambda _height: 0):
         """`boxes` by the height in the picture, from 0 at the top to 1."""
         self.now, self.pixel_s, self.boxes, self.sizes, self.longest = 0.0, pixel_s, boxes, [], 0.0
-        self.sketched: list[tuple[int, int]] = []
-        self.sketch_s = 0.01
 
-    def begin(self, view: PinholeView) -> OnePass:
+    def begin(self, view: PinholeView, coarseness: int) -> OnePass:
+        assert coarseness == VIEW.width // view.width
         self.sizes.append((view.width, view.height))
         return OnePass(self, view)
-
-    def sketch(self, view: PinholeView) -> SimpleNamespace:
-        """Its time is seen by who waits for it."""
-        self.sketched.append((view.width, view.height))
-        seconds = self.sketch_s * view.width * view.height / (VIEW.width * VIEW.height)
-        return SimpleNamespace(wait=lambda: self.wait(seconds))
-
-    def wait(self, seconds: float) -> None:
-        self.now += seconds
 
     def refine_to_the_end(self, refinement: GpuRefinement) -> list[tuple[int, int]]:
         """Coarseness and sample of the pictures that appear."""
@@ -65,11 +53,6 @@ class OnePass:
     def __init__(self, gpu: SlowGpu, view: PinholeView):
         rows = -(-view.height // 8)
         self._gpu, self._work = gpu, [8 * view.width * (1 + gpu.boxes(row / rows)) for row in range(rows)]
-        self._rows = rows
-
-    @property
-    def done(self) -> float:
-        return 1 - len(self._work) / self._rows
 
     def advance(self, work: float) -> bool:
         done = 0
@@ -83,7 +66,7 @@ class OnePass:
 
 
 def request(gpu: SlowGpu, key: object) -> MarchRequest:
-    return MarchRequest(key, VIEW, gpu.sketch, gpu.begin)
+    return MarchRequest(key, VIEW, gpu.begin)
 
 
 def refined(gpu: SlowGpu, key: object = "a") -> GpuRefinement:
@@ -93,15 +76,22 @@ def refined(gpu: SlowGpu, key: object = "a") -> GpuRefinement:
     return refinement
 
 
-def test_a_picture_is_sketched_refined_and_antialiased_when_nothing_moves():
+def test_a_picture_is_refined_and_antialiased_when_nothing_moves():
     gpu = SlowGpu(1e-6)
     refinement = GpuRefinement(lambda: gpu.now)
     refinement.want(request(gpu, "a"))
     shown = gpu.refine_to_the_end(refinement)
-    assert shown == [(SKETCH, 0), (2, 0), (1, 0), *((1, n) for n in range(1, SAMPLES))]
-    assert gpu.sizes[:2] == [(320, 240), (640, 480)]
+    assert shown == [*((coarseness, 0) for coarseness in COARSENESS), *((1, n) for n in range(1, SAMPLES))]
+    assert gpu.sizes[:4] == [(80, 60), (160, 120), (320, 240), (640, 480)]
     assert gpu.longest < 2 * SLICE_S
     assert not refinement.advance()
+
+
+def test_a_fast_gpu_skips_what_it_does_not_need():
+    gpu = SlowGpu(1e-7)
+    refinement = GpuRefinement(lambda: gpu.now)
+    refinement.want(request(gpu, "a"))
+    assert gpu.refine_to_the_end(refinement)[:3] == [(8, 0), (1, 0), (1, 1)]
 
 
 def test_a_fast_gpu_marches_in_full_while_the_view_moves():
@@ -115,7 +105,7 @@ def test_a_fast_gpu_marches_in_full_while_the_view_moves():
         gpu.now += REST_S / 2
 
 
-@pytest.mark.parametrize("pixel_s", [1e-9, 1e-7, 1e-6, 2e-5, 1e-3])
+@pytest.mark.parametrize("pixel_s", [1e-9, 1e-7, 1e-6, 2e-5, 5e-5])
 def test_the_first_call_after_any_change_shows_a_whole_picture_of_the_new_view(pixel_s):
     gpu = SlowGpu(pixel_s)
     refinement = GpuRefinement(lambda: gpu.now)
@@ -134,7 +124,7 @@ def test_a_gpu_that_has_become_slow_is_noticed_at_the_first_picture():
     gpu = SlowGpu(1e-7)
     refinement = refined(gpu)
     gpu.pixel_s = 2e-6
-    for key, coarseness in (("b", 1), ("c", SKETCH)):
+    for key, coarseness in (("b", 1), ("c", 4)):
         refinement.want(request(gpu, key))
         began = gpu.now
         assert refinement.advance()
@@ -142,54 +132,15 @@ def test_a_gpu_that_has_become_slow_is_noticed_at_the_first_picture():
     assert gpu.now - began < 0.05
 
 
-def test_sketches_that_take_long_are_followed_by_ones_of_half_the_resolution():
-    gpu = SlowGpu(1e-5)
+def test_while_a_view_moves_its_pictures_are_as_fine_as_the_gpu_is_fast():
+    gpu, shown = SlowGpu(1e-7), []
     refinement = GpuRefinement(lambda: gpu.now)
-    for key, seconds in enumerate((0.1, 0.1, 0.05, 0.02, 0.02)):
-        gpu.sketch_s = seconds
+    for key in range(8):
+        gpu.pixel_s = 1e-7 if key < 4 else 1e-6
         refinement.want(request(gpu, key))
         refinement.advance()
-    whole, half = (640, 480), (320, 240)
-    assert gpu.sketched == [whole, half, half, half, whole]
-
-
-def test_a_sketch_stays_while_the_gpu_cannot_march_and_is_refined_as_soon_as_it_can():
-    gpu = SlowGpu(1e-6)
-    refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(MarchRequest("a", VIEW, gpu.sketch, None))
-    assert gpu.refine_to_the_end(refinement) == [(SKETCH, 0)]
-    refinement.want(request(gpu, "a"))
-    assert not refinement.fresh
-    assert gpu.refine_to_the_end(refinement)[-1] == (1, SAMPLES - 1)
-
-
-def test_a_slow_picture_is_shown_as_far_as_it_has_come():
-    gpu = SlowGpu(1e-5)
-    refinement, come = GpuRefinement(lambda: gpu.now), []
-    refinement.want(request(gpu, "a"))
-    refinement.advance()
-    assert refinement.coming is None
-    gpu.now += REST_S
-    began = gpu.now
-    while refinement.shown.coarseness == SKETCH:
-        if refinement.advance() and refinement.coming is not None:
-            assert refinement.shown.coarseness == SKETCH, "the sketch stays below"
-            come.append((refinement.coming.done, gpu.now))
-    parts = [part for part, _ in come]
-    assert parts == sorted(set(parts))
-    assert 0 < parts[0] < 0.7
-    assert np.diff([began, *(moment for _, moment in come)]).min() >= REVEAL_S
-
-
-def test_what_antialiases_is_shown_when_it_is_complete():
-    gpu = SlowGpu(1e-5)
-    refinement = GpuRefinement(lambda: gpu.now)
-    refinement.want(request(gpu, "a"))
-    while not refinement.resting:
-        refinement.advance()
-        gpu.now += 0.02
-        if refinement.shown.coarseness == 1:
-            assert refinement.coming is None
+        shown.append(refinement.shown.coarseness)
+    assert shown == [8, 1, 1, 1, 1, 4, 4, 4]
 
 
 def test_a_human_below_empty_rows_does_not_stall_the_window():
@@ -214,12 +165,11 @@ def test_a_finer_picture_is_abandoned_when_the_view_moves():
         refinement.advance()
         gpu.now += REST_S
     refinement.want(request(gpu, "b"))
-    assert refinement.coming is None
     refinement.advance()
     assert refinement.shown.request.key == "b"
     gpu.now += REST_S
     refinement.advance()
-    assert gpu.sizes[-1] == (320, 240)
+    assert gpu.sizes[-1] == (160, 120)
 
 
 def test_an_equal_request_changes_nothing_and_rays_stay_in_their_pixels():
