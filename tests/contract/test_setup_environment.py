@@ -14,11 +14,13 @@ from blender_primdiffusion.formats.whole_files import write_atomically
 from support.errors import refused
 from support.fake_child import FAKE_CHILD
 from tiny_packages import own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
+from waiting import BACKEND, PYTHON
 
 from blender_primdiffusion.backend import setup
+from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import MARK, VARIABLE, SetUpFolder, candidates, state_of
 from blender_primdiffusion.backend.packages import read_lock
-from blender_primdiffusion.backend.requests import run_to_end
+from blender_primdiffusion.backend.requests import Backend, ChildRequest, run_to_end
 from blender_primdiffusion.backend.setup import Steps
 
 
@@ -188,6 +190,28 @@ def test_an_environment_that_fails_its_self_test_is_not_ready(place):
     write_lock(place.lock, write_packages(place.wheels, problem="the graphics card is on fire"))
     assert failed(place.from_folder()) == "the self-test failed: the graphics card is on fire"
     assert state_of(place.folder)[0] == "broken"
+
+
+@pytest.mark.slow
+def test_the_self_test_compiles_what_the_first_press_needs(tmp_path, monkeypatch):
+    monkeypatch.setenv("PRIMDIFFUSION_DEVICE", "cpu")
+    cache = tmp_path / "cache"
+    run_to_end(setup._trial(PYTHON, BACKEND, cache, tmp_path))
+    compiled = sorted(cache.rglob("*.nbc"))
+    assert compiled
+    backend = Backend(lambda: _client(cache))
+    request = ChildRequest(
+        backend, "generate", {"seed": 1, "steps": 3, "picture_px": 64, "out_dir": str(tmp_path / "out")}
+    )
+    until(lambda: request.tick() is None or request.finished)
+    backend.release()
+    assert request.error is None
+    assert sorted(cache.rglob("*.nbc")) == compiled
+
+
+def _client(cache: Path):
+    yield
+    return BackendClient(PYTHON, BACKEND, cache_dir=cache)
 
 
 def test_no_network_is_a_sentence(place, monkeypatch):
