@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -12,11 +11,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, ShapedBody, default_body
-from primdiffusion.capture.poses import BUILT_IN, built_in_poses
+from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.diffusion.codec import CellCodec, cells_from_voxels
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.model import DiffusionModel, sample, seeded
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.formats.poses.built_in import built_in_vectors
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import Human, people_of
@@ -91,7 +91,7 @@ def rest_scene(person: Person) -> Scene:
 
 def posed_scenes(person: Person) -> Iterator[Scene]:
     """Other poses: body from the front, and the head from its own front."""
-    names, rotations = list(json.loads(BUILT_IN.read_text(encoding="utf-8"))), built_in_poses().joint_rotation.float()
+    names, rotations = list(built_in_vectors()), built_in_poses().joint_rotation.float()
     body, head = default_body(), JOINT_NAMES.index("head")
     in_rest = shaped(person.betas)
     for name in POSES:

@@ -103,7 +103,7 @@ def register(_arguments: argparse.Namespace) -> dict[str, float]:
 
 
 def person(arguments: argparse.Namespace) -> dict[str, float | None]:
-    """One person: building, frames with both attachments, motion."""
+    """One person: building, frames with volumes shown, motion."""
     _enable(arguments)
     from blender_primdiffusion.scene.build import build_human
 
@@ -125,8 +125,6 @@ def person(arguments: argparse.Namespace) -> dict[str, float | None]:
         "amass_1500_seconds": keyed,
         "frame_ms": _frame_ms(context.scene),
     }
-    bpy.ops.primdiffusion.set_attachment(mode="SURFACE")
-    figures["frame_surface_ms"] = _frame_ms(context.scene)
     return figures
 
 

@@ -41,7 +41,6 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
-from unittest import mock
 
 import blender_isolated  # noqa: F401  before bpy
 import bpy
@@ -56,8 +55,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.edit import select_human
-from blender_primdiffusion.scene.pending import write_all_pending
 from blender_primdiffusion.scene.place import stand_at_cursor
+from blender_primdiffusion.scene.volume_files import write_volumes
 
 FRAMES = 60
 _ENTERING = (
@@ -156,14 +155,13 @@ def one_human(person: Path) -> dict[str, float]:
     figures["person_memory_mb"] = resident_mb() - memory
     figures["person_frame_ms"] = frame_ms(found[0])
     figures["outliner_rows"] = outliner_rows(found[0].users_collection[0])
-    figures["volumes_seconds"] = seconds(write_all_pending)
+    figures["volumes_seconds"] = seconds(lambda: write_volumes(found[0]))
     return figures
 
 
 def enter(person: Path) -> bpy.types.Object:
     """What blocks the window."""
-    with mock.patch.object(build, "volumes_may_wait", return_value=True):
-        human = build.build_human(bpy.context, person)
+    human = build.build_human(bpy.context, person)
     stand_at_cursor(bpy.context, human)
     bpy.context.view_layer.update()
     select_human(bpy.context, human)

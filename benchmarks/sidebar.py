@@ -142,8 +142,8 @@ class Layout:
     def template_icon(self, scale: float = 1.0, **_: Any) -> None:
         self.items.append(ROW * scale)
 
-    def template_icon_view(self, *_: Any, scale: float = 6.0, **__: Any) -> None:
-        self.items.append(ROW * scale)
+    def template_action(self, *_: Any, **__: Any) -> None:
+        self.items.append(ROW)
 
 
 class _Grid(Layout):

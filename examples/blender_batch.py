@@ -37,8 +37,7 @@ def main(options: list[str]) -> None:
         person.location.x = x
     first, second = (bpy.data.objects[f"Person {seed}"] for seed in arguments.seeds)
 
-    select(first)
-    operators.apply_pose(pose_name="Waving")
+    pose(first, "Waving")
     select(second)
     if arguments.motion is not None:
         operators.import_motion(filepath=str(arguments.motion))
@@ -61,6 +60,14 @@ def main(options: list[str]) -> None:
 def humans() -> list[bpy.types.Object]:
     """The people in the file: armatures, which are posed, moved and animated."""
     return [obj for obj in bpy.data.objects if "primdiffusion_human" in obj]
+
+
+def pose(person: bpy.types.Object, name: str) -> None:
+    """Apply a pose asset of the extension, as Blender's pose library does."""
+    library = bpy.context.preferences.filepaths.asset_libraries["PrimDiffusion"]
+    with bpy.data.libraries.load(str(Path(library.path) / "poses.blend")) as (_, wanted):
+        wanted.actions = [name]
+    person.pose.apply_pose_from_action(wanted.actions[0])
 
 
 def select(obj: bpy.types.Object) -> None:

@@ -12,12 +12,13 @@ import numpy as np
 
 from ..backend.requests import sentence
 from ..formats.answers import HumanAnswer
-from ..scene.attachment import volumes_may_wait
 from ..scene.cycles import overlap_warning_in
 from ..scene.edit import Replaced, replace_person
 from ..scene.payload import session_file
+from ..scene.representation import in_viewport, representation_of
+from ..scene.volume_files import write_volumes
+from ..scene.volume_nodes import set_folder
 from ..scene.volumes import free_unused_grids
-from .deferred_volumes import deferred_volumes
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .target import HumanTarget
 
@@ -28,8 +29,9 @@ _STEP_PICTURE_PX = 256
 def show_in_place(context: bpy.types.Context, person: bpy.types.Object, result: HumanAnswer) -> Replaced:
     """Show the human of the child's `result` in place of `person`. Raises as `replace_person` does."""
     done = replace_person(person, result.person)
-    if not volumes_may_wait(person):
-        deferred_volumes.finish()
+    if representation_of(person) == "VOLUMES" and in_viewport(person):
+        write_volumes(person)
+        set_folder(person, session_file(person).parent, again=True)
         context.view_layer.update()  # evaluated data holds the old grids
         free_unused_grids()
     return done

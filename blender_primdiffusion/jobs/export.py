@@ -18,9 +18,8 @@ from ..formats.poses.rotation import nearest
 from ..formats.poses.skeleton import unchain
 from ..formats.regular_files import exists_in_its_folder, remove_file
 from ..formats.whole_files import written_whole
-from ..motion.pose_library import rest_joints
+from ..motion.posture import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
-from ..scene.attachment import attachment_of, parts_by_mode, set_attachment
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
 from ..scene.human import link_part
 from ..scene.human_file import (
@@ -37,6 +36,7 @@ from ..scene.human_file import (
 from ..scene.merged import read_grid, write_grid
 from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
 from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
+from ..scene.representation import parts_by_representation, representation_of, set_representation
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
 from .generate import build_person
@@ -49,9 +49,9 @@ def show(person: bpy.types.Object, what: str) -> None:
     proxy = proxy_of(person)
     if proxy is None:
         raise ValueError(f"{person.name!r} has no mesh proxy yet: press Add Mesh Proxy")
-    set_attachment(person, attachment_of(person))  # shows the parts of the current attachment
+    set_representation(person, representation_of(person))  # shows its part again
     proxy.hide_viewport, proxy.hide_render = what == "VOLUMES", what != "MESH"
-    for part in parts_by_mode(person).values():
+    for part in parts_by_representation(person).values():
         if part is not None:
             part.hide_viewport = part.hide_viewport or what != "VOLUMES"
             part.hide_render = part.hide_render or what == "MESH"

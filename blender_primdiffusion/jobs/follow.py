@@ -12,7 +12,6 @@ from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import error_text, sentence
 from ..formats.regular_files import printable
 from ..places import backend_is_named
-from .deferred_volumes import keep_writing
 from .memory import release_when_idle
 from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
@@ -58,7 +57,6 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
         went_well = outcome.error is None
         if went_well and job.undo:
             bpy.ops.ed.undo_push(message=job.undo)
-            keep_writing()
         elif left_edit_mode or _data_blocks() != before:  # by a failure or an exporter; see `in_the_way`
             bpy.ops.ed.undo_push(message=job.undo or job.label)
         if not went_well:

@@ -19,13 +19,13 @@ from ..formats.answers import FitPostureAnswer, ReconstructAnswer
 from ..formats.camera_rig import View
 from ..formats.json_files import read_json
 from ..formats.regular_files import as_file_error
-from ..motion.pose_library import check_posable, take_world_posture, world_posture
-from ..scene.attachment import parts_by_mode
+from ..motion.posture import check_posable, take_world_posture, world_posture
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
-from ..scene.handles import handles_from_joints, joints_from_handles
+from ..scene.handles import check_no_handles
 from ..scene.human import humans
 from ..scene.payload import BODY
+from ..scene.representation import parts_by_representation
 from ..scene.shape import betas_of
 from .generate import build_person
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
@@ -72,7 +72,7 @@ class PictureTask:
                     f"the human {person.name!r} is on a body of your own files: pose one of the default body"
                 )
             check_posable(person)
-            joints_from_handles(context, person)
+            check_no_handles(person)
             pose, translation = world_posture(person)
             posed = {
                 "pose": [pose.ravel().tolist()],
@@ -155,10 +155,9 @@ class FitPictureJob(Job):
         fitted, person = read_fitted(result.posture, self.task.size), self.target.found()
         check_shapeable(person)
         check_posable(person)
+        check_no_handles(person)
         reshape(person, fitted.betas)
         take_world_posture(person, fitted.pose, fitted.translation)
-        context.view_layer.update()
-        handles_from_joints(context, person)
         if (camera := self.task.camera_now()) is not None:
             aim_at_picture(camera, fitted.view)
         return " ".join([f"Fitted in {result.seconds:.1f} s.", *map(sentence, result.warnings)])
@@ -200,7 +199,7 @@ class PictureJob(Job):
             _stand_at_origin(context, armature, camera)
         for other in humans(context.scene):
             if other.session_uid == self.posed_over:
-                for hidden in (other, *filter(None, parts_by_mode(other).values())):
+                for hidden in (other, *filter(None, parts_by_representation(other).values())):
                     hidden.hide_viewport = hidden.hide_render = True
         return notice
 

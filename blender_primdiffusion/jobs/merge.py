@@ -1,4 +1,4 @@
-"""Jobs for other renderers: merged volumes, and the density gain."""
+"""Jobs for other renderers: merged volumes."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from ..engine.picture import pose_of
 from ..formats.answers import MergeAnswer, MergeFramesAnswer
 from ..formats.joints import JOINT_NAMES
 from ..formats.regular_files import remove_file
-from ..scene.attachment import set_attachment
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
+from ..scene.representation import set_representation
 from .queue import Job
 from .target import HumanTarget
 
@@ -68,7 +68,7 @@ class MergeJob(Job):
         digest = write_grid(read_grid(result.out), folder / "grid.vdb")
         files = publish([folder / "grid.vdb"], [digest], merged_folder())
         show_merged(person, files, MergedState((self.moment.digest,), self.voxel))
-        set_attachment(person, "MERGED")
+        set_representation(person, "MERGED")
         size = files[0].stat().st_size / 1e6
         return f"Merged {person.name} at {self.voxel * 1e3:.3g} mm in {result.seconds:.1f} s, {size:.1f} MB"
 
@@ -122,7 +122,7 @@ class MergeFramesJob(Job):
         written = [_grid(folder, index).with_suffix(".vdb") for index in range(len(self.moments))]
         files = publish(written, self._digests, merged_folder())
         show_merged(person, files, MergedState(tuple(m.digest for m in self.moments), self.voxel, self.start))
-        set_attachment(person, "MERGED")
+        set_representation(person, "MERGED")
         size = sum(path.stat().st_size for path in files) / 1e6
         return f"Merged {len(files)} frames of {person.name} in {result.seconds:.1f} s, {size:.0f} MB"
 

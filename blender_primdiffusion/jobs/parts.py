@@ -15,7 +15,6 @@ from bpy.app.handlers import persistent
 
 from ..formats.regular_files import printable
 from ..scene.parts import complete_humans, orphans, without_parts
-from .deferred_volumes import keep_writing
 from .windows import in_the_way, window_of
 
 SOON_S = 0.2
@@ -39,7 +38,6 @@ def complete() -> None:
         return
     if changed:
         bpy.ops.ed.undo_push(message="Parts of Humans")
-        keep_writing()
 
 
 def tick() -> float | None:

@@ -63,6 +63,23 @@ def resample(motion: Motion, fps: float) -> Motion:
     return dataclasses.replace(motion, rotations=rotations, translations=places, fps=fps)
 
 
+def rounds_of(motion: Motion, rounds: int) -> Motion:
+    """The motion `rounds` times, each from where the one before has ended, in the direction in which it has ended.
+
+    The last frame is the next round's first, so it must be the first frame turned about the vertical and moved.
+    """
+    turn = motion.rotations[-1, 0] @ motion.rotations[0, 0].T
+    turned, place, rotations, places = np.eye(3), motion.translations[0], [], []
+    for number in range(rounds):
+        following = np.array(motion.rotations)
+        following[:, 0] = turned @ following[:, 0]
+        path = place + (motion.translations - motion.translations[0]) @ turned.T
+        rotations.append(following[number > 0 :])
+        places.append(path[number > 0 :])
+        turned, place = turn @ turned, path[-1]
+    return dataclasses.replace(motion, rotations=np.concatenate(rotations), translations=np.concatenate(places))
+
+
 def scale_places(motion: Motion, factor: float) -> Motion:
     """The motion with its translations scaled."""
     return dataclasses.replace(motion, translations=motion.translations * factor)

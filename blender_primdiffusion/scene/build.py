@@ -1,4 +1,4 @@
-"""Build a human in the scene: an armature with body mesh and volumes as its children."""
+"""Build a human in the scene: an armature with body mesh, and splats or volumes, as its children."""
 
 from __future__ import annotations
 
@@ -13,11 +13,10 @@ from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
 from .armature import build_armature, floor_below
-from .attachment import IN_VIEWPORT, VOLUMES_IN_VIEWPORT, set_attachment, volumes_may_wait
 from .convention import points_to_blender
 from .human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, link_part
 from .payload import pack
-from .pending import write_volumes
+from .representation import set_representation
 from .rest_human import read_human, shape_model_of
 from .shape import betas_of
 from .splats import SPLATS_AVAILABLE
@@ -27,15 +26,18 @@ NAME_LENGTH = 40
 """Characters of a new human's name; names of its parts are longer, and Blender allows 63."""
 
 _ABOUT_BETAS = "Shape of the body. The sliders in the sidebar set it; keys and drivers move the engine's picture alone"
-_KINDS = ("collections", "objects", "volumes", "meshes", "armatures", "actions", "materials", "images", "pointclouds")
+_KINDS = (
+    "collections", "objects", "volumes", "meshes", "armatures", "actions", "materials", "images", "pointclouds",
+    "node_groups",
+)  # fmt: skip
 
 
 def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human") -> bpy.types.Object:
     """Build the human of a file in a collection of their own: an armature that holds the file, and its parts.
 
     The human faces -y and stands at the world's origin. The armature's origin is on the floor below the pelvis; in its
-    space, the backend's axes are turned z up and the body is raised by ORIGIN. Without a window the volumes' files are
-    written too. Raises as `read_human`, also for what cannot be written, and then leaves no data. Makes no undo step.
+    space, the backend's axes are turned z up and the body is raised by ORIGIN. Raises as `read_human`, and then leaves
+    no data. Makes no undo step.
     """
     file = Path(file)
     human = read_human(file)
@@ -50,7 +52,6 @@ def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human
         person[BETAS] = human.payload.betas.tolist()
         person.id_properties_ui(BETAS).update(description=_ABOUT_BETAS)
         person[MARK] = human.provenance()
-        person[IN_VIEWPORT] = VOLUMES_IN_VIEWPORT
         collection.objects.link(person)
         build_missing_parts(person)
         context.scene.collection.children.link(collection)
@@ -58,18 +59,14 @@ def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human
 
 
 def build_missing_parts(person: bpy.types.Object) -> None:
-    """Give a human, such as a copy of the armature alone, its body and, where it has none of both, splats or volumes.
+    """Give a human, such as a copy of the armature alone, its body, and splats or, before Blender 5.3, volumes.
 
     Raises as `read_human` does, and then leaves no data. Makes no undo step.
     """
     with _no_data_left_on_failure():
-        for collection in _with_volumes_of_others(person):
-            collection.objects.unlink(person)
         if body_of(person) is None:
             _build_body(person)
-        set_attachment(person, "SPLATS" if SPLATS_AVAILABLE else "ARMATURE")
-        if not volumes_may_wait(person):
-            write_volumes(person)
+        set_representation(person, "SPLATS" if SPLATS_AVAILABLE else "VOLUMES")
 
 
 def _build_body(person: bpy.types.Object) -> None:
@@ -82,12 +79,6 @@ def _build_body(person: bpy.types.Object) -> None:
     link_part(person, body)
     if not SPLATS_AVAILABLE:  # they show without the extension
         link_part(person, build_stand_in(person.name, person, body))
-
-
-def _with_volumes_of_others(person: bpy.types.Object) -> list[bpy.types.Collection]:
-    """The collections in which Blender has put a copy because the copied human was there, beside its volumes."""
-    found = [one for one in person.users_collection if any(obj.type == "VOLUME" for obj in one.objects)]
-    return found if len(found) < len(person.users_collection) else []
 
 
 @contextmanager

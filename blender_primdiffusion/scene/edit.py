@@ -1,4 +1,4 @@
-"""Edits of a human: another shape, for which bones, body mesh, volumes and proxy move to their new rest places; the
+"""Edits of a human: another shape, for which bones, body mesh and proxy move to their new rest places; the
 region painted for an edit by the backend; and its result in place of the human before."""
 
 from __future__ import annotations
@@ -11,24 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.joints import JOINT_NAMES
-from ..formats.poses.rotation import matrix_to_quaternion
 from .armature import floor_below, move_rest_joints
-from .convention import frames_to_blender, points_to_blender
-from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data, volumes_of
+from .cells import scale_cells
+from .convention import points_to_blender
+from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data
 from .payload import pack, session_file
-from .pending import show_volume
 from .proxy import follow_shape, proxy_of
 from .rest_human import read_human, shape_model_of
 from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
-from .splats import replace_splats, scale_splats
-from .surface import scale_surface
-
-_FLOOR_TOLERANCE = 1e-3
-"""Metres the soles may be off the floor and still count as on it."""
+from .splats import replace_splats
+from .volume_nodes import set_folder
 
 
 def check_shapeable(person: bpy.types.Object) -> None:
-    """Raises ValueError for a human whose bones, mesh or volumes cannot follow a shape now."""
+    """Raises ValueError for a human whose bones or mesh cannot follow a shape now."""
     body = body_of(person)
     for obj in (person, person.data, body and body.data):
         if obj and obj.library is not None:
@@ -49,8 +45,8 @@ def check_shapeable(person: bpy.types.Object) -> None:
 def reshape(person: bpy.types.Object, betas: NDArray) -> str:
     """Give a human another shape [10]; returns what could not follow in a sentence, empty when everything did.
 
-    Bones, body mesh, volumes and mesh proxy move to their new rest places, with the soles where they were; pose,
-    animation and files stay. Raises ValueError or FileNotFoundError before anything is touched. Makes no undo step.
+    Bones, body mesh and mesh proxy move to their new rest places, with the soles where they were; pose and animation
+    stay. Raises ValueError or FileNotFoundError before anything is touched. Makes no undo step.
     """
     betas = np.asarray(betas, np.float64)
     if betas.shape != (BETA_COUNT,) or not np.abs(betas).max() <= LARGEST_BETA:
@@ -59,64 +55,30 @@ def reshape(person: bpy.types.Object, betas: NDArray) -> str:
     check_shapeable(person)
     model, generated = shape_model_of(person), generated_betas(person)
     growth = model.growth(generated, betas)
-    notice = apply_rest(person, model.rest(betas), betas, growth)
-    scale_splats(person, model, betas, growth)
+    notice = apply_rest(person, model.rest(betas), betas)
+    scale_cells(person, model, betas, growth)
     follow_shape(person, proxy_of(person), betas)
     return notice
 
 
-def apply_rest(person: bpy.types.Object, rest: Rest, betas: NDArray, growth: NDArray) -> str:
-    """Move bones, body mesh and volumes to `rest` (see `reshape`), volumes scaled by `growth` [K, 3]; returns a warning
-    as `reshape` does."""
+def apply_rest(person: bpy.types.Object, rest: Rest, betas: NDArray) -> str:
+    """Move bones and body mesh, which volumes and splats follow, to `rest`; returns a warning as `reshape` does."""
     body = body_of(person)
     bones = own_data(person, person)
-    vertices, on_floor = points_to_blender(rest.vertices), ORIGIN in bones
-    origin = floor_below(vertices) if on_floor else np.zeros(3)
+    vertices = points_to_blender(rest.vertices)
+    origin = floor_below(vertices)
     vertices += origin
     mesh = None if body is None else own_data(body, person)
     unchanged = mesh is not None and len(mesh.vertices) == len(vertices) and mesh.shape_keys is None
-    lowest = float(_heights(mesh).min()) if unchanged else None
     move_rest_joints(bones, points_to_blender(rest.joints) + origin)
-    if on_floor:
-        bones[ORIGIN] = origin.tolist()
-        bones.update_tag()
+    bones[ORIGIN] = origin.tolist()
+    bones.update_tag()
     person[BETAS] = betas.tolist()
-    position = points_to_blender(rest.position) + origin
-    quaternion = matrix_to_quaternion(frames_to_blender(rest.rotation))
-    for k, objects in volumes_of(person).items():
-        for obj in objects if k < len(growth) else ():  # the number is the file name's
-            obj.location, obj.rotation_quaternion, obj.scale = position[k], quaternion[k], growth[k]
-    scale_surface(person, growth)
     person.update_tag()
-    if lowest is not None:
-        if not on_floor:
-            _keep_on_floor(person, lowest, float(vertices[:, 2].min()))
+    if unchanged:
         mesh.vertices.foreach_set("co", vertices.astype(np.float32).ravel())
         mesh.update()
     return "" if body is None or unchanged else f"the mesh {body.name!r} was changed by hand and keeps its shape"
-
-
-def apply_growth(person: bpy.types.Object, growth: NDArray) -> None:
-    """Scale volumes by `growth` [K, 3], however they are attached."""
-    for k, objects in volumes_of(person).items():
-        for obj in objects if k < len(growth) else ():
-            obj.scale = growth[k]
-    scale_surface(person, growth)
-
-
-def _heights(mesh: bpy.types.Mesh) -> NDArray[np.float32]:
-    flat = np.empty(3 * len(mesh.vertices), np.float32)
-    mesh.vertices.foreach_get("co", flat)
-    return flat[2::3]
-
-
-def _keep_on_floor(armature: bpy.types.Object, before: float, after: float) -> None:
-    """For humans of earlier versions: lift an upright armature, whose lowest rest point, at height `before` in its
-    space, was on z = 0, so that a point at `after` is."""
-    matrix = np.array(armature.matrix_basis)
-    upright = np.abs(matrix[2, :2]).max() < 1e-4 * abs(matrix[2, 2])
-    if armature.parent is None and upright and abs(matrix[2, 3] + matrix[2, 2] * before) < _FLOOR_TOLERANCE:
-        armature.location.z = -matrix[2, 2] * after
 
 
 @dataclasses.dataclass(frozen=True)
@@ -124,7 +86,7 @@ class Replaced:
     """What an edit has changed."""
 
     reshaped: bool
-    """The body has another shape: bones, body mesh and volumes have moved."""
+    """The body has another shape: bones and body mesh have moved."""
     warning: str
     """What could not be done, in a sentence; empty otherwise."""
 
@@ -132,37 +94,28 @@ class Replaced:
 def replace_person(person: bpy.types.Object, file: Path) -> Replaced:
     """Show the human of a file where `person` shows another.
 
-    Armature, pose, animation, transform, names, materials and other changes by hand stay, as do deleted volumes. Where
-    the edit has changed the betas, the bones' rest, the body mesh and the volumes' places follow, unless the user has
-    given the human a custom shape, which stays. Makes no undo step.
+    Armature, pose, animation, transform, names, materials and other changes by hand stay. Where the edit has changed
+    the betas, the bones' rest and the body mesh follow, unless the user has given the human a custom shape, which
+    stays. Makes no undo step.
 
     Raises as `read_human` and `check_editable` before the scene is touched.
     """
     human = read_human(file)
     betas = human.payload.betas.astype(np.float64)
     check_editable(person)
-    shown, count = volumes_of(person), len(human.payload.density)
-    if max(shown, default=0) >= count:
-        raise ValueError(
-            f"the human {person.name!r} has a volume {max(shown)} and the edited one only {count}; "
-            "use an add-on and a backend of the same release"
-        )
     new_betas = not np.allclose(betas, generated_betas(person), atol=SAME_BETAS)
     custom = has_custom_shape(person)
     reshaped = new_betas and not custom
     if reshaped:
         check_shapeable(person)
-    growth = human.model.growth(betas, betas_of(person)) if custom else np.ones((count, 3))
+    growth = human.model.growth(betas, betas_of(person)) if custom else np.ones((len(human.payload.density), 3))
     pack(person, file, own_body=human.payload.rest_half_extent is not None)
-    warning = apply_rest(person, human.rest, betas, growth) if reshaped else ""
+    warning = apply_rest(person, human.rest, betas) if reshaped else ""
     if reshaped:
         follow_shape(person, proxy_of(person), betas)
-    if new_betas and custom:
-        apply_growth(person, growth)
     replace_splats(person, human)
-    scale_splats(person, human.model, betas_of(person), growth)
-    for volume in {own_data(obj, person) for objects in shown.values() for obj in objects}:
-        show_volume(volume, session_file(person).parent)
+    scale_cells(person, human.model, betas_of(person), growth)
+    set_folder(person, session_file(person).parent)
     person[MARK] = human.provenance()
     person.update_tag()
     return Replaced(reshaped, warning)

@@ -7,22 +7,23 @@ the constraints: Blender's solver starts from these, and ends there as long as n
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 
 import bpy
 import numpy as np
-from mathutils import Matrix
-from numpy.typing import NDArray
+from mathutils import Matrix, Quaternion, Vector
 
-from ..formats.poses.rotation import matrix_to_quaternion, nearest
 from .actions import action_curves, frames_in_use, loops, own_curves, repeat
-from .armature import CONTROLS, LIMBS, POLE_M, Limb, add_keys, editing_bones, place_controls, rest_rotations
-from .convention import continuous_quaternions
+from .armature import CONTROLS, LIMBS, POLE_M, Limb, editing_bones, place_controls, rest_rotations
 from .export_model import scene_with_only
 
 COLLECTION = "IK Handles"
 """Of bones: handles and poles."""
 _MOVED = tuple(joint for limb in LIMBS for joint in limb.joints)
+_TURN = "rotation_quaternion"
+_JOINT_KEYS = dict.fromkeys(_MOVED, (_TURN,))
+_CONTROL_KEYS = {limb.handle: ("location", _TURN) for limb in LIMBS} | {limb.pole: ("location",) for limb in LIMBS}
 _STIFFNESS = 0.9
 """Of elbows and knees against twisting and bending sideways, which Blender's solver would do as readily."""
 _COLOUR = "THEME09"
@@ -51,7 +52,7 @@ def add_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None:
     check_no_handles(armature)
     rest_rotations(armature)
     frames = frames_in_use(armature)
-    matrices = _joint_matrices(context, armature, frames)
+    poses = [_joints(shown) for shown in _shown_on(context, armature, frames)]
     with editing_bones(_own_bones(armature)) as bones:
         for limb in LIMBS:
             for name in limb.controls:
@@ -63,7 +64,7 @@ def add_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None:
     for limb in LIMBS:
         _show(armature, limb)
         _constrain(armature, limb)
-    _pose_controls(armature, frames, matrices)
+    _pose_on(armature, frames, [partial(_put_controls, armature, pose) for pose in poses], _CONTROL_KEYS)
 
 
 def bake_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None:
@@ -73,7 +74,7 @@ def bake_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None
     if not has_handles(armature):
         raise ValueError(f"{armature.name!r} has no IK handles: press Add IK Handles first")
     frames = frames_in_use(armature)
-    rotations = _joint_rotations(context, armature, frames)
+    poses = [_turns(shown) for shown in _shown_on(context, armature, frames)]
     data = _own_bones(armature)
     with editing_bones(data) as bones:
         for name in CONTROLS:
@@ -85,40 +86,10 @@ def bake_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None
         middle, end = (armature.pose.bones[name] for name in (limb.middle, limb.end))
         for name in ("ik_stiffness_y", "ik_stiffness_z"):
             middle.property_unset(name)
-        for constraint in [one for one in end.constraints if _is_ours(one, limb)]:
+        for constraint in [one for one in end.constraints if getattr(one, "subtarget", "") == limb.handle]:
             end.constraints.remove(constraint)
-    _remove_keys(armature)
-    _pose_joints(armature, frames, rotations)
-
-
-def joints_from_handles(context: bpy.types.Context, armature: bpy.types.Object) -> None:
-    """Give the joints, below their constraints, the rotations that handles show now; nothing without handles or to a
-    linked armature."""
-    if has_handles(armature) and armature.library is None:
-        _pose_joints(armature, range(0), _joint_rotations(context, armature, range(0)))
-
-
-def handles_from_joints(context: bpy.types.Context, armature: bpy.types.Object) -> None:
-    """Put handles and poles where the joints' own rotations have the limbs; nothing without handles."""
-    ours = [constraint for limb in LIMBS for constraint in _constraints(armature, limb)]
-    if not all(name in armature.pose.bones for name in CONTROLS):
-        return
-    muted = [constraint.mute for constraint in ours]
-    for constraint in ours:
-        constraint.mute = True
-    matrices = _joint_matrices(context, armature, range(0))
-    for constraint, before in zip(ours, muted, strict=True):
-        constraint.mute = before
-    _pose_controls(armature, range(0), matrices)
-
-
-def key_handles(armature: bpy.types.Object, frame: float) -> None:
-    """Insert keyframes of handles and poles; nothing without handles."""
-    for limb in LIMBS:
-        for name, channels in ((limb.handle, ("location", "rotation_quaternion")), (limb.pole, ("location",))):
-            if name in armature.pose.bones:
-                for channel in channels:
-                    armature.pose.bones[name].keyframe_insert(channel, frame=frame, group=name)
+    _remove_curves(armature, _CONTROL_KEYS)
+    _pose_on(armature, frames, [partial(_turn_joints, armature, pose) for pose in poses], _JOINT_KEYS)
 
 
 def _check_bones(armature: bpy.types.Object) -> None:
@@ -174,23 +145,12 @@ def _constrain(armature: bpy.types.Object, limb: Limb) -> None:
     turn.owner_space = turn.target_space = "POSE"
 
 
-def _bend_axis(armature: bpy.types.Object, limb: Limb) -> NDArray[np.float64]:
+def _bend_axis(armature: bpy.types.Object, limb: Limb) -> Vector:
     """See `Limb.bend_axis`."""
-    return limb.bend_axis(np.array(armature.data.bones[limb.root].matrix_local.to_3x3()))
+    return Vector(limb.bend_axis(np.array(armature.data.bones[limb.root].matrix_local.to_3x3())))
 
 
-def _constraints(armature: bpy.types.Object, limb: Limb) -> Iterator[bpy.types.Constraint]:
-    bones = armature.pose.bones
-    for name in (limb.tip, limb.end):
-        if name in bones:
-            yield from (constraint for constraint in bones[name].constraints if _is_ours(constraint, limb))
-
-
-def _is_ours(constraint: bpy.types.Constraint, limb: Limb) -> bool:
-    return getattr(constraint, "subtarget", "") == limb.handle
-
-
-def _evaluated(context: bpy.types.Context, armature: bpy.types.Object, frames: range) -> Iterator[bpy.types.Object]:
+def _shown_on(context: bpy.types.Context, armature: bpy.types.Object, frames: range) -> Iterator[bpy.types.Object]:
     """The evaluated armature on each frame; where there are none, as it is shown now."""
     if not frames and armature.visible_get() and armature.data.pose_position == "POSE":
         yield armature.evaluated_get(context.evaluated_depsgraph_get())
@@ -201,96 +161,72 @@ def _evaluated(context: bpy.types.Context, armature: bpy.types.Object, frames: r
             yield armature.evaluated_get(scene.view_layers[0].depsgraph)
 
 
-def _joint_matrices(
-    context: bpy.types.Context, armature: bpy.types.Object, frames: range
-) -> dict[str, NDArray[np.float64]]:
-    """Matrices [F, 4, 4] in the armature's space of the joints that handles move."""
-    found = [
-        [shown.pose.bones[name].matrix.copy() for name in _MOVED] for shown in _evaluated(context, armature, frames)
-    ]
-    return dict(zip(_MOVED, np.moveaxis(np.array(found, np.float64), 1, 0), strict=True))
+def _joints(shown: bpy.types.Object) -> dict[str, Matrix]:
+    """The joints that handles move, in the armature's space."""
+    return {name: shown.pose.bones[name].matrix.copy() for name in _MOVED}
 
 
-def _joint_rotations(
-    context: bpy.types.Context, armature: bpy.types.Object, frames: range
-) -> dict[str, NDArray[np.float64]]:
-    """Quaternions [F, 4] of the same joints that pose them as they are shown, without constraints."""
-    found = []
-    for shown in _evaluated(context, armature, frames):
-        bones = [shown.pose.bones[name] for name in _MOVED]
-        local = [
-            shown.convert_space(pose_bone=bone, matrix=bone.matrix, from_space="POSE", to_space="LOCAL")
-            for bone in bones
-        ]
-        found.append([matrix.to_quaternion() for matrix in local])
-    turns = continuous_quaternions(np.array(found, np.float64))
-    return dict(zip(_MOVED, np.moveaxis(turns, 1, 0), strict=True))
+def _turns(shown: bpy.types.Object) -> dict[str, Quaternion]:
+    """The rotations that pose the same joints as they are shown, without constraints."""
+    spaces = {"from_space": "POSE", "to_space": "LOCAL"}
+    bones = [shown.pose.bones[name] for name in _MOVED]
+    return {b.name: shown.convert_space(pose_bone=b, matrix=b.matrix, **spaces).to_quaternion() for b in bones}
 
 
-def _pose_joints(armature: bpy.types.Object, frames: range, rotations: Mapping[str, NDArray]) -> None:
-    """Give joints these rotations [F, 4]: as keys, or without frames to the pose."""
-    for name in rotations:
-        armature.pose.bones[name].rotation_mode = "QUATERNION"
+def _pose_on(
+    armature: bpy.types.Object, frames: range, poses: Sequence[Callable[[], None]], keys: Mapping[str, Sequence[str]]
+) -> None:
+    """Take each pose and key these properties of bones on its frame, in place of their keys; or take the only one."""
+    looped = loops(armature)
     if frames:
-        _key(armature, frames, {name: {"rotation_quaternion": values} for name, values in rotations.items()})
-        return
-    for name, values in rotations.items():
-        armature.pose.bones[name].rotation_quaternion = values[0]
-
-
-def _pose_controls(armature: bpy.types.Object, frames: range, matrices: Mapping[str, NDArray]) -> None:
-    """Put handles and poles where the joints with these matrices [F, 4, 4] need them: keyed, or without frames now."""
-    keys = {}
-    for limb in LIMBS:
-        root, middle, end = (matrices[name] for name in limb.joints)
-        handle_rest, pole_rest = (np.array(armature.data.bones[name].matrix_local) for name in (limb.handle, limb.pole))
-        pole = np.tile(pole_rest, (len(end), 1, 1))
-        pole[:, :3, 3] = _pole_place(root, middle, end, _bend_axis(armature, limb))
-        if not frames:
-            armature.pose.bones[limb.handle].matrix = Matrix(end[0])
-            armature.pose.bones[limb.pole].matrix = Matrix(pole[0])
-            continue
-        basis = np.linalg.inv(handle_rest) @ end
-        turns = continuous_quaternions(matrix_to_quaternion(nearest(basis[:, :3, :3])))
-        keys[limb.handle] = {"location": basis[:, :3, 3], "rotation_quaternion": turns}
-        keys[limb.pole] = {"location": (np.linalg.inv(pole_rest) @ pole)[:, :3, 3]}
-    if frames:
-        _key(armature, frames, keys)
-
-
-def _pole_place(root: NDArray, middle: NDArray, end: NDArray, axis: NDArray) -> NDArray[np.float64]:
-    """The place of a pole [F, 3] that leaves a limb with these matrices [F, 4, 4] as it is.
-
-    Blender turns the limb about the line from root to end until `axis` [3], in the root's space, is in the half-plane
-    of line and pole.
-    """
-    start = root[:, :3, 3]
-    line = _unit(end[:, :3, 3] - start)
-    side = root[:, :3, :3] @ axis
-    side = _unit(side - (side * line).sum(-1, keepdims=True) * line)
-    along = ((middle[:, :3, 3] - start) * line).sum(-1, keepdims=True)
-    return start + along * line + POLE_M * side
-
-
-def _unit(vectors: NDArray) -> NDArray[np.float64]:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)
-
-
-def _key(armature: bpy.types.Object, frames: range, keys: Mapping[str, Mapping[str, NDArray]]) -> None:
-    """Replace the keys of properties of bones by these values [F, n], one on each frame."""
-    looped, curves = loops(armature), own_curves(armature)
-    for bone, channels in keys.items():
-        for name, values in channels.items():
-            path = f'pose.bones["{bone}"].{name}'
-            for index in range(values.shape[-1]):
-                if (curve := curves.find(path, index=index)) is not None:
-                    curves.remove(curve)
-                add_keys(curves.new(path, index=index), np.array(frames), values[:, index])
+        own_curves(armature)
+        _remove_curves(armature, keys)
+    for number, take in enumerate(poses):
+        take()
+        for name, channels in keys.items() if frames else ():
+            for channel in channels:
+                armature.pose.bones[name].keyframe_insert(channel, frame=frames[number], group=name)
     if looped:
         repeat(armature)
 
 
-def _remove_keys(armature: bpy.types.Object) -> None:
-    paths = tuple(f'pose.bones["{name}"]' for name in CONTROLS)
-    for curve in [curve for curve in action_curves(armature) or () if curve.data_path.startswith(paths)]:
+def _remove_curves(armature: bpy.types.Object, keys: Mapping[str, Sequence[str]]) -> None:
+    paths = {f'pose.bones["{name}"].{channel}' for name, channels in keys.items() for channel in channels}
+    for curve in [curve for curve in action_curves(armature) or () if curve.data_path in paths]:
         action_curves(armature).remove(curve)
+
+
+def _turn_joints(armature: bpy.types.Object, turns: Mapping[str, Quaternion]) -> None:
+    for name, turn in turns.items():
+        _turn(armature.pose.bones[name], turn)
+
+
+def _turn(bone: bpy.types.PoseBone, turn: Quaternion) -> None:
+    """Of q and -q, which are the same turn, the one nearer to the bone's, since Blender interpolates components."""
+    bone.rotation_mode = "QUATERNION"
+    near = turn.copy()
+    near.make_compatible(bone.rotation_quaternion)
+    bone.rotation_quaternion = near
+
+
+def _put_controls(armature: bpy.types.Object, pose: Mapping[str, Matrix]) -> None:
+    """Put handles and poles where joints with these matrices need them."""
+    for limb in LIMBS:
+        root, middle, end = (pose[name] for name in limb.joints)
+        handle, pole = (armature.pose.bones[name] for name in (limb.handle, limb.pole))
+        basis = handle.bone.matrix_local.inverted() @ end
+        handle.location = basis.translation
+        _turn(handle, basis.to_quaternion())
+        place = _pole_place(root, middle, end, _bend_axis(armature, limb))
+        pole.location = pole.bone.matrix_local.inverted() @ place
+
+
+def _pole_place(root: Matrix, middle: Matrix, end: Matrix, axis: Vector) -> Vector:
+    """The place of a pole that leaves a limb with these matrices as it is.
+
+    Blender turns the limb about the line from root to end until `axis`, in the root's space, is in the half-plane of
+    line and pole.
+    """
+    line, side = end.translation - root.translation, root.to_3x3() @ axis
+    side = (side - side.project(line)).normalized()
+    return root.translation + (middle.translation - root.translation).project(line) + POLE_M * side

@@ -1,9 +1,7 @@
-"""A human in the scene: an armature that holds its data, with a body mesh and volumes as its children."""
+"""A human in the scene: an armature that holds its data, with a body mesh, splats and volumes as its children."""
 
 from __future__ import annotations
 
-import re
-from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +9,6 @@ import bpy
 
 from ..formats.regular_files import FileError
 from .blend_values import stored_record
-
-PRIMITIVE_VDB = re.compile(r"prim_([0-9]{4,6})\.vdb")
-"""File names of the volumes of primitives."""
-
-
-def primitive_of(volume: bpy.types.Volume) -> int | None:
-    """The primitive that a human's volume shows, by the name of its file, wherever that is; None for other volumes."""
-    match = PRIMITIVE_VDB.fullmatch(re.split(r"[/\\]", volume.filepath)[-1])
-    return int(match[1]) if match is not None else None
-
-
-def volume_name(k: int) -> str:
-    """The file name of a primitive's volume."""
-    return f"prim_{k:04d}.vdb"
 
 
 def write_error(folder: Path, error: BaseException) -> FileError:
@@ -42,8 +26,7 @@ BETAS = "primdiffusion_betas"
 """Custom property of a human: the body's shape, which the engine draws and which may be animated."""
 ORIGIN = "primdiffusion_origin"
 """Custom property of a human's bones (the armature's data): the origin of the body model in the armature's space [3],
-metres, z up. The armature's own origin is on the floor, at the feet. In humans of earlier versions, which lack the
-property, the two are one."""
+metres, z up. The armature's own origin is on the floor, at the feet."""
 BETA_COUNT = 10
 """Numbers in a shape."""
 LARGEST_BETA = 5.0
@@ -71,16 +54,6 @@ def parts_of(person: bpy.types.Object) -> list[bpy.types.Object]:
 def body_of(person: bpy.types.Object) -> bpy.types.Object | None:
     """The human's body mesh; None when it was deleted."""
     return next((obj for obj in parts_of(person) if obj.type == "MESH" and BODY_MARK in obj), None)
-
-
-def volumes_of(person: bpy.types.Object) -> dict[int, list[bpy.types.Object]]:
-    """The human's volume objects by primitive, whatever the objects are called now."""
-    found = defaultdict(list)
-    for obj in parts_of(person):
-        primitive = primitive_of(obj.data) if obj.type == "VOLUME" else None
-        if primitive is not None:
-            found[primitive].append(obj)
-    return dict(found)
 
 
 def humans(scene: bpy.types.Scene) -> list[bpy.types.Object]:
@@ -112,12 +85,7 @@ def human_of(obj: bpy.types.Object | None) -> bpy.types.Object | None:
 
 def link_part(person: bpy.types.Object, part: bpy.types.Object) -> None:
     """Put a part, which is in no collection, into the one that the human is in."""
-    home_of(person).objects.link(part)
-
-
-def home_of(person: bpy.types.Object) -> bpy.types.Collection:
-    """The collection that the human is in, beside the hidden one of its volumes."""
-    return min(person.users_collection, key=lambda collection: collection.hide_viewport)
+    person.users_collection[0].objects.link(part)
 
 
 def own_data(obj: bpy.types.Object, person: bpy.types.Object) -> bpy.types.ID:

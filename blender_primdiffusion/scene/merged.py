@@ -18,7 +18,7 @@ from ..formats.regular_files import FileError, as_file_error, check_inside, real
 from ..formats.whole_files import written_whole
 from .blend_values import stored_record
 from .human import link_part, parts_of, write_error
-from .material import person_material
+from .material import volume_material
 from .payload import session_folder, state_of
 from .volumes import write_vdb
 
@@ -115,7 +115,7 @@ def show_merged(person: bpy.types.Object, files: Sequence[Path], state: MergedSt
         merged = bpy.data.objects.new(label, bpy.data.volumes.new(label))
         merged.parent = person
         merged.data.render.space = "WORLD"
-        merged.data.materials.append(person_material(person))
+        merged.data.materials.append(volume_material())
         link_part(person, merged)
     volume = merged.data
     volume.filepath = _stored(files[0])

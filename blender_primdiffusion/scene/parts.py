@@ -6,26 +6,27 @@ from __future__ import annotations
 import bpy
 
 from .build import build_missing_parts
-from .human import BODY_MARK, all_humans, primitive_of, volumes_of
+from .human import BODY_MARK, all_humans
 from .merged import MARK as MERGED_MARK
 from .proxy import PROXY_MARK
 from .splats import CELLS_MARK, SPLATS_AVAILABLE, SPLATS_MARK, cloud_of
 from .stand_in import STAND_IN
-from .surface import MARK as CARRIER_MARK
+from .volume_nodes import VOLUMES_MARK, volumes_of
 
-_MARKS = (BODY_MARK, PROXY_MARK, CARRIER_MARK, STAND_IN, MERGED_MARK, SPLATS_MARK, CELLS_MARK)
-"""Custom properties of parts; volumes of primitives have none."""
+_MARKS = (BODY_MARK, PROXY_MARK, VOLUMES_MARK, STAND_IN, MERGED_MARK, SPLATS_MARK, CELLS_MARK)
+"""Custom properties of parts."""
 
 
 def orphans() -> list[bpy.types.Object]:
     """Parts of this .blend whose armature was deleted."""
-    return [obj for obj in bpy.data.objects if obj.parent is None and _is_local(obj) and _is_part(obj)]
+    parts = (obj for obj in bpy.data.objects if any(mark in obj for mark in _MARKS))
+    return [part for part in parts if part.parent is None and _is_local(part)]
 
 
 def without_parts() -> list[bpy.types.Object]:
     """Humans of this .blend that lack splats and volumes: copies of an armature alone."""
     here = (person for person in all_humans() if _is_local(person) and person.users_scene)
-    return [one for one in here if not volumes_of(one) and not (SPLATS_AVAILABLE and cloud_of(one))]
+    return [one for one in here if volumes_of(one) is None and not (SPLATS_AVAILABLE and cloud_of(one))]
 
 
 def complete_humans() -> bool:
@@ -54,10 +55,3 @@ def complete_humans() -> bool:
 
 def _is_local(obj: bpy.types.Object) -> bool:
     return obj.library is None and obj.override_library is None
-
-
-def _is_part(obj: bpy.types.Object) -> bool:
-    if obj.type == "VOLUME" and primitive_of(obj.data) is not None:
-        targets = [target for constraint in obj.constraints for target in getattr(constraint, "targets", ())]
-        return bool(targets) and not any(target.target for target in targets)
-    return any(mark in obj for mark in _MARKS)

@@ -27,7 +27,7 @@ from .armature import floor_below, model_origin
 from .blend_values import as_numbers, stored_record
 from .build import build_body_mesh
 from .convention import points_to_blender
-from .human import BETA_COUNT, BODY_MARK, ORIGIN, own_data, parts_of
+from .human import BETA_COUNT, BODY_MARK, own_data, parts_of
 from .payload import state_of
 from .rest_human import shape_model_of
 from .shape import SAME_BETAS, ShapeModel
@@ -158,9 +158,8 @@ def follow_shape(person: bpy.types.Object, proxy: bpy.types.Object | None, betas
 def _model_origin(person: bpy.types.Object, betas: NDArray | None) -> NDArray[np.float64]:
     """The origin of the body model in the armature's space [3] when the human has these betas [10], not those it has
     now: see `human.ORIGIN`. Raises as `shape_model_of`."""
-    bones = person.data
-    if ORIGIN not in bones or betas is None:
-        return model_origin(bones)
+    if betas is None:
+        return model_origin(person.data)
     return floor_below(points_to_blender(shape_model_of(person).surface(betas)))
 
 

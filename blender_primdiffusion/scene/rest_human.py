@@ -17,7 +17,6 @@ from ..formats.arrays import MOST_BODY_VALUES, check_shapes, read_arrays
 from ..formats.body_layout import body_data, half_extents, read_layout, stencils
 from ..formats.human_layout import provenance_of
 from ..formats.regular_files import FileError, as_file_error, exists_in_its_folder
-from .cycles import max_overlap
 from .human import LARGEST_BETA
 from .human_file import (
     GENERATE_AGAIN,
@@ -29,6 +28,7 @@ from .human_file import (
     read_sizes,
     read_tensors,
 )
+from .overlap import max_overlap
 from .payload import BODY_FILE, session_file
 from .shape import FIELDS, OPTIONAL_FIELDS, Rest, ShapeModel, faulty_field
 from .volumes import Grids, bake

@@ -12,12 +12,12 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from .cells import add_nodes, cell_mesh
 from .human import body_of, link_part, own_data, parts_of
 from .payload import session_file
-from .rest_human import RestHuman, default_body, read_human
-from .shape import ShapeModel, betas_of, generated_betas
-from .splat_nodes import CELL, REST_SIDES, follow_body
-from .surface import GROWTH, PRIMITIVE, carrier_mesh, set_of_primitives
+from .rest_human import RestHuman, read_human
+from .shape import betas_of, generated_betas
+from .splat_nodes import BODY, CELL, CELLS, splat_group
 from .volumes import WINDOW_EXPONENT
 
 SPLATS_MARK, CELLS_MARK = "primdiffusion_splats", "primdiffusion_cells"
@@ -40,8 +40,6 @@ FAINTEST = 0.02
 LEAST = 0.004
 """Opacity of a voxel along the normal below which it makes none."""
 MOST_OPAQUE = 0.995
-_NEVER_STRETCHED = 1e3
-"""Side of a cell, metres, that no skin reaches."""
 C0 = 0.28209479177387814
 """The constant spherical harmonic, 1 / (2 sqrt(pi))."""
 
@@ -140,7 +138,8 @@ def build_splats(person: bpy.types.Object) -> bpy.types.Object:
     human, body, betas = read_human(session_file(person)), body_of(person), betas_of(person)
     if body is None:
         raise ValueError(f"the body mesh of {person.name!r} was deleted: undo that, or generate the human again")
-    mesh = carrier_mesh(f"{person.name}_cells", human.model, np.zeros(len(human.model.face), np.int32))
+    growth = human.model.growth(generated_betas(person), betas)
+    mesh = cell_mesh(f"{person.name}_cells", human.model, betas, growth)
     cloud = bpy.data.pointclouds.new(f"{person.name}_splats")
     cells, splats = (bpy.data.objects.new(data.name, data) for data in (mesh, cloud))
     cells.hide_viewport = cells.hide_render = True
@@ -148,9 +147,8 @@ def build_splats(person: bpy.types.Object) -> bpy.types.Object:
     for part in (splats, cells):
         part.parent = person
         link_part(person, part)
-    _scale_cells(mesh, human.model, betas, human.model.growth(generated_betas(person), betas))
     fill(cloud, splats_of(human))
-    follow_body(splats, body, cells)
+    add_nodes(splats, "Follow Body", splat_group(), {BODY: body, CELLS: cells})
     return splats
 
 
@@ -160,32 +158,16 @@ def cloud_of(person: bpy.types.Object) -> bpy.types.Object | None:
 
 
 def cells_of(person: bpy.types.Object) -> bpy.types.Object | None:
-    """The cells on which they lie; None where there are none, or they were deleted or changed by hand."""
-    marked = (obj for obj in parts_of(person) if obj.type == "MESH" and CELLS_MARK in obj)
-    return next((obj for obj in marked if PRIMITIVE in obj.data.attributes), None)
-
-
-def scale_splats(person: bpy.types.Object, model: ShapeModel, betas: NDArray, growth: NDArray) -> None:
-    """Have a human's splats, if it has any, grow by `growth` [K, 3] with its body, which now has these betas [10]."""
-    cells = cells_of(person)
-    if cells is not None:
-        _scale_cells(own_data(cells, person), model, betas, growth)
+    """The cells on which they lie; None where there are none."""
+    return next((obj for obj in parts_of(person) if obj.type == "MESH" and CELLS_MARK in obj), None)
 
 
 def replace_splats(person: bpy.types.Object, human: RestHuman) -> None:
     """Show another human's voxels by the splats of this one, if it has any. Earlier Blenders, which cannot write them,
-    remove them instead: *Attachment* makes them again."""
+    remove them instead: *Show As* makes them again."""
     splats, cells = cloud_of(person), cells_of(person)
     if splats is not None and SPLATS_AVAILABLE:
         fill(own_data(splats, person), splats_of(human))
         return
     for part in filter(None, (splats, cells)):
         bpy.data.objects.remove(part)
-
-
-def _scale_cells(mesh: bpy.types.Mesh, model: ShapeModel, betas: NDArray, growth: NDArray) -> None:
-    set_of_primitives(mesh, GROWTH, growth)
-    sides = np.full((len(model.face), 3), _NEVER_STRETCHED)
-    if model is default_body():  # the released code's boxes, on other bodies, do not follow the skin
-        sides[:, :2] = model.rest_sides(betas)
-    set_of_primitives(mesh, REST_SIDES, sides)

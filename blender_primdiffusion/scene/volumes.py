@@ -8,10 +8,8 @@ from __future__ import annotations
 
 import ctypes
 import dataclasses
-import functools
 import os
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
 
@@ -20,8 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..formats.whole_files import temporary_folder
-from .human import volume_name, volumes_of
-from .payload import session_file
 
 bpy.utils.expose_bundled_modules()
 try:
@@ -53,16 +49,6 @@ def openvdb() -> ModuleType:
             "install it (on Debian and Ubuntu: sudo apt install python3-openvdb), then start Blender again"
         )
     return _openvdb
-
-
-def grid_bytes(path: Path) -> int:
-    """Bytes that a file's grids take once read, as its header says; 0 where it is damaged, and without the module."""
-    if _openvdb is None:
-        return 0
-    try:
-        return sum(grid.metadata.get("file_mem_bytes", 0) for grid in _openvdb.readAllGridMetadata(str(path)))
-    except (OSError, RuntimeError):
-        return 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,44 +171,3 @@ def free_unused_grids() -> None:
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc alone has it
         if trim is not None:
             trim(0)
-
-
-def reload_volume(volume: bpy.types.Volume) -> None:
-    """Make Blender show a volume whose file was missing before: it remembers the error until grids are unloaded."""
-    volume.grids.load()
-    volume.grids.unload()
-    volume.update_tag()
-
-
-@dataclasses.dataclass(frozen=True)
-class Memory:
-    """Bytes of a human's volumes."""
-
-    files: int
-    """On disk."""
-    grids: int
-    """In memory once drawn: the trees of voxels, as in the files' headers. Cycles makes copies of its own when it
-    renders."""
-
-
-def person_memory(person: bpy.types.Object) -> Memory:
-    """Memory of the volumes of a human's primitives, shown or hidden; zero until all are written.
-
-    Reads the files' headers once, about .2 s for 1024 of them, and caches the result by their names. Raises as
-    `session_file`.
-    """
-    folder = session_file(person).parent
-    paths = [folder / volume_name(k) for k in sorted(volumes_of(person))]
-    return _memory_of(tuple(paths)) if all(path.is_file() for path in paths) else Memory(0, 0)
-
-
-@functools.lru_cache(maxsize=64)
-def _memory_of(paths: Sequence[Path]) -> Memory:
-    files = grids = 0
-    for path in paths:
-        try:
-            files += path.stat().st_size
-        except OSError:  # a missing one
-            continue
-        grids += grid_bytes(path)
-    return Memory(files, grids)

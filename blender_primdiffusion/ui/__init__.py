@@ -12,7 +12,7 @@ from types import ModuleType
 
 import bpy
 
-from ..jobs import deferred_volumes, follow, parts, windows
+from ..jobs import follow, parts, volumes, windows
 from ..scene import stand_in
 from . import (
     advanced_panel,
@@ -44,7 +44,7 @@ from . import (
 MODULES = (
     *filter(None, (preferences.setup, preferences)), windows, follow, jobs_panel, attributes,
     generate_panel, variations_panel, human_panel, shape_panel, edit_panel, parts,
-    deferred_volumes, import_motion, motion_panel, pose_panel, picture_panel,
+    volumes, import_motion, motion_panel, pose_panel, picture_panel,
     render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
     captures_panel, reconstruct_panel, viewport_humans, captures_command, manual, menus, stand_in,
 )  # fmt: skip

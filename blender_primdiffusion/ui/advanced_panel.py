@@ -1,67 +1,63 @@
-"""The sidebar panel Advanced: how volumes follow the body, merging, the look in Cycles, memory, files, the backend."""
+"""The sidebar panel Advanced: splats, volumes or a merged volume, the look in Cycles, facts, the backend."""
 
 from __future__ import annotations
 
 import bpy
 
 from ..backend.requests import sentence
-from ..formats.regular_files import printable
-from ..formats.requests import DENSITY_GAIN, VOXEL
-from ..jobs.deferred_volumes import deferred_volumes, keep_writing
+from ..formats.requests import VOXEL
 from ..jobs.export import show, shown
 from ..jobs.follow import submit
 from ..jobs.merge import MergeFramesJob, MergeJob, Moment
 from ..jobs.target import HumanTarget, selected_person
+from ..jobs.volumes import VolumesJob
 from ..places import backend_is_named
-from ..scene.attachment import (
-    attachment_before_merge,
-    attachment_of,
-    in_viewport,
-    set_attachment,
-    show_in_viewport,
-)
 from ..scene.blend_values import as_shown
-from ..scene.cycles import current_overlap, overlap_warning_in
-from ..scene.human import humans, parts_of, provenance_of
-from ..scene.material import density_gain, set_density_gain
+from ..scene.cycles import overlap_of, overlap_warning_in
+from ..scene.human import humans, provenance_of
+from ..scene.material import density_gain
 from ..scene.merged import merged_of, merged_state, remove_merged
-from ..scene.proxy import proxy_of
+from ..scene.representation import (
+    in_viewport,
+    representation_of,
+    set_representation,
+    show_in_viewport,
+    without_merged,
+)
 from ..scene.splats import SPLATS_AVAILABLE, cloud_of
-from ..scene.volumes import Memory, person_memory
+from ..scene.volume_nodes import volumes_of
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend
 from .on_person import OnPerson
 
-ATTACHMENT_ITEMS = (
-    ("ARMATURE", "Armature", "Each volume is an object that follows the bones; fast, and the default"),
-    ("SURFACE", "Surface", "Volumes are placed on the posed skin in each pose, as in the PrimDiffusion engine"),
-    ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
+REPRESENTATIONS = (
     (
         "SPLATS",
         "Splats",
         "Gaussian splats, which every view and engine draws: they cast shadows, but keep the light of their colors "
         "(Blender 5.3)",
     ),
+    ("VOLUMES", "Volumes", "A volume for each box, which follow every pose; Cycles needs minutes"),
+    ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
 )
 _MOST_FRAMES = 3_000
 
 
-class PRIMDIFFUSION_OT_set_attachment(OnPerson, bpy.types.Operator):
-    """Choose how the selected human's volumes follow the body"""
+class PRIMDIFFUSION_OT_set_representation(OnPerson, bpy.types.Operator):
+    """Choose what renders show of the selected human"""
 
-    bl_idname = "primdiffusion.set_attachment"
-    bl_label = "Set Attachment"
+    bl_idname = "primdiffusion.set_representation"
+    bl_label = "Show As"
     bl_options = {"UNDO"}
-    described_by = ("mode",)
+    described_by = ("representation",)
 
-    mode: bpy.props.EnumProperty(
-        name="Attachment", description="How volumes follow the body", items=ATTACHMENT_ITEMS, default="ARMATURE"
+    representation: bpy.props.EnumProperty(
+        name="Show As", description="What renders show of the human", items=REPRESENTATIONS, default="VOLUMES"
     )
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        set_attachment(person, self.mode)
-        keep_writing()  # volumes that splats had made unnecessary
+        set_representation(person, self.representation)
         return {"FINISHED"}
 
 
@@ -70,19 +66,15 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
 
     bl_idname = "primdiffusion.volumes_in_viewport"
     bl_label = "Volumes in Viewport"
-    bl_options = {"UNDO"}
-
-    everyone: bpy.props.BoolProperty(name="All Humans", description="Do it for all humans of the scene", options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        visible = not in_viewport(person)
-        if visible:
-            deferred_volumes.finish()
-        for each in humans(context.scene) if self.everyone else [person]:
-            what = shown(each)
-            show_in_viewport(each, visible)
-            if proxy_of(each) is not None:
-                show(each, what)
+        if not in_viewport(person) and representation_of(person) == "VOLUMES":
+            return submit(self, context, VolumesJob(HumanTarget.of(person)))
+        what = shown(person)
+        show_in_viewport(person, not in_viewport(person))
+        if what != "VOLUMES":
+            show(person, what)
+        bpy.ops.ed.undo_push(message=self.bl_label)
         return {"FINISHED"}
 
 
@@ -141,8 +133,8 @@ def _unmerge(person: bpy.types.Object) -> None:
     """Raises ValueError where there is no merged volume."""
     if merged_of(person) is None:
         raise ValueError(f"{person.name!r} has no merged volume")
-    if attachment_of(person) == "MERGED":
-        set_attachment(person, attachment_before_merge(person))
+    if representation_of(person) == "MERGED":
+        set_representation(person, without_merged(person))
     remove_merged(person)
 
 
@@ -181,34 +173,6 @@ class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
     )
 
 
-def _gain(person: bpy.types.Object) -> float:
-    gain = density_gain(person)
-    return DENSITY_GAIN if gain is None else gain
-
-
-def _set_gain(person: bpy.types.Object, gain: float) -> None:
-    try:
-        set_density_gain(person, gain)
-    except ValueError as error:  # a property has no report
-        print(printable(f"PrimDiffusion: {error}"))
-
-
-def gain_property() -> bpy.props.FloatProperty:
-    """`armature.primdiffusion_density_gain` of a human."""
-    return bpy.props.FloatProperty(
-        name="Density Gain",
-        description="Factor on the density in Cycles, which absorbs exponentially while the PrimDiffusion "
-        "engine adds opacity up",
-        min=0.01,
-        max=100.0,
-        soft_min=0.5,
-        soft_max=5.0,
-        step=10,
-        get=_gain,
-        set=_set_gain,
-    )
-
-
 class PRIMDIFFUSION_PT_advanced(SidebarPanel, bpy.types.Panel):
     """What a first picture does not need, in closed sections."""
 
@@ -236,9 +200,9 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         return
     page = "rendering"
     sections = [
-        (draw_section(layout, "attachment", text="Attachment", page=page, section="attachment"), _draw_attachment),
+        (draw_section(layout, "show_as", text="Show As", page=page, section="show-as"), _draw_representation),
         (draw_section(layout, "look", text="Look in Cycles", page=page, section="look-in-cycles"), _draw_cycles_look),
-        (draw_section(layout, "memory", text="Memory", page=page, section="memory"), _draw_memory),
+        (draw_section(layout, "facts", text="Facts"), _draw_facts),
     ]
     if backend_is_named():
         merge = draw_section(layout, "merge", text="Merge for Cycles", page=page, section="merge-for-cycles")
@@ -248,17 +212,19 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
             content(body, context, person)
 
 
-def _draw_attachment(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
-    """How volumes follow the body."""
-    now = attachment_of(person)
+def _draw_representation(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
+    """What renders show of the human."""
+    now = representation_of(person)
     absent = {"MERGED": merged_of(person) is None, "SPLATS": not SPLATS_AVAILABLE}
     row = layout.row(align=True)
-    for mode, label, _ in ATTACHMENT_ITEMS:
-        if not absent.get(mode):
-            row.operator("primdiffusion.set_attachment", text=label, depress=mode == now).mode = mode
+    for name, label, _ in REPRESENTATIONS:
+        if not absent.get(name):
+            row.operator("primdiffusion.set_representation", text=label, depress=name == now).representation = name
     if now != "SPLATS":
-        icon = "RESTRICT_VIEW_OFF" if in_viewport(person) else "RESTRICT_VIEW_ON"
-        layout.operator("primdiffusion.volumes_in_viewport", depress=in_viewport(person), icon=icon)
+        is_shown = in_viewport(person)
+        icon = "RESTRICT_VIEW_OFF" if is_shown else "RESTRICT_VIEW_ON"
+        text = "Hide Volumes in Viewport" if is_shown else "Show Volumes in Viewport"
+        draw_job(layout, "volumes", "primdiffusion.volumes_in_viewport", icon, text=text)
 
 
 def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
@@ -275,20 +241,21 @@ def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: 
 
 def _draw_cycles_look(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
     """What brings Cycles near the exact picture."""
-    if attachment_of(person) == "SPLATS":
+    if representation_of(person) == "SPLATS":
         draw_lines(layout, "Splats look the same in every engine", "INFO")
         return
-    if density_gain(person) is None:
-        draw_lines(layout, "The human's material has no node Density Gain", "INFO")
+    gain = density_gain()
+    if gain is None:
+        draw_lines(layout, "The material PrimDiffusion Volume has no node Density Gain", "INFO")
     else:
-        layout.prop(person, "primdiffusion_density_gain")
+        layout.prop(gain, "default_value", text="Density Gain")
     warning = overlap_warning_in(context.scene, person)
-    if warning is not None and attachment_of(person) != "MERGED":
+    if warning is not None:
         draw_lines(layout, sentence(f"{warning}, or merge the human"), "ERROR")
 
 
-def _draw_memory(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
-    """How the human was made, and what it takes."""
+def _draw_facts(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
+    """How the human was made."""
     column = layout.column(align=True)
     for name, value in details(person):
         column.label(text=f"{name}: {value}", translate=False)
@@ -309,7 +276,7 @@ _MOST_LINES = 60
 
 
 def details(person: bpy.types.Object) -> list[tuple[str, str]]:
-    """Names and values: how the human was made, what its files and volumes take."""
+    """Names and values: how the human was made."""
     provenance = provenance_of(person)
     attributes, edits = provenance.get("attributes"), provenance.get("edits")
     shown = {name: provenance[name] for name in _SHOWN if provenance.get(name) not in (None, "")}
@@ -327,24 +294,12 @@ def details(person: bpy.types.Object) -> list[tuple[str, str]]:
     cloud = cloud_of(person)
     if cloud is not None:
         lines.append(("Splats", f"{len(cloud.data.points):,}"))
-    volumes = [obj for obj in parts_of(person) if obj.type == "VOLUME"]
-    if not volumes:
-        return lines
-    try:
-        memory = person_memory(person)
-    except (ValueError, OSError):  # the panel Human says why
-        memory = Memory(0, 0)
-    try:
-        most = str(current_overlap(person))
-    except ValueError:  # changed by hand
-        most = "?"
-    lines.append(("Volumes", f"{len(volumes)}, up to {most} overlap"))
-    lines.append(("Memory once drawn", f"{memory.grids / 1e6:.0f} MB"))
-    lines.append(("Files", f"{memory.files / 1e6:.0f} MB"))
+    if volumes_of(person) is not None:
+        try:
+            lines.append(("Volumes", f"up to {overlap_of(person)} overlap"))
+        except ValueError:  # changed by hand
+            lines.append(("Volumes", "?"))
     return lines
 
 
-PROPERTIES = (
-    (bpy.types.Scene, "primdiffusion_merging", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_merging)),
-    (bpy.types.Object, "primdiffusion_density_gain", gain_property()),
-)
+PROPERTIES = ((bpy.types.Scene, "primdiffusion_merging", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_merging)),)

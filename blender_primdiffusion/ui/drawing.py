@@ -87,6 +87,12 @@ def draw_job(
     row = row_unless(layout, reason)
     # Blender takes no None for the label's own text
     props = row.operator(operator_idname, icon=icon, **({} if text is None else {"text": text}))
+    draw_job_state(layout, kind)
+    return props
+
+
+def draw_job_state(layout: bpy.types.UILayout, kind: str) -> None:
+    """The progress of a job of this kind, and how the last one ended."""
     if queue.current is not None and queue.current.job.kind == kind:
         if so_far.icon:
             layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
@@ -95,7 +101,6 @@ def draw_job(
         layout.label(text=f"Queued: {waiting}", icon="SORTTIME", translate=False)
     if (outcome := queue.outcomes.get(kind)) is not None:
         _draw_outcome(layout, outcome)
-    return props
 
 
 def draw_lines(layout: bpy.types.UILayout, text: str, icon: str, width: int = _LINE) -> None:

@@ -1,90 +1,37 @@
-"""The sidebar panels Export and From File, with the operators that make assets; and .human files dropped onto the 3D
+"""The sidebar panels Export and From File, with the operator that makes assets; and .human files dropped onto the 3D
 view."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import bpy
 
 from ..backend.requests import sentence
-from ..jobs.assets import HumanAssetJob, PoseAssetJob, mark_human, write_pose_library
+from ..jobs.assets import HumanAssetJob
 from ..jobs.export import shown
-from ..jobs.follow import Reporting, submit
+from ..jobs.follow import submit
 from ..jobs.target import HumanTarget, selected_person
 from ..places import INSTALLS_BACKEND, backend_is_named
-from ..scene.handles import joints_from_handles
 from ..scene.human import humans
 from ..scene.proxy import is_outdated, proxy_of
 from ..scene.shape import betas_of
 from . import gallery
-from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .export_operators import OPTIONS
 from .on_person import OnPerson
 
-_ASSETS = (
-    (
-        "HUMAN",
-        "Human",
-        "Mark the selected human as an asset with a preview, to drag from the Asset Browser into any file",
-    ),
-    ("POSE", "Pose", "Mark the selected human's pose as an asset, to apply to any human from the pose library"),
-)
 _JOBS = {"PLY": "export_gaussians", "VDB": "export_vdb_sequence"}
 """Kinds of jobs by format; a .human file needs none, the others are meshes."""
 _LABELS = {"VOLUMES": "Show Volumes", "VIEWPORT": "Show Mesh in Viewport", "MESH": "Show Mesh"}
 
 
 class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
-    """Mark the selected human, or its pose, as an asset with a preview, to use from the Asset Browser in any file"""
+    """Mark the selected human as an asset with a preview, to drag from the Asset Browser into any file"""
 
     bl_idname = "primdiffusion.mark_as_asset"
-    bl_label = "Mark as Asset"
-    described_by = ("what",)
-
-    what: bpy.props.EnumProperty(
-        name="Mark",
-        description="What becomes an asset",
-        items=_ASSETS,
-        options=SKIP,
-    )
-    name: bpy.props.StringProperty(name="Name", description="Of the pose", default="Pose", options=SKIP)
-    picture: bpy.props.StringProperty(
-        name="Picture",
-        description="Image file for the preview; empty: one is drawn",
-        subtype="FILE_PATH",
-        options=SKIP,
-    )
+    bl_label = "Mark Human as Asset"
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        if self.what == "POSE":
-            joints_from_handles(context, person)
-        of_pose = PoseAssetJob.of(person, self.name.strip() or "Pose") if self.what == "POSE" else None
-        job = of_pose or HumanAssetJob(HumanTarget.of(person))
-        if not self.picture:
-            return submit(self, context, job)
-        picture = Path(bpy.path.abspath(self.picture))
-        self.report({"INFO"}, of_pose.marked(picture) if of_pose is not None else mark_human(person, picture))
-        bpy.ops.ed.undo_push(message=job.undo)
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_make_pose_assets(Reporting, bpy.types.Operator):
-    """Write the built-in poses as assets to a folder, and add it to the asset libraries"""
-
-    bl_idname = "primdiffusion.make_pose_assets"
-    bl_label = "Make Pose Assets"
-
-    directory: bpy.props.StringProperty(
-        name="Folder", description="Empty: in the extension's own folder", subtype="DIR_PATH", options=SKIP
-    )
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        folder = Path(bpy.path.abspath(self.directory)) if self.directory else None
-        path, count = write_pose_library(context, folder)
-        self.report({"INFO"}, f"{count} poses are in {path}, and in the Asset Browser")
-        return {"FINISHED"}
+        return submit(self, context, HumanAssetJob(HumanTarget.of(person)))
 
 
 class PRIMDIFFUSION_PT_export(SidebarPanel, bpy.types.Panel):
@@ -149,7 +96,7 @@ def draw_as_mesh(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
 
 
 def _draw_assets(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """Humans and poses for other files."""
+    """Humans for other files."""
     try:
         person = selected_person(context) if humans(context.scene) else None
     except ValueError as error:
@@ -160,10 +107,7 @@ def _draw_assets(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         row.context_pointer_set("id", person)
         row.operator("asset.clear_single", text="Unmark Human Asset", icon="X")
     else:
-        draw_job(layout, "human_asset", "primdiffusion.mark_as_asset", "ASSET_MANAGER", text="Mark Human as Asset")
-    props = draw_job(layout, "pose_asset", "primdiffusion.mark_as_asset", "ARMATURE_DATA", text="Mark Pose as Asset")
-    props.what = "POSE"
-    layout.operator("primdiffusion.make_pose_assets", icon="FILE_FOLDER")
+        draw_job(layout, "human_asset", "primdiffusion.mark_as_asset", "ASSET_MANAGER")
 
 
 class PRIMDIFFUSION_PT_from_file(SidebarPanel, bpy.types.Panel):

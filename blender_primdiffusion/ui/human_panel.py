@@ -5,8 +5,8 @@ from __future__ import annotations
 import bpy
 
 from ..backend.requests import sentence
-from ..jobs.deferred_volumes import deferred_volumes
 from ..jobs.target import selected_person
+from ..jobs.volumes import faults
 from .drawing import SidebarPanel, draw_lines
 
 
@@ -18,8 +18,8 @@ class PRIMDIFFUSION_PT_human(SidebarPanel, bpy.types.Panel):
     manual_page = "editing"
 
     def draw(self, context: bpy.types.Context) -> None:
-        if deferred_volumes.error:
-            draw_lines(self.layout, deferred_volumes.error, "ERROR")
+        if faults.text:
+            draw_lines(self.layout, faults.text, "ERROR")
         try:
             self.layout.prop(selected_person(context), "name", text="", icon="OUTLINER_OB_ARMATURE")
         except ValueError as error:

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
+from pathlib import Path
 
 import bpy
-import numpy as np
 from bpy_extras.io_utils import ExportHelper
 
 from ..backend.requests import sentence
-from ..formats.poses.files import write_amass
-from ..motion.built_in_motions import built_in_motion
-from ..motion.pose_library import check_posable
+from ..formats.poses.files import read_motion, write_amass
+from ..formats.poses.motion import Motion
+from ..motion.adjust import rounds_of
 from ..scene.actions import action_curves
-from ..scene.armature import pose_from_joint_rotations
 from ..scene.blend_values import as_shown, stored_record
-from ..scene.handles import check_no_handles
 from .drawing import SidebarPanel, draw_lines, property_columns
 from .export_operators import destination
 from .motion_placing import Placement, extend_range, place_motion, sample_motion
@@ -29,65 +27,14 @@ _BUILT_IN = [
     ("WAVE", "Wave", "Standing and waving with the right hand"),
     ("TURN", "Turn Left", "A quarter turn to the left in two steps"),
 ]
+_FOLDER = Path(__file__).parents[1] / "motion" / "data"
 
 
-class PRIMDIFFUSION_OT_use_action(OnArmature, bpy.types.Operator):
-    """Use another action of this file for the human"""
-
-    bl_idname = "primdiffusion.use_action"
-    bl_label = "Use Motion"
-    bl_options = {"REGISTER", "UNDO"}
-
-    action: bpy.props.StringProperty(
-        name="Action", description="Name of the action; empty: none, and the rest pose", options={"SKIP_SAVE"}
-    )
-
-    @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return (
-            str(cls.__doc__)
-            if properties.action
-            else "Remove the motion from the human; the action stays in the file, the human returns to the rest pose"
-        )
-
-    def on(self, _context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        check_posable(armature)
-        check_no_handles(armature)
-        if not self.action:
-            _clear_motion(armature)
-            return {"FINISHED"}
-        action = bpy.data.actions.get(self.action)
-        if action is None:
-            raise ValueError(f"there is no action {self.action!r} in this file")
-        if not moves_bones(action):
-            raise ValueError(f"the action {self.action!r} does not animate the bones of a human")
-        animation = armature.animation_data_create()
-        animation.action = action
-        if action_curves(armature) is None:
-            animation.action_slot = next(slot for slot in action.slots if slot.target_id_type == "OBJECT")
-        return {"FINISHED"}
-
-
-def _clear_motion(armature: bpy.types.Object) -> None:
-    """Remove action and strips, and pose the armature as at rest. Raises ValueError where there are none."""
-    animation = armature.animation_data
-    if animation is None or (animation.action is None and not animation.nla_tracks):
-        raise ValueError(f"{armature.name!r} has no motion to clear")
-    animation.action = None
-    for track in list(animation.nla_tracks):
-        animation.nla_tracks.remove(track)
-    pose_from_joint_rotations(armature, np.tile(np.eye(3), (24, 1, 1)))
-
-
-def moves_bones(action: bpy.types.Action) -> bool:
-    """Whether an action turns the pelvis of some armature."""
-    return any(
-        curve.data_path == 'pose.bones["pelvis"].rotation_quaternion'
-        for layer in action.layers
-        for strip in layer.strips
-        for bag in strip.channelbags
-        for curve in bag.fcurves
-    )
+def built_in_motion(name: str) -> Motion:
+    """One round of a motion of _BUILT_IN, for average legs."""
+    motion = read_motion(_FOLDER / f"{name.lower()}.npz")
+    label = next(label for one, label, _ in _BUILT_IN if one == name)
+    return dataclasses.replace(motion, name=label, detected=dataclasses.replace(motion.detected, average_legs=True))
 
 
 class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
@@ -102,10 +49,12 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
     speed: bpy.props.FloatProperty(name="Speed", description="2 is twice as fast", default=1.0, min=0.1, max=10.0)
 
     def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        rate = scene_fps(context.scene)
-        made = dataclasses.replace(built_in_motion(self.motion, self.rounds, rate / self.speed), fps=rate)
-        how = Placement(start=self.start, timing="SOURCE", root=self.root, ground=False, into=self.into)
-        _, last = place_motion(context, armature, made, how)
+        motion = rounds_of(built_in_motion(self.motion), self.rounds)
+        seconds = (len(motion) - 1) / motion.fps / self.speed
+        frames = max(1, round(seconds * scene_fps(context.scene)))  # whole, for a loop's end to be its beginning
+        motion = dataclasses.replace(motion, fps=(len(motion) - 1) / frames * scene_fps(context.scene))
+        how = Placement(start=self.start, root=self.root, ground=False, into=self.into)
+        _, last = place_motion(context, armature, motion, how)
         if self.extend:
             extend_range(context.scene, last)
         return {"FINISHED"}
@@ -159,16 +108,13 @@ class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
             draw_lines(layout, sentence(error), "INFO")
             return
         self._draw_action(layout, armature)
-        column = layout.column(align=True)
-        column.operator("primdiffusion.key_pose", icon="KEY_HLT")
-        animation = armature.animation_data
-        if animation is not None and (animation.action is not None or animation.nla_tracks):
-            column.operator("primdiffusion.use_action", text="Clear Motion", icon="X").action = ""
         layout.operator("primdiffusion.export_motion", icon="EXPORT")
 
     def _draw_action(self, layout: bpy.types.UILayout, armature: bpy.types.Object) -> None:
+        row = layout.row()
+        row.context_pointer_set("animated_id", armature)
+        row.template_action(armature, unlink="action.unlink")
         action = armature.animation_data.action if armature.animation_data else None
-        layout.menu("PRIMDIFFUSION_MT_actions", text=action.name if action else "No Motion", icon="ACTION")
         if action is None:
             return
         box = layout.box().column(align=True)
@@ -182,19 +128,6 @@ class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
         row.label(text=f"{start:g} \N{EN DASH} {end:g}", translate=False)
         if action_curves(armature) is not None:
             layout.prop(armature.primdiffusion_human, "loop", toggle=True, icon="FILE_REFRESH")
-
-
-class PRIMDIFFUSION_MT_actions(bpy.types.Menu):
-    """The motions of this file."""
-
-    bl_label = "Motions"
-
-    def draw(self, _context: bpy.types.Context) -> None:
-        actions = [action for action in bpy.data.actions if moves_bones(action)]
-        for action in actions:
-            self.layout.operator("primdiffusion.use_action", text=action.name, icon="ACTION").action = action.name
-        if not actions:
-            self.layout.label(text="No motion in this file: import one")
 
 
 def facts_of(action: bpy.types.Action) -> dict[str, str]:

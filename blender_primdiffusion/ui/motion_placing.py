@@ -16,7 +16,7 @@ from ..formats.poses.motion import Motion
 from ..formats.poses.rotation import nearest
 from ..formats.poses.skeleton import unchain
 from ..motion.adjust import cut, from_origin, in_place, on_floor, resample, scale_places, stride_ratio
-from ..motion.pose_library import check_posable, rest_joints
+from ..motion.posture import check_posable, rest_joints
 from ..scene.actions import last_key, push_to_strip
 from ..scene.armature import append_poses, keyframe_poses, model_origin, rest_rotations
 from ..scene.blend_values import stored_numbers

@@ -12,7 +12,6 @@ import bpy
 from ..backend.client import PROGRAM
 from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, state_of, tried
 from ..backend.requests import sentence
-from ..jobs.deferred_volumes import keep_writing
 from ..jobs.follow import redraw
 from ..jobs.queue import queue
 from ..places import EXTENSION, INSTALLS_BACKEND, installed_backend, preference, set_up_folder
@@ -30,14 +29,6 @@ _COMPUTE = (
     ("CPU", "CPU", "Smallest download; a human takes seconds instead of fractions of one"),
     ("CUDA", "NVIDIA (CUDA)", "Large download; needs an NVIDIA card and driver"),
     ("APPLE", "Apple", "For Apple Silicon; computes on its processor"),
-)
-_VOLUMES = (
-    ("ALWAYS", "Always", "Volumes are written as soon as the human stands, so that any renderer has them"),
-    (
-        "WHEN_RENDERING",
-        "When Rendering",
-        "Volumes are written when another engine than PrimDiffusion renders for the first time",
-    ),
 )
 
 
@@ -133,10 +124,6 @@ def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.type
     redraw()
 
 
-def _volumes_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
-    keep_writing()
-
-
 def _captures_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
     redraw()
 
@@ -174,12 +161,6 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         min=0,
         soft_max=120,
     )
-    volumes: bpy.props.EnumProperty(
-        name="Write Volumes",
-        description="When the volumes that Cycles and EEVEE draw are written; 25 MB a human",
-        items=_VOLUMES,
-        update=_volumes_changed,
-    )
     captures: bpy.props.BoolProperty(
         name="Captures",
         description=f"Show the tab {DATA} in the sidebar: training data from scans, and humans from images",
@@ -191,7 +172,7 @@ class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
         _draw_backend(self, layout.box())
         layout.use_property_split = True
         layout.use_property_decorate = False
-        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "volumes", "captures"):
+        for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "captures"):
             layout.prop(self, name)
 
 

@@ -11,12 +11,14 @@ from mathutils import Euler, Vector
 from ..backend.environment import NOT_INSTALLED
 from ..engine.engine import ENGINE
 from ..engine.who_draws import Drawer, who_draws
-from ..jobs.follow import Reporting
+from ..jobs.follow import Reporting, submit
+from ..jobs.merge import MergeJob, Moment
+from ..jobs.target import HumanTarget
 from ..places import backend_is_named
-from ..scene.attachment import in_viewport
 from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera, posed_extent
 from ..scene.human import human_of, humans
-from .drawing import SidebarPanel, draw_lines, property_columns
+from ..scene.representation import in_viewport, representation_of
+from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
 
 _FROM_EEVEE = frozenset(
     {
@@ -130,7 +132,20 @@ class PRIMDIFFUSION_OT_set_up_engine(Reporting, bpy.types.Operator):
             scene.cycles.max_bounces = bounces
         scene.render.engine = self.engine
         _plain_colours(scene)
-        return {"FINISHED"}
+        return _merge_all(self, context) if self.engine == "CYCLES" and backend_is_named() else {"FINISHED"}
+
+
+def _merge_all(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
+    """Merge the humans that volumes show: Cycles then renders them in seconds. Those that move keep their volumes."""
+    graph, voxel = context.evaluated_depsgraph_get(), context.scene.primdiffusion_merging.voxel
+    jobs = [
+        MergeJob(HumanTarget.of(person), Moment.now(person, person.evaluated_get(graph)), voxel)
+        for person in humans(context.scene)
+        if representation_of(person) == "VOLUMES" and not (person.animation_data and person.animation_data.action)
+    ]
+    for job in jobs:
+        submit(operator, context, job)
+    return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_add_camera(Reporting, bpy.types.Operator):
@@ -164,7 +179,7 @@ def _plain_colours(scene: bpy.types.Scene) -> None:
 
 EXACT = "Renders humans exactly, other objects with simple shading"
 APPROXIMATE = "Renders humans approximately, with light and shadows"
-UNLIT = "Renders humans approximately, with light and shadows; 3D views need Volumes in Viewport for that"
+UNLIT = "Renders humans approximately, with light and shadows; 3D views need Show Volumes in Viewport for that"
 OTHER_ENGINE = "Renders humans blurred: choose an engine above"
 
 
@@ -213,4 +228,5 @@ class PRIMDIFFUSION_PT_render(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         draw_engines(self.layout, context.scene)
+        draw_job_state(self.layout, "merge")
         self.layout.operator("primdiffusion.add_camera", icon="CAMERA_DATA")

@@ -11,7 +11,6 @@ from bpy.app.handlers import persistent
 
 from ..backend.requests import sentence
 from ..formats.requests import VariationsRequest
-from ..jobs.deferred_volumes import keep_writing
 from ..jobs.follow import Reporting, redraw, submit
 from ..jobs.pictures import icons
 from ..jobs.queue import queue
@@ -227,7 +226,6 @@ def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bp
         return built, sentence(error)
     finally:
         context.window_manager.progress_end()
-        keep_writing()
     return built, ""
 
 

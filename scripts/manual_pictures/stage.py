@@ -15,11 +15,11 @@ _FLOOR_TILES = 64
 
 def empty_file(blend: Path) -> bpy.types.Scene:
     """A saved empty file, with the extension registered and this interpreter as its backend."""
+    bpy.ops.wm.read_homefile(use_factory_startup=True, use_empty=True)
     if not hasattr(bpy.types, "PRIMDIFFUSION_OT_generate"):
         import blender_primdiffusion
 
         blender_primdiffusion.register()
-    bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(blend))
     scene = bpy.context.scene
     scene.render.engine = "PRIMDIFFUSION"
@@ -44,7 +44,10 @@ def generate(seed: int, position: tuple[float, float] = (0.0, 0.0), attributes: 
 
 def pose(person: bpy.types.Object, name: str) -> None:
     bpy.context.view_layer.objects.active = person
-    bpy.ops.primdiffusion.apply_pose(pose_name=name)
+    library = bpy.context.preferences.filepaths.asset_libraries["PrimDiffusion"]
+    with bpy.data.libraries.load(str(Path(library.path) / "poses.blend")) as (_, wanted):
+        wanted.actions = [name]
+    person.pose.apply_pose_from_action(wanted.actions[0])
 
 
 def tiled_floor(scene: bpy.types.Scene, tile: float, columns: int = _FLOOR_TILES) -> bpy.types.Object:

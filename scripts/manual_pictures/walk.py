@@ -8,9 +8,9 @@ from pathlib import Path
 import bpy
 
 from blender_primdiffusion.motion.adjust import leg_ratio
-from blender_primdiffusion.motion.built_in_motions import CYCLE_SECONDS, STRIDE
-from blender_primdiffusion.motion.pose_library import rest_joints
+from blender_primdiffusion.motion.posture import rest_joints
 
+from ..bake_poses.motions import CYCLE_SECONDS, STRIDE
 from .shrink import save_gif
 from .stage import empty_file, generate, look, render, tiled_floor
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import bpy
 from panels import show, sidebar, view
-from press import Steps, press, wait
+from press import Steps, pose, press, wait
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, people_file, queue_of, select, with_people
 from visible_scene import at_rest
 
@@ -107,7 +107,7 @@ def copies(module: str, python: str) -> Steps:
 def read_back(module: str, python: str) -> Steps:
     """A waving human as GLB, USD and FBX, each read into an empty scene by Blender's own importer."""
     yield from with_people(module, python, FIRST_SEED)
-    press("primdiffusion.apply_pose", pose_name="Waving")
+    pose(bpy.context.active_object, "Waving")
     files = {name: Path(bpy.app.tempdir) / f"waving.{name}" for name in ("glb", "usdc", "fbx")}
     for path in files.values():
         press("primdiffusion.export", "EXEC_DEFAULT", filepath=str(path))

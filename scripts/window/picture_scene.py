@@ -8,7 +8,7 @@ from pathlib import Path
 
 import bpy
 from panels import show
-from press import Steps, press, wait
+from press import Steps, pose, press, wait
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, queue_of, select
 from visible_scene import at_rest
 
@@ -43,7 +43,7 @@ def from_a_posed_start(module: str, python: str) -> Steps:
     (armature,) = armatures()
     armature.location = armature.rotation_euler = (0.0, 0.0, 0.0)
     select(armature)
-    press("primdiffusion.apply_pose", pose_name="Waving")
+    pose(armature, "Waving")
     armature.rotation_euler.z += math.radians(8)
     yield from at_rest(module)
     yield "picture_posed"
@@ -53,7 +53,7 @@ def from_a_posed_start(module: str, python: str) -> Steps:
     yield "picture_posed_made"
 
 
-def drawn(module: str, python: str, seed: int, pose: str) -> Steps:
+def drawn(module: str, python: str, seed: int, name: str) -> Steps:
     """Returns a PNG with alpha of a human in a pose, drawn by the engine."""
     yield from begin(module, python)
     bpy.data.objects.remove(bpy.data.objects["Cube"])
@@ -61,7 +61,7 @@ def drawn(module: str, python: str, seed: int, pose: str) -> Steps:
     yield from wait(lambda: not queue_of(module).busy, _MOST_S)
     (armature,) = armatures()
     select(armature)
-    press("primdiffusion.apply_pose", pose_name=pose)
+    pose(armature, name)
     press("primdiffusion.add_camera")
     scene = bpy.context.scene
     scene.render.engine, scene.render.film_transparent = "PRIMDIFFUSION", True

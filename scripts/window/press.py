@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import bpy
 from panels import view
@@ -22,6 +23,14 @@ def press(operator: str, how: str = "INVOKE_DEFAULT", **given: object) -> set[st
         except RuntimeError as error:
             print(f"{operator}: {error}", flush=True)
             return {"CANCELLED"}
+
+
+def pose(armature: bpy.types.Object, name: str) -> None:
+    """Apply a pose of the extension's asset library, as a click in the asset shelf does."""
+    library = bpy.context.preferences.filepaths.asset_libraries["PrimDiffusion"]
+    with bpy.data.libraries.load(str(Path(library.path) / "poses.blend")) as (_, wanted):
+        wanted.actions = [name]
+    armature.pose.apply_pose_from_action(wanted.actions[0])
 
 
 def invoke(operator: str, **given: object) -> set[str]:

@@ -16,7 +16,7 @@ from file_scenes import cancelled_captures, copies, five_humans, handles, other_
 from moving_scenes import opening, playing, turning
 from panels import show, sidebar, view, wide_view
 from picture_scene import from_picture
-from press import Steps, invoke, press, wait
+from press import Steps, invoke, pose, press, wait
 from start import (
     FIRST_SEED,
     SECOND_SEED,
@@ -140,11 +140,13 @@ def human(module: str, python: str) -> Steps:
     yield from show("PRIMDIFFUSION_PT_advanced/memory")
     yield "human_details"
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
-    bpy.context.scene.primdiffusion_motion.pose = "Waving"
-    yield 1.0
-    press("primdiffusion.apply_pose")
+    press("object.posemode_toggle")
+    yield 1.0  # until it is drawn in Pose Mode, the view has no asset shelf
+    view()[1].spaces.active.show_region_asset_shelf = True
+    pose(bpy.context.active_object, "Waving")
     yield 6.0
     yield "human_poses"
+    press("object.posemode_toggle")
     yield from show("PRIMDIFFUSION_PT_export/assets", "PRIMDIFFUSION_PT_advanced/files")
     yield "human_assets"
 
@@ -192,7 +194,7 @@ def motion(module: str, python: str) -> Steps:
     path = Path(bpy.app.tempdir) / "walk_01.npz"
     press("primdiffusion.add_motion", motion="WALK", rounds=3)
     press("primdiffusion.export_motion", "EXEC_DEFAULT", filepath=str(path))
-    press("primdiffusion.use_action", action="")
+    bpy.context.active_object.animation_data_clear()
     yield 1.0
     yield {"point": [500, 500]}
     invoke("primdiffusion.import_motion", filepath=str(path))
@@ -208,24 +210,18 @@ def motion(module: str, python: str) -> Steps:
 
 
 def render(module: str, python: str) -> Steps:
-    """Engine and Cycles, attachment, merging, gain, memory."""
+    """Engine and Cycles, what shows the human, merging, gain."""
     yield from with_people(module, python, FIRST_SEED)
-    names = ("render", *(f"advanced/{section}" for section in ("attachment", "merge", "look", "memory")))
-    writing = import_module(f"{module}.jobs.deferred_volumes")._tick
-    yield from wait(lambda: not bpy.app.timers.is_registered(writing), 120)
+    names = ("render", *(f"advanced/{section}" for section in ("show_as", "merge", "look", "facts")))
     yield from show(*(f"PRIMDIFFUSION_PT_{name}" for name in names))
     press("primdiffusion.set_up_engine", engine="CYCLES")
     yield "render_cycles"
-    press("primdiffusion.set_attachment", mode="SURFACE")
-    yield 1.0
-    yield "render_surface"
     queue = queue_of(module)
-    press("primdiffusion.merge")
     yield 3.0
     yield "render_merging"
     yield from wait(lambda: not queue.busy, 240)
     yield "render_merged"
-    press("primdiffusion.apply_pose", pose_name="Waving")
+    pose(bpy.context.active_object, "Waving")
     press("primdiffusion.set_up_engine")
     yield "render_outdated"
 

@@ -16,7 +16,7 @@ _NOTICED_S = 0.1
 _OURS = (
     ("jobs.follow", "Building", "advance"),
     ("jobs.follow", "", "enter"),
-    ("jobs.deferred_volumes", "DeferredVolumes", "work"),
+    ("jobs.volumes", "VolumesJob", "advance"),
     ("engine.gpu.overlay", "Overlay", "advance"),
     ("engine.gpu.overlay", "Overlay", "draw"),
 )

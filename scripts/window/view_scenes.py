@@ -154,9 +154,8 @@ def stalls(module: str, python: str) -> Steps:
 
 
 def entering(module: str, seed: int, prefix: str) -> Steps:
-    """Generate a person and measure from the child's answer until a view shows them and their volumes are written."""
+    """Generate a person and measure from the child's answer until a view shows them."""
     queue, overlay = queue_of(module), import_module(f"{module}.engine.gpu.overlay").overlay
-    writing = import_module(f"{module}.jobs.deferred_volumes")._tick
     humans = len(armatures()) + 1
 
     def shown() -> set[tuple]:
@@ -166,14 +165,11 @@ def entering(module: str, seed: int, prefix: str) -> Steps:
     def in_view() -> bool:
         return any(len(key) == humans for key in shown() - before)
 
-    def written() -> bool:
-        return not queue.busy and not bpy.app.timers.is_registered(writing)
-
     before, load = shown(), os.getloadavg()[0]
     press("primdiffusion.generate", seed=seed)
     measured = Stalls({"answered": lambda: queue.ready, "standing": lambda: not queue.busy, "in view": in_view})
     yield from wait(lambda: "in view" in measured.met, 240)
-    yield from wait(written, 240)
+    yield from wait(lambda: not queue.busy, 240)
     yield AFTERWARDS_S
     print(f"adding a person: {measured.end()}", flush=True)
     answered = measured.met["answered"]

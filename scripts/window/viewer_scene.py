@@ -6,7 +6,7 @@ from importlib import import_module
 
 import bpy
 from panels import sidebar, view
-from press import Steps, press, wait
+from press import Steps, pose, press, wait
 from start import armatures, begin, queue_of, select
 from visible_scene import at_rest
 
@@ -24,7 +24,7 @@ def viewer(module: str, _python: str) -> Steps:
     select(armatures()[0])
     yield from at_rest(module)
     yield "viewer_human"
-    press("primdiffusion.apply_pose", pose_name="Waving")
+    pose(armatures()[0], "Waving")
     press("view3d.view_selected", "EXEC_DEFAULT")
     _, area = view()
     area.spaces.active.shading.type = "MATERIAL"

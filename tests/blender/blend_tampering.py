@@ -26,12 +26,12 @@ sys.path.insert(0, str(Path(__file__).parents[2] / "benchmarks"))
 import sidebar
 
 from blender_primdiffusion.places import EXTENSION
-from blender_primdiffusion.scene import attachment, merged, proxy, splats, stand_in, surface
+from blender_primdiffusion.scene import cells, merged, proxy, representation, splats, stand_in, volume_nodes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import replace_person
 from blender_primdiffusion.scene.human import BETAS, BODY_MARK, MARK, ORIGIN, body_of, is_human, link_part, parts_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD
-from blender_primdiffusion.scene.pending import open_humans, write_all_pending
+from blender_primdiffusion.scene.volume_files import open_humans, write_volumes
 from blender_primdiffusion.ui.drawing import DATA
 from blender_primdiffusion.ui.on_person import FACTS
 
@@ -93,7 +93,6 @@ def build(stage: Stage) -> None:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(stage.blend))
     person = build_human(bpy.context, first / "person.human.safetensors", "Anna")
-    attachment.set_attachment(person, "SURFACE")
     armature = person
     bpy.context.view_layer.objects.active = armature
     armature.animation_data_create().action = bpy.data.actions.new("Walk")
@@ -130,14 +129,13 @@ def _with(mark: str) -> Callable[[], bpy.types.Object]:
 
 
 HOLDERS: dict[str, Callable[[], Any]] = {
-    **dict.fromkeys((MARK, attachment.ATTACHMENT, attachment._BEFORE), person),
-    attachment.IN_VIEWPORT: person,
+    **dict.fromkeys((MARK, representation.REPRESENTATION, representation.IN_VIEWPORT), person),
     **dict.fromkeys((BETAS, PAYLOAD, BODY), person),
     ORIGIN: lambda: person().data,
     BODY_MARK: lambda: body_of(person()),
     proxy.PROXY_MARK: _with(proxy.PROXY_MARK),
     merged.MARK: _with(merged.MARK),
-    surface.MARK: _with(surface.MARK),
+    volume_nodes.VOLUMES_MARK: _with(volume_nodes.VOLUMES_MARK),
     splats.SPLATS_MARK: _with(splats.SPLATS_MARK),
     splats.CELLS_MARK: _with(splats.CELLS_MARK),
     stand_in.STAND_IN: _with(stand_in.STAND_IN),
@@ -186,8 +184,9 @@ def _set_custom(name: str) -> Callable[[object], None]:
     return put
 
 
-def _set_volume(value: object) -> None:
-    next(iter(bpy.data.volumes)).filepath = value
+def _set_folder(value: object) -> None:
+    modifier = volume_nodes.volumes_of(person()).modifiers[volume_nodes.MODIFIER]
+    cells.set_input(modifier, volume_nodes.FOLDER, value)
 
 
 def _set_merged(value: object) -> None:
@@ -208,7 +207,7 @@ def _set_name(value: object) -> None:
 
 PROPERTIES: dict[str, Callable[[object], None]] = {
     **{name: _set_custom(name) for name in HOLDERS},
-    "volume.filepath": _set_volume,
+    "volumes.folder": _set_folder,
     "merged.filepath": _set_merged,
     "library.filepath": _set_library,
     "armature.name": _set_name,
@@ -217,7 +216,7 @@ PROPERTIES: dict[str, Callable[[object], None]] = {
     **{f"preferences.{name}": _set_preference(name) for name in PREFERENCES},
 }
 """How each is set, as a stranger would."""
-TEXT_ONLY = {"volume.filepath", "merged.filepath", "library.filepath", "armature.name"} | {
+TEXT_ONLY = {"volumes.folder", "merged.filepath", "library.filepath", "armature.name"} | {
     f"preferences.{name}" for name in PREFERENCES
 }
 """Blender itself stores these as text."""
@@ -280,7 +279,7 @@ def _menus() -> list[type]:
 
 
 OPERATORS: tuple[tuple[str, dict[str, object]], ...] = (
-    ("set_attachment", {"mode": "ARMATURE"}), ("reshape", {"to": "GENERATED"}),
+    ("set_representation", {"representation": "VOLUMES"}), ("reshape", {"to": "GENERATED"}),
     ("human_from_captures", {}), ("verify_captures", {}),
     ("show_proxy", {"shown": "REMOVED"}), ("merge", {"what": "NOTHING"}),
 )  # fmt: skip
@@ -305,7 +304,7 @@ def edit_fault(stage: Stage, source: Path) -> str:
     try:
         replace_person(person(), source / "person.human.safetensors")
         merged.publish([source / "grid.vdb"], ["a"], merged.merged_folder())
-        write_all_pending()
+        write_volumes(person())
     except (ValueError, OSError):
         return ""
     except Exception as error:

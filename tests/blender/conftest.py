@@ -61,15 +61,6 @@ def saved_scene(empty_scene, tmp_path):
 
 
 @pytest.fixture
-def volumes_shown(monkeypatch):
-    """New humans have volumes that viewports show, as they had in earlier versions."""
-    from blender_primdiffusion.scene import attachment, build
-
-    for module in (attachment, build):
-        monkeypatch.setattr(module, "VOLUMES_IN_VIEWPORT", True)
-
-
-@pytest.fixture
 def splats():
     """New humans are shown by splats, if this Blender has them."""
 
@@ -78,9 +69,9 @@ def splats():
 def only_volumes(request, monkeypatch):
     """New humans are shown by volumes on every Blender, unless a test asks for `splats`."""
     if "splats" not in request.fixturenames:
-        from blender_primdiffusion.scene import attachment, build, parts
+        from blender_primdiffusion.scene import build, parts, representation
 
-        for module in (attachment, build, parts):
+        for module in (build, parts, representation):
             monkeypatch.setattr(module, "SPLATS_AVAILABLE", False)
 
 

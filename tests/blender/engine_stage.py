@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from unittest import mock
 
 import bpy
 import numpy as np
 
-from blender_primdiffusion.scene import build, volume_objects
-from blender_primdiffusion.scene.rest_human import read_human
+from blender_primdiffusion.scene import build
 
 ROOT = Path(__file__).resolve().parents[2]
 PYTHON = os.environ.get("PRIMDIFFUSION_PYTHON", sys.executable)
@@ -23,8 +20,6 @@ PYTHON = os.environ.get("PRIMDIFFUSION_PYTHON", sys.executable)
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Blender from backend."""
 STEP = 0.004
-PRIMITIVES_IN_BLENDER = 4
-"""Volumes that stand for a person in the scene: the engine reads the person's own file, with all of them."""
 
 
 class Oracle:
@@ -62,12 +57,8 @@ class Oracle:
 
 
 def add_human(folder: Path) -> bpy.types.Object:
-    """Build the human of `Oracle.make`, with few of its volumes, so that it is quick."""
-    whole, few = read_human(folder / "person.human.safetensors"), slice(PRIMITIVES_IN_BLENDER)
-    fields = ("face", "barycentric", "stencil_vertex", "stencil_du", "stencil_dv", "rest_half_extent")
-    model = dataclasses.replace(whole.model, **{name: getattr(whole.model, name)[few] for name in fields})
-    with mock.patch.object(volume_objects, "shape_model_of", return_value=model):
-        return build.build_human(bpy.context, folder / "person.human.safetensors")
+    """Build the human of `Oracle.make`."""
+    return build.build_human(bpy.context, folder / "person.human.safetensors")
 
 
 def set_up_render(

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import bpy
 
-from blender_primdiffusion.scene.human import parts_of, volumes_of
+from blender_primdiffusion.scene.human import parts_of
 from blender_primdiffusion.scene.parts import complete_humans
 from blender_primdiffusion.scene.payload import PAYLOAD, session_file
+from blender_primdiffusion.scene.volume_files import files_of
 
 
 def person_file(person: bpy.types.Object) -> Path:
@@ -22,8 +23,8 @@ def folder_of(person: bpy.types.Object) -> Path:
 
 
 def paths_of(person: bpy.types.Object) -> list[Path]:
-    """What the human's volumes show."""
-    return [Path(obj.data.filepath) for objects in volumes_of(person).values() for obj in objects]
+    """The files of the human's volumes, there or not."""
+    return files_of(person)
 
 
 def volume_path(volume: bpy.types.Volume) -> Path:

@@ -4,23 +4,15 @@ from __future__ import annotations
 
 import bpy
 import numpy as np
-from synthetic import skinning
+from synthetic import frames, skinning
 
-from blender_primdiffusion.scene.human import parts_of
+from blender_primdiffusion.scene.volume_files import write_volumes
+from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 Z_UP = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Blender from backend, written out by hand: forward +z becomes -y, up +y becomes +z."""
 TOLERANCE_M = 2e-5
 """Of points on posed bodies, whose files hold float32."""
-
-
-def blended_frames(human: dict, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
-    """Rest frames moved by linear blend skinning [K, 4, 4], z up: (sum_j w_j G_j) [R diag(growth) | x]."""
-    frames = np.tile(np.eye(4), (len(human["position"]), 1, 1))
-    growth = human.get("growth", np.ones((len(frames), 3)))
-    frames[:, :3, :3], frames[:, :3, 3] = human["rotation"] * growth[:, None], human["position"]
-    transforms = skinning(human["joints"], rotations, translation)
-    return Z_UP @ np.einsum("kj,jab->kab", human["primitive_weights"], transforms) @ frames
 
 
 def blended_vertices(human: dict, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -43,8 +35,24 @@ def world_from_model(armature: bpy.types.Object, vertices: np.ndarray) -> np.nda
     return np.array(armature.matrix_world) @ raised(vertices)
 
 
-def evaluated_matrices(collection: bpy.types.Object) -> np.ndarray:
-    """World matrices [K, 4, 4] of a person's volumes, in the order of their names."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    volumes = sorted((o for o in parts_of(collection) if o.type == "VOLUME"), key=lambda o: o.name)
-    return np.array([np.array(o.evaluated_get(depsgraph).matrix_world) for o in volumes])
+def surface_frames(human: dict, rotations: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Where the paper has the boxes [K, 4, 4], z up: the frames of the posed surface, by definition, scaled."""
+    vertices = blended_vertices(human, rotations, translation) @ Z_UP[:3, :3]  # y up again
+    position, rotation = frames(vertices, human)
+    growth = human.get("growth", np.ones((len(position), 3)))
+    found = np.tile(np.eye(4), (len(position), 1, 1))
+    found[:, :3, :3], found[:, :3, 3] = rotation * growth[:, None], position
+    return Z_UP @ found
+
+
+def evaluated_matrices(person: bpy.types.Object) -> np.ndarray:
+    """World matrices [K, 4, 4] of a human's volumes as Blender draws them; shows them meanwhile, and writes files."""
+    write_volumes(person)
+    volumes = volumes_of(person)
+    hidden, volumes.hide_viewport = volumes.hide_viewport, False
+    bpy.context.view_layer.update()
+    instances = bpy.context.evaluated_depsgraph_get().object_instances
+    found = [np.array(one.matrix_world) for one in instances if one.is_instance and one.parent.original == volumes]
+    volumes.hide_viewport = hidden
+    bpy.context.view_layer.update()
+    return np.array(found)

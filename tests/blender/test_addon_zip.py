@@ -51,6 +51,7 @@ def test_the_zip_holds_addon_backend_and_licence_and_nothing_stray(archive):
     assert names == sorted(names)
     wanted = {"blender_manifest.toml", "__init__.py", "LICENSE", "backend/client.py", "scene/human.py"}
     wanted |= {"gallery/Sample.human", "bundled/primdiffusion/human.py", "bundled/primdiffusion/body/data/body.npz"}
+    wanted |= {f"motion/data/{name}" for name in ("poses.blend", "walk.npz", "idle.npz", "wave.npz", "turn.npz")}
     assert wanted <= set(names)
     assert not [name for name in names if "__pycache__" in name or name.endswith((".pyc", ".nbi", ".nbc"))]
     assert WEIGHTS.is_file() == ("bundled/primdiffusion/weights/default.safetensors" in names)

@@ -29,8 +29,8 @@ from blender_primdiffusion.scene.handles import add_handles
 from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.ui.drawing import DATA
 
-ELSEWHERE = {"set_up_backend", "make_pose_assets", "copy_diagnostics"}
-"""Set up, write a library or a text: whatever is in the scene, it stays as it is."""
+ELSEWHERE = {"set_up_backend", "copy_diagnostics"}
+"""Set up, write a text: whatever is in the scene, it stays as it is."""
 
 
 def operators() -> list[tuple[str, dict[str, object]]]:
@@ -208,8 +208,7 @@ def anna(addon, tmp_path, monkeypatch):
 
 @pytest.fixture
 def outside(anna, monkeypatch):
-    """Nothing is downloaded or installed; libraries are small and written where tests write."""
-    from blender_primdiffusion.jobs import assets
+    """Nothing is downloaded or installed."""
     from blender_primdiffusion.ui.setup import SetUpSession
 
     def start(session: SetUpSession, _steps: object) -> None:
@@ -217,15 +216,9 @@ def outside(anna, monkeypatch):
 
     monkeypatch.setattr(SetUpSession, "start", start)
     monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: anna / "set up")
-    monkeypatch.setattr(assets, "own_folder", lambda: anna / "own")
-    two = dict(list(assets.builtin_poses().items())[:2])  # a picture of each is drawn
-    monkeypatch.setattr(assets, "builtin_poses", lambda: two)
     bpy.context.preferences.system.use_online_access = True
     yield
     bpy.context.preferences.system.use_online_access = False
-    libraries = bpy.context.preferences.filepaths.asset_libraries
-    for ours in [one for one in libraries if one.name.startswith(assets.LIBRARY)]:
-        libraries.remove(ours)
 
 
 def _asked(monkeypatch, folder: Path) -> None:

@@ -14,13 +14,13 @@ from support.errors import refused
 
 from blender_primdiffusion.backend import environment
 from blender_primdiffusion.backend.environment import BackendNotFound, candidates
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes, write_before_rendering
 from blender_primdiffusion.jobs.queue import chosen_checkpoint, queue
+from blender_primdiffusion.jobs.volumes import faults, write_before_rendering
 from blender_primdiffusion.places import EXTENSION, preference
 from blender_primdiffusion.scene import payload
 from blender_primdiffusion.scene.human import body_of
 from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_folder
-from blender_primdiffusion.scene.pending import pending_of
+from blender_primdiffusion.scene.volume_files import are_written
 from blender_primdiffusion.ui.preferences import known
 
 
@@ -42,16 +42,9 @@ def test_no_value_of_a_property_leaves_the_folder_or_raises(pristine, tmp_path, 
     assert pristine.users.read_bytes() == SECRET
 
 
-def by_timer() -> None:
-    while deferred_volumes.work(0.0):
-        pass
-
-
 WRITERS = {
-    "timer": by_timer,
     "render": lambda: write_before_rendering(bpy.context.scene),
     "viewport": lambda: bpy.ops.primdiffusion.volumes_in_viewport(),
-    "undo": lambda: (bpy.ops.ed.undo_push(), bpy.ops.ed.undo_push(), bpy.ops.ed.undo(), by_timer()),
 }
 
 
@@ -65,8 +58,8 @@ def test_no_volume_is_read_or_written_in_a_folder_that_a_blend_names(pristine, w
     assert len(paths_of(person())) == COUNT
     assert all(path.is_file() and path.is_relative_to(session_folder()) for path in paths_of(person()))
     assert pristine.before() == before
-    assert pending_of(person()) is None
-    assert not deferred_volumes.error
+    assert are_written(person())
+    assert not faults.text
 
 
 @pytest.mark.parametrize("link", [False, True])
@@ -76,7 +69,7 @@ def test_no_volume_is_written_beside_a_blend_that_a_human_is_appended_or_linked_
     with bpy.data.libraries.load(str(pristine.blend), link=link) as (_, wanted):
         wanted.collections = ["Anna"]
     bpy.context.scene.collection.children.link(bpy.data.collections["Anna"])
-    by_timer()
+    write_before_rendering(bpy.context.scene)
     assert len(paths_of(person())) == COUNT
     assert all(path.is_file() and path.is_relative_to(session_folder()) for path in paths_of(person()))
     assert pristine.before() == before
@@ -118,9 +111,8 @@ def test_a_damaged_or_foreign_packed_file_shows_the_body_and_is_told_once(pristi
     before = pristine.before()
     bpy.ops.wm.open_mainfile(filepath=str(pristine.blend))
     assert not body_of(person()).hide_viewport
-    assert "the human 'Anna' cannot be drawn" in deferred_volumes.error
-    assert "\n" not in deferred_volumes.error
-    by_timer()
+    assert "the human 'Anna' cannot be drawn" in faults.text
+    assert "\n" not in faults.text
     assert not panels_fault()
     assert capsys.readouterr().out.count("cannot be drawn") == 1
     assert pristine.before() == before

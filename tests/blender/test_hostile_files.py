@@ -21,13 +21,11 @@ READS = {
     "import_motion": ("filepath", (".npz", ".npy", ".json", ".bvh", ".fbx")),
     "choose_picture": ("filepath", (".png", ".jpg")),
     "import_human": ("filepath", (".human", ".human.safetensors", ".npz")),
-    "mark_as_asset": ("picture", (".png", ".jpg", ".exr", ".hdr")),
-    "mark_as_asset POSE": ("picture", (".png", ".jpg", ".exr", ".hdr")),
 }
-"""Operators that read a file, with their `what` unless it is the default: the property with its path, and endings."""
+"""Operators that read a file: the property with its path, and endings."""
 WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human", ".vdb"))]
 """Operators that write the file of their `filepath`."""
-FOLDERS = {"human_from_captures", "make_pose_assets", "set_up_backend"}
+FOLDERS = {"human_from_captures", "set_up_backend"}
 """Operators on the folder of their `directory`."""
 SENT = {"human_from_picture": {"mask"}}
 """Files that the backend alone reads: tests/contract/test_bad_files.py tries its reader."""
@@ -163,7 +161,6 @@ def test_a_place_that_cannot_be_written_is_named_in_one_sentence(anna, name, end
 def test_a_folder_that_is_none_is_named_in_one_sentence(anna, name, monkeypatch):
     monkeypatch.setattr("blender_primdiffusion.ui.setup.follow_session", lambda _: {"FINISHED"})
     (anna / "file").write_bytes(b"a user's file")
-    places = ["file", "n" * 300, *([] if name == "make_pose_assets" else ["nowhere"])]  # it makes the folder
-    faults = [fault(name, anna, directory=str(anna / place)) for place in places]
+    faults = [fault(name, anna, directory=str(anna / place)) for place in ("file", "n" * 300, "nowhere")]
     assert not list(filter(None, faults)), "\n".join(filter(None, faults))
     assert (anna / "file").read_bytes() == b"a user's file"

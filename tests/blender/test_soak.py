@@ -9,7 +9,7 @@ from human_files import remove_human
 from jobs_driven import drive
 
 import blender_primdiffusion
-from blender_primdiffusion.jobs import deferred_volumes, follow
+from blender_primdiffusion.jobs import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.pictures import so_far
 from blender_primdiffusion.jobs.queue import queue
@@ -71,7 +71,7 @@ def test_fifty_humans_in_and_out_leave_nothing_behind(addon, capsys):
     blender_primdiffusion.unregister()
     try:
         assert not [handler for handler in handlers() if "primdiffusion" in handler]
-        timers = (follow.follow, follow.watch, deferred_volumes._tick)
+        timers = (follow.follow, follow.watch)
         assert not any(map(bpy.app.timers.is_registered, timers))
     finally:
         blender_primdiffusion.register()

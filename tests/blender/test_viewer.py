@@ -49,6 +49,11 @@ def test_the_zip_is_small_whole_and_accepted(archive):
     assert list(manifest["permissions"]) == ["files"]
     assert len(manifest["permissions"]["files"]) <= 64
     assert {"LICENSE", "gallery/Ada.human", "gallery/Sample.human", "bundled/primdiffusion/formats/arrays.py"} <= names
+    assert {
+        "motion/data/poses.blend",
+        "motion/data/walk.npz",
+        "bundled/primdiffusion/formats/poses/built_in.json",
+    } <= names
     assert not [name for name in names if name.endswith((".safetensors", ".txt"))]
     assert not [name for name in names if name.startswith(("ui/setup", "requirements"))]
 

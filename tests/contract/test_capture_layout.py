@@ -12,14 +12,11 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.formats import camera_rig, capture_layout, picture_files
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.camera import look_at
 from scipy.spatial.transform import Rotation
 from support.errors import refused
-
-from blender_primdiffusion.motion import poses as motion_poses
 
 ROOT = Path(__file__).resolve().parents[2]
 SMALL = camera_rig.Rig(count=7, width=40, height=60)
@@ -38,11 +35,6 @@ for name in {names}:
     files = dict(line.split(maxsplit=1) for line in done.stdout.splitlines())
     assert files == {name: str(ROOT / f"backend/primdiffusion/formats/{name}.py") for name in names}
     assert "capture_layout" in files
-
-
-def test_both_programs_have_the_same_poses():
-    ours, theirs = built_in_poses(), motion_poses.built_in_poses()
-    assert np.allclose(ours.joint_rotation.numpy(), theirs.rotations, atol=1e-5)
 
 
 @pytest.mark.parametrize("arrangement", ["rings", "sphere", "hemisphere"])

@@ -9,22 +9,20 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from primdiffusion.body.model import BodyPose, J, default_body
-from primdiffusion.formats.json_files import read_json
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.formats.poses.built_in import built_in_vectors
 from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.pose_file import read_motion
 
 MOST_CANDIDATES = 2000
 """Frames to choose from; longer motions are subsampled evenly."""
-BUILT_IN = Path(__file__).parent / "data" / "poses.json"
-"""The extension's poses, 72 axis-angle values by name; made by scripts/bake_poses."""
 
 
 def built_in_poses() -> BodyPose:
     """All built-in poses, the near-T pose first: rotations [20, 24, 3, 3]."""
-    turns = np.array(list(read_json(BUILT_IN).values()))
-    return BodyPose(axis_angle_to_matrix(torch.from_numpy(turns.reshape(-1, J, 3))).float(), torch.zeros(len(turns), 3))
+    turns = torch.from_numpy(np.array(list(built_in_vectors().values())))
+    return BodyPose(axis_angle_to_matrix(turns).float(), torch.zeros(len(turns), 3))
 
 
 def read_motions(paths: Sequence[Path]) -> tuple[list[BodyPose], list[str]]:

@@ -60,7 +60,7 @@ class Overlay:
         except RuntimeError as error:
             self._fail(error)
         if self._fault:
-            self.error = f"{self._fault}: show the volumes instead (Advanced > Attachment > Volumes in Viewport)"
+            self.error = f"{self._fault}: show the volumes instead (Advanced > Show As > Show Volumes in Viewport)"
 
     def _draw(self, context: bpy.types.Context) -> None:
         reading = self.reading(context)

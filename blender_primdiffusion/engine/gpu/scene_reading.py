@@ -15,6 +15,7 @@ from ...scene.human import BODY_MARK, human_of
 from ...scene.human_file import FileVersion, file_version, read_payload
 from ...scene.proxy import PROXY_MARK
 from ...scene.splats import SPLATS_MARK
+from ...scene.volume_nodes import VOLUMES_MARK
 from ..boxes import Boxes, boxes_of
 from ..picture import PosedHuman, human_armatures, pose_of
 from ..solids import visible_instances
@@ -169,6 +170,7 @@ def concerns_humans(changed: bpy.types.ID) -> bool:
             changed.type in ("ARMATURE", "EMPTY", "VOLUME", "POINTCLOUD")
             or BODY_MARK in changed
             or PROXY_MARK in changed
+            or VOLUMES_MARK in changed
         )
     return not isinstance(changed, _UNRELATED)
 

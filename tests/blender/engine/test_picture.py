@@ -22,7 +22,6 @@ from engine_stage import (
     set_up_render,
 )
 from human_files import lose_data, remove_human
-from human_stage import make_earlier
 from mathutils import Euler, Matrix
 from oracle import raised
 from support.errors import refused
@@ -160,18 +159,6 @@ def test_a_posed_scaled_and_rotated_armature_renders_as_posed(stage, backend, se
     bpy.context.view_layer.update()
     people = [as_asked(backend.folders[0], stage.armature, rotations, translation)]
     assert_same(render_png(stage.out), eight_bit(expected(stage, backend, people, step=step)[0]))
-
-
-def test_a_human_of_an_earlier_version_renders_as_it_did(stage, backend):
-    rotations, translation = strong_pose(1)
-    pose_from_joint_rotations(stage.armature, rotations, translation)
-    bpy.context.view_layer.update()
-    wanted = eight_bit(
-        expected(stage, backend, [as_asked(backend.folders[0], stage.armature, rotations, translation)])[0]
-    )
-    make_earlier(stage.person)
-    assert stage.armature.location.z > 0.5
-    assert_same(render_png(stage.out), wanted)
 
 
 def test_constraints_parents_and_drivers_reach_the_picture(stage, backend):

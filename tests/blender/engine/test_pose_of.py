@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
-from human_stage import make_earlier
 from oracle import Z_UP, raised
 
 from blender_primdiffusion.engine.picture import pose_of
@@ -18,20 +17,17 @@ from blender_primdiffusion.scene.edit import reshape
 BETAS = np.array([1.5, -2.0, 1.0, 0, 0, 1.0, 0, 0, 0, 0])
 
 
-@pytest.mark.parametrize("earlier", [False, True], ids=["now", "earlier version"])
 @pytest.mark.parametrize("shaped", [False, True], ids=["generated", "reshaped"])
-def test_joints_and_place_are_those_of_smpls_own_space(saved_scene, tmp_path, earlier, shaped):
+def test_joints_and_place_are_those_of_smpls_own_space(saved_scene, tmp_path, shaped):
     person = build_human(saved_scene, synthetic_shape.write(tmp_path / "human"))
     armature, body = person, synthetic_shape.arrays()
     rng = np.random.default_rng(0)
     rotations, translation = synthetic.axis_angle(rng.normal(0, 0.6, (24, 3))), rng.normal(0, 0.5, 3)
     pose_from_joint_rotations(armature, rotations, translation)
-    if earlier:
-        make_earlier(person)
     if shaped:
         reshape(person, BETAS)
         body = synthetic_shape.at(body, BETAS)
-    place = np.zeros(3) if earlier else raised(body["vertices"])[:3, 3]
+    place = raised(body["vertices"])[:3, 3]
     armature.rotation_euler, armature.scale = (0.4, -0.3, 2.0), (1.2, 1.2, 1.2)
     bpy.context.view_layer.update()
     evaluated = armature.evaluated_get(bpy.context.evaluated_depsgraph_get())

@@ -10,7 +10,7 @@ import pytest
 import synthetic_shape
 from human_files import person_file
 
-from blender_primdiffusion.jobs.assets import HumanAssetJob, PoseAssetJob
+from blender_primdiffusion.jobs.assets import HumanAssetJob
 from blender_primdiffusion.jobs.edit import BlendJob, RedressJob, TransferJob, VaryJob
 from blender_primdiffusion.jobs.export import (
     AddProxyJob,
@@ -46,7 +46,6 @@ def jobs_about(person: bpy.types.Object, folder: Path) -> list[Job]:
         ExportGaussiansJob(target, folder / "ä.ply", posed_now(context, person), 500),
         ExportVdbSequenceJob(target, folder, "ä", posed_frames(context, person, range(1, 4)), 1, 0.01),
         HumanAssetJob(target),
-        PoseAssetJob.of(person, "Lehnt"),
     ]
 
 

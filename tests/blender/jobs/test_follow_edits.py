@@ -10,18 +10,18 @@ import pytest
 import synthetic_shape
 from human_files import folder_of, paths_of, person_file, remove_human
 from jobs_driven import drive, error_of, notice_of
+from oracle import evaluated_matrices
 
 from blender_primdiffusion.jobs import follow as follow_module
-from blender_primdiffusion.jobs.deferred_volumes import deferred_volumes
 from blender_primdiffusion.jobs.edit import VaryJob
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.human import humans, parts_of
+from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.payload import forget_session_files
+from blender_primdiffusion.scene.volume_nodes import volumes_of
 
-pytestmark = [pytest.mark.any_blender, pytest.mark.usefixtures("volumes_shown")]
+pytestmark = pytest.mark.any_blender
 
 FINE = 8
 """A seed that is no order to the fake child."""
@@ -71,7 +71,7 @@ def check_whole(person, count: int = COUNT) -> None:
     files = paths_of(person)
     assert len(files) == count
     assert all(path.parent == folder_of(person) for path in files)
-    assert all(obj.data.grids.load() for obj in parts_of(person) if obj.type == "VOLUME")
+    assert len(evaluated_matrices(person)) == count
     assert not list(folder_of(person).glob(".*.partial*"))
 
 
@@ -175,24 +175,11 @@ def test_undo_that_makes_the_person_another_meanwhile_rejects_the_result(person)
     check_whole(current())
 
 
-def test_volumes_brought_back_meanwhile_show_what_they_should(person):
-    removed = next(obj for obj in parts_of(person) if obj.type == "VOLUME").name
-    before = paths_of(person)
-    bpy.data.objects.remove(bpy.data.objects[removed])
-    bpy.ops.ed.undo_push(message="a volume deleted")
-    vary(person)
-    until_ready()
-    bpy.ops.ed.undo()
-    drive()
-    assert not set(paths_of(current())) & set(before)
-    check_whole(current())
-
-
-def test_a_volume_deleted_meanwhile_stays_so(varied):
-    bpy.data.objects.remove(next(obj for obj in parts_of(varied) if obj.type == "VOLUME"))
+def test_volumes_deleted_meanwhile_stay_so(varied):
+    bpy.data.objects.remove(volumes_of(varied))
     drive()
     assert notice_of("vary").startswith("Varied Human in ")
-    check_whole(varied, COUNT - 1)
+    assert volumes_of(varied) is None
 
 
 def test_a_person_reshaped_meanwhile_keeps_that_shape(varied):
@@ -218,20 +205,6 @@ def test_cancel_leaves_the_person_as_they_were(varied):
     assert notice_of("vary") == "Cancelled"
     assert person_file(varied) == before
     check_whole(varied)
-
-
-def test_a_full_disk_is_told_and_the_volumes_are_written_when_there_is_room(person, monkeypatch):
-    def full(*_):
-        raise OSError("no space left on device")
-
-    monkeypatch.setattr(volumes, "write_vdb", full)
-    vary(person)
-    drive()
-    assert "no space left" in deferred_volumes.error
-    monkeypatch.undo()
-    deferred_volumes.finish()
-    assert deferred_volumes.error == ""
-    check_whole(current())
 
 
 def test_a_failure_leaves_the_person_as_they_were(varied, monkeypatch):

@@ -10,9 +10,9 @@ import pytest
 from human_files import sequence_files, volume_path
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.merged import merged_of
+from blender_primdiffusion.scene.representation import representation_of, set_representation
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 ops = bpy.ops.primdiffusion
@@ -39,7 +39,7 @@ def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):
     pose_from_joint_rotations(person, turns)
     assert ops.merge(voxel=0.02) == {"FINISHED"}
     box = filled_box(volume_path(merged_of(person).data))
-    set_attachment(person, "SURFACE")
+    set_representation(person, "VOLUMES")
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
     lift = np.array(person.matrix_world)[:3, 3]
@@ -53,7 +53,7 @@ def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):
 
 def test_frames_come_from_the_child(person):
     ops.merge(what="FRAMES", frame_start=1, frame_end=3, voxel=0.03)
-    assert attachment_of(person) == "MERGED"
+    assert representation_of(person) == "MERGED"
     assert len(sequence_files(merged_of(person).data)) == 3
 
 

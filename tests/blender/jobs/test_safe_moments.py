@@ -9,7 +9,7 @@ import bpy
 import pytest
 from jobs_driven import drive, error_of
 
-from blender_primdiffusion.jobs import deferred_volumes, windows
+from blender_primdiffusion.jobs import windows
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
@@ -92,7 +92,6 @@ def test_nothing_is_changed_while_blender_reads_the_scene_in_a_thread(addon, mon
     assert windows.in_the_way() == shown
     for _ in range(5):
         assert follow() is not None
-    assert deferred_volumes.deferred_volumes.tick() == deferred_volumes.BLOCKED_S
     assert not humans(bpy.context.scene)
     monkeypatch.undo()
     drive()

@@ -12,10 +12,10 @@ from blender_primdiffusion.formats.poses.files import read_motion, write_amass
 from blender_primdiffusion.formats.poses.motion import Detected, Motion
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, joint_positions
 
-from blender_primdiffusion.motion.adjust import scale_places, stride_ratio
-from blender_primdiffusion.motion.built_in_motions import built_in_motion
+from blender_primdiffusion.motion.adjust import resample, rounds_of, scale_places, stride_ratio
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
+from blender_primdiffusion.ui.motion_panel import built_in_motion
 from blender_primdiffusion.ui.motion_placing import Placement, place_motion
 from blender_primdiffusion.ui.on_person import FACTS
 
@@ -42,7 +42,7 @@ def unknown(motion: Motion) -> Motion:
 
 @pytest.fixture(scope="module")
 def walk() -> Motion:
-    return unknown(built_in_motion("WALK", STEPS // 2, 60.0))
+    return unknown(rounds_of(built_in_motion("WALK"), STEPS // 2))
 
 
 def slip(walk: Motion, factor: float, rest: np.ndarray) -> float:
@@ -75,11 +75,11 @@ def test_lengths_of_an_average_person_need_no_guess(walk):
 
 @pytest.mark.parametrize("name", ["IDLE", "WAVE"])
 def test_a_motion_in_place_gives_no_stride(name):
-    assert stride_ratio(unknown(built_in_motion(name, 4, 30.0)), longer_legs(1.15)) is None
+    assert stride_ratio(unknown(rounds_of(built_in_motion(name), 4)), longer_legs(1.15)) is None
 
 
 def test_two_steps_are_enough():
-    walk = unknown(built_in_motion("WALK", 1, 60.0))
+    walk = unknown(built_in_motion("WALK"))
     up_and_down_and_aside = np.abs(np.diff(walk.translations[:, :2], axis=0)).sum()
     assert up_and_down_and_aside < 0.4, "less than tells: the way is on the floor"
     assert stride_ratio(walk, longer_legs(1.15)) == pytest.approx(1.15, abs=0.05)
@@ -93,7 +93,7 @@ def test_skaters_and_walkers_on_treadmills_slide_on_purpose(walk):
 
 
 def test_a_fast_camera_that_trembles_by_a_millimetre_gives_nearly_the_same():
-    walk = unknown(built_in_motion("WALK", STEPS // 2, 120.0))
+    walk = unknown(resample(rounds_of(built_in_motion("WALK"), STEPS // 2), 120.0))
     shake = np.random.default_rng(0).normal(0, 0.001, walk.translations.shape)
     shaken = dataclasses.replace(walk, translations=walk.translations + shake)
     assert stride_ratio(shaken, longer_legs(1.15)) == pytest.approx(1.15, abs=0.04)

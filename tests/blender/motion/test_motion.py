@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import synthetic
 from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.built_in import built_in_vectors
 from blender_primdiffusion.formats.poses.motion import Motion
 from blender_primdiffusion.formats.poses.rotation import (
     about_axis,
@@ -19,8 +20,8 @@ from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joi
 from support.errors import refused
 
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.motion.legs import FLOOR
-from blender_primdiffusion.motion.poses import BUILT_IN, built_in_poses, pick_poses
+from blender_primdiffusion.motion.poses import FLOOR, built_in_poses, pick_poses
+from scripts.bake_poses.poses import BUILT_IN
 
 pytestmark = pytest.mark.any_blender
 
@@ -111,8 +112,8 @@ def test_a_motion_of_unlike_lengths_is_rejected():
 
 
 def test_there_are_twenty_built_in_poses_and_the_first_is_nearly_a_t():
-    motion = built_in_poses()
-    assert len(motion) == 20 == len(BUILT_IN)
+    motion = built_in_poses(20)
+    assert len(motion) == 20 == len(built_in_vectors())
     arms = motion.joints()[0][[JOINT_NAMES.index("left_wrist"), JOINT_NAMES.index("right_wrist")]]
     rest = REST_JOINTS[[JOINT_NAMES.index("left_wrist"), JOINT_NAMES.index("right_wrist")]]
     assert (np.abs(arms - rest)[:, 0] < 0.03).all()
@@ -121,14 +122,20 @@ def test_there_are_twenty_built_in_poses_and_the_first_is_nearly_a_t():
     assert np.degrees(turned).max() < 12
 
 
+def test_the_file_of_poses_is_what_the_script_makes():
+    assert list(built_in_vectors()) == list(BUILT_IN)
+    for name, vectors in built_in_vectors().items():
+        np.testing.assert_allclose(from_axis_angle(vectors), BUILT_IN[name].rotations(), atol=1e-5)
+
+
 def test_built_in_poses_differ_from_each_other():
-    joints = built_in_poses().joints()
+    joints = built_in_poses(20).joints()
     apart = np.linalg.norm(joints[:, None] - joints[None], axis=-1).mean(-1)
     assert apart[~np.eye(20, dtype=bool)].min() > 0.05
 
 
 def test_built_in_poses_stand_on_the_floor():
-    body, motion = read_body(), built_in_poses()
+    body, motion = read_body(), built_in_poses(20)
     lowest = [
         body.pose(np.zeros(10), *pose)[0][:, 1].min()
         for pose in zip(motion.rotations, motion.translations, strict=True)
@@ -137,7 +144,7 @@ def test_built_in_poses_stand_on_the_floor():
 
 
 def test_left_is_left():
-    named = dict(zip(BUILT_IN, built_in_poses().joints(), strict=True))
+    named = dict(zip(built_in_vectors(), built_in_poses(20).joints(), strict=True))
     waving, walking = named["waving"], named["walking"]
     assert waving[JOINT_NAMES.index("right_wrist")][1] > waving[JOINT_NAMES.index("head")][1]
     assert waving[JOINT_NAMES.index("left_wrist")][1] < waving[JOINT_NAMES.index("pelvis")][1] + 0.1
@@ -146,14 +153,14 @@ def test_left_is_left():
 
 
 def test_no_built_in_pose_puts_a_hand_or_a_forearm_into_the_trunk():
-    body, motion = read_body(), built_in_poses()
+    body, motion = read_body(), built_in_poses(20)
     joint = body.skin_weights.argmax(1)
     hands = np.isin(joint, [JOINT_NAMES.index(f"{s}_{p}") for s in ("left", "right") for p in ("wrist", "hand")])
     trunk = np.isin(joint, [JOINT_NAMES.index(p) for p in ("pelvis", "spine1", "spine2", "spine3")])
     inner = trunk[body.faces].all(1)
     from mathutils.bvhtree import BVHTree
 
-    for name, *pose in zip(BUILT_IN, motion.rotations, motion.translations, strict=True):
+    for name, *pose in zip(built_in_vectors(), motion.rotations, motion.translations, strict=True):
         vertices = body.pose(np.zeros(10), *pose)[0]
         tree = BVHTree.FromPolygons(vertices.tolist(), body.faces[inner].tolist())
         deep = []
@@ -171,7 +178,7 @@ def test_more_poses_than_are_built_in_are_rejected():
 
 def test_picked_poses_begin_near_t_and_are_spread_better_than_chance():
     clumsy = Motion(
-        np.concatenate([np.tile(random_motion(1, 3).rotations, (80, 1, 1, 1)), built_in_poses().rotations]),
+        np.concatenate([np.tile(random_motion(1, 3).rotations, (80, 1, 1, 1)), built_in_poses(20).rotations]),
         np.zeros((100, 3)), 30.0, "clip",
     )  # fmt: skip
     picked = pick_poses([clumsy], 12, seed=1)

@@ -13,6 +13,7 @@ from blender_primdiffusion.scene.armature import model_origin, pose_from_joint_r
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import posed_extent, setup_cycles_preview
 from blender_primdiffusion.scene.material import GAIN_NODE, MATERIAL_NAME
+from blender_primdiffusion.scene.volume_files import write_volumes
 
 RED = (0.6, 0.1, 0.05)
 DENSITY = 20.0
@@ -41,7 +42,9 @@ def lone_box(saved_scene, tmp_path):
         "density": density,
     }
     person = synthetic.save(tmp_path / "human", {**arrays, **model})
-    return build_human(saved_scene, person)
+    human = build_human(saved_scene, person)
+    write_volumes(human)
+    return human
 
 
 def test_a_box_has_its_colour_opacity_size_and_place_in_cycles(lone_box, tmp_path):

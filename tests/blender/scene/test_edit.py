@@ -11,7 +11,7 @@ import pytest
 import synthetic
 import synthetic_shape
 from human_files import folder_of, person_file
-from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
+from oracle import TOLERANCE_M, blended_vertices, evaluated_matrices, raised, surface_frames, world_from_model
 from scene_stage import replace
 from support import tensor_files
 
@@ -19,8 +19,7 @@ from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import BETAS, MARK, body_of, human_of, humans, parts_of
 from blender_primdiffusion.scene.payload import state_of
-
-pytestmark = pytest.mark.usefixtures("volumes_shown")
+from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 COUNT = 12
 
@@ -49,13 +48,10 @@ def first(person) -> bool:
     return "edited" not in tensor_files.read_tensors(person_file(person))[1]["provenance"]
 
 
-def paths(collection) -> dict[str, str]:
-    return {o.name: o.data.filepath for o in parts_of(collection) if o.type == "VOLUME"}
-
-
 def transforms(collection) -> dict[str, list]:
-    bpy.context.view_layer.update()
-    return {o.name: [list(row) for row in o.matrix_world] for o in parts_of(collection)}
+    volumes = evaluated_matrices(collection).round(5).tolist()
+    places = {o.name: [list(row) for row in o.matrix_world] for o in parts_of(collection)}
+    return {**places, "volumes": volumes}
 
 
 @pytest.fixture
@@ -76,7 +72,6 @@ def test_an_edit_has_files_of_its_own_and_leaves_those_before(person, saved_scen
     assert transforms(person) == places
     assert {path: path.stat().st_mtime_ns for path in files} == files
     assert {path.name for path in files} == {path.name for path in folder_of(person).iterdir()}
-    assert all(volume.grids.load() for volume in bpy.data.volumes)
     assert not first(person)
     assert json.loads(person[MARK])["edited"] == [3, 7]
 
@@ -92,18 +87,18 @@ def test_the_state_is_told_apart_by_what_it_holds(person, saved_scene, tmp_path)
 
 def test_undo_and_redo_bring_back_volumes_and_the_persons_file(person, saved_scene, tmp_path):
     bpy.ops.ed.undo_push(message="before")
-    before = paths(person)
+    before = folder_of(person)
     replace(person, redyed(tmp_path, 3))
-    after = paths(person)
+    after = folder_of(person)
     bpy.ops.ed.undo_push(message="edit")
     bpy.ops.ed.undo()
     (person,) = humans(bpy.context.scene)
-    assert paths(person) == before
+    assert folder_of(person) == before
     assert first(person)
-    assert all(volume.grids.load() for volume in bpy.data.volumes)
+    assert len(evaluated_matrices(person)) == COUNT
     bpy.ops.ed.redo()
     (person,) = humans(bpy.context.scene)
-    assert paths(person) == after
+    assert folder_of(person) == after
     assert not first(person)
 
 
@@ -121,7 +116,7 @@ def test_other_betas_move_bones_mesh_and_volumes_and_keep_the_pose(person, saved
     arrays = edited_shape()
     body_of(person).hide_viewport = False  # hidden things are not evaluated
     bpy.context.view_layer.update()
-    expected = world_from_model(armature, arrays["vertices"]) @ blended_frames(arrays, rotations, np.zeros(3))
+    expected = world_from_model(armature, arrays["vertices"]) @ surface_frames(arrays, rotations, np.zeros(3))
     corners = np.array([[x, y, z, 1] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
     assert np.abs((evaluated_matrices(person) - expected) @ corners.T)[:, :3].max() < TOLERANCE_M
     body = body_of(person).evaluated_get(bpy.context.evaluated_depsgraph_get())
@@ -151,30 +146,18 @@ def test_a_mesh_changed_by_hand_keeps_its_shape_and_is_named(person, saved_scene
     assert "changed by hand" in replace(person, reshaped(tmp_path)).warning
 
 
-def test_what_was_renamed_moved_or_deleted_by_hand_stays_so(person, saved_scene, tmp_path):
-    objects = sorted((o for o in parts_of(person) if o.type == "VOLUME"), key=lambda o: o.name)
-    objects[3].name = "brooch"
-    objects[4].location.z += 1
-    height = objects[4].location.z
-    bpy.data.objects.remove(objects[5])
-    replace(person, redyed(tmp_path, 3, 4, 5))
-    assert sum(obj.type == "VOLUME" for obj in parts_of(person)) == COUNT - 1
-    assert bpy.data.objects["Human_prim_0004"].location.z == height
-    assert "Human_prim_0005" not in bpy.data.objects
-
-
-def test_a_duplicate_that_shares_volumes_is_not_edited_with_the_original(person, saved_scene, tmp_path):
+def test_a_duplicate_that_shares_data_is_not_edited_with_the_original(person, saved_scene, tmp_path):
     twin = person.copy()
     saved_scene.scene.collection.objects.link(twin)
     for obj in person.children:
         copy = obj.copy()
         copy.parent = twin
         saved_scene.scene.collection.objects.link(copy)
-    before = {o.name: o.data.filepath for o in twin.children if o.type == "VOLUME"}
     bones = [list(bone.head_local) for bone in twin.data.bones]
+    cells = volumes_of(twin).data
     replace(person, reshaped(tmp_path, 3))
-    assert {o.name: o.data.filepath for o in twin.children if o.type == "VOLUME"} == before
     assert [list(bone.head_local) for bone in twin.data.bones] == bones
+    assert volumes_of(twin).data == cells != volumes_of(person).data
     assert first(twin)
 
 

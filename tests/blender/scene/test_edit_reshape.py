@@ -9,20 +9,15 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
-from human_stage import make_earlier
-from oracle import TOLERANCE_M, blended_frames, blended_vertices, evaluated_matrices, raised, world_from_model
+from oracle import TOLERANCE_M, blended_vertices, evaluated_matrices, raised, surface_frames, world_from_model
 from scene_stage import replace
 
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.human import BETAS, MARK, ORIGIN, body_of, humans, parts_of
+from blender_primdiffusion.scene.human import BETAS, MARK, body_of, humans
 from blender_primdiffusion.scene.shape import betas_of, generated_betas, has_custom_shape
-from blender_primdiffusion.scene.surface import build_surface
-
-pytestmark = pytest.mark.usefixtures("volumes_shown")
 
 COUNT = 12
 SHAPE = np.array([2.0, -1.5, 1, 0, 0.5, 0, 0, -2, 0, 1])
@@ -59,7 +54,7 @@ def test_bones_mesh_and_volumes_go_where_the_new_body_has_them(person, saved_sce
     surface = np.array([vertex.co for vertex in body_of(person).data.vertices])
     np.testing.assert_allclose(surface, standing(wanted["vertices"], wanted), atol=TOLERANCE_M)
     saved_scene.view_layer.update()
-    matrices = world_from_model(person, wanted["vertices"]) @ blended_frames(
+    matrices = world_from_model(person, wanted["vertices"]) @ surface_frames(
         wanted, synthetic.axis_angle(np.zeros((24, 3))), np.zeros(3)
     )
     np.testing.assert_allclose(evaluated_matrices(person), matrices, atol=TOLERANCE_M)
@@ -76,7 +71,7 @@ def test_a_posed_person_is_the_new_body_in_the_same_pose(person, saved_scene):
     wanted = at(SHAPE)
     matrix = world_from_model(person, wanted["vertices"])
     corners = np.array([[x, y, z, 1] for x in (-0.05, 0.05) for y in (-0.05, 0.05) for z in (-0.05, 0.05)])
-    difference = evaluated_matrices(person) - matrix @ blended_frames(wanted, rotations, translation)
+    difference = evaluated_matrices(person) - matrix @ surface_frames(wanted, rotations, translation)
     assert np.abs(difference @ corners.T)[:, :3].max() < TOLERANCE_M
     body = body_of(person).evaluated_get(bpy.context.evaluated_depsgraph_get())
     vertices = np.array([vertex.co for vertex in body.data.vertices]) - raised(wanted["vertices"])[:3, 3]
@@ -89,7 +84,7 @@ def test_an_animation_turns_the_joints_as_before(person, saved_scene):
     reshape(person, SHAPE)
     saved_scene.scene.frame_set(5)
     world = world_from_model(person, at(SHAPE)["vertices"])
-    expected = world @ blended_frames(at(SHAPE), rotations[1], np.zeros(3))
+    expected = world @ surface_frames(at(SHAPE), rotations[1], np.zeros(3))
     np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2 * TOLERANCE_M)
 
 
@@ -101,29 +96,12 @@ def test_changing_the_shape_and_back_is_no_change(person, saved_scene):
     assert not has_custom_shape(person)
 
 
-@pytest.mark.parametrize("earlier", [False, True], ids=["now", "earlier version"])
 @pytest.mark.parametrize("scale", [1.0, 1.3])
-def test_soles_on_the_floor_stay_there(person, saved_scene, scale, earlier):
-    if earlier:
-        make_earlier(person)
-    armature = person
-    armature.location.z *= scale
-    armature.scale, armature.rotation_euler.z, armature.location.x = (scale,) * 3, 1.0, 4.0
+def test_soles_on_the_floor_stay_there(person, saved_scene, scale):
+    person.scale, person.rotation_euler.z, person.location.x = (scale,) * 3, 1.0, 4.0
     reshape(person, SHAPE)
     saved_scene.view_layer.update()
     assert lowest(person) == pytest.approx(0, abs=1e-5)
-
-
-@pytest.mark.parametrize("earlier", [False, True], ids=["now", "earlier version"])
-@pytest.mark.parametrize("change", [("location", 2, 0.2), ("rotation_euler", 0, 0.3)])
-def test_who_does_not_stand_on_the_floor_stays_in_place(person, saved_scene, change, earlier):
-    if earlier:
-        make_earlier(person)
-    armature, (name, axis, value) = person, change
-    getattr(armature, name)[axis] += value
-    height = armature.location.z
-    reshape(person, SHAPE)
-    assert armature.location.z == height
 
 
 def test_a_human_on_a_table_still_stands_on_it_in_another_shape(person, saved_scene):
@@ -131,18 +109,6 @@ def test_a_human_on_a_table_still_stands_on_it_in_another_shape(person, saved_sc
     saved_scene.view_layer.update()
     reshape(person, SHAPE)
     assert lowest(person) == pytest.approx(0.75, abs=1e-5)
-
-
-def test_a_human_of_an_earlier_version_is_reshaped_about_its_own_origin(person, saved_scene):
-    make_earlier(person)
-    rotations = synthetic.axis_angle(np.random.default_rng(3).normal(0, 0.6, (24, 3)))
-    pose_from_joint_rotations(person, rotations)
-    reshape(person, SHAPE)
-    np.testing.assert_allclose(heads(person), points_to_blender(at(SHAPE)["joints"]), atol=TOLERANCE_M)
-    saved_scene.view_layer.update()
-    expected = np.array(person.matrix_world) @ blended_frames(at(SHAPE), rotations, np.zeros(3))
-    np.testing.assert_allclose(evaluated_matrices(person), expected, atol=2 * TOLERANCE_M)
-    assert ORIGIN not in person.data
 
 
 def test_mode_selection_scenes_and_objects_stay_as_they_were(person, saved_scene):
@@ -238,56 +204,18 @@ def test_a_shape_that_was_not_chosen_follows_the_edit(person, tmp_path):
     assert not has_custom_shape(person)
 
 
-def shown_on_the_surface() -> dict[str, np.ndarray]:
-    """World matrices [4, 4] of the volumes that geometry nodes show, by the names of their files."""
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    return {
-        bpy.path.basename(one.object.data.filepath): np.array(one.matrix_world)
-        for one in depsgraph.object_instances
-        if one.is_instance and one.object.type == "VOLUME"
-    }
-
-
-def test_volumes_on_the_posed_surface_follow_the_shape_whatever_their_names(person):
-    set_attachment(person, "SURFACE")
-    reshape(person, SHAPE)
-    first = min((o for o in parts_of(person) if o.type == "VOLUME"), key=lambda o: o.name)
-    first.name = "Mantle"  # behind the others
-    build_surface(person)
-    before = shown_on_the_surface()
-    wanted = at(SHAPE)
-    for k, name in enumerate(sorted(before)):
-        place = wanted["position"][k] @ np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-        place += raised(wanted["vertices"])[:3, 3]
-        np.testing.assert_allclose(before[name][:3, 3], place, atol=1e-5)
-    assert len(before) == COUNT
-
-
 def sizes(matrices) -> np.ndarray:
     """How many times as large as in their files volumes are along their axes [K, 3]."""
     return np.linalg.norm(np.asarray(matrices)[:, :3, :3], axis=1)
 
 
-@pytest.mark.parametrize("first", ["reshape", "attach"])
-def test_volumes_grow_with_half_of_the_surface_s_stretch_in_either_attachment(person, saved_scene, first):
-    if first == "attach":
-        set_attachment(person, "SURFACE")
+def test_volumes_grow_with_half_of_the_surface_s_stretch(person):
     reshape(person, SHAPE)
-    if first == "reshape":
-        set_attachment(person, "SURFACE")
-    saved_scene.view_layer.update()
     wanted = at(SHAPE)["growth"]
     assert wanted.max() > 1.01
-    shown = shown_on_the_surface()
-    np.testing.assert_allclose(sizes([shown[name] for name in sorted(shown)]), wanted, rtol=1e-5)
-    set_attachment(person, "ARMATURE")
-    saved_scene.view_layer.update()
     np.testing.assert_allclose(sizes(evaluated_matrices(person)), wanted, rtol=1e-5)
     reshape(person, generated_betas(person))
-    set_attachment(person, "SURFACE")
-    saved_scene.view_layer.update()
-    np.testing.assert_array_equal([tuple(o.scale) for o in parts_of(person) if o.type == "VOLUME"], 1)
-    np.testing.assert_allclose(sizes(list(shown_on_the_surface().values())), 1, rtol=1e-5)
+    np.testing.assert_allclose(sizes(evaluated_matrices(person)), 1, rtol=1e-5)
 
 
 def test_volumes_of_an_edited_person_grow_from_the_edited_one_s_body(person, saved_scene, tmp_path):

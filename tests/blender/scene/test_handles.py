@@ -11,9 +11,8 @@ from human_files import copy_of
 from mathutils import Matrix, Vector
 from oracle import Z_UP
 
-from blender_primdiffusion.motion.built_in_motions import built_in_motion
-from blender_primdiffusion.motion.pose_library import current_pose
-from blender_primdiffusion.motion.poses import LIBRARY
+from blender_primdiffusion.motion.adjust import cut
+from blender_primdiffusion.motion.posture import current_pose
 from blender_primdiffusion.scene.actions import action_curves, loops, repeat
 from blender_primdiffusion.scene.armature import (
     CONTROLS,
@@ -27,6 +26,8 @@ from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import posed_extent
 from blender_primdiffusion.scene.handles import add_handles, bake_handles, has_handles
 from blender_primdiffusion.scene.place import _extent
+from blender_primdiffusion.ui.motion_panel import built_in_motion
+from scripts.bake_poses.poses import LIBRARY
 
 MM = 1e-3
 HALF_A_DEGREE = np.radians(0.5)
@@ -147,7 +148,7 @@ def test_a_knee_follows_its_pole(armature):
 
 
 def walking(armature):
-    motion = built_in_motion("WALK", 1, 24.0)
+    motion = cut(built_in_motion("WALK"), stride=2)
     frames = np.arange(5, 5 + len(motion))
     keyframe_poses(armature, frames, motion.rotations, motion.translations)
     return frames

@@ -9,7 +9,6 @@ import synthetic_shape
 from human_files import person_file
 
 from blender_primdiffusion.jobs.export import put
-from blender_primdiffusion.motion.pose_library import save_pose
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human_file import HumanTensors, read_tensors, write_tensors
@@ -52,10 +51,9 @@ def test_boxes_of_who_has_their_own_shape_are_as_in_their_file(person, tmp_path)
 def test_nothing_is_written_through_a_link_with_a_temporary_name(tmp_path):
     (tmp_path / "source").write_text("new")
     (tmp_path / "mine").write_text("mine")
-    for name in (".a.part", ".source.part", "sit.part", ".a.human.part"):
+    for name in (".a.part", ".source.part", ".a.human.part"):
         (tmp_path / name).symlink_to("mine")
     put(tmp_path / "source", tmp_path / "b")
     write_tensors(tmp_path / "a.human", HumanTensors({}, {}))
-    save_pose(tmp_path, "sit", np.zeros((24, 3)), np.zeros(3))
     assert (tmp_path / "mine").read_text() == "mine"
     assert (tmp_path / "b").read_text() == "new"

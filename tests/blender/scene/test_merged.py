@@ -11,18 +11,11 @@ import pytest
 import synthetic
 from blender_primdiffusion.formats.regular_files import FileError
 from blender_primdiffusion.formats.requests import DENSITY_GAIN
-from human_files import copy_of, folder_of, sequence_files, volume_path
+from human_files import sequence_files, volume_path
 from support.errors import refused
 
-from blender_primdiffusion.scene.attachment import attachment_before_merge, attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.human import parts_of
-from blender_primdiffusion.scene.material import (
-    density_gain,
-    person_material,
-    set_density_gain,
-    volume_material,
-)
+from blender_primdiffusion.scene.material import density_gain, volume_material
 from blender_primdiffusion.scene.merged import (
     MergedGrid,
     MergedState,
@@ -36,12 +29,16 @@ from blender_primdiffusion.scene.merged import (
     show_merged,
     write_grid,
 )
-from blender_primdiffusion.scene.volumes import person_memory
+from blender_primdiffusion.scene.representation import (
+    representation_of,
+    set_representation,
+    show_in_viewport,
+    without_merged,
+)
+from blender_primdiffusion.scene.volume_files import write_volumes
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
-
-pytestmark = pytest.mark.usefixtures("volumes_shown")
 
 
 def grid(seed: int = 0) -> MergedGrid:
@@ -55,7 +52,10 @@ def grid(seed: int = 0) -> MergedGrid:
 
 @pytest.fixture
 def person(saved_scene, tmp_path):
-    return build_human(saved_scene, synthetic.write(tmp_path / "human", 6))
+    person = build_human(saved_scene, synthetic.write(tmp_path / "human", 6))
+    write_volumes(person)
+    show_in_viewport(person, True)
+    return person
 
 
 def merge(person, tmp_path, seeds=(0,), start=0) -> bpy.types.Object:
@@ -89,17 +89,17 @@ def test_openvdb_reads_back_what_was_merged(tmp_path):
 
 def test_a_merged_person_is_one_volume_and_goes_back(person, tmp_path):
     merged = merge(person, tmp_path)
-    set_attachment(person, "MERGED")
+    set_representation(person, "MERGED")
     assert visible_volumes() == {merged.name}
     assert merged.data.materials[0] == volume_material()
     assert merged.data.filepath.startswith("//shot_volumes/merged_")
     assert merged.data.grids.load(), merged.data.grids.error_message
     assert {one.name for one in merged.data.grids} == {"density", "Cd"}
-    back = attachment_before_merge(person)
-    set_attachment(person, back)
+    assert without_merged(person) == "VOLUMES"
+    set_representation(person, "VOLUMES")
     remove_merged(person)
-    assert (back, attachment_of(person), merged_of(person)) == ("ARMATURE", "ARMATURE", None)
-    assert len(visible_volumes()) == 6
+    assert (representation_of(person), merged_of(person)) == ("VOLUMES", None)
+    assert visible_volumes() == {"Human_volumes"}
 
 
 def test_a_merged_person_moves_with_the_armature_object(person, tmp_path):
@@ -174,49 +174,12 @@ def test_a_grid_is_read_as_the_child_wrote_it(tmp_path):
     assert read.voxel == 0.02
 
 
-def test_a_gain_of_one_s_own_is_a_material_of_one_s_own(person, tmp_path):
-    other = build_human(bpy.context, synthetic.write(tmp_path / "second", 3, seed=1), "Second")
-    merged = merge(person, tmp_path)
-    set_density_gain(person, 2.0)
-    assert density_gain(person) == pytest.approx(2.0)
-    assert density_gain(other) == pytest.approx(DENSITY_GAIN)
-    assert merged.data.materials[0] == person_material(person) != volume_material()
-    set_density_gain(person, 1.8)
-    assert len(bpy.data.materials) == 2
-    set_density_gain(person, DENSITY_GAIN)
-    assert person_material(person) == volume_material()
-
-
-def test_a_duplicate_s_gain_is_its_own(person):
-    twin = copy_of(person)
-    set_density_gain(person, 2.0)
-    set_density_gain(twin, 1.9)
-    assert density_gain(person) == pytest.approx(2.0)
-    assert density_gain(twin) == pytest.approx(1.9)
-    assert {volume_path(data) for data in bpy.data.volumes} == set(folder_of(person).glob("prim_*.vdb"))
-
-
-def test_a_material_without_the_factor_is_rejected(person):
-    other = bpy.data.materials.new("Smoke")
-    for obj in parts_of(person):
-        if obj.type == "VOLUME":
-            obj.data.materials[0] = other
-    assert density_gain(person) is None
-    with refused(ValueError, "Density Gain"):
-        set_density_gain(person, 1.5)
-
-
-def test_memory_is_what_openvdb_reports_for_the_loaded_grids(person):
-    files = sorted(folder_of(person).glob("prim_*.vdb"))
-    memory = person_memory(person)
-    assert memory.files == sum(path.stat().st_size for path in files)
-    assert memory.grids == sum(one.memUsage() for path in files for one in openvdb.readAll(str(path))[0])
-
-
-def test_missing_files_take_no_memory(person):
-    for path in folder_of(person).glob("prim_*.vdb"):
-        path.rename(path.with_suffix(".gone"))
-    assert person_memory(person).files == 0
+def test_the_gain_is_the_one_of_the_material_where_it_still_has_the_node(empty_scene):
+    assert density_gain() is None
+    material = volume_material()
+    assert density_gain().default_value == pytest.approx(DENSITY_GAIN)
+    material.node_tree.nodes.remove(material.node_tree.nodes["Density Gain"])
+    assert density_gain() is None
 
 
 @pytest.mark.parametrize("change", [{"density": np.nan}, {"colour": np.inf}, {"voxel": 0.0}, {"origin": 1e39}])

@@ -9,7 +9,6 @@ import pytest
 import synthetic
 import synthetic_shape
 from blender_primdiffusion.formats.answers import ProxyAnswer
-from human_stage import make_earlier
 from scene_stage import replace
 
 from blender_primdiffusion.jobs.export import AddProxyJob
@@ -18,7 +17,7 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import reshape
 from blender_primdiffusion.scene.human import body_of, link_part
-from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, remove_proxy, shown_betas
+from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
 from blender_primdiffusion.scene.shape import betas_of, generated_betas
 
 TALLER, WIDER = np.eye(10)[0] * 2.0, np.eye(10)[1] * 2.0
@@ -61,18 +60,6 @@ def test_the_proxy_goes_where_the_body_goes(person, change):
     assert np.sqrt((off**2).mean()) < 0.15 * np.sqrt((moved**2).mean()), "neighbours' mean, not the vertex' own way"
     assert np.allclose(shown_betas(proxy), before + change)
     assert not is_outdated(person, proxy, betas_of(person))
-
-
-def test_the_proxy_of_a_human_of_an_earlier_version_follows_about_its_own_origin(person, tmp_path):
-    remove_proxy(proxy_of(person))
-    make_earlier(person)
-    before = betas_of(person)
-    proxy = build_proxy(person, read_proxy(tmp_path / "proxy.npz"), tmp_path / "proxy.png", before)
-    link_part(person, proxy)
-    np.testing.assert_allclose(places(proxy), model(before), atol=1e-5)
-    reshape(person, before + TALLER)
-    off, moved = places(proxy) - model(before + TALLER), model(before + TALLER) - model(before)
-    assert np.sqrt((off**2).mean()) < 0.15 * np.sqrt((moved**2).mean())
 
 
 def test_an_edit_that_changes_the_body_takes_the_proxy_along(person, tmp_path):

@@ -12,22 +12,22 @@ import synthetic
 import synthetic_shape
 from human_files import press_x
 from human_stage import strong_pose
-from oracle import Z_UP, blended_vertices, world_from_model
+from oracle import Z_UP, blended_vertices, evaluated_matrices, world_from_model
 from support.errors import refused
 
 from blender_primdiffusion.engine.boxes import boxes_of
 from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.scene import build
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of, set_attachment
 from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.cells import set_input
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.human import body_of, humans, volumes_of
+from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.scene.parts import complete_humans
-from blender_primdiffusion.scene.pending import pending_volumes
+from blender_primdiffusion.scene.representation import representation_of, set_representation
 from blender_primdiffusion.scene.splat_nodes import GROUP_NAME
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE, WIDTH, cells_of, cloud_of
-from blender_primdiffusion.scene.surface import set_node_input
+from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 pytestmark = [
     pytest.mark.usefixtures("splats"),
@@ -113,24 +113,22 @@ def test_splats_of_the_sample_stretch_with_the_skin_as_the_engines_boxes_do(save
 
 def test_volumes_are_made_only_when_splats_no_longer_show_the_human(person):
     human, _ = person
-    assert attachment_of(human) == "SPLATS"
-    assert not bpy.data.volumes
-    assert not pending_volumes()
+    assert representation_of(human) == "SPLATS"
+    assert volumes_of(human) is None
     assert not cloud_of(human).hide_render
-    set_attachment(human, "SURFACE")
-    assert len(volumes_of(human)) == COUNT
-    assert len(pending_volumes()) == 1
+    set_representation(human, "VOLUMES")
+    assert len(evaluated_matrices(human)) == COUNT
     assert cloud_of(human).hide_render
-    set_attachment(human, "SPLATS")
-    assert not pending_volumes()
+    set_representation(human, "SPLATS")
+    assert volumes_of(human).hide_render
     assert not cloud_of(human).hide_viewport
 
 
 def test_a_human_of_volumes_gets_splats_when_they_are_asked_for(person):
     human, arrays = person
-    set_attachment(human, "ARMATURE")
+    set_representation(human, "VOLUMES")
     bpy.data.batch_remove([cloud_of(human), cells_of(human)])
-    set_attachment(human, "SPLATS")
+    set_representation(human, "SPLATS")
     pose = strong_pose(1)
     pose_from_joint_rotations(human, *pose)
     np.testing.assert_allclose(drawn(human), expected(human, arrays, *pose), atol=2e-5)
@@ -191,17 +189,15 @@ def test_a_human_without_body_mesh_cannot_have_splats(person):
     human, _ = person
     bpy.data.batch_remove([cloud_of(human), body_of(human)])
     with refused(ValueError, "deleted"):
-        set_attachment(human, "SPLATS")
+        set_representation(human, "SPLATS")
 
 
 def test_detail_and_size_are_inputs_of_the_group(person):
     human, _ = person
     before = drawn(human, "scale")
-    items = bpy.data.node_groups[GROUP_NAME].interface.items_tree
-    names = {item.name: item.identifier for item in items if item.in_out == "INPUT"}
     modifier = cloud_of(human).modifiers[0]
-    set_node_input(modifier, names["Size"], 1.5)
-    set_node_input(modifier, names["Detail"], 0.125)
+    set_input(modifier, "Size", 1.5)
+    set_input(modifier, "Detail", 0.125)
     cloud_of(human).update_tag()
     after = drawn(human, "scale")
     assert len(after) == math.ceil(len(before) / 8)

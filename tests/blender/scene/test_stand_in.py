@@ -17,7 +17,7 @@ import blender_primdiffusion
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import body_of, parts_of
 from blender_primdiffusion.scene.stand_in import STAND_IN
-from blender_primdiffusion.scene.surface import primitives_of
+from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 WITHOUT = """
 import json, sys
@@ -126,7 +126,7 @@ def test_it_stays_hidden_in_undo_redo_and_new_frames(person):
 
 
 def test_renders_do_not_show_it(person, tmp_path):
-    primitives_of(person).hide_render = True
+    volumes_of(person).hide_render = True
     scene = bpy.context.scene
     setup_cycles_preview(scene, size=16)
     scene.render.filepath = str(tmp_path / "picture.png")

@@ -10,8 +10,8 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.cycles import max_overlap
-from blender_primdiffusion.scene.human import volume_name
+from blender_primdiffusion.scene.overlap import max_overlap
+from blender_primdiffusion.scene.volume_nodes import FILES
 from blender_primdiffusion.scene.volumes import FAINTEST, bake, window, write_volume
 
 bpy.utils.expose_bundled_modules()
@@ -20,7 +20,7 @@ import openvdb  # noqa: E402
 
 def written(grids, folder) -> list[Path]:
     folder.mkdir()
-    paths = [folder / volume_name(k) for k in range(len(grids.density))]
+    paths = [folder / FILES.format(k) for k in range(len(grids.density))]
     for k, path in enumerate(paths):
         write_volume(grids, k, path)
     return paths

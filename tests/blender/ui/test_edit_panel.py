@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import synthetic
 import synthetic_shape
-from human_files import person_file, remove_human
+from human_files import paths_of, person_file, remove_human
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
@@ -43,10 +43,6 @@ def person(addon, tmp_path, monkeypatch):
     return first
 
 
-def paths(person) -> list[str]:
-    return [obj.data.filepath for obj in sorted(parts_of(person), key=lambda o: o.name) if obj.type == "VOLUME"]
-
-
 def sent(person) -> dict:
     """What the child was asked, but for the folder of the job."""
     asked = request_of(person_file(person))
@@ -65,34 +61,34 @@ def drawn(kind: str) -> str:
 
 
 def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):
-    first, before = person_file(person), paths(person)
+    first, before = person_file(person), paths_of(person)
     person.location.x = 3.0
     bpy.ops.ed.undo_push(message="moved")
     assert ops.vary(amount=0.25, seed=FINE, steps=3) == {"FINISHED"}
     assert sent(person) == {"person": str(first), "amount": 0.25, "seed": FINE, "steps": 3}
-    assert not set(before) & set(paths(person))
+    assert not set(before) & set(paths_of(person))
     assert person.location.x == 3.0
     assert notice_of("vary").startswith("Varied Human in ")
-    after = paths(person)
+    after = paths_of(person)
     bpy.ops.ed.undo()
     person = humans(bpy.context.scene)[0]
-    assert paths(person) == before
+    assert paths_of(person) == before
     assert person_file(person) == first
     assert person.location.x == 3.0
     bpy.ops.ed.redo()
-    assert paths(humans(bpy.context.scene)[0]) == after
+    assert paths_of(humans(bpy.context.scene)[0]) == after
     assert not list(Path(bpy.app.tempdir).glob("vary_*"))
 
 
 def test_redress_changes_the_primitives_of_the_region_alone(person):
-    before, other = read_tensors(person_file(person))[0], paths(humans(bpy.context.scene)[1])
+    before, other = read_tensors(person_file(person))[0], paths_of(humans(bpy.context.scene)[1])
     assert ops.redress(parts={"top", "left_foot"}, seed=FINE, steps=2, attributes="outfit=dress") == {"FINISHED"}
     asked = sent(person)
     assert asked["region"] == ["left_foot", "top"]
     assert (asked["attributes"], asked["guidance"]) == ({"outfit": "dress"}, 2.0)
     after = read_tensors(person_file(person))[0]
     assert [k for k in range(COUNT) if (after["rgb"][k] != before["rgb"][k]).any()] == [1, 2]
-    assert paths(humans(bpy.context.scene)[1]) == other
+    assert paths_of(humans(bpy.context.scene)[1]) == other
 
 
 def test_what_a_script_does_not_give_is_the_panels(person):
@@ -121,11 +117,10 @@ def test_a_blend_moves_the_body_where_the_betas_differ(person):
 
 def test_any_part_of_a_person_selects_it_and_a_script_may_name_it(person):
     other = humans(bpy.context.scene)[1]
-    before = paths(person)
-    volume = next(obj for obj in parts_of(other) if obj.type == "VOLUME")
-    bpy.context.view_layer.objects.active = volume
+    before = paths_of(person)
+    bpy.context.view_layer.objects.active = body_of(other)
     ops.vary(seed=FINE, steps=1)
-    assert paths(person) == before
+    assert paths_of(person) == before
     assert sent(other)["seed"] == FINE
     ops.vary(human="Human", seed=FINE + 1, steps=1)
     assert sent(person)["seed"] == FINE + 1
@@ -170,11 +165,11 @@ def test_a_vertex_group_that_is_not_there_is_named(person):
     [(DIES, "ended by itself"), (FAILS, "checkpoint is damaged"), (GIVES_GARBAGE, "contains no human")],
 )
 def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, seed, sentence):
-    before, file, files = paths(person), person_file(person), sorted(person_file(person).parent.iterdir())
+    before, file, files = paths_of(person), person_file(person), sorted(person_file(person).parent.iterdir())
     with pytest.raises(RuntimeError, match=sentence) as caught:
         ops.vary(seed=seed, steps=1)
     assert str(caught.value).count("Error:") == 1
-    assert (paths(person), person_file(person)) == (before, file)
+    assert (paths_of(person), person_file(person)) == (before, file)
     assert sorted(file.parent.iterdir()) == files
     assert not list(Path(bpy.app.tempdir).glob("vary_*"))
     assert sentence in drawn("VARY").replace(" | ", " ")  # lines are wrapped
@@ -184,7 +179,7 @@ def test_a_failure_raises_one_sentence_and_leaves_the_person_as_it_was(person, s
 @pytest.mark.parametrize("by_hand", [False, True], ids=["human removed", "objects deleted by hand"])
 def test_a_human_removed_during_the_job_is_reported_and_the_other_is_untouched(person, by_hand):
     _, other = humans(bpy.context.scene)
-    before = paths(other)
+    before = paths_of(other)
     start(person)
     until_running()
     if by_hand:
@@ -193,7 +188,7 @@ def test_a_human_removed_during_the_job_is_reported_and_the_other_is_untouched(p
         remove_human(person)
     drive()
     assert "'Human' was removed during the edit" in error_of("vary")
-    assert paths(other) == before
+    assert paths_of(other) == before
     assert not queue.busy
 
 
@@ -201,24 +196,24 @@ def test_undo_of_something_else_during_the_job_does_not_lose_the_person(person):
     cube = bpy.data.objects.new("cube", None)
     bpy.context.scene.collection.objects.link(cube)
     bpy.ops.ed.undo_push(message="cube")
-    before = paths(person)
+    before = paths_of(person)
     start(person)
     until_running()
     bpy.ops.ed.undo()
     drive()
     assert error_of("vary") == ""
-    assert not set(paths(humans(bpy.context.scene)[0])) & set(before)
+    assert not set(paths_of(humans(bpy.context.scene)[0])) & set(before)
 
 
 def test_undo_of_an_earlier_edit_during_the_job_rejects_the_result(person):
-    before = paths(person)
+    before = paths_of(person)
     ops.vary(seed=FINE, steps=1)
     start(person, FINE + 1)
     until_running()
     bpy.ops.ed.undo()
     drive()
     assert "changed during the edit" in error_of("vary")
-    assert paths(humans(bpy.context.scene)[0]) == before
+    assert paths_of(humans(bpy.context.scene)[0]) == before
 
 
 def test_saving_for_the_first_time_and_renaming_during_the_job_do_not_matter(addon, tmp_path):
@@ -242,24 +237,24 @@ def test_a_result_that_comes_in_edit_mode_leaves_it_and_can_be_undone(person, pa
     obj = {"armature": person, "body": body_of(person), "cube": cube}[part]
     bpy.context.view_layer.objects.active = obj
     bpy.ops.ed.undo_push(message="before")
-    before = paths(person)
+    before = paths_of(person)
     start(person)
     bpy.ops.object.mode_set(mode="EDIT")
     drive()
     assert error_of("vary") == ""
     assert bpy.context.mode == "OBJECT"
-    assert not set(paths(person)) & set(before)
+    assert not set(paths_of(person)) & set(before)
     bpy.ops.ed.undo()
-    assert paths(humans(bpy.context.scene)[0]) == before
+    assert paths_of(humans(bpy.context.scene)[0]) == before
 
 
 def test_locked_hidden_people_are_edited(person):
     for obj in list(parts_of(person)):
         obj.lock_location = obj.lock_rotation = obj.lock_scale = (True, True, True)
         obj.hide_select = obj.hide_viewport = True
-    before = paths(person)
+    before = paths_of(person)
     assert ops.blend(human="Human", other="Human.001", steps=1) == {"FINISHED"}
-    assert not set(paths(person)) & set(before)
+    assert not set(paths_of(person)) & set(before)
 
 
 def test_a_human_that_cannot_be_edited_is_reported_before_a_job_begins(addon, tmp_path):

@@ -21,11 +21,10 @@ from blender_primdiffusion.scene.armature import keyframe_poses
 from blender_primdiffusion.scene.human import BETAS, humans
 from blender_primdiffusion.scene.human_file import read_tensors
 from blender_primdiffusion.scene.proxy import proxy_of
-from blender_primdiffusion.scene.surface import primitives_of
+from blender_primdiffusion.scene.representation import show_in_viewport
+from blender_primdiffusion.scene.volume_nodes import volumes_of
 from blender_primdiffusion.ui.export_operators import PRIMDIFFUSION_OT_export
 from blender_primdiffusion.ui.export_panel import draw_as_mesh
-
-pytestmark = pytest.mark.usefixtures("volumes_shown")
 
 OPERATORS = bpy.ops.primdiffusion
 
@@ -45,7 +44,9 @@ def store(saved_scene, tmp_path, monkeypatch):
 
 @pytest.fixture
 def anna(store):
-    return exporting.add_person(store)
+    person = exporting.add_person(store)
+    show_in_viewport(person, True)
+    return person
 
 
 @pytest.fixture
@@ -121,13 +122,13 @@ def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
     proxy = proxy_of(anna)
     assert proxy.parent == anna
     assert (proxy.hide_viewport, proxy.hide_render) == (False, True)
-    assert (primitives_of(anna).hide_viewport, primitives_of(anna).hide_render) == (True, False)
+    assert (volumes_of(anna).hide_viewport, volumes_of(anna).hide_render) == (True, False)
     OPERATORS.show_proxy(shown="MESH")
-    assert (proxy.hide_render, primitives_of(anna).hide_render) == (False, True)
+    assert (proxy.hide_render, volumes_of(anna).hide_render) == (False, True)
     OPERATORS.show_proxy(shown="VOLUMES")
     assert (proxy.hide_viewport, proxy.hide_render) == (True, True)
-    assert not primitives_of(anna).hide_viewport
-    assert not primitives_of(anna).hide_render
+    assert not volumes_of(anna).hide_viewport
+    assert not volumes_of(anna).hide_render
 
 
 def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
@@ -154,7 +155,7 @@ def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):
     assert {kind: len(names) for kind, names in everything().items()} == {k: len(n) for k, n in once.items()}
     OPERATORS.show_proxy(shown="REMOVED")
     assert everything() == before
-    assert not primitives_of(anna).hide_viewport
+    assert not volumes_of(anna).hide_viewport
 
 
 def test_gaussians_are_requested_in_the_current_pose(anna, out):

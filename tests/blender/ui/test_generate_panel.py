@@ -194,7 +194,7 @@ def test_after_success_the_panel_has_one_line_the_button_of_the_next_step_and_as
 
 
 def test_limits_of_cycles_are_named_in_the_result_where_cycles_is_chosen_alone(addon, monkeypatch):
-    monkeypatch.setattr(cycles, "current_overlap", lambda _: 37)
+    monkeypatch.setattr(cycles, "overlap_of", lambda _: 37)
     for engine, named in (("BLENDER_WORKBENCH", False), ("CYCLES", True)):
         addon.scene.render.engine = engine
         bpy.ops.primdiffusion.generate(seed=7, steps=1)

@@ -27,8 +27,6 @@ from blender_primdiffusion.ui.shape_panel import (
     PRIMDIFFUSION_PT_shape,
 )
 
-pytestmark = pytest.mark.usefixtures("volumes_shown")
-
 ops = bpy.ops.primdiffusion
 TALL = [2.0] + [0.0] * 9
 
@@ -194,7 +192,7 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
     assert "'" in panel
     details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
     made = ("Seed: 0", "Steps: 5", "Sex: female", "Not followed: hair (shows long)", "Edit: vary", "amount 0.5")
-    for text in (*made, "Volumes: 12", "Files: 0 MB"):
+    for text in (*made, "Volumes: up to"):
         assert text in details
 
 

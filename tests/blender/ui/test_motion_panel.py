@@ -12,9 +12,9 @@ from amass_files import feet, write_amass
 from blender_primdiffusion.formats.poses.files import read_motion
 from jobs_driven import Layout
 
-from blender_primdiffusion.motion.pose_library import current_pose
+from blender_primdiffusion.motion.posture import current_pose
 from blender_primdiffusion.scene.actions import action_curves, last_key, loops
-from blender_primdiffusion.ui.motion_panel import PRIMDIFFUSION_MT_actions, PRIMDIFFUSION_PT_motion
+from blender_primdiffusion.ui.motion_panel import PRIMDIFFUSION_PT_motion
 
 ops = bpy.ops.primdiffusion
 
@@ -43,7 +43,7 @@ def test_a_strip_moves_the_person_as_the_action_did(addon, armature):
     ops.add_motion(motion="WAVE", rounds=1)
     addon.scene.frame_set(30)
     wanted = np.array(armature.pose.bones["right_elbow"].matrix)
-    ops.use_action(action="")
+    armature.animation_data_clear()
     ops.add_motion(motion="WAVE", rounds=1, into="STRIP")
     assert armature.animation_data.action is None
     (track,) = armature.animation_data.nla_tracks
@@ -65,7 +65,7 @@ def test_a_looped_walk_continues_from_where_it_has_got_to(addon, armature):
     assert armature.primdiffusion_human.loop
     armature.primdiffusion_human.loop = False
     assert not loops(armature)
-    ops.use_action(action="")
+    armature.animation_data_clear()
     armature.primdiffusion_human.loop = True
     assert not armature.primdiffusion_human.loop, "there is nothing to loop"
 
@@ -80,20 +80,16 @@ def test_built_in_motion_fits_long_and_short_legs(addon, armature):
     assert max(heights) < 0.03
 
 
-def test_clear_motion_brings_the_rest_pose_and_keeps_the_action(addon, armature):
-    ops.add_motion(motion="WAVE")
-    name = armature.animation_data.action.name
-    addon.scene.frame_set(40)
-    assert ops.use_action(action="") == {"FINISHED"}
-    np.testing.assert_allclose(current_pose(armature)[0], np.tile(np.eye(3), (24, 1, 1)), atol=1e-5)
-    assert bpy.data.actions[name].use_fake_user
-    with pytest.raises(RuntimeError, match="has no motion to clear"):
-        ops.use_action(action="")
-    assert ops.use_action(action=name) == {"FINISHED"}
-    addon.scene.frame_set(40)
-    assert np.abs(current_pose(armature)[0][17] - np.eye(3)).max() > 0.3
-    with pytest.raises(RuntimeError, match="no action 'gone'"):
-        ops.use_action(action="gone")
+@pytest.mark.parametrize("fps", [24, 25, 60])
+@pytest.mark.parametrize("motion", ["WALK", "IDLE", "WAVE"])
+def test_a_round_ends_on_a_whole_frame_as_it_began(addon, armature, motion, fps):
+    addon.scene.render.fps = fps
+    ops.add_motion(motion=motion, rounds=2)
+    assert last_key(armature).is_integer()
+    for curve in action_curves(armature):
+        if "rotation" in curve.data_path:
+            first, last = (curve.keyframe_points[end].co[1] for end in (0, -1))
+            assert abs(first) == pytest.approx(abs(last), abs=1e-5)
 
 
 def test_exported_motion_comes_back_the_same(addon, armature, tmp_path):
@@ -149,6 +145,5 @@ def test_the_panel_shows_what_was_found(addon, armature, tmp_path):
     shown = texts(PRIMDIFFUSION_PT_motion, addon)
     assert {"SMPL-H", "z", "31 (0.3 s)", "120", "metres"} <= set(shown)
     assert "loop" in shown
-    assert texts(PRIMDIFFUSION_MT_actions, addon) == ["primdiffusion.use_action"]
     armature.animation_data.action["primdiffusion_motion"] = "rubbish"
     assert "SMPL-H" not in texts(PRIMDIFFUSION_PT_motion, addon)

@@ -19,7 +19,7 @@ from blender_primdiffusion.capture.cameras import picture_of, picture_view, stor
 from blender_primdiffusion.jobs import from_picture
 from blender_primdiffusion.jobs.from_picture import PictureJob, PictureTask
 from blender_primdiffusion.jobs.queue import queue
-from blender_primdiffusion.motion.pose_library import take_world_posture, world_posture
+from blender_primdiffusion.motion.posture import take_world_posture, world_posture
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import humans
 from blender_primdiffusion.scene.shape import betas_of
@@ -129,6 +129,14 @@ def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
     bpy.ops.ed.undo()
     armature = humans(bpy.context.scene)[0]
     assert world_posture(armature)[1] == pytest.approx(translation, abs=1e-5)
+
+
+def test_handles_are_baked_before_a_human_is_fitted(chosen):
+    person = a_human()
+    assert bpy.ops.primdiffusion.add_handles(person=person.name) == {"FINISHED"}
+    for only_fit in (True, False):
+        with refused(RuntimeError, person.name, "IK handles"):
+            bpy.ops.primdiffusion.human_from_picture(only_fit=only_fit, human=person.name)
 
 
 def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, picture, tmp_path):

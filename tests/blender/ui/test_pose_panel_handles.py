@@ -1,15 +1,17 @@
-"""IK handles as the panel offers them, beside the pose library, keys, motions and edits of the shape."""
+"""The panel Pose: the way to the pose library, and IK handles beside motions."""
 
 from __future__ import annotations
+
+from types import SimpleNamespace
 
 import bpy
 import numpy as np
 import pytest
 import synthetic
-from jobs_driven import shown
+from jobs_driven import Layout, shown
+from pose_assets import pose_from_library
 
-from blender_primdiffusion.scene.actions import action_curves
-from blender_primdiffusion.scene.armature import CONTROLS, LIMBS
+from blender_primdiffusion.scene.armature import CONTROLS
 from blender_primdiffusion.scene.handles import has_handles
 from blender_primdiffusion.ui import pose_panel
 
@@ -25,10 +27,17 @@ def heads(armature) -> np.ndarray:
     return np.array([armature.pose.bones[name].head for name in synthetic.NAMES])
 
 
-def in_pose(armature, name) -> np.ndarray:
-    ops.apply_pose(what="REST")
-    ops.apply_pose(pose_name=name, ground=False)
-    return heads(armature)
+def test_the_panel_leads_to_the_asset_shelf_of_pose_mode(addon, armature):
+    addon.view_layer.objects.active = armature
+    for button, other in (
+        ("object.posemode_toggle", "show_region_asset_shelf"),
+        ("show_region_asset_shelf", "object.posemode_toggle"),
+    ):
+        layout = Layout()
+        pose_panel.PRIMDIFFUSION_PT_poses.draw(SimpleNamespace(layout=layout), addon)
+        assert button in layout.of("button", "prop")
+        assert other not in layout.of("button", "prop")
+        bpy.ops.object.posemode_toggle()
 
 
 def test_the_panel_offers_to_add_handles_or_else_to_bake_them(addon, armature):
@@ -45,90 +54,19 @@ def test_the_panel_offers_to_add_handles_or_else_to_bake_them(addon, armature):
         ops.bake_handles()
 
 
-@pytest.mark.parametrize("name", ["Sitting", "Waving", "T"])
-def test_a_pose_of_the_library_looks_the_same_with_handles(armature, name):
-    wanted = in_pose(armature, name)
-    ops.apply_pose(pose_name="Dancing")
-    ops.add_handles()
-    np.testing.assert_allclose(in_pose(armature, name), wanted, atol=EXACT_M)
-    for limb in LIMBS:
-        handle = np.array(armature.pose.bones[limb.handle].head)
-        np.testing.assert_allclose(handle, wanted[synthetic.NAMES.index(limb.end)], atol=EXACT_M)
-
-
-def test_mirroring_and_resetting_move_the_handles_too(armature):
-    ops.apply_pose(pose_name="Reaching", ground=False)
-    ops.apply_pose(what="MIRRORED")
-    mirrored = heads(armature)
-    ops.apply_pose(what="REST")
-    rest = heads(armature)
-    ops.apply_pose(pose_name="Reaching", ground=False)
-    ops.add_handles()
-    ops.apply_pose(what="MIRRORED")
-    np.testing.assert_allclose(heads(armature), mirrored, atol=EXACT_M)
-    ops.apply_pose(what="REST")
-    np.testing.assert_allclose(heads(armature), rest, atol=EXACT_M)
-
-
-def test_a_saved_pose_is_the_one_that_handles_show(armature, tmp_path, monkeypatch):
-    monkeypatch.setattr(pose_panel, "own_folder", lambda: tmp_path / "own")
-    ops.add_handles()
-    armature.pose.bones["left_hand_ik"].location = (0.1, -0.2, 0.1)
-    armature.pose.bones["pelvis"].location = (0.0, -0.1, 0.0)
-    seen = heads(armature)
-    ops.save_pose(pose_name="mine")
-    np.testing.assert_allclose(heads(armature), seen, atol=OUT_OF_REACH_M)
-    ops.bake_handles()
-    np.testing.assert_allclose(heads(armature), seen, atol=OUT_OF_REACH_M)
-    ops.apply_pose(what="REST")
-    ops.apply_pose(pose_name="mine")
-    np.testing.assert_allclose(heads(armature), seen, atol=OUT_OF_REACH_M)
-
-
-def test_keying_the_pose_keys_joints_and_handles_as_they_are_seen(addon, armature):
-    ops.add_handles()
-    addon.scene.frame_set(1)
-    ops.key_pose()
-    addon.scene.frame_set(11)
-    armature.pose.bones["left_foot_ik"].location = (0.0, 0.15, 0.1)
-    seen = heads(armature)
-    ops.key_pose()
-    for frame in (1, 11):
-        addon.scene.frame_set(frame)
-    np.testing.assert_allclose(heads(armature), seen, atol=EXACT_M)
-    ops.bake_handles()
-    addon.scene.frame_set(1)
-    assert np.abs(heads(armature) - seen).max() > 0.1
-    addon.scene.frame_set(11)
-    np.testing.assert_allclose(heads(armature), seen, atol=EXACT_M)
-    assert {len(curve.keyframe_points) for curve in action_curves(armature) if "left_knee" in curve.data_path} == {11}
-
-
-def test_a_pose_is_keyed_with_its_handles_where_keys_are_set_automatically(addon, armature):
-    ops.add_handles()
-    addon.scene.tool_settings.use_keyframe_insert_auto = True
-    addon.scene.frame_set(5)
-    wanted = in_pose(armature, "Walking")
-    addon.scene.frame_set(20)
-    in_pose(armature, "Squatting")
-    addon.scene.frame_set(5)
-    np.testing.assert_allclose(heads(armature), wanted, atol=EXACT_M)
-
-
-@pytest.mark.parametrize("call", [lambda: ops.add_motion(motion="WALK"), lambda: ops.use_action(action="")])
-def test_motions_wait_until_handles_are_baked(armature, call):
+def test_motions_wait_until_handles_are_baked(armature):
     ops.add_motion(motion="WAVE", rounds=1)
     ops.add_handles()
     action = armature.animation_data.action
     with pytest.raises(RuntimeError, match="has IK handles"):
-        call()
+        ops.add_motion(motion="WALK")
     assert armature.animation_data.action == action
     ops.bake_handles()
-    assert call() == {"FINISHED"}
+    assert ops.add_motion(motion="WALK") == {"FINISHED"}
 
 
 def test_undo_takes_handles_away_and_brings_them_back(addon, armature):
-    in_pose(armature, "Walking")
+    pose_from_library(armature, "Walking")
     bpy.ops.ed.undo_push(message="before")
     ops.add_handles()
     bpy.ops.ed.undo_push(message="handles")

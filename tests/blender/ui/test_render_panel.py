@@ -17,10 +17,10 @@ from blender_primdiffusion.jobs.merge import MergeFramesJob, MergeJob, Moment
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.armature import keyframe_poses, pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import attachment_of, show_in_viewport
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import MARK, humans
 from blender_primdiffusion.scene.merged import merged_of, merged_state
+from blender_primdiffusion.scene.representation import representation_of, show_in_viewport
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE
 from blender_primdiffusion.ui import advanced_panel, render_panel
 
@@ -58,26 +58,18 @@ def test_a_merged_pose_is_one_undo_step_and_unmerging_goes_back(person):
     raise_left_arm(person, 0.5)
     bpy.ops.ed.undo_push(message="posed")
     assert ops.merge(voxel=0.02) == {"FINISHED"}
-    assert attachment_of(person) == "MERGED"
+    assert representation_of(person) == "MERGED"
     assert density_of(person) == pytest.approx(10 + 10 * np.sin(0.5), rel=2e-3)
     assert merged_state(merged_of(person)).voxel == pytest.approx(0.02)
     assert "Merged Human at 20 mm" in notice_of("merge")
     bpy.ops.ed.undo()
     person = humans(bpy.context.scene)[0]
-    assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
+    assert (representation_of(person), merged_of(person)) == ("VOLUMES", None)
     bpy.ops.ed.redo()
     person = humans(bpy.context.scene)[0]
-    assert attachment_of(person) == "MERGED"
+    assert representation_of(person) == "MERGED"
     assert ops.merge(what="NOTHING") == {"FINISHED"}
-    assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
-
-
-def test_unmerging_goes_back_to_the_surface_where_that_was_shown(person):
-    assert ops.set_attachment(mode="SURFACE") == {"FINISHED"}
-    ops.merge()
-    ops.merge()
-    ops.merge(what="NOTHING")
-    assert attachment_of(person) == "SURFACE"
+    assert (representation_of(person), merged_of(person)) == ("VOLUMES", None)
 
 
 def test_the_panel_reports_a_changed_pose(person):
@@ -160,7 +152,7 @@ def test_a_child_that_misbehaves_leaves_the_person_as_they_were(person, monkeypa
     before = sorted(folder_of(person).iterdir())
     with pytest.raises(RuntimeError, match=message):
         ops.merge(what=what)
-    assert (attachment_of(person), merged_of(person)) == ("ARMATURE", None)
+    assert (representation_of(person), merged_of(person)) == ("VOLUMES", None)
     assert sorted(folder_of(person).iterdir()) == before
 
 
@@ -171,28 +163,27 @@ def test_a_human_removed_meanwhile_is_not_merged(person):
     assert "was removed" in error_of("merge")
 
 
-def test_set_attachment_reports_what_stands_in_the_way(person):
+def test_set_representation_reports_what_stands_in_the_way(person):
     with refused(RuntimeError, "Merge"):
-        ops.set_attachment(mode="MERGED")
+        ops.set_representation(representation="MERGED")
     with refused(RuntimeError, "merged"):
         ops.merge(what="NOTHING")
     with refused(RuntimeError, "Nobody"):
-        ops.set_attachment(mode="SURFACE", human="Nobody")
+        ops.set_representation(representation="VOLUMES", human="Nobody")
 
 
-def test_panels_show_modes_warnings_and_memory(person):
+def test_panels_show_representations_and_warnings(person):
     context = bpy.context
     assert advanced().count("primdiffusion.merge") == 2
-    assert advanced().count("set_attachment") == 2 + SPLATS_AVAILABLE
+    assert advanced().count("set_representation") == 1 + SPLATS_AVAILABLE
     ops.merge()
-    assert advanced().count("set_attachment") == 3 + SPLATS_AVAILABLE
+    assert advanced().count("set_representation") == 2 + SPLATS_AVAILABLE
     ops.merge(what="NOTHING")
     person[MARK] = person[MARK].replace('"most_overlapping": ', '"most_overlapping": 9')
     context.scene.render.engine = "CYCLES"
     assert "volumes overlap" in advanced()
     context.scene.render.engine = "PRIMDIFFUSION"
     assert "volumes overlap" not in advanced(), "of no interest to this engine"
-    assert "MB" in advanced()
     assert shown(render_panel.PRIMDIFFUSION_PT_render, context).count("primdiffusion.set_up_engine") == 2
 
 

@@ -21,7 +21,8 @@ from blender_primdiffusion.engine.view import NO_SURFACE_M, clip_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
 from blender_primdiffusion.scene.human import body_of
-from blender_primdiffusion.scene.surface import primitives_of
+from blender_primdiffusion.scene.volume_files import write_volumes
+from blender_primdiffusion.scene.volume_nodes import volumes_of
 from blender_primdiffusion.ui import viewport_humans
 from blender_primdiffusion.ui.viewport_humans import PRIMDIFFUSION_OT_click_human
 
@@ -57,14 +58,10 @@ def people(addon, tmp_path, monkeypatch):
     for seed, (name, x) in enumerate((("Anna", 0.0), ("Bert", 1.0))):
         human = build_human(addon, synthetic_shape.write(tmp_path / name, 12, seed), name)
         human.location.x = x
-        volumes_of(human).hide_viewport = True
+        write_volumes(human)
         found.append(human)
     bpy.context.view_layer.update()
     return SimpleNamespace(anna=found[0], bert=found[1], overlay=Overlay())
-
-
-def volumes_of(human) -> bpy.types.Collection:
-    return primitives_of(human)
 
 
 def context(matrix=PERSPECTIVE, shading="SOLID", volumes=True) -> SimpleNamespace:

@@ -5,14 +5,11 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from blender_primdiffusion.formats.joints import JOINT_NAMES
+from blender_primdiffusion.formats.poses.rotation import about_axis
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES
-from ..formats.poses.rotation import about_axis
-from ..formats.poses.skeleton import REST_JOINTS
-
-FLOOR = -1.168
-"""Height of the soles at rest, metres."""
 X, Y = 0, 1
 _LONGEST = 0.9995
 """Longest reach as a share of the leg's length; beyond it, the foot stays behind."""

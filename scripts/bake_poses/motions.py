@@ -1,18 +1,17 @@
-"""Built-in motions: walk, idle, wave, turn."""
+"""One round of each built-in motion, for the average skeleton standing on the floor: walk, idle, wave, turn."""
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable
-
 import numpy as np
+from blender_primdiffusion.formats.poses.motion import Motion
+from blender_primdiffusion.formats.poses.rotation import about_axis
+from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
 from numpy.typing import NDArray
 
-from ..formats.poses.motion import Detected, Motion
-from ..formats.poses.rotation import about_axis
-from ..formats.poses.skeleton import REST_JOINTS
-from .legs import FLOOR, FootTrack, joint, leg_length, reach
-from .poses import Arm, Leg, Pose
+from blender_primdiffusion.motion.poses import FLOOR
+
+from .legs import FootTrack, joint, leg_length, reach
+from .limbs import Arm, Leg, Pose
 
 CYCLE_SECONDS = 1.1
 """Two steps."""
@@ -37,13 +36,12 @@ _STRETCH = 0.997
 """Longest reach of a leg that carries, as a share of its length."""
 
 
-def walk(cycles: int = 2, fps: float = 30.0) -> Motion:
-    """A walk forward along +z at `fps` frames per second; the last frame is the first, `cycles` strides further on.
+def walk() -> Motion:
+    """Two steps forward along +z; the last frame is the first, a stride further on.
 
     Feet do not slide: legs reach for feet that stay where they were put down, on heel, sole and ball in turn.
     """
-    count = round(cycles * CYCLE_SECONDS * fps)
-    phase = np.arange(count + 1) / count * cycles
+    phase = _phase(CYCLE_SECONDS, 60.0)
     feet = {"left": _foot(phase, 0.0, 1), "right": _foot(phase, 0.5, -1)}
     turned = np.radians(
         [
@@ -57,7 +55,7 @@ def walk(cycles: int = 2, fps: float = 30.0) -> Motion:
     place[:, 1] = _carried(phase, pelvis, place, feet)
     rotations = _upper_body(phase)
     rotations[:, 0] = pelvis
-    return Motion(reach(rotations, place, feet), place, count / (cycles * CYCLE_SECONDS), "Walk")
+    return Motion(reach(rotations, place, feet), place, 60.0, "Walk")
 
 
 def _wave(phase: NDArray) -> NDArray[np.float64]:
@@ -150,30 +148,9 @@ _TOES_OUT = np.radians(9.0)
 _IDLE_SECONDS, _WAVE_SECONDS, _TURN_SECONDS = 6.0, 3.0, 2.4
 
 
-@dataclasses.dataclass(frozen=True)
-class BuiltIn:
-    """A motion that needs no file."""
-
-    label: str
-    about: str
-    """Description for the menu."""
-    seconds: float
-    """Duration of one round."""
-    loops: bool
-    """Whether the end continues into the beginning."""
-    make: Callable[[int, float], Motion]
-    """Makes the motion from a number of rounds and a frame rate."""
-
-
-def built_in_motion(name: str, rounds: int, fps: float) -> Motion:
-    """One of `MOTIONS`, repeated `rounds` times, for the average skeleton standing on the floor. Raises KeyError."""
-    motion = MOTIONS[name].make(rounds, fps)
-    return dataclasses.replace(motion, detected=Detected(rig="built in", up="y", average_legs=True))
-
-
-def idle(rounds: int = 1, fps: float = 30.0) -> Motion:
+def idle() -> Motion:
     """Standing: the weight shifts from leg to leg and back, two breaths; the feet stay."""
-    phase = _phase(rounds, _IDLE_SECONDS, fps)
+    phase = _phase(_IDLE_SECONDS, 30.0)
     sway, breath = np.sin(2 * np.pi * phase), np.cos(4 * np.pi * phase)
     return _standing(
         Pose(
@@ -186,15 +163,14 @@ def idle(rounds: int = 1, fps: float = 30.0) -> Motion:
             whole=(0.0, -1.5 * sway, -1.5 * sway),
         ),
         np.stack([0.028 * sway, -0.016 + 0.001 * breath, np.zeros_like(phase)], -1),
-        fps,
+        30.0,
         "Idle",
     )
 
 
-def wave(rounds: int = 1, fps: float = 30.0) -> Motion:
+def wave() -> Motion:
     """Standing; the right hand goes up, waves and comes down."""
-    phase = _phase(rounds, _WAVE_SECONDS, fps)
-    share = phase - np.floor(np.minimum(phase, rounds - 1e-9))
+    share = _phase(_WAVE_SECONDS, 60.0)
     up = _ease(share / 0.25) * (1 - _ease((share - 0.75) / 0.25))
     to_and_fro = np.sin(2 * np.pi * 4 * (share - 0.2)) * _ease((share - 0.2) / 0.1) * (1 - _ease((share - 0.7) / 0.1))
     return _standing(
@@ -215,14 +191,14 @@ def wave(rounds: int = 1, fps: float = 30.0) -> Motion:
             whole=(0.0, 0.0, 0.8 * up),
         ),
         np.stack([0.012 * up, np.full_like(up, -0.014), np.zeros_like(up)], -1),
-        fps,
+        60.0,
         "Wave",
     )
 
 
-def turn(rounds: int = 1, fps: float = 30.0) -> Motion:
-    """A quarter turn to the left on the spot, left foot first; each round continues from the one before."""
-    phase = _phase(rounds, _TURN_SECONDS, fps)
+def turn() -> Motion:
+    """A quarter turn to the left on the spot, left foot first; the last frame is the first, turned."""
+    phase = _phase(_TURN_SECONDS, 60.0)
     quarter = np.pi / 2
     looking, going = (_steps(phase, *span) * quarter for span in ((0.02, 0.72), (0.1, 0.86)))
     feet = {
@@ -243,21 +219,12 @@ def turn(rounds: int = 1, fps: float = 30.0) -> Motion:
     )
     rotations = pose.rotations()
     rotations[:, 0] = about_axis(1, going) @ about_axis(2, np.radians(1.5 * weight))
-    return Motion(reach(rotations, place, feet), place, fps, "Turn Left")
+    return Motion(reach(rotations, place, feet), place, 60.0, "Turn Left")
 
 
-MOTIONS: dict[str, BuiltIn] = {
-    "WALK": BuiltIn("Walk", "An easy walk straight ahead; the feet do not slide", CYCLE_SECONDS, True, walk),
-    "IDLE": BuiltIn("Idle", "Standing, breathing, the weight going from leg to leg", _IDLE_SECONDS, True, idle),
-    "WAVE": BuiltIn("Wave", "Standing and waving with the right hand", _WAVE_SECONDS, True, wave),
-    "TURN": BuiltIn("Turn Left", "A quarter turn to the left in two steps", _TURN_SECONDS, False, turn),
-}
-"""By the names that operators use."""
-
-
-def _phase(rounds: int, seconds: float, fps: float) -> NDArray[np.float64]:
-    """Rounds at each frame [F]; the first and the last frame are whole numbers."""
-    return np.arange(round(rounds * seconds * fps) + 1) / (seconds * fps)
+def _phase(seconds: float, fps: float) -> NDArray[np.float64]:
+    """The share of the round at each frame [F], from 0 to 1."""
+    return np.linspace(0.0, 1.0, round(seconds * fps) + 1)
 
 
 def _standing(pose: Pose, place: NDArray, fps: float, name: str) -> Motion:

@@ -12,10 +12,10 @@ from scene_stage import render
 from blender_primdiffusion.engine.picture import posed_humans
 from blender_primdiffusion.engine.solids import scene_solids
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
-from blender_primdiffusion.scene.attachment import MODES, set_attachment
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.merged import MergedGrid, MergedState, merged_folder, publish, show_merged, write_grid
+from blender_primdiffusion.scene.representation import set_representation
 
 COUNT = 6
 SIZE = 64
@@ -42,23 +42,13 @@ def show_grid(person, grid: MergedGrid, tmp_path) -> None:
     show_merged(person, files, MergedState(("",), grid.voxel))
 
 
-def test_cycles_sees_the_same_at_rest_by_the_armature_and_on_the_surface(person, tmp_path):
-    setup_cycles_preview(bpy.context.scene, size=SIZE, samples=2)
-    by_armature = render(tmp_path / "armature.exr")
-    set_attachment(person, "SURFACE")
-    on_surface = render(tmp_path / "surface.exr")
-    assert (by_armature[..., 3] > 0.1).sum() > 20
-    np.testing.assert_allclose(on_surface, by_armature, atol=0.02)
-    assert np.abs(on_surface - by_armature).mean() < 1e-3
-
-
 def test_a_merged_box_has_its_colour_opacity_size_and_place_in_cycles(person, tmp_path):
     """By hand: 0.12 m of 10 / m through the usual gain of 1.6 is an alpha of 1 - exp(-1.92)."""
     bpy.utils.expose_bundled_modules()
     voxel, colour = 0.01, (0.6, 0.1, 0.05)
     low, high = (-0.1, -0.06, 0.2), (0.06, 0.06, 0.32)
     show_grid(person, box_grid(voxel, low, high, 10.0, colour), tmp_path)
-    set_attachment(person, "MERGED")
+    set_representation(person, "MERGED")
     camera = setup_cycles_preview(bpy.context.scene, size=96, samples=8)
     camera.data.type, camera.data.ortho_scale = "ORTHO", 0.32
     lift = person.location.z
@@ -77,7 +67,7 @@ def test_a_merged_box_has_its_colour_opacity_size_and_place_in_cycles(person, tm
     np.testing.assert_allclose(edges, expected, atol=1.5)
 
 
-@pytest.mark.parametrize("mode", [mode for mode in MODES if mode != "SPLATS"])
+@pytest.mark.parametrize("mode", ["VOLUMES", "MERGED"])
 def test_the_engine_draws_the_person_alone_in_every_mode(person, tmp_path, mode):
     bpy.utils.expose_bundled_modules()
     turns = np.zeros((24, 3))
@@ -86,7 +76,7 @@ def test_the_engine_draws_the_person_alone_in_every_mode(person, tmp_path, mode)
     bpy.context.view_layer.update()
     expected = posed_humans(bpy.context.evaluated_depsgraph_get())[0].params()
     show_grid(person, box_grid(0.05, (-0.1, -0.1, 0.2), (0.1, 0.1, 0.4), 10.0, (0.5, 0.5, 0.5)), tmp_path)
-    set_attachment(person, mode)
+    set_representation(person, mode)
     bpy.context.view_layer.update()
     graph = bpy.context.evaluated_depsgraph_get()
     assert [one.params() for one in posed_humans(graph)] == [expected]

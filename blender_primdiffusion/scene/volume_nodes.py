@@ -1,0 +1,105 @@
+"""The volumes of a human as one object, whose node group shows a VDB file for each primitive on the skinned body."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import bpy
+
+from .cells import FIRST, PRIMITIVE, NodeGroup, add_nodes, cell_mesh, set_input, shared_group
+from .human import body_of, link_part, parts_of
+from .material import volume_material
+from .payload import session_file
+from .rest_human import shape_model_of
+from .shape import betas_of, generated_betas
+
+VOLUMES_MARK = "primdiffusion_volumes"
+"""Custom property of the object of a human that shows its volumes."""
+GROUP_NAME = "PrimDiffusion Volumes on Body"
+BODY, FOLDER, MATERIAL = "Body", "Folder", "Material"
+"""Inputs of the group."""
+MODIFIER = "Volumes on Body"
+FILES = "prim_{:04}.vdb"
+"""Names of the files, by primitive."""
+
+
+def build_volumes(person: bpy.types.Object) -> bpy.types.Object:
+    """Give a human the object, hidden in views; writes no files.
+
+    Raises as `shape_model_of` and `session_file`, and ValueError where the body mesh was deleted. Makes no undo step.
+    """
+    model, body, betas = shape_model_of(person), body_of(person), betas_of(person)
+    if body is None:
+        raise ValueError(f"the body mesh of {person.name!r} was deleted: undo that, or generate the human again")
+    mesh = cell_mesh(f"{person.name}_volumes", model, betas, model.growth(generated_betas(person), betas))
+    volumes = bpy.data.objects.new(mesh.name, mesh)
+    volumes.hide_viewport = True
+    volumes[VOLUMES_MARK] = True
+    volumes.parent = person
+    link_part(person, volumes)
+    add_nodes(volumes, MODIFIER, _volume_group(), {BODY: body, MATERIAL: volume_material()})
+    set_folder(person, session_file(person).parent)
+    return volumes
+
+
+def volumes_of(person: bpy.types.Object) -> bpy.types.Object | None:
+    """The object that shows the human's volumes; None for humans without."""
+    return next((obj for obj in parts_of(person) if VOLUMES_MARK in obj), None)
+
+
+def set_folder(person: bpy.types.Object, folder: Path, *, again: bool = False) -> None:
+    """Have a human's volumes show the files of this folder.
+
+    Blender remembers for the whole session which files were missing. With `again` the folder is spelled in another way,
+    for which Blender looks for the files anew.
+    """
+    volumes = volumes_of(person)
+    modifier = volumes.modifiers.get(MODIFIER) if volumes is not None else None
+    if modifier is not None and modifier.node_group is not None:
+        set_input(modifier, FOLDER, f"{folder}/." if again else str(folder))
+        volumes.update_tag(refresh={"DATA"})
+
+
+def _volume_group() -> bpy.types.NodeTree:
+    """The shared node group, made on first use."""
+    about = "Shows a folder of volumes, one for each box of a human, on its body"
+    return shared_group(GROUP_NAME) or _build(NodeGroup(GROUP_NAME, about))
+
+
+def _build(group: NodeGroup) -> bpy.types.NodeTree:
+    group.socket("Cells", "INPUT", "NodeSocketGeometry")
+    group.socket(BODY, "INPUT", "NodeSocketObject", "The human's body mesh, which its armature bends")
+    group.socket(FOLDER, "INPUT", "NodeSocketString", "The folder of the VDB files, with its whole path")
+    group.socket(MATERIAL, "INPUT", "NodeSocketMaterial", "The material of the volumes")
+    group.socket("Volumes", "OUTPUT", "NodeSocketGeometry")
+    node = group.node
+    inputs = node("NodeGroupInput").outputs
+    centre, rotation, scale = group.frames(group.geometry_of(inputs[BODY]))
+    first = group.attribute(FIRST, "BOOLEAN")
+    cells = {"Geometry": inputs["Cells"], "Selection": first}
+    each, end = node("GeometryNodeForeachGeometryElementInput"), node("GeometryNodeForeachGeometryElementOutput")
+    each.pair_with_output(end)
+    group.put(each.inputs["Geometry"], node("GeometryNodeSeparateGeometry", cells, domain="POINT").outputs[0])
+    path = node("FunctionNodeFormatString", {"Format": f"{{}}/{FILES}"})
+    path.format_items.new("STRING", "Folder")
+    path.format_items.new("INT", "Primitive")
+    group.put(path.inputs["Folder"], inputs[FOLDER])
+    group.put(path.inputs["Primitive"], each.outputs["Index"])
+    volume = node("GeometryNodeImportVDB", {"Path": path.outputs[0]}).outputs[0]
+    volume = node("GeometryNodeSetMaterial", {"Geometry": volume, "Material": inputs[MATERIAL]}).outputs[0]
+    made = [socket for socket in end.inputs if socket.name == "Geometry"][-1]
+    group.put(made, node("GeometryNodeGeometryToInstance", {0: volume}).outputs[0])
+    instances = node(
+        "GeometryNodeInstanceOnPoints",
+        {
+            "Points": node("GeometryNodeSetPosition", {"Geometry": inputs["Cells"], "Position": centre}).outputs[0],
+            "Selection": first,
+            "Instance": [socket for socket in end.outputs if socket.name == "Geometry"][-1],
+            "Pick Instance": True,
+            "Instance Index": group.attribute(PRIMITIVE, "INT"),
+            "Rotation": rotation,
+            "Scale": scale,
+        },
+    )
+    group.put(node("NodeGroupOutput").inputs["Volumes"], instances.outputs["Instances"])
+    return group.tree
