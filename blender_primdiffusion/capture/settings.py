@@ -47,8 +47,8 @@ class CaptureSettings:
     hdri: Path | None = None
     """Environment picture, .exr or .hdr, or a folder of them, of which the seed of every view chooses one."""
     background: Background = "black"
-    """What is behind people in one more pass: "rgba" (transparent, straight alpha) or "hdri" (the HDRI light); img stays
-    over black."""
+    """What is behind people in one more pass: "rgba" (transparent, straight alpha) or "hdri" (the HDRI light); img
+    stays over black."""
     samples: Annotated[Count, Slider(1, 1024)] = 16
     """Samples of each pixel."""
     denoise: bool = False
