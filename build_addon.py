@@ -39,7 +39,7 @@ VIEWER = {
     "tagline": "Pose, animate, reshape and render generated 3D humans",
 }
 """Entries of the viewer's manifest that differ."""
-VIEWER_LACKS = ("backend/setup.py", "backend/packages.py", "requirements/", "ui/setup/", "bundled/")
+VIEWER_LACKS = ("backend/setup.py", "backend/packages.py", "requirements/", "ui/setup.py", "bundled/")
 """What downloads or is downloaded for: files and folders that the viewer does not have."""
 VIEWER_BUNDLES = ("bundled/primdiffusion/formats/", "bundled/primdiffusion/body/data/")
 """Parts of the backend that the viewer does have."""

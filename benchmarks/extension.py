@@ -191,9 +191,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
         print(f"round {number + 1}: {blender[-1]:.0f} MB, {megabytes[-1]:.0f} MB with the child", flush=True)
     expected = {"shot.blend", "shot.blend1"}
     stray = [path for path in (arguments.folder / "scene").rglob("*") if path.is_file() and path.name not in expected]
-    compiled = Path(bpy.app.tempdir) / "primdiffusion" / "cache"  # code cache of an add-on that is not installed
-    temporary = [path for path in Path(bpy.app.tempdir).rglob("*") if path.is_file()]
-    stray += [path for path in temporary if not path.is_relative_to(compiled)]
+    stray += [path for path in Path(bpy.app.tempdir).rglob("*") if path.is_file()]
     for path in stray:
         print(f"left behind: {path}", flush=True)
     queue.close()

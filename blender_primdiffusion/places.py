@@ -58,10 +58,12 @@ def own_folder() -> Path:
         return Path(bpy.app.tempdir) / "primdiffusion"
 
 
-def cache_folder() -> Path:
-    """Folder for the children's byte code and compiled kernels."""
-    named = os.environ.get(CACHE_VARIABLE, "")
-    return Path(named).absolute() if named else own_folder() / "cache"
+def cache_folder() -> Path | None:
+    """Folder for the children's byte code and compiled kernels; None in a checkout: beside its sources, where its
+    commands find them too."""
+    if named := os.environ.get(CACHE_VARIABLE, ""):
+        return Path(named).absolute()
+    return own_folder() / "cache" if EXTENSION.startswith("bl_ext.") else None
 
 
 def set_up_folder() -> environment.SetUpFolder:

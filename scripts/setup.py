@@ -179,6 +179,9 @@ def ready() -> None:
     pip_install(".[training,blender]")
     if subprocess.run([program(VENV), "-c", "import bpy"], cwd=ROOT, env=environment(), check=False).returncode:
         raise Stop("Blender's module did not load: install the system packages named in README.md")
+    print("Generating a small human, which compiles the renderer, once")
+    with tempfile.TemporaryDirectory(dir=temporary_folder()) as folder:
+        run([program(VENV), "-m", "primdiffusion", "generate", "--steps", "3", "--size", "16", "--out", folder])
     mark.touch()
 
 

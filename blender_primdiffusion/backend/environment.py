@@ -10,8 +10,9 @@ import sys
 import time
 from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
+from typing import Any, Literal
 
-from ..formats.json_files import parse_json
+from ..formats.json_files import parse_json, read_json
 from ..formats.regular_files import is_local_path
 from .child_process import Output
 from .client import PROGRAM, child_environment, is_program
@@ -108,6 +109,21 @@ class SetUpFolder:
     def log(self) -> Path:
         """The output of the set-up."""
         return self.root / "set_up.log"
+
+
+def state_of(folder: SetUpFolder) -> tuple[Literal["absent", "broken", "ready"], dict[str, Any]]:
+    """How far the environment is, and what its mark says of it. Takes a few file system calls.
+
+    broken: never finished, or the Python that it was made with is gone (another Blender was put in its place).
+    """
+    if not folder.environment.is_dir():
+        return "absent", {}
+    try:
+        about = read_json(folder.environment / MARK)
+        made_with = Path(about["base"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return "broken", {}
+    return ("ready" if folder.python.exists() and made_with.exists() else "broken"), about
 
 
 def short_root(own: Path, local: Path | None, name: str) -> Path:

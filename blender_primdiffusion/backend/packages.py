@@ -216,10 +216,6 @@ _WHAT_WENT_WRONG = (
         "or use Install from Folder",
     ),
     (
-        r"because they point to directories:\s+\S+ from \S*/(\S+)",
-        "{0} is a folder where the wheel of this name should be: fetch the wheels with 'pip download' (see the manual)",
-    ),
-    (
         r"No matching distribution found for (\S+)",
         "there is no {0} for this Python and system: check the network and your pip settings, or, for Install from "
         "Folder, fetch the wheels with 'pip download' (see the manual)",

@@ -1,4 +1,4 @@
-"""The backend's private environment: made by venv and pip, tried, removed.
+"""The backend's private environment: made by venv and pip, and tried.
 
 What takes long is a process that a generator follows: it yields how far it is while it waits, so that a timer, or a
 command, can drive it, and closing it ends the process.
@@ -18,19 +18,17 @@ import mimetypes
 import os
 import sys
 import time
-from collections.abc import Generator, Mapping
+from collections.abc import Generator
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-from ..formats.json_files import read_json
 from ..formats.regular_files import check_regular, remove_file, remove_folder
 from ..formats.whole_files import write_atomically
 from .client import BackendClient
-from .environment import MARK, BackendPython, SetUpFolder, search, tried
+from .environment import MARK, SetUpFolder, search, tried
 from .packages import Lock, clean_environment, followed, what_went_wrong
 from .requests import Backend, ChildRequest
 
-State = Literal["absent", "broken", "ready"]
 OFFLINE = (
     "Blender may not use the network; allow it in Preferences > System > Network > Allow Online Access, "
     "or use Install from Folder"
@@ -61,23 +59,8 @@ Steps = Generator[Step, None, str]
 """Returns a sentence on how it ended; raises RuntimeError or OSError."""
 
 
-def state_of(folder: SetUpFolder) -> tuple[State, dict[str, Any]]:
-    """How far the environment is, and what its mark says of it. Takes a few file system calls.
-
-    broken: never finished, or the Python that it was made with is gone (another Blender was put in its place).
-    """
-    if not folder.environment.is_dir():
-        return "absent", {}
-    try:
-        about = read_json(folder.environment / MARK)
-        made_with = Path(about["base"])
-    except (OSError, ValueError, KeyError, TypeError):
-        return "broken", {}
-    return ("ready" if folder.python.exists() and made_with.exists() else "broken"), about
-
-
 def set_up(
-    folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path, wheels: Path | None = None
+    folder: SetUpFolder, lock: Lock, compute: str, module_path: Path, cache: Path | None, wheels: Path | None = None
 ) -> Steps:
     """Rebuild the environment from the package index, or from a folder of `wheels`; it is ready once it has generated
     a human. `compute` (cpu, cuda or apple) is for its mark. Raises RuntimeError, and OSError."""
@@ -86,7 +69,7 @@ def set_up(
     for path in () if wheels is None else wheels.iterdir():
         if mimetypes.guess_type(path.name)[0] == "text/html":
             raise RuntimeError(f"{path} is a web page, whose links pip would follow: remove it from the folder")
-        with contextlib.suppress(IsADirectoryError, FileNotFoundError):  # pip says so of those that it needs
+        if path.suffix == ".whl":
             check_regular(path)  # pip would wait for ever for a pipe
     folder.root.mkdir(parents=True, exist_ok=True)
     remove_file(folder.environment / MARK, folder.environment)
@@ -117,30 +100,8 @@ def set_up(
     write_atomically(folder.environment / MARK, json.dumps(marked, indent=1))
     for leftover in (folder.downloads, folder.temporary):
         remove_folder(leftover, leftover.parent)
-    return _ready(about)
-
-
-def self_test(folder: SetUpFolder, python: Path | None, module_path: Path, cache: Path) -> Steps:
-    """Make a human in a few steps with the environment, or with another `python`."""
-    folder.temporary.mkdir(parents=True, exist_ok=True)
-    about = yield from _trial(python or folder.python, module_path, cache, folder.temporary)
-    return _ready(about)
-
-
-def remove(folder: SetUpFolder, cache: Path | None) -> Steps:
-    """Environment, downloads and `cache`, where it is not shared, are gone; nothing else in the folder is touched."""
-    _, about = state_of(folder)
-    _check_own(folder)
-    remove_file(folder.environment / MARK, folder.environment)
-    going = [folder.environment, folder.downloads, folder.temporary, *([cache] if cache is not None else ())]
-    program = "import shutil, sys; [shutil.rmtree(path) for path in sys.argv[1:]]"
-    command = [sys.executable, "-I", "-c", program, *(str(path) for path in going if path.exists())]
-    environment = clean_environment(folder.root, folder.downloads)
-    yield Step("Removing the environment", 0.0)
-    for _ in followed(command, folder.log, environment, _in_use):
-        yield Step("Removing the environment", 0.5)
-    freed = f"; {about['bytes'] / 1e6:.0f} MB are free again" if "bytes" in about else ""
-    return f"The backend was removed{freed}"
+    device = about["device"] or "the CPU"
+    return f"The backend is ready: torch {about['torch']} on {device}, tested in {about['seconds']:.0f} s"
 
 
 def _check_own(folder: SetUpFolder) -> None:
@@ -154,20 +115,26 @@ def _pip(python: Path) -> list[str]:
     return [str(python), "-I", "-m", "pip"]
 
 
-def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Generator[Step, None, dict[str, Any]]:
-    """The real child makes a human; returns what it is and what it computes on."""
-    found: list[BackendPython] = []
+def _trial(
+    python: Path, module_path: Path, cache: Path | None, temporary: Path
+) -> Generator[Step, None, dict[str, Any]]:
+    """The real child makes a human; returns what it is and what it computes on.
+
+    The human's previews are drawn, which compiles the marcher into `cache`: the first press does not wait for that.
+    """
 
     def make_client() -> Generator[None, None, BackendClient]:
-        found.append((yield from search(python, module_path=module_path, cache_dir=cache, timeout_s=TRIAL_S)))
-        return BackendClient(python, module_path, cache_dir=cache)
+        found = yield from search(python, module_path=module_path, cache_dir=cache, timeout_s=TRIAL_S)
+        client = BackendClient(found.path, module_path, cache_dir=cache)
+        client.info.update(torch=found.torch, python=found.python, version=found.version)
+        return client
 
     backend, began = Backend(make_client), time.monotonic()
     person = temporary / "person"
     try:
         request = ChildRequest(backend, "generate", {**_TRIAL, "out_dir": str(person)})
         while not request.finished:
-            yield Step(f"Testing the backend: {request.message}", _INSTALLED)
+            yield Step(f"Testing the backend, which compiles its renderer, once: {request.message}", _INSTALLED)
             request.tick()
         if request.error is not None:
             tried[python] = False
@@ -178,9 +145,7 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
         return {
             "device": request.info.get("device_name") or "",
             "seconds": round(time.monotonic() - began, 1),
-            "torch": found[0].torch,
-            "python": found[0].python,
-            "version": found[0].version,
+            **{name: request.info[name] for name in ("torch", "python", "version")},
         }
     finally:
         backend.release()
@@ -190,9 +155,7 @@ def _trial(python: Path, module_path: Path, cache: Path, temporary: Path) -> Gen
 def _installing(folder: SetUpFolder, lock: Lock, said: str) -> Step:
     """How far pip is, by its files."""
     if "Installing collected packages" in said:
-        pattern = "Lib/site-packages/*.dist-info" if os.name == "nt" else "lib/python*/site-packages/*.dist-info"
-        share = min(len(list(folder.environment.glob(pattern))) / len(lock.packages), 1.0)
-        return Step(f"Installing {len(lock.packages)} packages", _DOWNLOADED + (_INSTALLED - _DOWNLOADED) * share)
+        return Step(f"Installing {len(lock.packages)} packages", _DOWNLOADED)
     total = max(lock.download_bytes, 1)
     now = min(_wheel_bytes(folder.temporary), total)
     return Step(f"Downloading, {now / 1e6:.0f} of {total / 1e6:.0f} MB", _DOWNLOADED * now / total)
@@ -211,16 +174,4 @@ def _no_venv(_said: str, _exit_code: int) -> str:
     return (
         f"the Python of this Blender ({sys.executable}) cannot make an environment: it lacks venv or ensurepip; "
         "install them (on Debian and Ubuntu: sudo apt install python3-venv), then try again"
-    )
-
-
-def _in_use(said: str, _exit_code: int) -> str:
-    reason = said.strip().splitlines()[-1:]
-    return f"the environment cannot be removed ({' '.join(reason)}): close other Blenders, then try again"
-
-
-def _ready(about: Mapping[str, Any]) -> str:
-    return (
-        f"The backend is ready: torch {about['torch']} on {about['device'] or 'the CPU'}, "
-        f"tested in {about['seconds']:.0f} s"
     )

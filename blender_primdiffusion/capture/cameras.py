@@ -63,7 +63,7 @@ def view_of(
     """
     evaluated = camera.evaluated_get(depsgraph)
     if evaluated.type != "CAMERA" or evaluated.data.type != "PERSP":
-        raise ValueError(f"{camera.name!r} is no perspective camera: choose others, or change its lens type")
+        raise ValueError(f"{camera.name!r} is not a perspective camera: choose others, or change its lens type")
     width, height = size
     projection = camera.calc_matrix_camera(depsgraph, x=width, y=height, scale_x=aspect[0], scale_y=aspect[1])
     intrinsics = np.array(

@@ -151,7 +151,7 @@ def _files_of_poses(paths: Sequence[Path]) -> Iterator[Path]:
 def _shard(text: str) -> tuple[int, int]:
     index, _, count = text.partition("/")
     if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
-        raise argparse.ArgumentTypeError(f"{text!r} is no shard: 0/4 is the first of four")
+        raise argparse.ArgumentTypeError(f"{text!r} is not a shard: 0/4 is the first of four")
     return int(index), int(count)
 
 

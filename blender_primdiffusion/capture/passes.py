@@ -1,11 +1,9 @@
-"""From Cycles' render of a view (an uncompressed OpenEXR, read with numpy) to the pictures of its passes."""
+"""From Cycles' render of a view (an OpenEXR) to the pictures of its passes."""
 
 from __future__ import annotations
 
 import dataclasses
 import errno
-import struct
-from collections.abc import Iterator
 from pathlib import Path
 
 import bpy
@@ -14,112 +12,39 @@ from numpy.typing import NDArray
 
 from ..formats.capture_layout import picture_path
 from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_exr, write_png
-from ..formats.regular_files import FileError, as_file_error, read_regular
+from ..formats.regular_files import FileError, as_file_error, check_regular
 from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from .surfaces import PART
 
-_LARGEST_FILE = 2**32
-_MAGIC, _MULTIPART = 20000630, 0x1000
-_DTYPES = {0: np.dtype("<u4"), 1: np.dtype("<f2"), 2: np.dtype("<f4")}
+bpy.utils.expose_bundled_modules()
+import OpenImageIO  # noqa: E402  Blender's own, importable only after the line above
 
-
-@dataclasses.dataclass(frozen=True)
-class _Part:
-    channels: tuple[tuple[str, np.dtype], ...]
-    width: int
-    height: int
+JPEG_QUALITY = 95
+_ENVIRONMENT = "Environment"
+_NOTHING_M = 1e9
+"""Cycles gives rays that hit nothing a depth of 1e10."""
 
 
 def read_exr(path: Path) -> dict[str, NDArray[np.float32]]:
     """All channels by name, [H, W] float32, top row first; those of a part called `ViewLayer.Depth` too.
 
-    Names are as Blender gives them: "ViewLayer.Combined.R". Raises FileError.
+    Names are as Blender gives them: "ViewLayer.Combined.R". Raises OSError and FileError.
     """
-    data = read_regular(path, _LARGEST_FILE)
-    with as_file_error(path, "is not a whole, uncompressed OpenEXR picture", "render it again", struct.error):
-        return _read(data)
-
-
-def _read(data: bytes) -> dict[str, NDArray[np.float32]]:
-    magic, version = struct.unpack_from("<ii", data, 0)
-    if magic != _MAGIC:
-        raise ValueError("it does not begin as one")
-    multipart = bool(version & _MULTIPART)
-    parts, at = [], 8
-    while True:
-        attributes, at = _header(data, at)
-        parts.append(_part(attributes))
-        if not multipart:
-            break
-        if data[at] == 0:
-            at += 1
-            break
+    check_regular(path)
     planes: dict[str, NDArray[np.float32]] = {}
-    for part in parts:
-        offsets = struct.unpack_from(f"<{part.height}Q", data, at)
-        at += 8 * part.height
-        planes |= _planes(data, part, [offset + 4 * multipart for offset in offsets])
+    with as_file_error(path, "is not a whole OpenEXR picture", "render it again"):
+        file = OpenImageIO.ImageInput.open(str(path))
+        if file is None:
+            raise ValueError(OpenImageIO.geterror())
+        part = 0
+        while file.seek_subimage(part, 0):
+            pixels = file.read_image("float")
+            if pixels is None:
+                raise ValueError(file.geterror())
+            planes |= dict(zip(file.spec().channelnames, np.moveaxis(pixels, -1, 0), strict=True))
+            part += 1
     return planes
-
-
-def _header(data: bytes, at: int) -> tuple[dict[str, bytes], int]:
-    attributes = {}
-    while data[at]:
-        name, at = _text(data, at)
-        _kind, at = _text(data, at)
-        (size,) = struct.unpack_from("<i", data, at)
-        if size < 0:  # which would lead back
-            raise ValueError(f"an attribute of {size} bytes")
-        attributes[name] = data[at + 4 : at + 4 + size]
-        at += 4 + size
-    return attributes, at + 1
-
-
-def _part(attributes: dict[str, bytes]) -> _Part:
-    if attributes["compression"][0] != 0:
-        raise ValueError("it is compressed")
-    left, top, right, bottom = struct.unpack("<4i", attributes["dataWindow"])
-    return _Part(tuple(_channels(attributes["channels"])), right - left + 1, bottom - top + 1)
-
-
-def _channels(data: bytes) -> Iterator[tuple[str, np.dtype]]:
-    at = 0
-    while data[at]:
-        name, at = _text(data, at)
-        (kind,) = struct.unpack_from("<i", data, at)
-        yield name, _DTYPES[kind]
-        at += 16
-
-
-def _planes(data: bytes, part: _Part, offsets: list[int]) -> dict[str, NDArray[np.float32]]:
-    """Each line is its y, its size in bytes, then its channels one after the other."""
-    row = np.dtype([(f"c{i}", dtype, (part.width,)) for i, (_, dtype) in enumerate(part.channels)])
-    if part.height * row.itemsize > len(data):
-        raise ValueError(f"it is cut short: {part.height} lines of {row.itemsize} bytes are announced")
-    lines, seen = np.empty(part.height, row), np.zeros(part.height, bool)
-    (first,) = struct.unpack_from("<i", data, offsets[0])
-    top = min(first, struct.unpack_from("<i", data, offsets[-1])[0])
-    for offset in offsets:
-        y, size = struct.unpack_from("<ii", data, offset)
-        if size != row.itemsize:
-            raise ValueError(f"a line of {size} bytes instead of {row.itemsize}")
-        if not 0 <= y - top < part.height or seen[y - top]:
-            raise ValueError(f"line {y} twice, or outside of the picture")
-        lines[y - top], seen[y - top] = np.frombuffer(data, row, 1, offset + 8)[0], True
-    return {name: lines[f"c{i}"].astype(np.float32) for i, (name, _) in enumerate(part.channels)}
-
-
-def _text(data: bytes, at: int) -> tuple[str, int]:
-    end = data.index(0, at)
-    return data[at:end].decode(), end + 1
-
-
-JPEG_QUALITY = 95
-_ENVIRONMENT = ("Environment", "Env")
-"""The pass's name in Blender 5 and before."""
-_NOTHING_M = 1e9
-"""Cycles gives rays that hit nothing a depth of 1e10."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -150,8 +75,9 @@ def read_colours(path: Path) -> Colours:
     """The combined pass of a multilayer EXR; with denoising only its colours are denoised, not its alpha."""
     planes = read_exr(path)
     red, green, blue, alpha = _chosen(path, planes, [f"Combined.{channel}" for channel in "RGBA"])
-    name = next((name for name in _ENVIRONMENT if any(plane.endswith(f".{name}.R") for plane in planes)), None)
-    behind = None if name is None else np.stack(_chosen(path, planes, [f"{name}.{channel}" for channel in "RGB"]), -1)
+    behind = None
+    if any(name.endswith(f".{_ENVIRONMENT}.R") for name in planes):
+        behind = np.stack(_chosen(path, planes, [f"{_ENVIRONMENT}.{channel}" for channel in "RGB"]), -1)
     return Colours(np.stack([red, green, blue], -1), alpha, behind)
 
 

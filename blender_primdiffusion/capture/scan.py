@@ -196,7 +196,7 @@ def _fit_notes(fit: ShapeFit, at_rest: NDArray) -> list[str]:
         notes.append(f"scaled by {fit.scale:.2f} to the size of a body")
     if _largest_turn(at_rest) > _T_REST_DEG:
         notes.append(
-            f"its rest is no T pose, limbs are up to {_largest_turn(at_rest):.0f} degrees off: taken into account"
+            f"its rest pose is not a T pose (limbs up to {_largest_turn(at_rest):.0f} degrees off): taken into account"
         )
     return notes
 

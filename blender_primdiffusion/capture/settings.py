@@ -43,12 +43,12 @@ class CaptureSettings:
     float_depth: bool = False
     """Also write depth as OpenEXR, float32."""
     light: Light = "uniform"
-    """uniform: every surface shows its own colour; dome: a white sky; hdri: an environment picture."""
+    """Lighting. uniform: every surface shows its own colour; dome: a white sky; hdri: an environment picture."""
     hdri: Path | None = None
     """Environment picture, .exr or .hdr, or a folder of them, of which the seed of every view chooses one."""
     background: Background = "black"
-    """transparent adds the pass "rgba", with straight alpha, hdri the pass "hdri", over the environment of the HDRI
-    light; img stays over black."""
+    """What is behind people in one more pass: "rgba" (transparent, straight alpha) or "hdri" (the HDRI light); img
+    stays over black."""
     samples: Annotated[Count, Slider(1, 1024)] = 16
     """Samples of each pixel."""
     denoise: bool = False
@@ -68,7 +68,7 @@ class CaptureSettings:
     released_reference: bool = False
     """Also store the first subject under the name that the released code expects."""
     body: Path | None = None
-    """Your SMPL body as .npz of plain arrays; the default body if omitted."""
+    """SMPL body, an .npz of plain arrays; the bundled body by default."""
 
     def __post_init__(self) -> None:
         check(self)

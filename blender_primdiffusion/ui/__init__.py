@@ -17,7 +17,6 @@ from ..scene import stand_in
 from . import (
     advanced_panel,
     attributes,
-    backend_state,
     captures_command,
     captures_panel,
     captures_settings,
@@ -34,6 +33,7 @@ from . import (
     motion_panel,
     picture_panel,
     pose_panel,
+    preferences,
     reconstruct_panel,
     render_panel,
     shape_panel,
@@ -42,7 +42,7 @@ from . import (
 )
 
 MODULES = (
-    *backend_state.MODULES, windows, follow, jobs_panel, attributes,
+    *filter(None, (preferences.setup, preferences)), windows, follow, jobs_panel, attributes,
     generate_panel, variations_panel, human_panel, shape_panel, edit_panel, parts,
     volumes, import_motion, motion_panel, pose_panel, picture_panel,
     render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,

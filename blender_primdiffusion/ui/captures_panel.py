@@ -2,45 +2,39 @@
 
 from __future__ import annotations
 
-import contextlib
 import shlex
 import time
+from collections.abc import Sequence
 
 import bpy
 import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from ..backend.requests import error_text
 from ..capture.cameras import aim
-from ..capture.command import ASK_FROM, describe, estimate, parse, scans_in, settings_of
-from ..capture.job import run
-from ..console import Report, report_path
+from ..capture.command import ASK_FROM, estimate, parse, scans_in, settings_of
+from ..console import FAILED
 from ..formats.camera_rig import bounding_sphere
-from ..formats.capture_repair import repair, verify
 from ..formats.regular_files import printable
 from ..jobs.follow import Reporting, redraw
 from ..places import shows_captures
 from ..scene.blend_values import setting_path
 from ..scene.convention import points_to_backend
 from .captures_session import captures
-from .captures_settings import words_of
+from .captures_settings import command_args
 from .drawing import DATA, SidebarPanel, draw_lines, draw_section, property_columns
 
 RIG = "Capture Rig"
 _TICK_S = 0.1
-_PRINT_S = 1.0
-"""Between lines of progress in background mode."""
 _PERSON_M = 1.1
 """Radius of the sphere around a human in T pose at the world's origin, where nothing is selected."""
 
 
-class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
+class PRIMDIFFUSION_OT_render_captures(Reporting, bpy.types.Operator):
     """Render all people in the folder from all sides, into the folder of captures"""
 
     bl_idname = "primdiffusion.render_captures"
     bl_label = "Render Captures"
-    bl_options: set[str] = set()  # neither REGISTER (redo) nor UNDO: the scene stays as it is
 
     people: bpy.props.StringProperty(name="People", description="Empty: the panel's")
     out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
@@ -49,7 +43,7 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Ask before a long run; errors are reported by `execute`."""
         try:
-            options = parse(self._words(context))
+            options = parse(self._args(context))
             views, message = estimate(settings_of(options), len(scans_in(options.people, options.only)))
         except (OSError, ValueError, RuntimeError):
             return self.execute(context)
@@ -59,44 +53,15 @@ class PRIMDIFFUSION_OT_render_captures(bpy.types.Operator):
             self, event, title="Render Captures?", message=message, confirm_text="Render"
         )
 
-    def _words(self, context: bpy.types.Context) -> list[str]:
+    def _args(self, context: bpy.types.Context) -> list[str]:
         asked = context.scene.primdiffusion_captures
-        return words_of(asked, context, captures.new_folder(), self.people, self.out) + shlex.split(self.options)
+        return command_args(asked, context, captures.new_folder(), self.people, self.out) + shlex.split(self.options)
 
-    def execute(self, context: bpy.types.Context) -> set[str]:
-        """With a window another Blender renders and a timer follows it; in background mode this one renders."""
-        try:
-            if captures.busy:
-                raise ValueError("captures are being rendered; wait for them or press Cancel")
-            words = self._words(context)
-            if bpy.app.background:
-                return self._render_here(context, words)
-            settings_of(parse(words))  # report impossible settings at once
-            captures.start(words)
-        except (OSError, ValueError, RuntimeError) as error:
-            self.report({"ERROR"}, error_text(error))
-            return {"CANCELLED"}
-        bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
-        return {"FINISHED"}
-
-    def _render_here(self, context: bpy.types.Context, words: list[str]) -> set[str]:
-        options = parse(words)
-        settings, report, printed = settings_of(options), Report(), 0.0
-        captures.close()  # the file of cameras is read
-        scans = scans_in(options.people, options.only)
-        with contextlib.closing(run(context, settings, scans, report)) as steps:
-            for progress in steps:
-                for line in progress.news:
-                    print(printable(f"PrimDiffusion: {line}"), flush=True)
-                if time.monotonic() - printed > _PRINT_S:
-                    printed = time.monotonic()
-                    print(f"PrimDiffusion: {describe(progress)}", flush=True)
-        if report.failed:
-            first, path = report.failed[0], report_path(settings.out, settings.shard)
-            who = first["subject"] or first["what"]
-            self.report({"ERROR"}, f"{len(report.failed)} failed; {who}: {first['why']} (all: {path})")
-            return {"CANCELLED"}
-        return {"FINISHED"}
+    def act(self, context: bpy.types.Context) -> set[str]:
+        """Another Blender renders; a timer follows it, or in background mode this waits."""
+        args = self._args(context)
+        settings_of(parse(args))  # report impossible settings at once
+        return follow_captures(args)
 
 
 class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
@@ -111,25 +76,10 @@ class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
     )
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        """With a window another Blender verifies; in background mode this one, failing on damage."""
         out = bpy.path.abspath(self.out) or setting_path(context.scene.primdiffusion_captures.out, "Captures")
         if not out:
             raise ValueError("choose the folder of captures first")
-        words = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]
-        if not bpy.app.background:
-            captures.start(words)
-            bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
-            return {"FINISHED"}
-        root = parse(words).out
-        wrong = verify(root)
-        for path, what in wrong.items():
-            print(printable(f"PrimDiffusion: {path}: {what}"))
-        if self.repair:
-            repair(root, wrong)
-        elif wrong:
-            first, what = next(iter(wrong.items()))
-            raise ValueError(f"{len(wrong)} problems; the first: {first}: {what}")
-        return {"FINISHED"}
+        return follow_captures(["--out", out, "--verify", *(["--repair"] if self.repair else [])])
 
 
 class PRIMDIFFUSION_OT_preview_rig(Reporting, bpy.types.Operator):
@@ -163,6 +113,33 @@ def remove_rig(collection: bpy.types.Object) -> None:
     bpy.data.batch_remove([*ours, *cameras, collection])
 
 
+def follow_captures(args: Sequence[str]) -> set[str]:
+    """Start a run and follow it: by a timer with a window, by waiting in background mode.
+
+    Raises ValueError while one runs, and in background mode for one that fails; OSError.
+    """
+    captures.start(args)
+    if not bpy.app.background:
+        bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
+        return {"FINISHED"}
+    shown = ""
+    try:
+        while captures.busy:
+            time.sleep(_TICK_S)
+            captures.tick()
+            if captures.message != shown:
+                shown = captures.message
+                print(printable(f"PrimDiffusion: {shown}"), flush=True)
+    finally:
+        captures.close()
+    for line in captures.lines:
+        print(printable(f"PrimDiffusion: {line}"), flush=True)
+    failed = captures.exit_code == FAILED
+    if captures.error and not (failed and "--repair" in args):  # what was damaged is mended then
+        raise ValueError("; ".join(list(captures.lines)[-2:]) if failed else captures.error)
+    return {"FINISHED"}
+
+
 def follow() -> float | None:
     """The timer: process the child's output, redraw."""
     if captures.tick():
@@ -188,6 +165,7 @@ def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], flo
 
 
 _SHOWN_LINES = 4
+_OUTPUT = ("width", "height", "background", "passes", "float_depth", "layouts", "released_reference")
 
 
 class DataPanel(SidebarPanel):
@@ -230,79 +208,48 @@ class PRIMDIFFUSION_PT_captures(DataPanel, bpy.types.Panel):
 def _draw_settings(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:
     """Sections of settings, which cannot be changed while captures are rendered."""
     sections = (
-        (draw_section(layout, "captures_input", text="Input"), _draw_input),
-        (draw_section(layout, "captures_poses", text="Poses"), _draw_poses),
-        (draw_section(layout, "captures_cameras", text="Cameras"), _draw_cameras),
-        (draw_section(layout, "captures_cycles", text="Cycles"), _draw_cycles),
-        (draw_section(layout, "captures_output", text="Output"), _draw_output),
+        ("Input", ("body", "seed", "shard", "shards"), None),
+        ("Poses", ("poses", "pose_count", "together"), None),
+        ("Cameras", _cameras(asked), _draw_preview),
+        ("Cycles", _cycles(asked), None),
+        ("Output", _OUTPUT, _draw_verify),
     )
-    for body, content in sections:
+    for text, names, more in sections:
+        body = draw_section(layout, f"captures_{text.lower()}", text=text)
         if body is None:
             continue
         if captures.busy:
             draw_lines(body, "Wait for the captures, or cancel them", "INFO")
         column = property_columns(body.column())
         column.enabled = not captures.busy
-        content(column, asked, context)
+        for name in names:
+            column.column().prop(asked, name)  # flags are one below the other
+        if more is not None:
+            more(column, asked, context)
 
 
-def _draw_input(layout: bpy.types.UILayout, asked, _context) -> None:
-    """Whose body, and which part of the people."""
-    layout.prop(asked, "body")
-    layout.prop(asked, "seed")
-    row = layout.row(align=True)
-    row.prop(asked, "shard")
-    row.prop(asked, "shards")
-
-
-def _draw_poses(layout: bpy.types.UILayout, asked, _context) -> None:
-    """Which poses they take."""
-    layout.prop(asked, "poses")
-    layout.prop(asked, "pose_count")
-    layout.prop(asked, "together")
-
-
-def _draw_cameras(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:
-    """Where the cameras stand."""
-    layout.prop(asked, "arrangement")
+def _cameras(asked) -> tuple[str, ...]:
     if asked.arrangement == "custom":
-        layout.prop(asked, "cameras")
-        if asked.cameras is None:
-            layout.label(text="Without a collection: the selected cameras", icon="INFO")
-        return
-    layout.prop(asked, "camera_count")
-    if asked.arrangement == "rings":
-        for name in ("rings", "lowest", "highest"):
-            layout.prop(asked, name)
-    layout.prop(asked, "fov")
-    layout.prop(asked, "margin")
-    shown = RIG in context.scene.collection.children
-    layout.operator(
-        "primdiffusion.preview_rig", text="Hide Cameras" if shown else "Preview Cameras", icon="CAMERA_DATA"
-    )
+        return "arrangement", "cameras"
+    rings = ("rings", "lowest", "highest") if asked.arrangement == "rings" else ()
+    return ("arrangement", "camera_count", *rings, "fov", "margin")
 
 
-def _draw_cycles(layout: bpy.types.UILayout, asked, _context) -> None:
-    """How Cycles renders."""
-    layout.prop(asked, "samples")
-    layout.prop(asked, "device")
-    layout.prop(asked, "light")
-    if asked.light == "hdri":
-        layout.prop(asked, "hdri")
-    if asked.light != "uniform":
-        layout.prop(asked, "denoise")
-        if asked.together > 1:
-            layout.prop(asked, "shadows")
+def _cycles(asked) -> tuple[str, ...]:
+    hdri = ("hdri",) if asked.light == "hdri" else ()
+    shaded = () if asked.light == "uniform" else ("denoise", "shadows") if asked.together > 1 else ("denoise",)
+    return ("samples", "device", "light", *hdri, *shaded)
 
 
-def _draw_output(layout: bpy.types.UILayout, asked, _context) -> None:
-    """What is written."""
-    for name in ("width", "height", "background"):
-        layout.prop(asked, name)
-    layout.column().prop(asked, "passes")
-    layout.prop(asked, "float_depth")
-    layout.column().prop(asked, "layouts")
-    layout.prop(asked, "released_reference")
+def _draw_preview(layout: bpy.types.UILayout, asked, context: bpy.types.Context) -> None:
+    if asked.arrangement != "custom":
+        text = "Hide Cameras" if RIG in context.scene.collection.children else "Preview Cameras"
+        layout.operator("primdiffusion.preview_rig", text=text, icon="CAMERA_DATA")
+    elif asked.cameras is None:
+        layout.label(text="Without a collection: the selected cameras", icon="INFO")
+
+
+def _draw_verify(layout: bpy.types.UILayout, _asked, _context) -> None:
     row = layout.row(align=True)
     row.operator("primdiffusion.verify_captures", icon="CHECKMARK").repair = False
     row.operator("primdiffusion.verify_captures", text="Repair", icon="TOOL_SETTINGS").repair = True

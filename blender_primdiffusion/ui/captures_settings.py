@@ -24,6 +24,7 @@ _PASS_NAMES = {
     "part": ("Part", "Which of the 24 joints moves the surface"),
 }
 _LAYOUT_NAMES = {"nerf": "NeRF", "opencv": "OpenCV", "colmap": "COLMAP"}
+_FLAGS = ("denoise", "float_depth", "released_reference")
 _PASS_ITEMS = [(kind, *_PASS_NAMES[kind], 1 << i) for i, kind in enumerate(PASSES)]
 _LAYOUT_ITEMS = [(name, _LAYOUT_NAMES[name], "", 1 << i) for i, name in enumerate(LAYOUTS)]
 
@@ -38,12 +39,10 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         name="Captures", description="Folder of the dataset; an unfinished one is resumed", subtype="DIR_PATH"
     )
     seed: declared(CaptureSettings, "seed")
-    body: bpy.props.StringProperty(
-        name="Body", description="Your SMPL body as .npz of plain arrays; empty: the default body", subtype="FILE_PATH"
-    )
+    body: declared(CaptureSettings, "body")
     shard: bpy.props.IntProperty(name="Shard", description="Part of the people that this machine renders", min=0)
     shards: bpy.props.IntProperty(
-        name="of", description="Number of parts the people are divided into", min=1, default=1
+        name="Shards", description="Number of parts the people are divided into", min=1, default=1
     )
 
     together: declared(CaptureSettings, "together")
@@ -95,39 +94,15 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     )
 
     samples: declared(CaptureSettings, "samples")
-    light: bpy.props.EnumProperty(
-        name="Light",
-        description="Lighting of the people",
-        items=[
-            ("uniform", "Uniform", "Every surface shows its own colour"),
-            ("dome", "Dome", "A white sky, soft shadows"),
-            ("hdri", "HDRI", "An environment picture"),
-        ],
-    )
-    hdri: bpy.props.StringProperty(
-        name="HDRI",
-        description="Environment picture, .exr or .hdr, or a folder of them, one for each view",
-        subtype="FILE_PATH",
-    )
+    light: declared(CaptureSettings, "light")
+    hdri: declared(CaptureSettings, "hdri", name="HDRI")
     denoise: declared(CaptureSettings, "denoise")
     shadows: declared(CaptureSettings, "shadows", name="Shadows Between People")
-    device: bpy.props.EnumProperty(
-        name="Device",
-        description="What Cycles renders on",
-        items=[("auto", "Automatic", "A GPU if there is one"), ("cpu", "CPU", ""), ("gpu", "GPU", "")],
-    )
+    device: declared(CaptureSettings, "device")
 
     width: declared(Rig, "width", subtype="PIXEL")
     height: declared(Rig, "height", subtype="PIXEL")
-    background: bpy.props.EnumProperty(
-        name="Background",
-        description="What is behind the people",
-        items=[
-            ("black", "Black", ""),
-            ("transparent", "Transparent", "One more pass: PNG with straight alpha"),
-            ("hdri", "HDRI", "One more pass: over the environment picture of the light HDRI"),
-        ],
-    )
+    background: declared(CaptureSettings, "background")
     passes: bpy.props.EnumProperty(
         name="Passes",
         description="Kinds of pictures to write",
@@ -167,10 +142,10 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         )
 
 
-def words_of(
+def command_args(
     asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path, people: str = "", out: str = ""
 ) -> list[str]:
-    """The command `capture` in words (`capture.command`); a file of cameras, where needed, goes to `folder`.
+    """The arguments of the command `capture` (`capture.command`); a file of cameras, where needed, goes to `folder`.
 
     `people` and `out` go before the panel's. Raises ValueError where something is missing or a path is impossible.
     """
@@ -178,34 +153,32 @@ def words_of(
     out = os.path.abspath(bpy.path.abspath(out)) if out else setting_path(asked.out, "Captures")
     if not people or not out:
         raise ValueError(f"choose a folder {'of people' if not people else 'for the captures'} first")
-    words = ["--people", people, "--out", out, "--seed", str(asked.seed)]
-    words += ["--shard", f"{min(asked.shard, asked.shards - 1)}/{asked.shards}"]
-    words += ["--poses", str(asked.pose_count), "--size", str(asked.width), str(asked.height)]
-    words += ["--samples", str(asked.samples), "--light", asked.light, "--device", asked.device]
-    words += ["--background", asked.background, "--together", str(asked.together)]
+    args = ["--people", people, "--out", out, "--shard", f"{min(asked.shard, asked.shards - 1)}/{asked.shards}"]
+    args += ["--poses", str(asked.pose_count), "--size", str(asked.width), str(asked.height)]
+    for name in ("seed", "samples", "light", "device", "background", "together"):
+        args += [f"--{name}", str(getattr(asked, name))]
     hdri = asked.hdri if asked.light == "hdri" else ""
     for name, label, path in (
-        ("--body", "Body", asked.body),
-        ("--pose-files", "Poses", asked.poses),
-        ("--hdri", "HDRI", hdri),
+        ("body", "Body", asked.body),
+        ("pose-files", "Poses", asked.poses),
+        ("hdri", "HDRI", hdri),
     ):
-        words += [name, setting_path(path, label)] if path else []
-    words += ["--denoise"] if asked.denoise else []
-    words += ["--shadows"] if asked.shadows and asked.together > 1 and asked.light != "uniform" else []
-    words += ["--float-depth"] if asked.float_depth else []
-    words += ["--released-reference"] if asked.released_reference else []
-    words += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]
-    words += ["--layouts", *(name for name in LAYOUTS if name in asked.layouts)]
-    return words + (_custom_words(asked, context, folder) if asked.arrangement == "custom" else _rig_words(asked.rig()))
+        args += [f"--{name}", setting_path(path, label)] if path else []
+    shadows = asked.shadows and asked.together > 1 and asked.light != "uniform"
+    args += ["--shadows"] if shadows else []
+    args += [f"--{name.replace('_', '-')}" for name in _FLAGS if getattr(asked, name)]
+    args += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]
+    args += ["--layouts", *(name for name in LAYOUTS if name in asked.layouts)]
+    return args + (_camera_args(asked, context, folder) if asked.arrangement == "custom" else _rig_args(asked.rig()))
 
 
-def _rig_words(rig: Rig) -> list[str]:
+def _rig_args(rig: Rig) -> list[str]:
     angles = [f"{angle:g}" for angle in rig.elevations]
-    words = ["--arrangement", rig.arrangement, "--cameras", str(rig.count), "--elevations", *angles]
-    return [*words, "--fov", f"{rig.vertical_fov:.6g}", "--margin", f"{rig.margin:.6g}"]
+    args = ["--arrangement", rig.arrangement, "--cameras", str(rig.count), "--elevations", *angles]
+    return [*args, "--fov", f"{rig.vertical_fov:.6g}", "--margin", f"{rig.margin:.6g}"]
 
 
-def _custom_words(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
+def _camera_args(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
     depsgraph, render = context.evaluated_depsgraph_get(), context.scene.render
     aspect = (render.pixel_aspect_x, render.pixel_aspect_y)
     objects = asked.cameras.all_objects if asked.cameras is not None else context.selected_objects

@@ -17,12 +17,12 @@ from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
 from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
-from .backend_state import draw_set_up
 from .declared import PANELS, SKIP, declared, not_given
 from .drawing import BackendPanel, SidebarPanel, draw_job, draw_lines, property_columns
 from .export_panel import draw_as_mesh
 from .gallery import draw_samples
 from .manual import draw_manual_button
+from .preferences import draw_set_up
 from .render_panel import draw_next_step
 
 LARGEST_SEED = 2**31 - 1

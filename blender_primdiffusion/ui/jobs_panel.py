@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
-import getpass
 import os
 import platform
-import re
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
+from pathlib import Path
 
 import bpy
 from bpy.app.handlers import persistent
@@ -19,91 +17,42 @@ from ..jobs.follow import Reporting, redraw, submit
 from ..jobs.memory import device_line
 from ..jobs.pictures import so_far
 from ..jobs.queue import queue
-from ..places import EXTENSION, backend_module_path, preference
-from .backend_state import being_set_up, cancel_set_up
+from ..places import EXTENSION
 from .captures_session import captures
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_ended, draw_lines, draw_queue
+from .preferences import being_set_up, cancel_set_up
 
 TEXT = "PrimDiffusion Diagnostics"
-_LOG_LINES = 60
-_PATHS = ("backend_python", "checkpoint", "encoder")
-_KNOWN = re.compile(
-    r"(?:blender_primdiffusion|primdiffusion|site-packages|dist-packages|python3\.\d+|scripts[/\\]+(?:modules|addons_core))"
-    r"[/\\].*",
-    re.DOTALL,
-)
-"""From these folders on, a path belongs to a program and is not private."""
-_SLASH = r"(?:/|\\{1,8}|%2[Ff]|%5[Cc])"
-_DRIVE = rf"(?:file:/{{2,3}})?[A-Za-z](?::|%3[Aa]){_SLASH}"
-_SHARE = r"(?:file:/*)?(?:\\{2,8}|(?:%5[Cc]){2,8})(?=[^\s\\])"
-_ROOT = r"(?:file:)?(?:/|%2[Ff])+(?=[^\s/])"
-_START = rf"(?:{_DRIVE}|{_SHARE}|{_ROOT})"
-"""C:\\, UNC, /, file://; as they are, in JSON and percent-encoded."""
-_PART = r"[^\s\"'<>|*?:,;()\[\]{}/\\%]|%(?!2[Ff]|5[Cc])"
-_WORD = rf"(?:{_PART})+"
-_FOLDER = rf"{_WORD}(?: {_WORD})*{_SLASH}"
-_FILE = rf"(?:{_WORD}(?: {_WORD}){{0,5}}?\.[A-Za-z][A-Za-z0-9]{{0,12}}(?![A-Za-z0-9.])|{_WORD})?"
-_PATH = re.compile(rf"(?<![A-Za-z0-9_.<>~/\\%]){_START}(?:{_FOLDER})*{_FILE}")
-_QUOTED = re.compile(rf"(?P<quote>[\"'])(?P<path>{_START}[^\"'\n]*)(?P=quote)")
-_SUFFIX = re.compile(r"\.[A-Za-z][A-Za-z0-9]{0,12}$")
+_LOG_LINES = 40
 
 
 def diagnostics() -> str:
-    """Versions, device, memory, the last job, its error and the end of the child's log; redacted."""
-    return redact("\n".join(_lines()), _names())
-
-
-def redact(text: str, names: Iterable[str] = ()) -> str:
-    """`text` with absolute paths as <path>, and each of `names` (of the user, of the machine) as <name>.
-
-    A file's ending stays, and so does what lies below a program's folder: <path>/site-packages/torch/nn.py. Paths are
-    found also with blanks, in JSON, percent-encoded, on Windows and on shares. Too much may go, too little must not.
-    """
-    text = _QUOTED.sub(lambda found: f"{found['quote']}{_short(found['path'])}{found['quote']}", text)
-    text = _PATH.sub(lambda found: _short(found[0]), text)
-    for name in sorted({name for name in names if len(name) > 1}, key=len, reverse=True):
-        text = re.sub(rf"(?<![A-Za-z0-9]){re.escape(name)}(?![A-Za-z0-9])", "<name>", text, flags=re.IGNORECASE)
-    return text
-
-
-def _short(path: str) -> str:
-    if not re.search(r"[^/\\%]", path):
-        return path
-    if known := _KNOWN.search(path):
-        return f"<path>/{known[0]}"
-    ending = _SUFFIX.search(path)
-    return f"<path>{ending[0] if ending else ''}"
+    """Versions, device, and the last job with its error and the end of the child's log; the home folder is "~"."""
+    return "\n".join(_lines()).replace(str(Path.home()), "~")
 
 
 def _lines() -> Iterator[str]:
-    info = queue.info
+    info, outcome = queue.info, queue.last
     yield f"PrimDiffusion {_version()} ({'extension' if EXTENSION.startswith('bl_ext.') else 'from source'})"
-    yield f"Blender {bpy.app.version_string} ({bpy.app.build_hash.decode(errors='replace')}), {_window()}"
+    yield f"Blender {bpy.app.version_string} ({bpy.app.build_hash.decode(errors='replace')})"
     yield f"System {platform.platform()}, {platform.machine()}, {os.cpu_count()} processors"
     python, torch = info.get("python", "?"), info.get("torch", "?")
     yield f"Backend {info.get('version', 'not started yet')}, Python {python}, torch {torch}"
-    yield f"Backend found: {'yes' if backend_module_path() else 'no'}"
-    yield "Set in the preferences: " + (", ".join(filter(preference, _PATHS)) or "nothing")
     yield f"Device {device_line()}"
-    yield f"Memory {info.get('memory_gb', '?')} GB, {info.get('memory_free_gb', '?')} GB free at the backend's start"
-    yield f"Child running: {queue.child_pid is not None}; queued: {len(queue.waiting)}"
-    if queue.current is not None:
-        yield f"Running: {queue.current.job.label}: {queue.request.state}, {queue.request.message}"
-    if (outcome := queue.last) is not None:
-        spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.seconds.items())
-        yield f"Last job: {outcome.entry.job.label} ({outcome.entry.job.method}) {spent}"
-        yield f"Ended: {outcome.notice or 'with an error'}"
-        if outcome.error is not None:
-            yield f"Error ({outcome.error.kind}): {outcome.sentence}"
-    error = queue.last.error if queue.last is not None else None
-    log = error.log if error is not None and error.log else queue.log
-    yield f"Log, the last {min(len(log), _LOG_LINES)} lines:"
-    yield from (f"    {line}" for line in log[-_LOG_LINES:])
+    if outcome is None:
+        return
+    spent = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in outcome.seconds.items())
+    yield f"Last job: {outcome.entry.job.label} ({outcome.entry.job.method}) {spent}"
+    if outcome.error is None:
+        yield f"Ended: {outcome.notice}"
+        return
+    yield f"Error ({outcome.error.kind}): {outcome.sentence}"
+    yield from (f"    {line}" for line in (outcome.error.log or queue.log)[-_LOG_LINES:])
 
 
 def _version() -> str:
-    manifest = os.path.join(os.path.dirname(os.path.dirname(__file__)), "blender_manifest.toml")
+    manifest = Path(__file__).resolve().parents[1] / "blender_manifest.toml"
     try:
         with open(manifest, "rb") as file:
             return tomllib.load(file)["version"]
@@ -111,21 +60,8 @@ def _version() -> str:
         return "of unknown version"
 
 
-def _window() -> str:
-    return "no window" if bpy.app.background else "with a window"
-
-
-def _names() -> set[str]:
-    """Names of the user, the home folder and the machine."""
-    home = os.path.basename(os.path.expanduser("~"))
-    names = {home, os.environ.get("USER", ""), os.environ.get("USERNAME", ""), platform.node()}
-    with contextlib.suppress(OSError, KeyError, ImportError):  # no such user on this system (containers)
-        names.add(getpass.getuser())
-    return names
-
-
 class PRIMDIFFUSION_OT_copy_diagnostics(bpy.types.Operator):
-    """Copy what a bug report needs: versions, device, last error and log, without user names or folder names"""
+    """Copy what a bug report needs: versions, device, the last error and its log, which may name your files"""
 
     bl_idname = "primdiffusion.copy_diagnostics"
     bl_label = "Copy Diagnostics"

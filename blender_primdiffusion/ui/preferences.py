@@ -1,35 +1,148 @@
-"""Preferences that every build has."""
+"""The preferences; and the backend as panels show it, set up by the extension or installed by the user."""
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+import importlib.util
+from typing import Literal
+
 import bpy
 
+from ..backend.client import PROGRAM
+from ..backend.environment import NOT_INSTALLED, BackendNotFound, candidates, state_of, tried
+from ..backend.requests import sentence
 from ..jobs.follow import redraw
 from ..jobs.queue import queue
-from ..places import EXTENSION
-from .drawing import DATA
+from ..places import EXTENSION, INSTALLS_BACKEND, installed_backend, preference, set_up_folder
+from .drawing import DATA, draw_lines
 
-WIDTH = 90
-"""Characters in a line of the preferences window at its default size."""
-NOTHING_TO_CANCEL = "nothing is being set up"
+if INSTALLS_BACKEND:
+    from . import setup
+else:
+    setup = None
+
+_WINDOW, _SIDEBAR = 90, 30
+"""Characters in a line of the preferences window, and of a box in a sidebar beside an icon, at their default sizes."""
+_COMPUTE = (
+    ("AUTOMATIC", "Automatic", "NVIDIA where there is a driver that is new enough, else the processor"),
+    ("CPU", "CPU", "Smallest download; a human takes seconds instead of fractions of one"),
+    ("CUDA", "NVIDIA (CUDA)", "Large download; needs an NVIDIA card and driver"),
+    ("APPLE", "Apple", "For Apple Silicon; computes on its processor"),
+)
 
 
-def _redraw(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
-    redraw()
+@dataclasses.dataclass(frozen=True)
+class Known:
+    """Which Python would run the backend."""
+
+    state: Literal["named", "own Python", "ready", "outdated", "broken", "absent", "wrong"]
+    line: str
+    """For the panels."""
+    works: bool | None = None
+    """Whether it imported torch and the backend; None until it was tried."""
+    size: int = 0
+    """Bytes of the private environment."""
+
+    @property
+    def usable(self) -> bool:
+        """Whether there is a Python to try."""
+        return self.state in {"named", "own Python", "ready", "outdated"}
 
 
-def forget_failures() -> None:
-    """Forget how jobs failed for want of a backend: another one was chosen."""
+def known() -> Known:
+    """Which Python would run the backend, in the order in which it is searched; fast enough for drawing."""
+    folder = set_up_folder()
+    state, about = state_of(folder) if setup else ("absent", {})
+    own = folder.environment if state == "ready" else None
+    try:
+        named = candidates(preference("backend_python"), own, installed_backend(), own_python=False)
+        source, python = next(named, ("", None))
+    except BackendNotFound as error:
+        return Known("wrong", sentence(error))
+    if python is not None and python != folder.python:
+        return Known("named", f"Uses {python}, named by {source}", tried.get(python))
+    if python is not None:
+        line = f"Ready: torch {about.get('torch')}, Python {about.get('python')}, {about.get('device') or 'CPU'}"
+        works, size = tried.get(python, True), about.get("bytes", 0)
+        if setup.is_outdated(about):
+            return Known("outdated", f"{line}. Made for another version of the extension: press Repair", works, size)
+        return Known("ready", line, works, size)
+    if _own_python_will_do():
+        return Known("own Python", "Uses Blender's own Python, which has torch", works=True)
+    if state == "broken":
+        return Known("broken", "Half installed, or made by a Blender that is gone: press Repair")
+    return Known("absent", "The backend is not set up yet" if setup else sentence(NOT_INSTALLED))
+
+
+@functools.cache
+def _own_python_will_do() -> bool:
+    """Whether Blender's own Python has torch, as in an environment with Blender as a module, or the whole backend."""
+    return importlib.util.find_spec("torch" if setup else PROGRAM) is not None
+
+
+def draw_set_up(layout: bpy.types.UILayout) -> bool:
+    """For panels that need the backend: the progress of a set-up, or what to do; nothing where a backend is ready.
+
+    Returns whether it is.
+    """
+    if being_set_up():
+        setup.draw_progress(layout, _SIDEBAR)
+        return False
+    now = known()
+    if now.usable:
+        return True
+    box = layout.box()
+    draw_lines(box, now.line, "ERROR", _SIDEBAR)
+    if setup is None or now.state == "wrong" or not setup.draw_button(box, _SIDEBAR, broken=now.state == "broken"):
+        box.operator("preferences.addon_show", text="Open Preferences", icon="PREFERENCES").module = EXTENSION
+    if setup:
+        setup.draw_result(box, _SIDEBAR)
+    return False
+
+
+def being_set_up() -> bool:
+    """Whether the backend is being set up; the viewer build never does that."""
+    return setup is not None and setup.session.busy
+
+
+def cancel_set_up() -> None:
+    """Stop the set-up. Raises ValueError where there is none."""
+    if not being_set_up():
+        raise ValueError("nothing is being set up")
+    setup.session.cancel()
+    setup.redraw()
+
+
+def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+    """What the former Python did is of no interest any more."""
+    if setup:
+        setup.session.error = setup.session.notice = ""
     for kind, outcome in list(queue.outcomes.items()):
         if outcome.error is not None and outcome.error.kind in {"environment", "timeout"}:
             del queue.outcomes[kind]
+    redraw()
 
 
-class CommonPreferences:
-    """Base of the preferences, which declare `backend_python` too; `bpy.types.AddonPreferences` is their other base."""
+def _captures_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:
+    redraw()
+
+
+class PRIMDIFFUSION_AP_preferences(bpy.types.AddonPreferences):
+    """Shown in Edit > Preferences > Add-ons > PrimDiffusion."""
 
     bl_idname = EXTENSION
 
+    compute: bpy.props.EnumProperty(
+        name="Compute On", description="Device that packages are installed for", items=_COMPUTE
+    )
+    backend_python: bpy.props.StringProperty(
+        name="Existing Python",
+        description="Python 3.11 or newer with PrimDiffusion's packages (torch), or the program primdiffusion; empty: "
+        + ("the private environment" if setup else "the program on the PATH"),
+        subtype="FILE_PATH",
+        update=_python_changed,
+    )
     checkpoint: bpy.props.StringProperty(
         name="Checkpoint",
         description="Diffusion model, a .safetensors file; empty: the bundled one",
@@ -48,16 +161,42 @@ class CommonPreferences:
         min=0,
         soft_max=120,
     )
-
     captures: bpy.props.BoolProperty(
         name="Captures",
         description=f"Show the tab {DATA} in the sidebar: training data from scans, and humans from images",
-        update=_redraw,
+        update=_captures_changed,
     )
 
-    def draw_properties(self, layout: bpy.types.UILayout) -> None:
-        """All properties that need no more than a field."""
+    def draw(self, _context: bpy.types.Context) -> None:
+        layout = self.layout
+        _draw_backend(self, layout.box())
         layout.use_property_split = True
         layout.use_property_decorate = False
         for name in ("backend_python", "checkpoint", "encoder", "idle_minutes", "captures"):
             layout.prop(self, name)
+
+
+def _icon(now: Known) -> str:
+    if not now.usable or now.works is False:
+        return "ERROR"
+    return "QUESTION" if now.works is None else "CHECKMARK"
+
+
+def _draw_backend(preferences: PRIMDIFFUSION_AP_preferences, box: bpy.types.UILayout) -> None:
+    if being_set_up():
+        setup.draw_progress(box, _WINDOW)
+        return
+    now = known()
+    draw_lines(box, now.line, _icon(now), _WINDOW)
+    if setup is None:
+        return
+    folder = set_up_folder()
+    if folder.environment.is_dir():
+        size = f"{setup.gigabytes(now.size)} in " if now.size else ""
+        draw_lines(box, f"{size}{folder.environment}", "FILE_FOLDER", _WINDOW)
+    if now.state not in {"named", "wrong"}:
+        box.row().prop(preferences, "compute", expand=True)
+        setup.draw_private(box, _WINDOW, there=folder.environment.is_dir())
+    setup.draw_result(box, _WINDOW)
+    if setup.session.error and folder.log.is_file():
+        box.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(folder.log)

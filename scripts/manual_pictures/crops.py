@@ -28,7 +28,7 @@ PANELS = {
 """Rows of sidebars, cropped to their panels."""
 WINDOWS = {
     "preferences_without": ("set_up_preferences", "window 1"),
-    "preferences_with": ("set_up_tested", "window 1"),
+    "preferences_with": ("set_up_named", "window 1"),
     "window_solid": ("first_solid", "window 0"),
     "window_person": ("first_person", "window 0"),
     "window_redressed": ("edit_redressed", "window 0"),

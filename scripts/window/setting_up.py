@@ -19,7 +19,7 @@ _MOST_S = 2400.0
 
 
 def set_up_real(module: str, _python: str) -> Steps:
-    """Cost, download, cancel, second start, installation, self-test, ready; removed again."""
+    """Cost, download, cancel, second start, installation, self-test, ready."""
     bpy.context.preferences.system.use_online_access = True
     preferences = bpy.context.preferences.addons[module].preferences
     preferences.compute = os.environ.get("PRIMDIFFUSION_COMPUTE", "automatic").upper()
@@ -27,7 +27,7 @@ def set_up_real(module: str, _python: str) -> Steps:
     window = _preferences_window(module)
     yield 1.0
     yield "set_up_real_before"
-    session = import_module(f"{module}.ui.setup.operators").session
+    session = import_module(f"{module}.ui.setup").session
     began = time.monotonic()
     press("primdiffusion.set_up_backend")
     yield from wait(lambda: not session.busy or session.fraction > 0.1, _MOST_S)
@@ -46,10 +46,6 @@ def set_up_real(module: str, _python: str) -> Steps:
     yield "set_up_real_ready"
     if session.error:
         raise RuntimeError(session.error)
-    press("primdiffusion.remove_backend", how="EXEC_DEFAULT")
-    yield from wait(lambda: not session.busy, 120)
-    yield 1.0
-    yield "set_up_real_removed"
     with bpy.context.temp_override(window=window):
         bpy.ops.wm.window_close()
     yield 0.5

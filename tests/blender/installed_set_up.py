@@ -1,4 +1,4 @@
-"""Run by test_setup_installed in a Blender of its own: install the zip, set up its backend, generate, remove, report.
+"""Run by test_setup_installed in a Blender of its own: install the zip, set up its backend, generate, repair, report.
 
 python installed_set_up.py ZIP FOLDER_OF_WHEELS_OR_EMPTY
 """
@@ -16,22 +16,28 @@ archive, wheels = sys.argv[1:]
 os.environ.pop("PRIMDIFFUSION_PYTHON", None)
 bpy.ops.extensions.package_install_files(filepath=archive, repo="user_default", enable_on_install=True)
 (module,) = [name for name in bpy.context.preferences.addons.keys() if name.endswith(".primdiffusion")]  # noqa: SIM118
-known = import_module(f"{module}.ui.setup.known")
+setup = import_module(f"{module}.ui.setup")
+preferences = import_module(f"{module}.ui.preferences")
+state_of = import_module(f"{module}.backend.environment").state_of
 places = import_module(f"{module}.places")
-known._has_torch = lambda: False  # as in a Blender that is no module of a Python with torch
-report = {"blender": bpy.app.version_string, "root": str(places.set_up_folder().root), "before": known.known().state}
+preferences._own_python_will_do = lambda: False  # as in a Blender that is no module of a Python with torch
+report = {
+    "blender": bpy.app.version_string,
+    "root": str(places.set_up_folder().root),
+    "before": preferences.known().state,
+}
 if wheels:
     report["offline"] = not bpy.app.online_access
     press = lambda: bpy.ops.primdiffusion.set_up_backend(directory=wheels)  # noqa: E731
 else:
     bpy.context.preferences.system.use_online_access = True
-    report["cost"] = known.cost(known.chosen()[1])
+    report["cost"] = setup.cost(setup.chosen()[1])
     press = bpy.ops.primdiffusion.set_up_backend
 started = time.perf_counter()
 report["outcome"] = sorted(press())
 report["seconds"] = round(time.perf_counter() - started, 1)
-report["after"] = known.known().state
-report["about"] = known.known().about
+report["after"] = preferences.known().state
+report["about"] = state_of(places.set_up_folder())[1]
 if not wheels:
     bpy.ops.wm.save_as_mainfile(filepath=str(Path(os.environ["BLENDER_USER_RESOURCES"]) / "shot.blend"))
     started = time.perf_counter()
@@ -44,9 +50,6 @@ repair = (
 )  # without a network, from the folder again
 report["repaired"] = sorted(repair())
 report["seconds_repair"] = round(time.perf_counter() - started, 1)
-report["tested"] = sorted(bpy.ops.primdiffusion.test_backend())
-report["removed"] = sorted(bpy.ops.primdiffusion.remove_backend())
-report["at_last"] = known.known().state
-report["left"] = sorted(path.name for path in places.set_up_folder().root.iterdir())
+report["at_last"] = preferences.known().state
 bpy.ops.preferences.addon_disable(module=module)
 print("REPORT " + json.dumps(report), flush=True)

@@ -29,7 +29,7 @@ from blender_primdiffusion.scene.handles import add_handles
 from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.ui.drawing import DATA
 
-ELSEWHERE = {"test_backend", "set_up_backend", "copy_diagnostics"}
+ELSEWHERE = {"set_up_backend", "copy_diagnostics"}
 """Set up, write a text: whatever is in the scene, it stays as it is."""
 
 
@@ -209,7 +209,7 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.fixture
 def outside(anna, monkeypatch):
     """Nothing is downloaded or installed."""
-    from blender_primdiffusion.ui.setup.operators import SetUpSession
+    from blender_primdiffusion.ui.setup import SetUpSession
 
     def start(session: SetUpSession, _steps: object) -> None:
         session.notice = "as if it were done"

@@ -17,7 +17,6 @@ from blender_primdiffusion.backend.packages import (
     locks_for,
     read_lock,
     this_machine,
-    what_went_wrong,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -147,13 +146,6 @@ def test_a_list_of_packages_that_is_none_is_one_short_sentence(tmp_path, content
         read_lock(path)
     assert len(str(caught.value)) < 200 + len(str(path))
     assert "\n" not in str(caught.value)
-
-
-def test_a_folder_in_place_of_a_wheel_is_named():
-    said = """ERROR: Can't verify hashes for these file:// requirements because they point to directories:
-    idna==3.10 from file:///srv/wheels/idna-3.10-py3-none-any.whl (from -r /srv/wheels/requirements.txt (line 1))
-"""
-    assert what_went_wrong(said, 1).startswith("idna-3.10-py3-none-any.whl is a folder")
 
 
 HASH = f"--hash=sha256:{'0' * 64}"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import sys
 from pathlib import Path
 from typing import NamedTuple
@@ -15,12 +14,14 @@ from blender_primdiffusion.formats.whole_files import write_atomically
 from support.errors import refused
 from support.fake_child import FAKE_CHILD
 from tiny_packages import own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
+from waiting import BACKEND, PYTHON
 
 from blender_primdiffusion.backend import setup
-from blender_primdiffusion.backend.environment import MARK, VARIABLE, SetUpFolder, candidates
+from blender_primdiffusion.backend.client import BackendClient
+from blender_primdiffusion.backend.environment import MARK, VARIABLE, SetUpFolder, candidates, state_of
 from blender_primdiffusion.backend.packages import read_lock
-from blender_primdiffusion.backend.requests import run_to_end
-from blender_primdiffusion.backend.setup import Steps, state_of
+from blender_primdiffusion.backend.requests import Backend, ChildRequest, run_to_end
+from blender_primdiffusion.backend.setup import Steps
 
 
 class Place(NamedTuple):
@@ -83,35 +84,17 @@ def test_an_environment_may_have_a_pip_of_its_own(place, monkeypatch):
     assert list(place.folder.environment.rglob("pip-*.dist-info"))
 
 
-def test_removing_takes_environment_and_caches_and_nothing_else(place):
-    done(place.from_folder())
-    other = place.folder.root / "another_file"
-    other.touch()
-    place.cache.joinpath("bytecode").mkdir(parents=True, exist_ok=True)
-    assert "removed" in done(setup.remove(place.folder, place.cache))
-    assert state_of(place.folder)[0] == "absent"
-    assert not place.cache.exists()
-    assert other.exists()
-
-
 @pytest.mark.parametrize("name", ["environment", "downloads", "temporary"])
-def test_what_a_link_leads_to_is_neither_emptied_nor_removed(place, tmp_path, name):
+def test_what_a_link_leads_to_is_not_emptied(place, tmp_path, name):
     own = tmp_path / "own" / MARK
     write_atomically(own, "mine")
     link = getattr(place.folder, name)
     link.parent.mkdir(parents=True, exist_ok=True)
     link.symlink_to(own.parent, target_is_directory=True)
-    for steps in (place.from_folder(), setup.remove(place.folder, None)):
-        assert failed(steps).endswith("is a link to another folder: remove the link, then set the backend up again")
+    assert failed(place.from_folder()).endswith(
+        "is a link to another folder: remove the link, then set the backend up again"
+    )
     assert own.read_text() == "mine"
-
-
-def test_removing_leaves_a_cache_that_is_shared(place):
-    place.folder.downloads.mkdir(parents=True)
-    place.cache.mkdir()
-    done(setup.remove(place.folder, None))
-    assert not place.folder.downloads.exists()
-    assert place.cache.exists()
 
 
 def test_setting_up_again_mends_a_damaged_environment(place):
@@ -145,6 +128,13 @@ def test_pip_gets_the_lock_as_it_was_checked(place):
 def test_a_web_page_among_the_wheels_is_named_before_anything_is_made(place):
     (place.wheels / "links.HTM").write_text('<a href="http://localhost:9/torch-9-py3-none-any.whl">')
     assert "links.HTM is a web page" in failed(place.from_folder())
+    assert not place.folder.root.exists()
+
+
+def test_a_folder_in_place_of_a_wheel_is_named_before_anything_is_made(place):
+    (place.wheels / "idna-3.10-py3-none-any.whl").mkdir()
+    with refused(IsADirectoryError, "idna-3.10"):
+        done(place.from_folder())
     assert not place.folder.root.exists()
 
 
@@ -202,12 +192,26 @@ def test_an_environment_that_fails_its_self_test_is_not_ready(place):
     assert state_of(place.folder)[0] == "broken"
 
 
-def test_another_python_can_be_tested_alone(place, tmp_path):
-    missing = tmp_path / "no-python"
-    assert "no-python" in failed(setup.self_test(place.folder, missing, FAKE_CHILD, place.cache))
-    shutil.rmtree(place.folder.root)
-    done(place.from_folder())
-    assert done(setup.self_test(place.folder, place.folder.python, FAKE_CHILD, place.cache))
+@pytest.mark.slow
+def test_the_self_test_compiles_what_the_first_press_needs(tmp_path, monkeypatch):
+    monkeypatch.setenv("PRIMDIFFUSION_DEVICE", "cpu")
+    cache = tmp_path / "cache"
+    run_to_end(setup._trial(PYTHON, BACKEND, cache, tmp_path))
+    compiled = sorted(cache.rglob("*.nbc"))
+    assert compiled
+    backend = Backend(lambda: _client(cache))
+    request = ChildRequest(
+        backend, "generate", {"seed": 1, "steps": 3, "picture_px": 64, "out_dir": str(tmp_path / "out")}
+    )
+    until(lambda: request.tick() is None or request.finished)
+    backend.release()
+    assert request.error is None
+    assert sorted(cache.rglob("*.nbc")) == compiled
+
+
+def _client(cache: Path):
+    yield
+    return BackendClient(PYTHON, BACKEND, cache_dir=cache)
 
 
 def test_no_network_is_a_sentence(place, monkeypatch):

@@ -95,6 +95,7 @@ def test_all_tests_run_on_three_blenders_in_environments_that_are_made_once(chec
     installed = [command for command in checkout.commands if "install" in command]
     assert [command[0] for command in installed] == [pythons[0], pythons[0], *pythons[1:]]
     assert all("requirements.lock" in command for command in installed[:2])
+    assert [command[0] for command in checkout.commands if "generate" in command] == [pythons[0]]  # compiles, once
     checkout.commands.clear()
     setup.test([])
     assert len(checkout.commands) == 3

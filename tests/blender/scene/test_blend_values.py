@@ -49,7 +49,7 @@ OPERATORS_OWN = {
     "scene/blend_values.py",
     "ui/captures_panel.py", "ui/captures_settings.py", "ui/export_operators.py", "ui/export_panel.py",
     "ui/import_motion.py", "ui/picture_panel.py", "ui/reconstruct_panel.py",
-    "ui/setup/operators.py",
+    "ui/setup.py",
 }  # fmt: skip
 """Modules that resolve paths: besides the reader, those whose operators are given one by the user or a script."""
 PERSON = "primdiffusion_person"

@@ -30,7 +30,7 @@ from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui import captures_session
 from blender_primdiffusion.ui.captures_panel import RIG, PRIMDIFFUSION_OT_render_captures
 from blender_primdiffusion.ui.captures_session import captures
-from blender_primdiffusion.ui.captures_settings import words_of
+from blender_primdiffusion.ui.captures_settings import command_args
 
 pytestmark = pytest.mark.any_blender
 
@@ -172,7 +172,7 @@ def test_a_wrong_command_line_exits_with_2_and_an_error(tmp_path):
     for words, message in (
         (["--people", str(tmp_path)], "--out"),
         (["--out", str(tmp_path), "--cameras", "none"], "--cameras"),
-        (["--out", str(tmp_path / "a"), "--people", str(tmp_path), "--shard", "4/4"], "no shard"),
+        (["--out", str(tmp_path / "a"), "--people", str(tmp_path), "--shard", "4/4"], "not a shard"),
     ):
         done = command(*words)
         assert done.returncode == UNUSABLE
@@ -192,7 +192,7 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
     asked = extension.scene.primdiffusion_captures
     asked.people, asked.out = str(only_good), str(out)
     asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 2, 48, 48, 2
-    captures.start(words_of(asked, extension, captures.new_folder()))
+    captures.start(command_args(asked, extension, captures.new_folder()))
     messages = set()
     while captures.busy:
         captures.tick()
@@ -203,7 +203,7 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
     assert "anna: view 4 of 4" in messages
     assert (out / "anna" / "complete.json").is_file()
     asked.seed = 3
-    captures.start(words_of(asked, extension, captures.new_folder()))
+    captures.start(command_args(asked, extension, captures.new_folder()))
     follow()
     assert "seed is 0, not 3" in captures.error
 
@@ -231,14 +231,14 @@ def test_cancelling_ends_the_child_and_the_next_run_resumes(extension, only_good
     asked = extension.scene.primdiffusion_captures
     asked.people, asked.out = str(only_good), str(tmp_path / "captures")
     asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 3, 200, 200, 8
-    captures.start(words_of(asked, extension, captures.new_folder()))
+    captures.start(command_args(asked, extension, captures.new_folder()))
     follow(until=lambda: captures.fraction > 0)
     assert bpy.ops.primdiffusion.cancel(what="CAPTURES") == {"FINISHED"}
     follow()
     assert captures.notice.startswith("Cancelled")
     assert captures.error == ""
     done = files_of(tmp_path / "captures")
-    captures.start(words_of(asked, extension, captures.new_folder()))
+    captures.start(command_args(asked, extension, captures.new_folder()))
     follow()
     assert captures.exit_code == DONE, captures.error
     after = files_of(tmp_path / "captures")
@@ -274,14 +274,14 @@ def test_a_polite_kill_in_the_midst_of_a_view_ends_the_command_after_it(only_goo
 
 def test_the_panels_defaults_are_the_commands(extension, tmp_path):
     asked = extension.scene.primdiffusion_captures
-    from_panel = settings_of(parse(words_of(asked, extension, tmp_path, "people", "out")))
+    from_panel = settings_of(parse(command_args(asked, extension, tmp_path, "people", "out")))
     from_line = settings_of(parse(["--people", "people", "--out", str(Path("out").absolute())]))
     assert from_panel == from_line
     assert (from_line.camera_count, from_line.pose_count, from_line.size, from_line.samples) == (36, 20, (512, 512), 16)
 
 
 def test_paths_that_begin_with_a_hyphen_are_no_options(extension, tmp_path):
-    words = words_of(extension.scene.primdiffusion_captures, extension, tmp_path, "-people", "--out")
+    words = command_args(extension.scene.primdiffusion_captures, extension, tmp_path, "-people", "--out")
     assert parse(words).people == [Path("-people").absolute()]
     assert parse(words).out == Path("--out").absolute()
 
@@ -290,14 +290,14 @@ def test_cameras_of_the_scene_are_taken_by_name(extension, tmp_path):
     scene, asked = extension.scene, extension.scene.primdiffusion_captures
     asked.arrangement, asked.width, asked.height = "custom", 80, 60
     with refused(ValueError, "camera"):
-        words_of(asked, extension, tmp_path, "people", "out")
+        command_args(asked, extension, tmp_path, "people", "out")
     asked.cameras = bpy.data.collections.new("rig")
     scene.collection.children.link(asked.cameras)
     for name, x in (("b", 1.0), ("a", 2.0)):
         camera = bpy.data.objects.new(name, bpy.data.cameras.new(name))
         camera.location, camera.rotation_euler = (x, -4.0, 0.5), (np.pi / 2, 0, 0)
         asked.cameras.objects.link(camera)
-    settings = settings_of(parse(words_of(asked, extension, tmp_path, "people", "out")))
+    settings = settings_of(parse(command_args(asked, extension, tmp_path, "people", "out")))
     assert [view.position.round(4).tolist() for view in settings.cameras] == [[2, 0.5, 4], [1, 0.5, 4]]
     assert settings.camera_count == 2
     assert (settings.cameras[0].width, settings.cameras[0].height) == (80, 60)
@@ -341,7 +341,7 @@ def test_the_button_asks_before_hundreds_of_views(extension, only_good, tmp_path
     manager = SimpleNamespace(invoke_confirm=lambda *_, **words: asked.append(words) or {"RUNNING_MODAL"})
     context = SimpleNamespace(scene=extension.scene, window_manager=manager)
     button = SimpleNamespace(people="", out="", options="", execute=lambda _: begun.append(1) or {"FINISHED"})
-    button._words = lambda context: PRIMDIFFUSION_OT_render_captures._words(button, context)
+    button._args = lambda context: PRIMDIFFUSION_OT_render_captures._args(button, context)
     assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"RUNNING_MODAL"}
     assert asked[0]["message"].startswith("720 views (1 person x 20 poses x 36 cameras) take about 26 min")
     panel.pose_count = 1

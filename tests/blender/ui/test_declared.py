@@ -33,6 +33,15 @@ def test_a_setting_has_the_limits_of_its_request(addon, group, field):
         assert shown.default == pytest.approx(getattr(record, field))
 
 
+def test_a_choice_and_a_file_are_those_of_the_record(addon):
+    shown = addon.scene.primdiffusion_captures.bl_rna.properties
+    assert [(item.identifier, item.name) for item in shown["light"].enum_items] == [
+        ("uniform", "Uniform"), ("dome", "Dome"), ("hdri", "HDRI")
+    ]  # fmt: skip
+    assert shown["light"].default == CaptureSettings.light
+    assert (shown["body"].subtype, shown["body"].default) == ("FILE_PATH", "")
+
+
 def test_an_operator_has_the_limits_of_its_request(addon):
     for name, record, field in (
         ("generate", requests.GenerateRequest, "guidance"),

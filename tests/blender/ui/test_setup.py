@@ -16,9 +16,11 @@ import blender_primdiffusion
 import build_addon
 from blender_primdiffusion import places
 from blender_primdiffusion.backend import setup
-from blender_primdiffusion.backend.environment import VARIABLE
-from blender_primdiffusion.ui.setup import known, operators, preferences
-from blender_primdiffusion.ui.setup.operators import session
+from blender_primdiffusion.backend.environment import VARIABLE, state_of
+from blender_primdiffusion.ui import preferences
+from blender_primdiffusion.ui import setup as ui_setup
+from blender_primdiffusion.ui.preferences import known
+from blender_primdiffusion.ui.setup import session
 
 pytestmark = pytest.mark.any_blender
 
@@ -35,9 +37,9 @@ def wheels(empty_scene, tmp_path, monkeypatch) -> Path:
     with_this_pip(monkeypatch, setup)
     monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: tmp_path / "eigener ordner")
     monkeypatch.setattr(places, "backend_module_path", lambda: FAKE_CHILD)
-    monkeypatch.setattr("blender_primdiffusion.ui.setup.operators.backend_module_path", lambda: FAKE_CHILD)
-    monkeypatch.setattr(known, "_has_torch", lambda: False)
-    monkeypatch.setattr(known, "available", lambda: {"cpu": lock})
+    monkeypatch.setattr("blender_primdiffusion.ui.setup.backend_module_path", lambda: FAKE_CHILD)
+    monkeypatch.setattr(preferences, "_own_python_will_do", lambda: False)
+    monkeypatch.setattr(ui_setup, "available", lambda: {"cpu": lock})
     bpy.context.preferences.system.use_online_access = False
     session.error = session.notice = ""
     blender_primdiffusion.register()
@@ -58,15 +60,11 @@ def said(layout: Layout) -> str:
 
 def draw_preferences() -> Layout:
     layout = Layout()
-    fake = type("Preferences", (), {"layout": layout})()
-    fake._draw_backend = lambda box: preferences.PRIMDIFFUSION_AP_preferences._draw_backend(fake, box)
-    fake._draw_buttons = lambda box, *words: preferences.PRIMDIFFUSION_AP_preferences._draw_buttons(fake, box, *words)
-    fake.draw_properties = lambda box: preferences.PRIMDIFFUSION_AP_preferences.draw_properties(fake, box)
-    preferences.PRIMDIFFUSION_AP_preferences.draw(fake, bpy.context)
+    preferences.PRIMDIFFUSION_AP_preferences.draw(type("Preferences", (), {"layout": layout})(), bpy.context)
     return layout
 
 
-def test_from_no_backend_to_a_backend_and_back(wheels):
+def test_from_no_backend_to_a_backend(wheels):
     layout = Layout()
     assert not preferences.draw_set_up(layout)
     assert "The backend is not set up yet" in said(layout)
@@ -74,7 +72,7 @@ def test_from_no_backend_to_a_backend_and_back(wheels):
     assert "primdiffusion.set_up_backend" in layout.of("button")
 
     assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
-    assert known.known().state == "ready"
+    assert known().state == "ready"
     assert session.notice.startswith("The backend is ready: torch 0-tiny")
     layout = Layout()
     assert preferences.draw_set_up(layout)
@@ -82,22 +80,19 @@ def test_from_no_backend_to_a_backend_and_back(wheels):
     layout = draw_preferences()
     assert "Ready: torch 0-tiny" in said(layout)
     assert str(places.set_up_folder().environment)[:40] in said(layout)
-    assert {"primdiffusion.set_up_backend", "primdiffusion.remove_backend"} <= set(layout.of("button"))
+    assert "primdiffusion.set_up_backend" in layout.of("button")
 
     assert press.set_up_backend() == {"FINISHED"}  # nothing to do
-    assert press.test_backend() == {"FINISHED"}
-    assert press.remove_backend() == {"FINISHED"}
-    assert known.known().state == "absent"
 
 
 def test_set_up_backend_downloads_when_blender_may_use_the_network(online, monkeypatch):
     with served(online) as (index, _):
         own_index(monkeypatch, index)
         assert press.set_up_backend() == {"FINISHED"}
-        assert known.known().state == "ready"
+        assert known().state == "ready"
         next(places.set_up_folder().environment.rglob("tiny.py")).unlink()
         assert press.set_up_backend(repair=True) == {"FINISHED"}
-    assert known.known().state == "ready"
+    assert known().state == "ready"
     assert list(places.set_up_folder().environment.rglob("tiny.py"))
 
 
@@ -122,35 +117,31 @@ def test_a_failure_raises_and_stays_in_the_panel(online):
 
 def test_a_folder_may_bring_its_own_list_of_packages(wheels, tmp_path, monkeypatch):
     ours = write_lock(tmp_path / "ours.txt", [write_wheel(tmp_path / "elsewhere", "torch", "")])
-    monkeypatch.setattr(known, "available", lambda: {"cpu": ours})
+    monkeypatch.setattr(ui_setup, "available", lambda: {"cpu": ours})
     with refused(RuntimeError, "differs"):
         press.set_up_backend(choose=True, directory=str(wheels))
-    write_lock(wheels / operators.OWN_LOCK, sorted(wheels.glob("*.whl"))[:1])
+    write_lock(wheels / ui_setup.OWN_LOCK, sorted(wheels.glob("*.whl"))[:1])
     with refused(RuntimeError, "torch"):
         press.set_up_backend(choose=True, directory=str(wheels))
-    write_lock(wheels / operators.OWN_LOCK, sorted(wheels.glob("*.whl")))
+    write_lock(wheels / ui_setup.OWN_LOCK, sorted(wheels.glob("*.whl")))
     assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
-    assert known.known().about["lock_name"] == "requirements.txt"
+    assert state_of(places.set_up_folder())[1]["lock_name"] == "requirements.txt"
 
 
 def test_an_environment_with_outdated_packages_is_reported(wheels, monkeypatch):
     assert press.set_up_backend(choose=True, directory=str(wheels)) == {"FINISHED"}
-    (path,) = known.available().values()
-    monkeypatch.setattr(known, "LOCKS", path.parent)
+    (path,) = ui_setup.available().values()
+    monkeypatch.setattr(ui_setup, "LOCKS", path.parent)
     path.write_text(path.read_text() + "# another\n")
-    known.read_once.cache_clear()
-    assert known.known().state == "outdated"
-    assert "press Repair" in known.known().line
+    ui_setup.read_once.cache_clear()
+    assert known().state == "outdated"
+    assert "press Repair" in known().line
     with refused(RuntimeError, "Blender"):
         press.set_up_backend(repair=True)
-    assert known.known().state == "outdated"  # still there, and it works
+    assert known().state == "outdated"  # still there, and it works
 
 
-def test_nothing_to_remove_test_or_cancel_is_rejected(wheels):
-    with refused(RuntimeError, "backend"):
-        press.remove_backend()
-    with refused(RuntimeError, "Set Up Backend"):
-        press.test_backend()
+def test_nothing_to_cancel_is_rejected(wheels):
     with refused(RuntimeError, "Nothing"):
         press.cancel(what="SET_UP")
 
@@ -158,7 +149,7 @@ def test_nothing_to_remove_test_or_cancel_is_rejected(wheels):
 def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, tmp_path, monkeypatch):
     with served(online, stalls="torch") as (index, handler):
         own_index(monkeypatch, index)
-        session.start(operators.installing())
+        session.start(ui_setup.installing())
         until(lambda: session.tick() is None or any(path.startswith("/torch-") for path in handler.asked))
         layout = Layout()
         assert not preferences.draw_set_up(layout)
@@ -168,25 +159,22 @@ def test_while_one_is_under_way_a_second_is_rejected_and_cancel_ends_it(online, 
         assert press.cancel(what="SET_UP") == {"FINISHED"}
     assert not session.busy
     assert session.notice.startswith("Cancelled")
-    assert known.known().state == "broken"
+    assert known().state == "broken"
 
 
-def test_an_existing_python_goes_first_and_is_tried(wheels, monkeypatch):
+def test_an_existing_python_goes_first(wheels, monkeypatch):
     monkeypatch.setenv(VARIABLE, "/no/such/python")
-    assert known.known().line == f"Uses /no/such/python, named by the environment variable {VARIABLE}"
-    with refused(RuntimeError, "/no/such/python"):
-        press.test_backend()
+    assert known().line == f"Uses /no/such/python, named by the environment variable {VARIABLE}"
 
 
 def test_a_named_python_has_no_tick_before_it_was_tried(wheels, monkeypatch):
-    monkeypatch.setattr(known, "tried", tried := {})
+    monkeypatch.setattr(preferences, "tried", tried := {})
     monkeypatch.setenv(VARIABLE, "/some/python")
     for works, icon in ((None, "QUESTION"), (False, "ERROR"), (True, "CHECKMARK")):
         if works is not None:
             tried[Path("/some/python")] = works
-        assert preferences._icon(known.known()) == icon
-        assert ("Not tested yet: press Test" in said(draw_preferences())) == (works is None)
-        assert known.known().usable
+        assert preferences._icon(known()) == icon
+        assert known().usable
 
 
 def test_another_python_clears_what_the_one_before_failed_at(wheels, monkeypatch):
@@ -202,7 +190,7 @@ def test_another_python_clears_what_the_one_before_failed_at(wheels, monkeypatch
 
 
 def test_a_machine_without_packages_gets_an_error_with_a_remedy(online, monkeypatch):
-    monkeypatch.setattr(known, "available", dict)
+    monkeypatch.setattr(ui_setup, "available", dict)
     with refused(RuntimeError, "environment"):
         press.set_up_backend()
     layout = Layout()
@@ -221,7 +209,7 @@ def test_set_up_is_rejected_while_a_person_is_made(online, monkeypatch):
 def test_disabling_the_extension_ends_a_set_up(online, monkeypatch):
     with served(online, stalls="torch") as (index, _):
         own_index(monkeypatch, index)
-        session.start(operators.installing())
+        session.start(ui_setup.installing())
         blender_primdiffusion.unregister()
         blender_primdiffusion.register()
     assert not session.busy

@@ -1,0 +1,292 @@
+"""Set up or repair the backend's private environment, and cancel that; the scene stays as it is.
+
+The viewer build lacks this file.
+"""
+
+from __future__ import annotations
+
+import functools
+import os
+import time
+from pathlib import Path
+
+import bpy
+
+from ..backend import setup
+from ..backend.environment import state_of
+from ..backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
+from ..backend.requests import sentence
+from ..backend.setup import Steps
+from ..engine import drawing_child
+from ..jobs.follow import Reporting
+from ..jobs.queue import queue
+from ..places import EXTENSION, backend_module_path, cache_folder, set_up_folder
+from .declared import SKIP
+from .drawing import draw_lines
+
+LOCKS = Path(__file__).resolve().parents[1] / "requirements"
+OWN_LOCK = "requirements.txt"
+"""In a folder of wheels: a list of packages that goes before ours."""
+TICK_S = 0.2
+_PRINT_S = 2.0
+"""Between lines of progress on the console in background mode."""
+_LINE_BYTES_PER_S = 50e6 / 8
+"""Assumed speed of the network: 50 Mbit/s."""
+_UNPACKED_BYTES_PER_S = 30e6
+_SELF_TEST_S = 30.0
+_ONLINE = (
+    "Blender may not use the network: allow it in System > Network > Allow Online Access, or install from a folder"
+)
+
+
+class SetUpSession:
+    """Runs the steps of a set-up. All methods are for Blender's main thread."""
+
+    def __init__(self) -> None:
+        self.message = ""
+        self.fraction = 0.0
+        self.error = ""
+        """Why the last one failed, in a sentence."""
+        self.notice = ""
+        """How the last one ended otherwise."""
+        self._steps: Steps | None = None
+
+    @property
+    def busy(self) -> bool:
+        """Whether the backend is being set up."""
+        return self._steps is not None
+
+    def start(self, steps: Steps) -> None:
+        """Begin at the next tick."""
+        self._steps, self.error, self.notice, self.message, self.fraction = steps, "", "", "Starting", 0.0
+
+    def tick(self) -> bool:
+        """Continue; True when something visible changed. At the end `notice` or `error` is set."""
+        if self._steps is None:
+            return False
+        before = (self.message, self.fraction)
+        try:
+            step = next(self._steps)
+        except StopIteration as done:
+            self._steps, self.notice = None, done.value
+        except (RuntimeError, OSError) as error:
+            self._steps, self.error = None, sentence(error)
+        else:
+            self.message, self.fraction = step.message, step.fraction
+        return not self.busy or before != (self.message, self.fraction)
+
+    def cancel(self) -> None:
+        """End the set-up and its processes at once."""
+        if self._steps is not None:
+            self._steps.close()
+            self._steps, self.notice = None, "Cancelled; what has been downloaded is used by the next Set Up Backend"
+
+
+session = SetUpSession()
+"""One for all windows."""
+
+
+def follow_session(operator: bpy.types.Operator) -> set[str]:
+    """Follow the session: by a timer with a window, by waiting in background mode, which reports an error."""
+    if not bpy.app.background:
+        if not bpy.app.timers.is_registered(follow):
+            bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
+        return {"FINISHED"}
+    printed = 0.0
+    try:
+        while session.busy:
+            if session.tick() and session.busy and time.monotonic() - printed > _PRINT_S:
+                printed = time.monotonic()
+                print(f"PrimDiffusion: {session.message}", flush=True)
+            time.sleep(TICK_S / 4)
+    finally:
+        session.cancel()
+    if session.error:
+        operator.report({"ERROR"}, session.error)
+        return {"CANCELLED"}
+    print(f"PrimDiffusion: {session.notice}", flush=True)
+    return {"FINISHED"}
+
+
+def follow() -> float | None:
+    """The timer."""
+    if session.tick():
+        redraw()
+    return TICK_S if session.busy else None
+
+
+def redraw() -> None:
+    """Redraw sidebars and preferences."""
+    for window in bpy.context.window_manager.windows:
+        for area in window.screen.areas:
+            if area.type in {"VIEW_3D", "PREFERENCES"}:
+                area.tag_redraw()
+
+
+@functools.cache
+def machine() -> Machine:
+    """The machine we run on."""
+    return this_machine()
+
+
+@functools.lru_cache(maxsize=16)
+def read_once(path: Path) -> Lock:
+    """The lock in a file. Raises OSError, ValueError."""
+    return read_lock(path)
+
+
+@functools.cache
+def available() -> dict[str, Path]:
+    """The locks for this machine, by device."""
+    return locks_for(LOCKS, machine().platform, machine().python)
+
+
+def chosen() -> tuple[str, Lock, str]:
+    """What would be set up: the device, its packages, and a note or "".
+
+    Raises ValueError in a sentence.
+    """
+    addon = bpy.context.preferences.addons.get(EXTENSION)
+    wish = addon.preferences.compute.lower() if addon is not None else "automatic"
+    compute, note = chosen_compute(machine(), wish, available())
+    return compute, read_once(available()[compute]), note
+
+
+def is_outdated(about: dict) -> bool:
+    """Whether the environment with this mark was made of another lock than the extension's of now."""
+    path = LOCKS / str(about.get("lock_name", ""))
+    return path.is_file() and read_once(path).digest != about.get("lock")
+
+
+def installing(wheels: Path | None = None) -> Steps:
+    """Steps of a set-up from the package index, or from a folder of wheels, whose own lock takes precedence.
+
+    Raises ValueError where there are no packages for this machine or Blender may not use the network, and OSError.
+    """
+    compute, lock, _ = chosen()
+    if wheels is None and not bpy.app.online_access:
+        raise ValueError(setup.OFFLINE)
+    if wheels is not None and (wheels / OWN_LOCK).is_file():
+        lock = read_lock(wheels / OWN_LOCK)  # the user may have changed it since
+    module_path = backend_module_path()
+    if module_path is None:
+        raise ValueError("the extension lacks its backend: install its zip again")
+    return setup.set_up(set_up_folder(), lock, compute, module_path, cache_folder(), wheels)
+
+
+def draw_progress(layout: bpy.types.UILayout, width: int) -> None:
+    """The bar, the current step below it (a bar cuts long texts), and Cancel."""
+    layout.progress(factor=session.fraction, text=f"{session.fraction:.0%}")
+    draw_lines(layout, session.message, "BLANK1", width)
+    layout.operator("primdiffusion.cancel", icon="CANCEL").what = "SET_UP"
+
+
+def draw_cost(layout: bpy.types.UILayout, width: int) -> bool:
+    """The cost of a set-up, and what prevents it; returns whether it is possible on this machine."""
+    try:
+        _, lock, note = chosen()
+    except (ValueError, OSError) as error:
+        draw_lines(layout, sentence(error), "ERROR", width)
+        return False
+    draw_lines(layout, cost(lock), "BLANK1", width)
+    if note:
+        draw_lines(layout, note, "INFO", width)
+    if not bpy.app.online_access:
+        draw_lines(layout, _ONLINE, "INTERNET_OFFLINE", width)
+    return True
+
+
+def draw_button(layout: bpy.types.UILayout, width: int, *, broken: bool) -> bool:
+    """For a sidebar: the cost and the button; what prevents it, and False, where there are no packages."""
+    possible = draw_cost(layout, width)
+    if possible:
+        text, icon = ("Repair", "TOOL_SETTINGS") if broken else ("Set Up Backend", "IMPORT")
+        layout.operator("primdiffusion.set_up_backend", text=text, icon=icon).repair = broken
+    return possible
+
+
+def draw_private(layout: bpy.types.UILayout, width: int, *, there: bool) -> None:
+    """For the preferences: what was found, the cost and all buttons; `there`: an environment to repair."""
+    draw_lines(layout, f"Found: {machine().described}", "SYSTEM", width)
+    possible = draw_cost(layout, width)
+    row = layout.row()
+    row.enabled = possible
+    row.operator("primdiffusion.set_up_backend", icon="IMPORT")
+    row.operator("primdiffusion.set_up_backend", text="Install from Folder", icon="FILE_FOLDER").choose = True
+    if there:
+        row.operator("primdiffusion.set_up_backend", text="Repair", icon="TOOL_SETTINGS").repair = True
+
+
+def draw_result(layout: bpy.types.UILayout, width: int) -> None:
+    """How the last set-up ended."""
+    if session.error:
+        draw_lines(layout, session.error, "ERROR", width)
+    elif session.notice:
+        draw_lines(layout, session.notice, "INFO", width)
+
+
+def cost(lock: Lock) -> str:
+    """The cost of a set-up, as a sentence."""
+    seconds = lock.download_bytes / _LINE_BYTES_PER_S + lock.installed_bytes / _UNPACKED_BYTES_PER_S + _SELF_TEST_S
+    return (
+        f"Downloads {gigabytes(lock.download_bytes)}, takes {gigabytes(lock.installed_bytes)} on disk, "
+        f"about {max(round(seconds / 60), 1)} min at 50 Mbit/s"
+    )
+
+
+def gigabytes(size: float) -> str:
+    """Bytes in GB or MB."""
+    return f"{size / 1e9:.1f} GB" if size >= 1e9 else f"{size / 1e6:.0f} MB"
+
+
+class PRIMDIFFUSION_OT_set_up_backend(Reporting, bpy.types.Operator):
+    """Download the backend's packages into a private environment and test it"""
+
+    bl_idname = "primdiffusion.set_up_backend"
+    bl_label = "Set Up Backend"
+    described_by = ("choose", "repair")
+
+    repair: bpy.props.BoolProperty(name="Repair", description="Reinstall the backend", options=SKIP)
+    choose: bpy.props.BoolProperty(
+        name="Install from Folder",
+        description="Set up the backend from a folder of wheels, without a network; every file is checked against its "
+        "known hash",
+        options=SKIP,
+    )
+    directory: bpy.props.StringProperty(
+        name="Folder", description="Folder of wheels; empty: they are downloaded", subtype="DIR_PATH", options=SKIP
+    )
+    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
+
+    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
+        if not self.choose:
+            return self.execute(context)
+        context.window_manager.fileselect_add(self)
+        return {"RUNNING_MODAL"}
+
+    def act(self, _context: bpy.types.Context) -> set[str]:
+        if session.busy:
+            raise ValueError("the backend is being set up already; wait for it, or press Cancel")
+        wheels = None
+        if self.choose or self.directory:
+            wheels = Path(bpy.path.abspath(self.directory))
+            if not os.path.isdir(wheels):
+                raise ValueError(f"{self.directory!r:.200} is not a folder: choose the one that holds the wheels")
+        state, about = state_of(set_up_folder())
+        if wheels is None and not self.repair and state == "ready" and about.get("compute") == chosen()[0]:
+            self.report({"INFO"}, "the backend is set up already; press Repair to reinstall it")
+            return {"FINISHED"}
+        steps = installing(wheels)
+        if queue.busy:
+            raise ValueError("the backend is at work; wait until it is done, or press Cancel")
+        queue.close()  # children that run on the environment: their files could not be replaced
+        drawing_child.close()
+        session.start(steps)
+        return follow_session(self)
+
+
+def unregister() -> None:
+    """End a running set-up."""
+    session.cancel()
+    if bpy.app.timers.is_registered(follow):
+        bpy.app.timers.unregister(follow)

@@ -1,1 +1,0 @@
-"""Preferences, and the backend's private environment: set up, repaired, removed, tested."""
