@@ -83,7 +83,7 @@ def _allocated(folder: Path, size: int) -> Path:
             os.ftruncate(descriptor, size)
     except OSError:
         os.close(descriptor)
-        os.unlink(path)
+        remove_file(Path(path), folder)
         raise
     os.close(descriptor)
     return Path(path)

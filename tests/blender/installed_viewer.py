@@ -59,6 +59,8 @@ report["exported"] = sorted(press.export(filepath=str(file), compact=True))
 report["bytes"] = file.stat().st_size
 report["imported"] = sorted(press.import_human(filepath=str(file)))
 report["humans"] = len(human.humans(bpy.context.scene))
+press.set_representation(representation="VOLUMES")
+press.volumes_in_viewport()
 report["volumes"] = len(list(Path(bpy.app.tempdir).rglob("*.vdb")))
 try:
     press.generate(seed=7)
