@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[2]
 BACKEND, EXTENSION = ROOT / "backend" / "primdiffusion", ROOT / "blender_primdiffusion"
 ALLOWED = {
-    "zipfile": {"formats/arrays.py", "torch_file.py", "export/usd.py"},
+    "zipfile": {"formats/arrays.py", "torch_file.py"},
     "numpy.load": {"formats/arrays.py"},
     "numpy.lib.format.read_array": set(),
     "json.load": set(),

@@ -13,7 +13,6 @@ from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.export.gaussians import gaussians_of, write_gaussians
 from primdiffusion.export.proxy import ARRAYS, TEXTURE, mesh_proxy, write_proxy_arrays, write_proxy_glb, write_proxy_obj
-from primdiffusion.export.usd import write_proxy_usdz
 from primdiffusion.formats.answers import GaussiansAnswer, HumanAnswer, ProxyAnswer
 from primdiffusion.formats.requests import GaussiansRequest, OpenHumanRequest, ProxyRequest
 from primdiffusion.formats.whole_files import staged
@@ -91,8 +90,6 @@ def run(command: ExportCommand) -> None:
         write_gaussians(command.out, gaussians_of(place_on_floor(human, pose), command.gaussians))
     elif command.out.suffix.lower() == ".glb":
         write_proxy_glb(command.out, mesh_proxy(human, command), human.provenance)
-    elif command.out.suffix.lower() == ".usdz":
-        write_proxy_usdz(command.out, mesh_proxy(human, command), human.provenance)
     else:
         write_proxy_obj(command.out, mesh_proxy(human, command))
     print(command.out)

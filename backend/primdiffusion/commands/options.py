@@ -115,12 +115,12 @@ class RenderCommand(PoseOptions):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ExportCommand(ProxySettings, PoseOptions):
-    """Export a human to other programs; the extension of --out selects the format: .glb, .usdz, .obj or .ply."""
+    """Export a human to other programs; the extension of --out selects the format: .glb, .obj or .ply."""
 
     human: Person
     """A .human file (or .human.safetensors)."""
-    out: Annotated[Path, Ending((".glb", ".usdz", ".obj", ".ply"))]
-    """.glb, .usdz: textured mesh with a skeleton; .obj: the mesh alone, with .mtl and .png; .ply: 3D Gaussians."""
+    out: Annotated[Path, Ending((".glb", ".obj", ".ply"))]
+    """.glb: textured mesh with a skeleton; .obj: the mesh alone, with .mtl and .png; .ply: 3D Gaussians."""
     gaussians: Count = GaussiansRequest.limit
     """Largest number of Gaussians; about 130,000 of a human are visible."""
 

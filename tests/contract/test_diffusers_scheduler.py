@@ -1,13 +1,18 @@
-"""The adapter, beside diffusers' own schedulers with the same betas."""
+"""The example of a scheduler, beside diffusers' own schedulers with the same betas."""
+
+import sys
+from pathlib import Path
 
 import pytest
 import torch
 from diffusers import DDIMScheduler, DDPMScheduler, DPMSolverMultistepScheduler
-from primdiffusion.diffusion.diffusers_scheduler import PrimDiffusionScheduler
 from primdiffusion.diffusion.model import sample
 from primdiffusion.formats import requests
 from support.errors import refused
 from tiny_model import tiny_model
+
+sys.path.insert(0, str(Path(__file__).parents[2] / "examples"))
+from diffusers_scheduler import PrimDiffusionScheduler
 
 SHAPE = (2, 3, 4, 4)
 GUIDANCE = requests.Conditioning.guidance

@@ -15,11 +15,10 @@ from diffusers.configuration_utils import ConfigMixin, register_to_config
 from diffusers.schedulers.scheduling_ddim import DDIMSchedulerOutput
 from diffusers.schedulers.scheduling_utils import SchedulerMixin
 from jaxtyping import Float, Int
-from torch import Tensor
-
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import SAMPLERS, Generators, ddim_step, ddpm_step, dpmpp_2m_step
 from primdiffusion.diffusion.schedule import CHAINS, CLEAN, SCHEDULES, schedule_name
+from torch import Tensor
 
 PREDICTIONS = ("sample", "epsilon")
 
