@@ -49,7 +49,8 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     bpy.ops.wm.save_as_mainfile(filepath=str(arguments.blend))
 
     start = time.perf_counter()
-    bpy.ops.primdiffusion.generate(seed=arguments.seed, steps=arguments.steps)
+    bpy.context.scene.primdiffusion.steps = arguments.steps
+    bpy.ops.primdiffusion.generate(seed=arguments.seed)
     pressed = time.perf_counter() - start
 
     scene_human = import_module(f"{MODULE}.scene.human")

@@ -30,7 +30,7 @@ _SHAPES = (
     ("GENERATED", "As Generated", "Reset the selected human to the shape of the last edit, or of generation"),
     ("OTHER", "Other Human", "Copy the body shape of the other human to the selected human"),
 )
-_SETTINGS = {"GIVEN": ("betas", "height", "weight"), "RANDOM": ("seed", "spread"), "GENERATED": (), "OTHER": ("other",)}
+_SETTINGS = {"GIVEN": ("betas", "height", "weight"), "RANDOM": ("seed", "spread"), "GENERATED": (), "OTHER": ()}
 """Properties of the operator that matter, by shape."""
 
 
@@ -184,9 +184,6 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         min=0.0,
         max=2.0,
     )
-    other: bpy.props.StringProperty(
-        name="Other Human", description="Name of the other human. Not given: the panel's", options=SKIP
-    )
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
@@ -224,7 +221,7 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         return betas_of_measures(shape_model_of(person), betas, height, weight)
 
     def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
-        other = other_human(context, person, self.other)
+        other = other_human(context, person)
         if len(shape_model_of(other).template) != len(shape_model_of(person).template):
             raise ValueError(
                 f"{other.name!r} stands on another body than {person.name!r}: their shape parameters are not comparable"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import random
 from pathlib import Path
-from typing import Any
 
 import bpy
 from bpy.app.handlers import persistent
@@ -18,9 +17,9 @@ from ..jobs.variations import Variation, VariationsJob, sheet
 from ..scene.build import build_human
 from ..scene.cycles import overlap_warning_in
 from ..scene.place import stand_at_cursor
-from .declared import SKIP, declared, not_given
+from .declared import SKIP, declared
 from .drawing import BackendPanel, draw_job, property_columns, row_unless
-from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed, random_seed
+from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, last_seed, random_seed, sampling, seed_property
 
 COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in (4, 8, 12, 16)]
 
@@ -71,23 +70,20 @@ class _OnSheet(Reporting):
         return bool(sheet.variations)
 
 
-class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
+class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
     """Show several humans to choose from before building them"""
 
     bl_idname = "primdiffusion.variations"
     bl_label = "Show Variations"
     described_by = ("clear", "like")
 
-    count: bpy.props.IntProperty(
-        name="Count", default=0, min=0, max=64, description="How many humans; 0: the panel's", options=SKIP
-    )
+    seed: seed_property()
     like: bpy.props.BoolProperty(
         name="More Like This", description="Variations of a human of the sheet, with the same body", options=SKIP
     )
     index: bpy.props.IntProperty(
         name="Index", default=-1, min=-1, description=f"Of the human for More Like This. {_SELECTED}", options=SKIP
     )
-    amount: not_given(VariationsRequest, "amount", name="Difference")
     clear: bpy.props.BoolProperty(
         name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=SKIP
     )
@@ -98,29 +94,23 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
             clear_before_loading()
             redraw()
             return {"FINISHED"}
-        sampling, like = self._sampling_of_sheet(context), {}
+        settings, like = context.scene.primdiffusion_variations, {}
         if self.like:
             around = _only(_targets(self.index), "select only the one to vary")
-            amount = self.chosen("amount", context.scene.primdiffusion_variations)
-            like = {"person": str(around.person), "amount": amount, "title": f"Like seed {around.seed}"}
-        from_panel = context.scene.primdiffusion_variations.seeds != "RANDOM" and not self.like
+            like = {"person": str(around.person), "amount": settings.amount, "title": f"Like seed {around.seed}"}
+        from_panel = settings.seeds != "RANDOM" and not self.like
         first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
-        return submit(self, context, VariationsJob(self._seeds(context, first), sampling, **like))
+        fields = sampling(context.scene.primdiffusion)
+        if settings.quality == "DRAFT":
+            fields |= zip(("steps", "sampler"), STEPS_AND_SAMPLER["DRAFT"], strict=True)
+        return submit(self, context, VariationsJob(_seeds(first, int(settings.count)), fields, **like))
 
-    def _seeds(self, context: bpy.types.Context, first: int) -> tuple[int, ...]:
-        """Seeds from `first` on, random ones where it is negative. Raises ValueError."""
-        count = self.count or int(context.scene.primdiffusion_variations.count)
-        if first < 0:
-            return tuple(random.sample(range(LARGEST_SEED + 1), count))
-        return tuple(range(first, last_seed(first, count) + 1))
 
-    def _sampling_of_sheet(self, context: bpy.types.Context) -> dict[str, Any]:
-        """As `sampling`, with the quality of the sheet."""
-        sampling = self.sampling(context.scene.primdiffusion)
-        if context.scene.primdiffusion_variations.quality == "DRAFT":
-            steps, sampler = STEPS_AND_SAMPLER["DRAFT"]
-            sampling |= {"steps": self.steps or steps, "sampler": self.sampler if self.given("sampler") else sampler}
-        return sampling
+def _seeds(first: int, count: int) -> tuple[int, ...]:
+    """Seeds from `first` on, random ones where it is negative. Raises ValueError."""
+    if first < 0:
+        return tuple(random.sample(range(LARGEST_SEED + 1), count))
+    return tuple(range(first, last_seed(first, count) + 1))
 
 
 class PRIMDIFFUSION_OT_select_variation(_OnSheet, bpy.types.Operator):

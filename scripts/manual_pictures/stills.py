@@ -60,9 +60,10 @@ def group(folder: Path) -> list[Path]:
 def redressed(folder: Path) -> list[Path]:
     """One person, then in a suit, then in a tee and shorts."""
     scene = _stage(folder, 0, "Contrapposto")
-    pictures = [render(scene, folder / "before.png", SIZE)]
+    pictures, settings = [render(scene, folder / "before.png", SIZE)], scene.primdiffusion_edit
     for number, (parts, outfit) in enumerate((({"clothes"}, "suit"), ({"clothes"}, "tee and shorts"))):
-        bpy.ops.primdiffusion.redress(parts=parts, attributes=f"outfit={outfit}", seed=5)
+        settings.parts, settings.attributes.outfit = parts, outfit
+        bpy.ops.primdiffusion.redress(seed=5)
         pictures.append(render(scene, folder / f"after{number}.png", SIZE))
     return pictures
 

@@ -78,10 +78,10 @@ for operator, words in (
         report["rejected"].append(str(error))
 if program is not None:
     os.environ["PATH"] = str(program.parent)
-    report["generated"] = [sorted(press.generate(seed=7, steps=2))]
+    report["generated"] = [sorted(press.generate(seed=7))]
     os.environ["PATH"] = ""
     bpy.context.preferences.addons[module].preferences.backend_python = str(program)
-    report["generated"].append(sorted(press.generate(seed=8, steps=2)))
+    report["generated"].append(sorted(press.generate(seed=8)))
     made = human.humans(bpy.context.scene)[2:]
     report["boxes"] = [sum(obj.type == "VOLUME" for obj in human.parts_of(one)) for one in made]
     report["provenance"] = [json.loads(one[human.MARK])["seed"] for one in made]

@@ -20,7 +20,8 @@ ops = bpy.ops.primdiffusion
 
 @pytest.fixture
 def person(real_child):
-    ops.generate(seed=1, steps=2)
+    real_child.scene.primdiffusion.steps = 2
+    ops.generate(seed=1)
     return humans(real_child.scene)[0]
 
 

@@ -34,7 +34,8 @@ def use_seed(**given):
 @pytest.fixture
 def shown_people(addon):
     """A sheet of seeds 11 to 14."""
-    ops.variations(seed=11, count=4, steps=2)
+    addon.scene.primdiffusion_variations.count = "4"
+    ops.variations(seed=11)
     return sheet
 
 
@@ -60,19 +61,21 @@ def test_variations_are_files_and_nothing_enters_the_scene(addon, shown_people):
 
 
 def test_the_panels_settings_are_requested_and_random_seeds_differ_each_time(addon):
-    addon.scene.primdiffusion.quality = "HIGH"
-    ops.variations(count=4)
+    settings = addon.scene.primdiffusion_variations
+    addon.scene.primdiffusion.quality, settings.count = "HIGH", "4"
+    ops.variations()
     first = seeds()
     asked = sent(sheet.variations[0].person)
     assert (asked["steps"], asked["sampler"], asked["size"]) == (60, "ddim", 256)
-    addon.scene.primdiffusion_variations.quality = "DRAFT"
+    settings.quality, settings.count = "DRAFT", "8"
     ops.variations()
     assert len(set(seeds())) == 8
     assert set(first).isdisjoint(seeds())
     asked = sent(sheet.variations[0].person)
     assert (asked["steps"], asked["sampler"]) == (8, "dpmpp_2m")
-    addon.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
-    ops.variations(count=4, steps=3, sampler="ddpm")
+    settings.seeds, settings.quality, settings.count = "CONSECUTIVE", "PANEL", "4"
+    addon.scene.primdiffusion.sampler = "ddpm"
+    ops.variations()
     assert seeds() == [7, 8, 9, 10]
     assert sent(sheet.variations[0].person)["sampler"] == "ddpm"
 
@@ -114,27 +117,28 @@ def test_nothing_selected_a_wrong_number_and_no_sheet_are_rejected(addon):
     for call in (more_like, use_seed):
         with refused(RuntimeError, "Show Variations"):
             call()
-    ops.variations(seed=11, count=2, steps=1)
+    ops.variations(seed=11)
     with refused(RuntimeError, "variation"):
         ops.build_variation()
-    with refused(RuntimeError, "variation 2"):
-        ops.select_variation(index=2)
+    with refused(RuntimeError, "variation 8"):
+        ops.select_variation(index=8)
     for index in (0, 1):
         ops.select_variation(index=index)
     for call in (more_like, use_seed):
         with refused(RuntimeError, "2 variations"):
             call()
-    with refused(RuntimeError, "2 seeds", "2147483647"):
-        ops.variations(seed=2**31 - 1, count=2)
+    with refused(RuntimeError, "8 seeds", "2147483647"):
+        ops.variations(seed=2**31 - 1)
 
 
 def test_more_like_this_requests_variants_of_the_chosen_human(addon, shown_people):
     ops.select_variation(index=1)
     kept = sheet.variations[1].person
-    assert more_like(count=3, seed=20, amount=0.25, steps=4) == {"FINISHED"}
+    addon.scene.primdiffusion_variations.amount, addon.scene.primdiffusion.steps = 0.25, 4
+    assert more_like(seed=20) == {"FINISHED"}
     asked = sent(sheet.variations[0].person)
     assert (asked["person"], asked["amount"], asked["steps"]) == (str(kept), 0.25, 4)
-    assert seeds() == [20, 21, 22]
+    assert seeds() == [20, 21, 22, 23]
     assert sheet.title == "Like seed 12"
     with refused(RuntimeError, "generated"):
         use_seed(index=0)
@@ -147,7 +151,7 @@ def test_a_seed_is_put_into_the_panel_and_locked(addon, shown_people):
 
 def test_a_failure_leaves_the_sheet_that_was_there(addon, shown_people):
     with refused(RuntimeError, "checkpoint"):
-        ops.variations(seed=FAILS, count=2, steps=1)
+        ops.variations(seed=FAILS)
     assert seeds() == [11, 12, 13, 14]
     assert all(variation.person.is_file() for variation in sheet.variations)
     assert "damaged" in error_of("variations")
@@ -230,7 +234,7 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
 
     monkeypatch.setattr("blender_primdiffusion.jobs.variations.shutil.move", full)
     with refused(RuntimeError, "space"):
-        ops.variations(seed=40, count=2, steps=1)
+        ops.variations(seed=40)
     assert seeds() == [11, 12, 13, 14]
     assert len(files_left()) == 1
 

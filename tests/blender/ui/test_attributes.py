@@ -55,34 +55,21 @@ def test_menus_hold_what_the_checkpoint_knows_and_any(known):
 
 
 def test_unchosen_attributes_are_not_requested(addon, known):
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     assert "attributes" not in sent(addon)
     known.sex, known.use_height, known.height, known.use_weight = "female", True, 1.82, True
-    addon.scene.primdiffusion.sampler = "dpmpp_2m"
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    addon.scene.primdiffusion.sampler, addon.scene.primdiffusion.guidance = "dpmpp_2m", 3.0
+    bpy.ops.primdiffusion.generate(seed=7)
     asked = sent(addon)
     assert asked["attributes"] == {"sex": "female", "height": 1.82}, "the checkpoint knows no weight"
-    assert (asked["guidance"], asked["sampler"]) == (2.0, "dpmpp_2m")
-
-
-def test_a_script_asks_past_the_panel(addon, known):
-    known.sex = "female"
-    wanted = {"attributes": "age=old, outfit=fitted tee and jeans; height=1.9", "guidance": 3.0, "sampler": "ddpm"}
-    bpy.ops.primdiffusion.generate(seed=7, steps=1, **wanted)
-    asked = sent(addon)
-    assert asked["attributes"] == {"age": "old", "outfit": "fitted tee and jeans", "height": 1.9}
-    assert (asked["guidance"], asked["sampler"]) == (3.0, "ddpm")
-    bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="")
-    assert "attributes" not in sent(addon)
-    with refused(RuntimeError, "tall"):
-        bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="tall")
+    assert (asked["guidance"], asked["sampler"]) == (3.0, "dpmpp_2m")
 
 
 def test_redressing_has_attributes_of_its_own(addon, known):
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     known.sex = "female"
     addon.scene.primdiffusion_edit.attributes.outfit = "suit"
-    bpy.ops.primdiffusion.redress(seed=8, steps=1)
+    bpy.ops.primdiffusion.redress(seed=8)
     asked = sent(addon)
     assert (asked["attributes"], asked["region"]) == ({"outfit": "suit"}, ["top"])
 
