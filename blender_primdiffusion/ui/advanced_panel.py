@@ -101,26 +101,17 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
     described_by = ("what",)
 
     what: bpy.props.EnumProperty(name="Merge", description="What is merged", items=_MERGES, options=SKIP)
-    voxel: bpy.props.FloatProperty(
-        name="Voxel Size",
-        description="Metres. Not given: the panel's",
-        min=0.0005,
-        default=VOXEL,
-        options=SKIP,
-    )
-    frame_start: bpy.props.IntProperty(name="Start", description="Not given: the scene's", options=SKIP)
-    frame_end: bpy.props.IntProperty(name="End", description="Not given: the scene's", options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         if self.what == "NOTHING":
             _unmerge(person)
             bpy.ops.ed.undo_push(message="Unmerge")
             return {"FINISHED"}
-        target, voxel = HumanTarget.of(person), self.chosen("voxel", context.scene.primdiffusion_merging)
+        target, voxel = HumanTarget.of(person), context.scene.primdiffusion_merging.voxel
         if self.what == "POSE":
             moment = _moment(person, context.evaluated_depsgraph_get())
             return submit(self, context, MergeJob(target, moment, voxel))
-        start, end = (self.chosen(name, context.scene) for name in ("frame_start", "frame_end"))
+        start, end = context.scene.frame_start, context.scene.frame_end
         if not 1 < end - start + 1 <= _MOST_FRAMES:
             raise ValueError(
                 f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
@@ -164,7 +155,7 @@ class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
         subtype="DISTANCE",
         unit="LENGTH",
         default=VOXEL,
-        min=0.001,
+        min=0.0005,
         max=0.1,
         soft_min=0.003,
         soft_max=0.02,

@@ -28,7 +28,8 @@ def engine_and_cycles(folder: Path) -> list[Path]:
     """One person drawn by the engine, and merged in Cycles with an object that reflects them."""
     scene = _stage(folder, 3, "Hands on Hips")
     exact = render(scene, folder / "engine.png", SIZE)
-    bpy.ops.primdiffusion.merge(voxel=0.005)
+    scene.primdiffusion_merging.voxel = 0.005
+    bpy.ops.primdiffusion.merge()
     bpy.ops.primdiffusion.set_up_engine(engine="CYCLES")
     sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
     sun.rotation_euler = (0.6, 0.3, 0.4)
