@@ -30,7 +30,10 @@ from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
 from ..scene.proxy import proxy_of, remove_proxy
 from .declared import SKIP, declared
 from .drawing import property_columns
+from .gallery import FOLDER
 from .on_person import OnPerson
+
+_SAMPLE = "Add a human that comes with the extension to the scene; its data are in the public domain (CC0)"
 
 
 def destination(filepath: str, endings: Sequence[str]) -> Path:
@@ -261,8 +264,12 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
         options=SKIP,
     )
 
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return _SAMPLE if Path(properties.filepath).parent == FOLDER else str(cls.__doc__)
+
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Import a dropped file at once; otherwise open the file browser."""
+        """Import a dropped file, or a sample, at once; otherwise open the file browser."""
         if self.filepath:
             return self.execute(context)
         context.window_manager.fileselect_add(self)

@@ -199,7 +199,6 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
         row = column.row(align=True)
         row.prop(settings, "seed")
         row.prop(settings, "keep_seed", text="", icon="LOCKED" if settings.keep_seed else "UNLOCKED")
-        row.operator("primdiffusion.set_seed", text="", icon="FILE_REFRESH")
         column.prop(settings, "count")
         column = layout.column()
         column.prop(settings, "quality")

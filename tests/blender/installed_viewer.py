@@ -39,7 +39,7 @@ def centres() -> np.ndarray:
 
 report = {"module": module}
 started = time.perf_counter()
-report["added"] = sorted(press.add_from_gallery(human="Ada.human"))
+report["added"] = sorted(press.import_human(filepath=str(Path(human.__file__).parents[1] / "gallery" / "Ada.human")))
 report["seconds"] = time.perf_counter() - started
 person = human.humans(bpy.context.scene)[0]
 armature = person
