@@ -133,7 +133,7 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     weight: bpy.props.FloatProperty(name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100)
 
 
-def asked(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
+def chosen_attributes(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
     """The chosen attributes that the checkpoint knows, as parameters of the child."""
     vocabulary = known()
     chosen: Attributes = {}

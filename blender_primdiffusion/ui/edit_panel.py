@@ -22,11 +22,11 @@ from ..places import backend_is_named
 from ..scene.edit import end_painting, painted_weights, start_painting
 from ..scene.human import BODY_MARK, body_of, humans
 from ..scene.payload import session_file
-from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, title
+from .attributes import PRIMDIFFUSION_PG_attributes, chosen_attributes, draw_attributes, title
 from .declared import SKIP, declared
 from .drawing import draw_job, property_columns
 from .generate_panel import seed_property
-from .on_person import HumanPanel, OnPerson, other_human
+from .on_person import HumanOperator, HumanPanel, other_human
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
@@ -119,7 +119,7 @@ def painting(context: bpy.types.Context) -> bool:
     return active is not None and active.mode == "WEIGHT_PAINT" and BODY_MARK in active
 
 
-class _Edit(OnPerson):
+class _Edit(HumanOperator):
     """Base of the edits, with the panel's settings."""
 
     job: str
@@ -172,13 +172,13 @@ class PRIMDIFFUSION_OT_redress(_SeededEdit, bpy.types.Operator):
     """Generate a region of the selected human again; everything else stays exactly as it is"""
 
     bl_idname = "primdiffusion.redress"
-    bl_label = "Re-dress Region"
+    bl_label = "Regenerate Region"
     job = "RedressJob"
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         params: dict[str, Any] = {"region": _region(settings, person), "seed": self.seed_of(settings)}
-        if wanted := asked(settings.attributes):
+        if wanted := chosen_attributes(settings.attributes):
             params |= {"attributes": wanted, "guidance": context.scene.primdiffusion.guidance}
         return params
 

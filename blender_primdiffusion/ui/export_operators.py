@@ -31,7 +31,7 @@ from ..scene.proxy import proxy_of, remove_proxy
 from .declared import SKIP, declared
 from .drawing import property_columns
 from .gallery import FOLDER
-from .on_person import OnPerson
+from .on_person import HumanOperator
 
 _SAMPLE = "Add a human that comes with the extension to the scene; its data are in the public domain (CC0)"
 
@@ -139,7 +139,7 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
 
 
-class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
     """Export the selected human: for another scene, as a textured mesh, as Gaussians, as volumes"""
 
     bl_idname = "primdiffusion.export"
@@ -218,7 +218,7 @@ class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
         return ExportMeshJob(target, int(settings.texture_px), settings.triangles, path, kind, frames)
 
 
-class PRIMDIFFUSION_OT_add_proxy(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_add_proxy(HumanOperator, bpy.types.Operator):
     """Add a textured mesh of the selected human that follows the armature: fast in any viewport and engine"""
 
     bl_idname = "primdiffusion.add_proxy"
@@ -230,7 +230,7 @@ class PRIMDIFFUSION_OT_add_proxy(OnPerson, bpy.types.Operator):
         return submit(self, context, AddProxyJob(target, int(settings.texture_px), settings.triangles))
 
 
-class PRIMDIFFUSION_OT_show_proxy(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_show_proxy(HumanOperator, bpy.types.Operator):
     """Choose how the selected human is shown: as volumes or as the mesh proxy; or remove the mesh proxy"""
 
     bl_idname = "primdiffusion.show_proxy"

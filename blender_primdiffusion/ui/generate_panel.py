@@ -16,7 +16,7 @@ from ..jobs.generate import GenerateJob
 from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
-from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes
+from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, chosen_attributes, draw_attributes
 from .backend_state import draw_set_up
 from .declared import SKIP, declared
 from .drawing import BackendPanel, SidebarPanel, draw_job, draw_lines, property_columns
@@ -115,7 +115,7 @@ def seed_property():
 
 def sampling(settings: bpy.types.PropertyGroup) -> dict[str, Any]:
     """Fields of `GenerateRequest` besides the seed."""
-    wanted = asked(settings.attributes)
+    wanted = chosen_attributes(settings.attributes)
     fields = {name: getattr(settings, name) for name in ("steps", "sampler", "guidance")}
     return fields | ({"attributes": wanted} if wanted else {})
 

@@ -13,7 +13,7 @@ from .declared import SKIP
 from .drawing import SidebarPanel
 
 
-class OnPerson(Reporting):
+class HumanOperator(Reporting):
     """Base of operators on one human, which it finds; subclasses define `run`."""
 
     human: bpy.props.StringProperty(

@@ -36,7 +36,7 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
         name="Seeds",
         description="Seeds of the humans",
         items=[
-            ("CONSECUTIVE", "From Seed On", "The seed of the panel Generate and the following ones"),
+            ("CONSECUTIVE", "Consecutive Seeds", "The seed of the panel Generate and the following ones"),
             ("RANDOM", "Random", "New random seeds each time"),
         ],
         default="RANDOM",

@@ -81,14 +81,14 @@ def test_a_choice_survives_saving_and_is_left_out_with_a_checkpoint_that_does_no
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     group = bpy.context.scene.primdiffusion.attributes
-    assert attributes.asked(group) == {"outfit": "suit"}
+    assert attributes.chosen_attributes(group) == {"outfit": "suit"}
     others = {**VOCABULARY, "categories": {"outfit": ["dress", "robe", "suit"]}}
     path = checkpoint(tmp_path / "others.safetensors", others)
     monkeypatch.setattr(attributes, "preference", lambda _: str(path))
-    assert attributes.asked(group) == {"outfit": "suit"}, "by its name, not by its place"
+    assert attributes.chosen_attributes(group) == {"outfit": "suit"}, "by its name, not by its place"
     checkpoint(path, {**VOCABULARY, "categories": {"outfit": ["robe"]}})
     os.utime(path, (1, 1))
-    assert attributes.asked(group) == {}
+    assert attributes.chosen_attributes(group) == {}
 
 
 @pytest.mark.parametrize("contents", [None, b"", b"no checkpoint at all"])
@@ -102,7 +102,7 @@ def test_a_checkpoint_that_cannot_be_read_or_knows_nothing_leaves_the_menus_empt
     layout = MagicMock()
     PRIMDIFFUSION_PT_attributes.draw(SimpleNamespace(layout=layout), addon)
     assert layout.label.call_args.kwargs["text"] == "This checkpoint has no attributes"
-    assert attributes.asked(addon.scene.primdiffusion.attributes) == {}
+    assert attributes.chosen_attributes(addon.scene.primdiffusion.attributes) == {}
 
 
 @pytest.mark.parametrize("vocabulary", [{"categories": {"sex": ["x" * 70_000]}}, {"scalars": {"height": [0, -1]}}])

@@ -28,7 +28,7 @@ from blender_primdiffusion.ui.captures_session import captures
 pytestmark = pytest.mark.any_blender
 SMALL_WINDOW_PX = 620
 """Of the sidebar in a window of 1400 x 900 pixels, above the timeline."""
-MOST_PANELS, MOST_OPERATORS = 20, 55
+MOST_PANELS, MOST_OPERATORS = 20, 40
 
 
 @pytest.fixture
