@@ -49,7 +49,8 @@ def person(arguments: argparse.Namespace) -> dict[str, float]:
     bpy.ops.wm.save_as_mainfile(filepath=str(arguments.blend))
 
     start = time.perf_counter()
-    bpy.ops.primdiffusion.generate(seed=arguments.seed, steps=arguments.steps)
+    bpy.context.scene.primdiffusion.steps = arguments.steps
+    bpy.ops.primdiffusion.generate(seed=arguments.seed)
     pressed = time.perf_counter() - start
 
     scene_human = import_module(f"{MODULE}.scene.human")
@@ -107,7 +108,8 @@ def cycles(arguments: argparse.Namespace) -> dict[str, float]:
     scene = bpy.context.scene
     (bpy.context.view_layer.objects.active,) = humans(scene)
     start = time.perf_counter()
-    bpy.ops.primdiffusion.merge(what="POSE", voxel=arguments.voxel)
+    scene.primdiffusion_merging.voxel = arguments.voxel
+    bpy.ops.primdiffusion.merge()
     merged = time.perf_counter() - start
     yaw = math.radians(arguments.yaw)
     setup_cycles_preview(scene, size=arguments.size, samples=arguments.samples, yaw=yaw, world=0.48)

@@ -177,7 +177,8 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     context.preferences.edit.undo_steps = UNDO_STEPS
     rng = np.random.default_rng(SEED)
     for number in range(arguments.rounds):
-        bpy.ops.primdiffusion.generate(seed=SEED + number, steps=arguments.steps)
+        bpy.context.scene.primdiffusion.steps = arguments.steps
+        bpy.ops.primdiffusion.generate(seed=SEED + number)
         armature = humans(context.scene)[0]
         for bone in armature.pose.bones:
             bone.rotation_quaternion = (1.0, *rng.normal(0, 0.1, 3))

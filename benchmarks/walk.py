@@ -90,7 +90,8 @@ def _generate(folder: Path, log: Path) -> int:
     trace = Trace(ROOT / "blender_primdiffusion", log)
     trace.start()
     try:
-        bpy.ops.primdiffusion.generate(seed=SEED, steps=STEPS)
+        bpy.context.scene.primdiffusion.steps = STEPS
+        bpy.ops.primdiffusion.generate(seed=SEED)
     finally:
         trace.stop()
     blender_primdiffusion.unregister()

@@ -29,9 +29,10 @@ def main(options: list[str]) -> None:
     out.mkdir(parents=True, exist_ok=True)
     bpy.ops.wm.save_as_mainfile(filepath=str(out / "people.blend"))
 
+    scene.primdiffusion.steps = arguments.steps
     for x, seed in zip((-0.6, 0.6), arguments.seeds, strict=True):
         before = set(humans())
-        operators.generate(seed=seed, steps=arguments.steps, count=1)
+        operators.generate(seed=seed)
         (person,) = set(humans()) - before
         person.name = f"Person {seed}"
         person.location.x = x

@@ -89,7 +89,7 @@ class RedressJob(EditJob):
     """Generate a region again."""
 
     kind = method = "inpaint"
-    undo, made = "Re-dress Region", "Re-dressed"
+    undo, made = "Regenerate Region", "Re-dressed"
 
 
 class TransferJob(EditJob):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 import traceback
-from typing import Any
 
 import bpy
 
@@ -106,10 +105,6 @@ class Reporting:
     def given(self, name: str) -> bool:
         """Whether a script or a button has set the property."""
         return self.properties.is_property_set(name)
-
-    def chosen(self, name: str, settings: bpy.types.PropertyGroup) -> Any:
-        """The operator's property if it is set, else the panel's."""
-        return getattr(self if self.given(name) else settings, name)
 
     def execute(self, context: bpy.types.Context) -> set[str]:
         try:

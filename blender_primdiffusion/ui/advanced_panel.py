@@ -29,7 +29,7 @@ from ..scene.volume_nodes import volumes_of
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend
-from .on_person import OnPerson
+from .on_person import HumanOperator
 
 REPRESENTATIONS = (
     (
@@ -44,7 +44,7 @@ REPRESENTATIONS = (
 _MOST_FRAMES = 3_000
 
 
-class PRIMDIFFUSION_OT_set_representation(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_set_representation(HumanOperator, bpy.types.Operator):
     """Choose what renders show of the selected human"""
 
     bl_idname = "primdiffusion.set_representation"
@@ -61,7 +61,7 @@ class PRIMDIFFUSION_OT_set_representation(OnPerson, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_volumes_in_viewport(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_volumes_in_viewport(HumanOperator, bpy.types.Operator):
     """Show or hide the selected human's volumes in viewports; drawn, they take a gigabyte. Renders always have them"""
 
     bl_idname = "primdiffusion.volumes_in_viewport"
@@ -93,7 +93,7 @@ _MERGES = (
 )
 
 
-class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_merge(HumanOperator, bpy.types.Operator):
     """Merge the selected human's volumes into one that Cycles renders much faster, or show its own volumes again"""
 
     bl_idname = "primdiffusion.merge"
@@ -101,26 +101,17 @@ class PRIMDIFFUSION_OT_merge(OnPerson, bpy.types.Operator):
     described_by = ("what",)
 
     what: bpy.props.EnumProperty(name="Merge", description="What is merged", items=_MERGES, options=SKIP)
-    voxel: bpy.props.FloatProperty(
-        name="Voxel Size",
-        description="Metres. Not given: the panel's",
-        min=0.0005,
-        default=VOXEL,
-        options=SKIP,
-    )
-    frame_start: bpy.props.IntProperty(name="Start", description="Not given: the scene's", options=SKIP)
-    frame_end: bpy.props.IntProperty(name="End", description="Not given: the scene's", options=SKIP)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         if self.what == "NOTHING":
             _unmerge(person)
             bpy.ops.ed.undo_push(message="Unmerge")
             return {"FINISHED"}
-        target, voxel = HumanTarget.of(person), self.chosen("voxel", context.scene.primdiffusion_merging)
+        target, voxel = HumanTarget.of(person), context.scene.primdiffusion_merging.voxel
         if self.what == "POSE":
             moment = _moment(person, context.evaluated_depsgraph_get())
             return submit(self, context, MergeJob(target, moment, voxel))
-        start, end = (self.chosen(name, context.scene) for name in ("frame_start", "frame_end"))
+        start, end = context.scene.frame_start, context.scene.frame_end
         if not 1 < end - start + 1 <= _MOST_FRAMES:
             raise ValueError(
                 f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
@@ -164,7 +155,7 @@ class PRIMDIFFUSION_PG_merging(bpy.types.PropertyGroup):
         subtype="DISTANCE",
         unit="LENGTH",
         default=VOXEL,
-        min=0.001,
+        min=0.0005,
         max=0.1,
         soft_min=0.003,
         soft_max=0.02,
@@ -201,7 +192,7 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     page = "rendering"
     sections = [
         (draw_section(layout, "show_as", text="Show As", page=page, section="show-as"), _draw_representation),
-        (draw_section(layout, "look", text="Look in Cycles", page=page, section="look-in-cycles"), _draw_cycles_look),
+        (draw_section(layout, "look", text="Cycles Material", page=page, section="cycles-material"), _draw_cycles_look),
         (draw_section(layout, "facts", text="Facts"), _draw_facts),
     ]
     if backend_is_named():

@@ -26,7 +26,7 @@ _LONGEST_TEXT = 1 << 16
 _LARGEST_NUMBER = 1e9
 ANY = "ANY"
 CATEGORIES = ("sex", "outfit", "pattern", "shoes", "hair", "hat")
-"""Those with a menu; scripts may use any that the checkpoint has."""
+"""Those with a menu."""
 SCALARS = {"height": "m", "weight": "kg"}
 _DEFAULT_CHECKPOINT = Path("primdiffusion", "weights", "default.safetensors")
 
@@ -133,7 +133,7 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     weight: bpy.props.FloatProperty(name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100)
 
 
-def asked(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
+def chosen_attributes(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
     """The chosen attributes that the checkpoint knows, as parameters of the child."""
     vocabulary = known()
     chosen: Attributes = {}
@@ -144,20 +144,6 @@ def asked(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
         if name in vocabulary.scalars and getattr(group, f"use_{name}"):
             chosen[name] = round(getattr(group, name), 4)
     return chosen
-
-
-def parsed(text: str) -> Attributes:
-    """Attributes as scripts write them: "sex=female, height=1.7"; empty for none. Raises ValueError."""
-    found: Attributes = {}
-    for part in filter(None, re.split(r"[,;]\s*", text.strip())):
-        name, equals, value = (piece.strip() for piece in part.partition("="))
-        if not (equals and name and value):
-            raise ValueError(f"the attribute {part!r} is not name=value: write for example sex=female, height=1.7")
-        try:
-            found[name] = float(value)
-        except ValueError:
-            found[name] = value
-    return found
 
 
 def draw_attributes(layout: bpy.types.UILayout, group: PRIMDIFFUSION_PG_attributes) -> None:

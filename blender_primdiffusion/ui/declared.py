@@ -12,7 +12,7 @@ import bpy
 from ..formats.schema import Range, Slider, descriptions, field_types, split
 
 SKIP = {"SKIP_SAVE"}
-PANELS = "Not given: the panel's"
+PANELS = "Defaults to the setting in the panel"
 _LARGEST = 2**31 - 1
 """Blender's integers are shorter than the backend's."""
 _MAKERS = {int: bpy.props.IntProperty, float: bpy.props.FloatProperty, bool: bpy.props.BoolProperty}

@@ -22,10 +22,11 @@ from ..places import backend_is_named
 from ..scene.edit import end_painting, painted_weights, start_painting
 from ..scene.human import BODY_MARK, body_of, humans
 from ..scene.payload import session_file
-from .attributes import PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed, title
-from .declared import PANELS, SKIP, declared, not_given
+from .attributes import PRIMDIFFUSION_PG_attributes, chosen_attributes, draw_attributes, title
+from .declared import SKIP, declared
 from .drawing import draw_job, property_columns
-from .on_person import HumanPanel, OnPerson, other_human
+from .generate_panel import seed_property
+from .on_person import HumanOperator, HumanPanel, other_human
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
@@ -35,17 +36,7 @@ _TRANSFERS = {
     "garment": ("Garment", "Colours and shape: what the other human wears there"),
 }
 TRANSFER_ITEMS = [(name, *_TRANSFERS[name]) for name in TRANSFERS]
-
-
-def parts_property():
-    """A choice of several body parts."""
-    return bpy.props.EnumProperty(
-        name="Parts",
-        description="Parts to change: Shift-click for several. Left and right are the human's",
-        items=[(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)],
-        options={"ENUM_FLAG", "SKIP_SAVE"},
-        default={"top"},
-    )
+PART_ITEMS = [(name, title(name), "", 1 << i) for i, name in enumerate(PARTS)]
 
 
 def _may_be_other(_self: PRIMDIFFUSION_PG_edit, obj: bpy.types.Object) -> bool:
@@ -75,7 +66,13 @@ class PRIMDIFFUSION_PG_edit(bpy.types.PropertyGroup):
             ("PAINTED", "Painted", "A vertex group of the body mesh: where its weight is one half or more"),
         ],
     )
-    parts: parts_property()
+    parts: bpy.props.EnumProperty(
+        name="Parts",
+        description="Parts to change: Shift-click for several. Left and right are the human's",
+        items=PART_ITEMS,
+        options={"ENUM_FLAG", "SKIP_SAVE"},
+        default={"top"},
+    )
     vertex_group: bpy.props.StringProperty(
         name="Vertex Group", description="Vertex group of the human's body mesh", default=PAINTED_GROUP
     )
@@ -122,16 +119,14 @@ def painting(context: bpy.types.Context) -> bool:
     return active is not None and active.mode == "WEIGHT_PAINT" and BODY_MARK in active
 
 
-class _Edit(OnPerson):
-    """Base of the edits; properties that are not given are the panel's."""
+class _Edit(HumanOperator):
+    """Base of the edits, with the panel's settings."""
 
     job: str
     """Class of `jobs.edit`."""
-    seed: not_given(VaryRequest, "seed")
-    steps: not_given(VaryRequest, "steps")
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        params = {"steps": self.chosen("steps", context.scene.primdiffusion), **self.params(context, person)}
+        params = {"steps": context.scene.primdiffusion.steps, **self.params(context, person)}
         return submit(self, context, getattr(edit, self.job).of(person, params))
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
@@ -139,89 +134,70 @@ class _Edit(OnPerson):
         raise NotImplementedError
 
 
-class _Region:
-    """Operators with a region."""
+class _SeededEdit(_Edit):
+    """Base of the edits that draw at random."""
 
-    parts: parts_property()
-    vertex_group: bpy.props.StringProperty(
-        name="Vertex Group", description="Vertex group with a painted region, instead of parts", options=SKIP
-    )
+    seed: seed_property()
 
-    def region(self, settings: bpy.types.PropertyGroup, person: bpy.types.Object) -> list[str] | dict[str, list[float]]:
-        """Names of parts, or painted weights [V]."""
-        if self.given("vertex_group") or (not self.given("parts") and settings.region == "PAINTED"):
-            body = body_of(person)
-            if body is None:
-                raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
-            return {"painted": painted_weights(body, self.chosen("vertex_group", settings)).tolist()}
-        parts = sorted(self.chosen("parts", settings))
-        if not parts:
-            raise ValueError("no part of the body is chosen: choose one or more in the panel")
-        return parts
+    def seed_of(self, settings: bpy.types.PropertyGroup) -> int:
+        """The operator's seed if it has one, else the panel's."""
+        return self.seed if self.seed >= 0 else settings.seed
 
 
-class PRIMDIFFUSION_OT_vary(_Edit, bpy.types.Operator):
+def _region(settings: bpy.types.PropertyGroup, person: bpy.types.Object) -> list[str] | dict[str, list[float]]:
+    """Names of parts, or painted weights [V]. Raises ValueError."""
+    if settings.region == "PAINTED":
+        body = body_of(person)
+        if body is None:
+            raise ValueError(f"the body mesh of {person.name!r} was deleted: choose parts by name instead")
+        return {"painted": painted_weights(body, settings.vertex_group).tolist()}
+    if not settings.parts:
+        raise ValueError("no part of the body is chosen: choose one or more in the panel")
+    return sorted(settings.parts)
+
+
+class PRIMDIFFUSION_OT_vary(_SeededEdit, bpy.types.Operator):
     """Turn the selected human into a similar one; the smaller the amount, the more similar"""
 
     bl_idname = "primdiffusion.vary"
     bl_label = "Vary"
     job = "VaryJob"
 
-    amount: not_given(VaryRequest, "amount")
-    attributes: bpy.props.StringProperty(
-        name="Attributes", description="For example sex=female, height=1.7; empty: no restriction", options=SKIP
-    )
-    guidance: not_given(VaryRequest, "guidance")
-
     def params(self, context: bpy.types.Context, _person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
-        params = {"amount": self.chosen("amount", settings), "seed": self.chosen("seed", settings)}
-        wanted = parsed(self.attributes)
-        if wanted:
-            params |= {"attributes": wanted, "guidance": self.chosen("guidance", context.scene.primdiffusion)}
-        return params
+        return {"amount": settings.amount, "seed": self.seed_of(settings)}
 
 
-class PRIMDIFFUSION_OT_redress(_Region, _Edit, bpy.types.Operator):
+class PRIMDIFFUSION_OT_redress(_SeededEdit, bpy.types.Operator):
     """Generate a region of the selected human again; everything else stays exactly as it is"""
 
     bl_idname = "primdiffusion.redress"
-    bl_label = "Re-dress Region"
+    bl_label = "Regenerate Region"
     job = "RedressJob"
-
-    attributes: bpy.props.StringProperty(
-        name="Attributes", description=f"For example outfit=suit. {PANELS}", options=SKIP
-    )
-    guidance: not_given(VaryRequest, "guidance")
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
-        params: dict[str, Any] = {"region": self.region(settings, person), "seed": self.chosen("seed", settings)}
-        wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
-        if wanted:
-            params |= {"attributes": wanted, "guidance": self.chosen("guidance", context.scene.primdiffusion)}
+        params: dict[str, Any] = {"region": _region(settings, person), "seed": self.seed_of(settings)}
+        if wanted := chosen_attributes(settings.attributes):
+            params |= {"attributes": wanted, "guidance": context.scene.primdiffusion.guidance}
         return params
 
 
-class PRIMDIFFUSION_OT_transfer_texture(_Region, _Edit, bpy.types.Operator):
+class PRIMDIFFUSION_OT_transfer_texture(_SeededEdit, bpy.types.Operator):
     """Transfer the texture, or the garment, of another human to a region of the selected human"""
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
     job = "TransferJob"
 
-    source: bpy.props.StringProperty(name="Source", description=f"Name of the other human. {PANELS}", options=SKIP)
-    what: bpy.props.EnumProperty(name="Transfer", items=TRANSFER_ITEMS, description=PANELS, options=SKIP)
-    harmonise: not_given(TransferRequest, "harmonise")
-
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
         return {
-            "source": str(session_file(other_human(context, person, self.source))),
-            "region": self.region(settings, person),
-            "what": self.chosen("what", settings),
-            "harmonise": self.chosen("harmonise", settings),
-            "seed": self.chosen("seed", settings),
+            "source": str(session_file(other_human(context, person))),
+            "region": _region(settings, person),
+            "what": settings.what,
+            "harmonise": settings.harmonise,
+            "seed": self.seed_of(settings),
         }
 
 
@@ -232,13 +208,9 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
     bl_label = "Blend"
     job = "BlendJob"
 
-    other: bpy.props.StringProperty(name="Other", description=f"Name of the other human. {PANELS}", options=SKIP)
-    fraction: not_given(InterpolateRequest, "fraction")
-
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
-        settings = context.scene.primdiffusion_edit
-        other = other_human(context, person, self.other)
-        return {"other": str(session_file(other)), "fraction": self.chosen("fraction", settings)}
+        other = other_human(context, person)
+        return {"other": str(session_file(other)), "fraction": context.scene.primdiffusion_edit.fraction}
 
 
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)

@@ -28,11 +28,12 @@ from ..jobs.target import HumanTarget
 from ..scene.export_model import check_ready
 from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
 from ..scene.proxy import proxy_of, remove_proxy
-from .declared import PANELS, SKIP, declared, not_given
+from .declared import SKIP, declared
 from .drawing import property_columns
-from .on_person import OnPerson
+from .gallery import FOLDER
+from .on_person import HumanOperator
 
-_SCENES = "Not given: the scene's"
+_SAMPLE = "Add a human that comes with the extension to the scene; its data are in the public domain (CC0)"
 
 
 def destination(filepath: str, endings: Sequence[str]) -> Path:
@@ -110,7 +111,7 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
     texture_px: bpy.props.EnumProperty(
         name="Texture",
-        description="Pixels a side of the mesh proxy's texture",
+        description="Texture resolution in pixels",
         items=[(str(px), f"{px} px", "") for px in (512, 1024, 2048, 4096)],
         default=str(ProxyRequest.texture_px),
     )
@@ -138,7 +139,7 @@ class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
     )
 
 
-class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
     """Export the selected human: for another scene, as a textured mesh, as Gaussians, as volumes"""
 
     bl_idname = "primdiffusion.export"
@@ -153,28 +154,16 @@ class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
         default="HUMAN",
         options=SKIP,
     )
-    motion: bpy.props.BoolProperty(name="With Motion", description=PANELS, options=SKIP)
-    compact: bpy.props.BoolProperty(name="Compact", description=PANELS, options=SKIP)
-    animation: bpy.props.BoolProperty(name="Animation", description=PANELS, options=SKIP)
-    texture_px: not_given(ProxyRequest, "texture_px", name="Texture")
-    triangles: not_given(ProxyRequest, "triangles")
-    gaussians: not_given(GaussiansRequest, "limit", name="Gaussians")
-    voxel: bpy.props.FloatProperty(name="Voxel Size", description=PANELS, min=0.002, max=0.05, options=SKIP)
-    first: bpy.props.IntProperty(name="First Frame", description=f"Of a VDB sequence. {_SCENES}", options=SKIP)
-    last: bpy.props.IntProperty(name="Last Frame", description=f"Of a VDB sequence. {_SCENES}", options=SKIP)
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Open the file browser with the panel's settings."""
+        """Open the file browser with the panel's format."""
         try:
             person = self.person(context)
         except ValueError as error:
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
-        settings = context.scene.primdiffusion_export
-        self.format = self.chosen("format", settings)
-        for name in OPTIONS[self.format]:
-            value = self.chosen(name, settings)
-            setattr(self, name, int(value) if name == "texture_px" else value)
+        if not self.given("format"):
+            self.format = context.scene.primdiffusion_export.format
         if not self.filepath:
             self.filepath = bpy.path.clean_name(person.name) + ENDINGS[self.format][0]
         context.window_manager.fileselect_add(self)
@@ -190,10 +179,11 @@ class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
         self.filepath = (name if known else self.filepath) + endings[0]
         return True
 
-    def draw(self, _context: bpy.types.Context) -> None:
+    def draw(self, context: bpy.types.Context) -> None:
         layout = property_columns(self.layout)
-        for name in ("format", *OPTIONS[self.format]):
-            layout.prop(self, name)
+        layout.prop(self, "format")
+        for name in OPTIONS[self.format]:
+            layout.prop(context.scene.primdiffusion_export, name)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         kind = self._format(context)
@@ -210,50 +200,37 @@ class PRIMDIFFUSION_OT_export(OnPerson, bpy.types.Operator):
 
     def _write_human(self, context: bpy.types.Context, person: bpy.types.Object, path: Path) -> set[str]:
         settings = context.scene.primdiffusion_export
-        frames = scene_frames(context.scene, True) if self.chosen("motion", settings) else None
-        write_human(context, person, path, frames, compact=self.chosen("compact", settings))
+        frames = scene_frames(context.scene, True) if settings.motion else None
+        write_human(context, person, path, frames, compact=settings.compact)
         self.report({"INFO"}, f"Exported {person.name} to {path.name}")
         return {"FINISHED"}
 
     def _job(self, context: bpy.types.Context, person: bpy.types.Object, kind: str, path: Path) -> Job:
         """What writes a mesh, Gaussians or volumes. Raises ValueError."""
-        target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
+        target, scene, settings = HumanTarget.of(person), context.scene, context.scene.primdiffusion_export
         if kind == "PLY":
-            return ExportGaussiansJob(target, path, posed_now(context, person), self.chosen("gaussians", settings))
+            return ExportGaussiansJob(target, path, posed_now(context, person), settings.gaussians)
         if kind == "VDB":
-            first, last = self._frames(context.scene)
-            people = posed_frames(context, person, range(first, last + 1))
-            return ExportVdbSequenceJob(target, path.parent, path.stem, people, first, self.chosen("voxel", settings))
+            people = posed_frames(context, person, range(scene.frame_start, scene.frame_end + 1))
+            return ExportVdbSequenceJob(target, path.parent, path.stem, people, scene.frame_start, settings.voxel)
         check_ready(person)
-        px, triangles = int(self.chosen("texture_px", settings)), self.chosen("triangles", settings)
-        frames = scene_frames(context.scene, self.chosen("animation", settings))
-        return ExportMeshJob(target, px, triangles, path, kind, frames)
-
-    def _frames(self, scene: bpy.types.Scene) -> tuple[int, int]:
-        first = self.first if self.given("first") else scene.frame_start
-        last = self.last if self.given("last") else scene.frame_end
-        if last < first:
-            raise ValueError(f"the last frame {last} is before the first, {first}: swap them")
-        return first, last
+        frames = scene_frames(scene, settings.animation)
+        return ExportMeshJob(target, int(settings.texture_px), settings.triangles, path, kind, frames)
 
 
-class PRIMDIFFUSION_OT_add_proxy(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_add_proxy(HumanOperator, bpy.types.Operator):
     """Add a textured mesh of the selected human that follows the armature: fast in any viewport and engine"""
 
     bl_idname = "primdiffusion.add_proxy"
     bl_label = "Add Mesh Proxy"
 
-    texture_px: not_given(ProxyRequest, "texture_px", name="Texture")
-    triangles: not_given(ProxyRequest, "triangles")
-
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
         check_ready(person)
-        px, triangles = int(self.chosen("texture_px", settings)), self.chosen("triangles", settings)
-        return submit(self, context, AddProxyJob(target, px, triangles))
+        return submit(self, context, AddProxyJob(target, int(settings.texture_px), settings.triangles))
 
 
-class PRIMDIFFUSION_OT_show_proxy(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_show_proxy(HumanOperator, bpy.types.Operator):
     """Choose how the selected human is shown: as volumes or as the mesh proxy; or remove the mesh proxy"""
 
     bl_idname = "primdiffusion.show_proxy"
@@ -287,8 +264,12 @@ class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):
         options=SKIP,
     )
 
+    @classmethod
+    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
+        return _SAMPLE if Path(properties.filepath).parent == FOLDER else str(cls.__doc__)
+
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Import a dropped file at once; otherwise open the file browser."""
+        """Import a dropped file, or a sample, at once; otherwise open the file browser."""
         if self.filepath:
             return self.execute(context)
         context.window_manager.fileselect_add(self)

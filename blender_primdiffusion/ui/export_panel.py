@@ -17,14 +17,14 @@ from ..scene.shape import betas_of
 from . import gallery
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .export_operators import OPTIONS
-from .on_person import OnPerson
+from .on_person import HumanOperator
 
 _JOBS = {"PLY": "export_gaussians", "VDB": "export_vdb_sequence"}
 """Kinds of jobs by format; a .human file needs none, the others are meshes."""
 _LABELS = {"VOLUMES": "Show Volumes", "VIEWPORT": "Show Mesh in Viewport", "MESH": "Show Mesh"}
 
 
-class PRIMDIFFUSION_OT_mark_as_asset(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_mark_as_asset(HumanOperator, bpy.types.Operator):
     """Mark the selected human as an asset with a preview, to drag from the Asset Browser into any file"""
 
     bl_idname = "primdiffusion.mark_as_asset"

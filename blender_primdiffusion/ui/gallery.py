@@ -7,41 +7,33 @@ from pathlib import Path
 
 import bpy
 
-from ..jobs.export import ImportHumanJob
-from ..jobs.follow import Reporting, submit
-
 FOLDER = Path(__file__).resolve().parents[1] / "gallery"
 
 
 @functools.cache
-def items() -> list[tuple[str, str, str]]:
-    """The humans in the gallery by name, as items of an enum; empty in builds without."""
-    return [(path.name, path.stem.replace("_", " "), "") for path in sorted(FOLDER.glob("*.human"))]
+def samples() -> list[Path]:
+    """The humans in the gallery; none in builds without."""
+    return sorted(FOLDER.glob("*.human"))
 
 
-def _items(_operator: bpy.types.Operator, _context: bpy.types.Context | None) -> list[tuple[str, str, str]]:
-    return items()
+class PRIMDIFFUSION_MT_samples(bpy.types.Menu):
+    """Add a human that comes with the extension"""
 
-
-class PRIMDIFFUSION_OT_add_from_gallery(Reporting, bpy.types.Operator):
-    """Add a human that comes with the extension, at the 3D cursor; its data are in the public domain (CC0)"""
-
-    bl_idname = "primdiffusion.add_from_gallery"
     bl_label = "Add Sample Human"
 
-    human: bpy.props.EnumProperty(
-        name="Human", description="Which human of the gallery", items=_items, options={"SKIP_SAVE"}
-    )
+    def draw(self, _context: bpy.types.Context) -> None:
+        for path in samples():
+            draw_sample(self.layout, path, path.stem.replace("_", " "))
 
-    def act(self, context: bpy.types.Context) -> set[str]:
-        if not self.human:
-            raise ValueError("this build of the extension has no gallery: choose Import Human File")
-        return submit(self, context, ImportHumanJob(str(FOLDER / self.human)))
+
+def draw_sample(layout: bpy.types.UILayout, path: Path, text: str) -> None:
+    """The button that adds one."""
+    layout.operator("primdiffusion.import_human", text=text, icon="COMMUNITY").filepath = str(path)
 
 
 def draw_samples(layout: bpy.types.UILayout) -> None:
     """The button, or a menu of several."""
-    if len(items()) > 1:
-        layout.operator_menu_enum("primdiffusion.add_from_gallery", "human", icon="COMMUNITY")
-    elif items():
-        layout.operator("primdiffusion.add_from_gallery", icon="COMMUNITY").human = items()[0][0]
+    if len(samples()) > 1:
+        layout.menu("PRIMDIFFUSION_MT_samples", icon="COMMUNITY")
+    elif samples():
+        draw_sample(layout, samples()[0], PRIMDIFFUSION_MT_samples.bl_label)

@@ -16,8 +16,8 @@ from ..jobs.generate import GenerateJob
 from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
-from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, asked, draw_attributes, parsed
-from .declared import PANELS, SKIP, declared, not_given
+from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, chosen_attributes, draw_attributes
+from .declared import SKIP, declared
 from .drawing import BackendPanel, SidebarPanel, draw_job, draw_lines, property_columns
 from .export_panel import draw_as_mesh
 from .gallery import draw_samples
@@ -108,28 +108,16 @@ class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
 
 
-class GenerateOptions(Reporting):
-    """Properties of operators that generate. None is redoable: a redo slider must not start an expensive job again."""
+def seed_property():
+    """The seed of an operator, for scripts."""
+    return declared(GenerateRequest, "seed", default=-1, min=-1, description="-1: the panel's seed", options=SKIP)
 
-    seed: not_given(GenerateRequest, "seed", default=-1, min=-1, description="-1: the panel's")
-    steps: not_given(GenerateRequest, "steps", default=0, min=0, description="0: the panel's")
-    sampler: bpy.props.EnumProperty(name="Sampler", items=SAMPLER_ITEMS, description=PANELS, options=SKIP)
-    guidance: not_given(GenerateRequest, "guidance")
-    attributes: bpy.props.StringProperty(
-        name="Attributes",
-        description="For example sex=female, height=1.7; empty: no restriction. Not given: the panel's",
-        options=SKIP,
-    )
 
-    def sampling(self, settings: bpy.types.PropertyGroup) -> dict[str, Any]:
-        """Fields of `GenerateRequest` besides the seed. Raises ValueError for attributes that are not name=value."""
-        wanted = parsed(self.attributes) if self.given("attributes") else asked(settings.attributes)
-        return {
-            "steps": self.steps or settings.steps,
-            "sampler": self.chosen("sampler", settings),
-            "guidance": self.chosen("guidance", settings),
-            **({"attributes": wanted} if wanted else {}),
-        }
+def sampling(settings: bpy.types.PropertyGroup) -> dict[str, Any]:
+    """Fields of `GenerateRequest` besides the seed."""
+    wanted = chosen_attributes(settings.attributes)
+    fields = {name: getattr(settings, name) for name in ("steps", "sampler", "guidance")}
+    return fields | ({"attributes": wanted} if wanted else {})
 
 
 SUBDIR = "primdiffusion/generate"
@@ -161,30 +149,27 @@ class PRIMDIFFUSION_OT_add_generate_preset(AddPresetBase, bpy.types.Operator):
     ]
 
 
-class PRIMDIFFUSION_OT_generate(GenerateOptions, bpy.types.Operator):
+class PRIMDIFFUSION_OT_generate(Reporting, bpy.types.Operator):
     """Generate humans from the seed and add them to the scene with armatures, side by side"""
 
     bl_idname = "primdiffusion.generate"
     bl_label = "Generate Human"
 
-    count: bpy.props.IntProperty(
-        name="Count", default=0, min=0, max=1000, description="How many humans; 0: the panel's", options={"SKIP_SAVE"}
-    )
+    seed: seed_property()
 
     def act(self, context: bpy.types.Context) -> set[str]:
         settings = context.scene.primdiffusion
         from_panel = self.seed < 0
         # a seed given by a script means one human, whatever the panel's count
-        count = self.count or (settings.count if from_panel else 1)
+        count = settings.count if from_panel else 1
         if from_panel and not settings.keep_seed and settings.seed in _queued_seeds():
             settings.seed = random_seed()
         seed = settings.seed if from_panel else self.seed
         last = last_seed(seed, count)
-        sampling = self.sampling(settings)
         for each in range(seed, last + 1):
             renew_seed = from_panel and not settings.keep_seed and each == last
             next_seed = random_seed() if renew_seed else None
-            if submit(self, context, GenerateJob(each, sampling, next_seed=next_seed)) == {"CANCELLED"}:
+            if submit(self, context, GenerateJob(each, sampling(settings), next_seed=next_seed)) == {"CANCELLED"}:
                 return {"CANCELLED"}
         return {"FINISHED"}
 
@@ -214,7 +199,6 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
         row = column.row(align=True)
         row.prop(settings, "seed")
         row.prop(settings, "keep_seed", text="", icon="LOCKED" if settings.keep_seed else "UNLOCKED")
-        row.operator("primdiffusion.set_seed", text="", icon="FILE_REFRESH")
         column.prop(settings, "count")
         column = layout.column()
         column.prop(settings, "quality")

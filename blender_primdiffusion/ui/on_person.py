@@ -13,7 +13,7 @@ from .declared import SKIP
 from .drawing import SidebarPanel
 
 
-class OnPerson(Reporting):
+class HumanOperator(Reporting):
     """Base of operators on one human, which it finds; subclasses define `run`."""
 
     human: bpy.props.StringProperty(
@@ -55,12 +55,12 @@ class HumanPanel(SidebarPanel):
         return True
 
 
-def other_human(context: bpy.types.Context, person: bpy.types.Object, name: str) -> bpy.types.Object:
-    """The other human, named by a script, or picked in the panel where the name is empty. Raises ValueError."""
+def other_human(context: bpy.types.Context, person: bpy.types.Object) -> bpy.types.Object:
+    """The other human, picked in the panel. Raises ValueError."""
     picked = context.scene.primdiffusion_edit.other
-    if not name and picked is None:
+    if picked is None:
         raise ValueError("choose the other human in the panel first")
-    other = named_person(context, name or picked.name)
+    other = named_person(context, picked.name)
     if other == person:
         raise ValueError(f"{person.name!r} cannot be the other human too: choose another one")
     return other

@@ -45,7 +45,7 @@ class _OfEngine:
 class PRIMDIFFUSION_PT_marching(_OfEngine, bpy.types.Panel):
     """Render tab: what is drawn, how finely, and over which background."""
 
-    bl_label = "Marching"
+    bl_label = "Ray Marching"
     bl_context = "render"
 
     def draw(self, context: bpy.types.Context) -> None:
@@ -111,7 +111,7 @@ class PRIMDIFFUSION_OT_set_up_engine(Reporting, bpy.types.Operator):
     """Choose the render engine for humans, with the settings that they need"""
 
     bl_idname = "primdiffusion.set_up_engine"
-    bl_label = "Set Up Engine"
+    bl_label = "Switch Render Engine"
     bl_options = {"UNDO"}
     described_by = ("engine",)
 

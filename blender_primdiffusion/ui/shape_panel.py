@@ -19,7 +19,7 @@ from ..scene.rest_human import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP
 from .drawing import draw_lines, property_columns
-from .on_person import HumanPanel, OnPerson, other_human
+from .on_person import HumanOperator, HumanPanel, other_human
 
 _NOT_ANIMATED: set[str] = set()
 """Options: an animation would move the rest bones in each frame; the custom property can be animated instead."""
@@ -30,7 +30,7 @@ _SHAPES = (
     ("GENERATED", "As Generated", "Reset the selected human to the shape of the last edit, or of generation"),
     ("OTHER", "Other Human", "Copy the body shape of the other human to the selected human"),
 )
-_SETTINGS = {"GIVEN": ("betas", "height", "weight"), "RANDOM": ("seed", "spread"), "GENERATED": (), "OTHER": ("other",)}
+_SETTINGS = {"GIVEN": ("betas", "height", "weight"), "RANDOM": ("seed", "spread"), "GENERATED": (), "OTHER": ()}
 """Properties of the operator that matter, by shape."""
 
 
@@ -55,7 +55,7 @@ def _betas(self: PRIMDIFFUSION_PG_human) -> Sequence[float]:
 
 
 def _set_betas(self: PRIMDIFFUSION_PG_human, betas: Sequence[float]) -> None:
-    _printed(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
+    _log_errors(lambda: reshape(person_of(self.id_data), np.clip(list(betas), -LARGEST_BETA, LARGEST_BETA)))
 
 
 def _measure(self: PRIMDIFFUSION_PG_human) -> BodyMeasures:
@@ -74,11 +74,11 @@ def _weight(self: PRIMDIFFUSION_PG_human) -> float:
 
 
 def _set_height(self: PRIMDIFFUSION_PG_human, height: float) -> None:
-    _printed(lambda: set_measures(person_of(self.id_data), height=height))
+    _log_errors(lambda: set_measures(person_of(self.id_data), height=height))
 
 
 def _set_weight(self: PRIMDIFFUSION_PG_human, weight: float) -> None:
-    _printed(lambda: set_measures(person_of(self.id_data), measures_of(self.id_data).height, weight))
+    _log_errors(lambda: set_measures(person_of(self.id_data), measures_of(self.id_data).height, weight))
 
 
 def set_measures(person: bpy.types.Object, height: float | None = None, weight: float | None = None) -> str:
@@ -89,7 +89,7 @@ def set_measures(person: bpy.types.Object, height: float | None = None, weight: 
     return reshape(person, betas_of_measures(shape_model_of(person), betas_of(person), height, weight))
 
 
-def _printed(change) -> None:
+def _log_errors(change) -> None:
     """Print errors: setters must not raise, and the panel shows beforehand what cannot be set."""
     try:
         change()
@@ -160,7 +160,7 @@ class PRIMDIFFUSION_PG_human(bpy.types.PropertyGroup):
     )
 
 
-class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
+class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
     """Set the body shape of the selected human: by numbers, at random, as generated, or as another human's"""
 
     bl_idname = "primdiffusion.reshape"
@@ -183,9 +183,6 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         default=1.0,
         min=0.0,
         max=2.0,
-    )
-    other: bpy.props.StringProperty(
-        name="Other Human", description="Name of the other human. Not given: the panel's", options=SKIP
     )
 
     @classmethod
@@ -224,7 +221,7 @@ class PRIMDIFFUSION_OT_reshape(OnPerson, bpy.types.Operator):
         return betas_of_measures(shape_model_of(person), betas, height, weight)
 
     def _betas_of_other(self, context: bpy.types.Context, person: bpy.types.Object) -> NDArray:
-        other = other_human(context, person, self.other)
+        other = other_human(context, person)
         if len(shape_model_of(other).template) != len(shape_model_of(person).template):
             raise ValueError(
                 f"{other.name!r} stands on another body than {person.name!r}: their shape parameters are not comparable"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import random
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import bpy
 from bpy.app.handlers import persistent
@@ -18,11 +18,12 @@ from ..jobs.variations import Variation, VariationsJob, sheet
 from ..scene.build import build_human
 from ..scene.cycles import overlap_warning_in
 from ..scene.place import stand_at_cursor
-from .declared import SKIP, declared, not_given
+from .declared import SKIP, declared
 from .drawing import BackendPanel, draw_job, property_columns, row_unless
-from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, GenerateOptions, last_seed, random_seed
+from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, last_seed, sampling, seed_property
 
-COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in (4, 8, 12, 16)]
+MOST = 16
+COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in range(4, MOST + 1, 4)]
 
 
 class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
@@ -35,7 +36,7 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
         name="Seeds",
         description="Seeds of the humans",
         items=[
-            ("CONSECUTIVE", "From Seed On", "The seed of the panel Generate and the following ones"),
+            ("CONSECUTIVE", "Consecutive Seeds", "The seed of the panel Generate and the following ones"),
             ("RANDOM", "Random", "New random seeds each time"),
         ],
         default="RANDOM",
@@ -56,38 +57,33 @@ class PRIMDIFFUSION_PG_variations(bpy.types.PropertyGroup):
     amount: declared(VariationsRequest, "amount", name="Difference", min=0.05)
 
 
+def _selected(_manager: bpy.types.WindowManager) -> list[bool]:
+    chosen = [variation.chosen for variation in sheet.variations[:MOST]]
+    return chosen + [False] * (MOST - len(chosen))
+
+
+def _select(_manager: bpy.types.WindowManager, selected: Sequence[bool]) -> None:
+    for variation, chosen in zip(sheet.variations, selected, strict=False):
+        variation.chosen = chosen
+
+
 _SELECTED = "Index from 0; -1: the selected ones"
-_OF_VARIATION = "Set the seed of the panel Generate to that of the selected human and lock it"
-_BUILD_ALL = "Add all of these humans to the scene, side by side"
+_USE_SEED = "Set the seed of the panel Generate to that of the selected human and lock it"
 
 
-class _OnSheet(Reporting):
-    """Base of the operators on the sheet."""
-
-    @classmethod
-    def poll(cls, _context: bpy.types.Context) -> bool:
-        if not sheet.variations:
-            cls.poll_message_set("There are no variations: press Show Variations first")
-        return bool(sheet.variations)
-
-
-class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
+class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
     """Show several humans to choose from before building them"""
 
     bl_idname = "primdiffusion.variations"
     bl_label = "Show Variations"
-    described_by = ("clear", "like")
+    described_by = ("clear", "like", "use_seed")
 
-    count: bpy.props.IntProperty(
-        name="Count", default=0, min=0, max=64, description="How many humans; 0: the panel's", options=SKIP
-    )
+    seed: seed_property()
     like: bpy.props.BoolProperty(
         name="More Like This", description="Variations of a human of the sheet, with the same body", options=SKIP
     )
-    index: bpy.props.IntProperty(
-        name="Index", default=-1, min=-1, description=f"Of the human for More Like This. {_SELECTED}", options=SKIP
-    )
-    amount: not_given(VariationsRequest, "amount", name="Difference")
+    use_seed: bpy.props.BoolProperty(name="Use Seed", description=_USE_SEED, options=SKIP)
+    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
     clear: bpy.props.BoolProperty(
         name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=SKIP
     )
@@ -98,59 +94,52 @@ class PRIMDIFFUSION_OT_variations(GenerateOptions, bpy.types.Operator):
             clear_before_loading()
             redraw()
             return {"FINISHED"}
-        sampling, like = self._sampling_of_sheet(context), {}
+        if self.use_seed:
+            return self._use_seed(context.scene.primdiffusion)
+        settings, like = context.scene.primdiffusion_variations, {}
         if self.like:
             around = _only(_targets(self.index), "select only the one to vary")
-            amount = self.chosen("amount", context.scene.primdiffusion_variations)
-            like = {"person": str(around.person), "amount": amount, "title": f"Like seed {around.seed}"}
-        from_panel = context.scene.primdiffusion_variations.seeds != "RANDOM" and not self.like
+            like = {"person": str(around.person), "amount": settings.amount, "title": f"Like seed {around.seed}"}
+        from_panel = settings.seeds != "RANDOM" and not self.like
         first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
-        return submit(self, context, VariationsJob(self._seeds(context, first), sampling, **like))
+        fields = sampling(context.scene.primdiffusion)
+        if settings.quality == "DRAFT":
+            fields |= zip(("steps", "sampler"), STEPS_AND_SAMPLER["DRAFT"], strict=True)
+        return submit(self, context, VariationsJob(_seeds(first, int(settings.count)), fields, **like))
 
-    def _seeds(self, context: bpy.types.Context, first: int) -> tuple[int, ...]:
-        """Seeds from `first` on, random ones where it is negative. Raises ValueError."""
-        count = self.count or int(context.scene.primdiffusion_variations.count)
-        if first < 0:
-            return tuple(random.sample(range(LARGEST_SEED + 1), count))
-        return tuple(range(first, last_seed(first, count) + 1))
-
-    def _sampling_of_sheet(self, context: bpy.types.Context) -> dict[str, Any]:
-        """As `sampling`, with the quality of the sheet."""
-        sampling = self.sampling(context.scene.primdiffusion)
-        if context.scene.primdiffusion_variations.quality == "DRAFT":
-            steps, sampler = STEPS_AND_SAMPLER["DRAFT"]
-            sampling |= {"steps": self.steps or steps, "sampler": self.sampler if self.given("sampler") else sampler}
-        return sampling
-
-
-class PRIMDIFFUSION_OT_select_variation(_OnSheet, bpy.types.Operator):
-    """Select this human, or not"""
-
-    bl_idname = "primdiffusion.select_variation"
-    bl_label = "Select Variation"
-    bl_options = {"INTERNAL"}
-
-    index: bpy.props.IntProperty(name="Index", description="Place in the sheet, from 0", min=0, options=SKIP)
-
-    def act(self, _context: bpy.types.Context) -> set[str]:
-        variation = sheet.at(self.index)
-        variation.chosen = not variation.chosen
-        redraw()
+    def _use_seed(self, settings: bpy.types.PropertyGroup) -> set[str]:
+        wanted = _only(_targets(self.index), "select one")
+        if sheet.around:
+            raise ValueError("variants of a human cannot be generated from a seed alone: build them instead")
+        settings.seed, settings.keep_seed = wanted.seed, True
+        bpy.ops.ed.undo_push(message="Use Seed")
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
+def _seeds(first: int, count: int) -> tuple[int, ...]:
+    """Seeds from `first` on, random ones where it is negative. Raises ValueError."""
+    if first < 0:
+        return tuple(random.sample(range(LARGEST_SEED + 1), count))
+    return tuple(range(first, last_seed(first, count) + 1))
+
+
+class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
     """Add the selected humans to the scene, exactly as shown, side by side"""
 
     bl_idname = "primdiffusion.build_variation"
     bl_label = "Build Selected"
+    described_by = ("build_all",)
 
     index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
-    build_all: bpy.props.BoolProperty(name="All", description="Build all humans of the sheet", options=SKIP)
+    build_all: bpy.props.BoolProperty(
+        name="All", description="Add all of these humans to the scene, side by side", options=SKIP
+    )
 
     @classmethod
-    def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
-        return _BUILD_ALL if properties.build_all else str(cls.__doc__)
+    def poll(cls, _context: bpy.types.Context) -> bool:
+        if not sheet.variations:
+            cls.poll_message_set("There are no variations: press Show Variations first")
+        return bool(sheet.variations)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         wanted = list(sheet.variations) if self.build_all else _targets(self.index)
@@ -165,37 +154,6 @@ class PRIMDIFFUSION_OT_build_variation(_OnSheet, bpy.types.Operator):
         for person in built:
             if warning := overlap_warning_in(context.scene, person):
                 self.report({"WARNING"}, sentence(warning))
-        return {"FINISHED"}
-
-
-class PRIMDIFFUSION_OT_set_seed(Reporting, bpy.types.Operator):
-    """Set a random seed"""
-
-    bl_idname = "primdiffusion.set_seed"
-    bl_label = "Set Seed"
-    bl_options = {"UNDO"}
-    described_by = ("to",)
-
-    to: bpy.props.EnumProperty(
-        name="To",
-        description="Which seed",
-        items=[
-            ("RANDOM", "Random Seed", "Set a random seed"),
-            ("VARIATION", "Seed of Variation", _OF_VARIATION),
-        ],
-        options=SKIP,
-    )
-    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
-
-    def act(self, context: bpy.types.Context) -> set[str]:
-        settings = context.scene.primdiffusion
-        if self.to == "RANDOM":
-            settings.seed = random_seed()
-            return {"FINISHED"}
-        wanted = _only(_targets(self.index), "select one")
-        if sheet.around:
-            raise ValueError("variants of a human cannot be generated from a seed alone: build them instead")
-        settings.seed, settings.keep_seed = wanted.seed, True
         return {"FINISHED"}
 
 
@@ -231,6 +189,13 @@ def _build(context: bpy.types.Context, wanted: list[Variation]) -> tuple[list[bp
 
 PROPERTIES = (
     (bpy.types.Scene, "primdiffusion_variations", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_variations)),
+    (
+        bpy.types.WindowManager,  # as the sheet: no undo changes it, no file keeps it
+        "primdiffusion_selected",
+        bpy.props.BoolVectorProperty(
+            name="Select", description="Select this human, or not", size=MOST, get=_selected, set=_select
+        ),
+    ),
 )
 
 
@@ -295,10 +260,8 @@ def _draw_sheet(layout: bpy.types.UILayout, columns: tuple[int, float]) -> None:
         cell = grid.column(align=True)
         _draw_picture(cell, variation.picture, columns[1])
         icon = "CHECKBOX_HLT" if variation.chosen else "CHECKBOX_DEHLT"
-        button = cell.operator(
-            "primdiffusion.select_variation", text=str(variation.seed), icon=icon, depress=variation.chosen
-        )
-        button.index = index
+        manager = bpy.context.window_manager
+        cell.prop(manager, "primdiffusion_selected", index=index, text=str(variation.seed), icon=icon, toggle=True)
 
 
 def _draw_picture(cell: bpy.types.UILayout, path: Path | None, units: float) -> None:
@@ -319,7 +282,7 @@ def _draw_choice(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup) 
     row = row_unless(layout, "" if number == 1 else "Select one human for these")
     row.operator("primdiffusion.variations", text="More Like This", icon="DUPLICATE").like = True
     if not sheet.around:
-        row.operator("primdiffusion.set_seed", text="Use Seed", icon="COPYDOWN").to = "VARIATION"
+        row.operator("primdiffusion.variations", text="Use Seed", icon="COPYDOWN").use_seed = True
     layout.prop(settings, "amount")
 
 

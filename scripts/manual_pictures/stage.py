@@ -32,10 +32,10 @@ def empty_file(blend: Path) -> bpy.types.Scene:
     return scene
 
 
-def generate(seed: int, position: tuple[float, float] = (0.0, 0.0), attributes: str = "") -> bpy.types.Object:
+def generate(seed: int, position: tuple[float, float] = (0.0, 0.0)) -> bpy.types.Object:
     """Generate a person at x, y, and select them."""
     before = set(bpy.data.objects)
-    bpy.ops.primdiffusion.generate(seed=seed, steps=30, attributes=attributes)
+    bpy.ops.primdiffusion.generate(seed=seed)
     person = next(obj for obj in set(bpy.data.objects) - before if "primdiffusion_human" in obj)
     person.location.xy = position
     bpy.context.view_layer.objects.active = person

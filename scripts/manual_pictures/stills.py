@@ -28,7 +28,8 @@ def engine_and_cycles(folder: Path) -> list[Path]:
     """One person drawn by the engine, and merged in Cycles with an object that reflects them."""
     scene = _stage(folder, 3, "Hands on Hips")
     exact = render(scene, folder / "engine.png", SIZE)
-    bpy.ops.primdiffusion.merge(voxel=0.005)
+    scene.primdiffusion_merging.voxel = 0.005
+    bpy.ops.primdiffusion.merge()
     bpy.ops.primdiffusion.set_up_engine(engine="CYCLES")
     sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
     sun.rotation_euler = (0.6, 0.3, 0.4)
@@ -60,9 +61,10 @@ def group(folder: Path) -> list[Path]:
 def redressed(folder: Path) -> list[Path]:
     """One person, then in a suit, then in a tee and shorts."""
     scene = _stage(folder, 0, "Contrapposto")
-    pictures = [render(scene, folder / "before.png", SIZE)]
+    pictures, settings = [render(scene, folder / "before.png", SIZE)], scene.primdiffusion_edit
     for number, (parts, outfit) in enumerate((({"clothes"}, "suit"), ({"clothes"}, "tee and shorts"))):
-        bpy.ops.primdiffusion.redress(parts=parts, attributes=f"outfit={outfit}", seed=5)
+        settings.parts, settings.attributes.outfit = parts, outfit
+        bpy.ops.primdiffusion.redress(seed=5)
         pictures.append(render(scene, folder / f"after{number}.png", SIZE))
     return pictures
 

@@ -38,7 +38,7 @@ def from_a_posed_start(module: str, python: str) -> Steps:
     picture = yield from drawn(module, python, SECOND_SEED, "Waving")
     yield from chosen(module, python, picture)
     gallery = import_module(f"{module}.ui.gallery")
-    press("primdiffusion.add_from_gallery", human=gallery.items()[0][0])
+    press("primdiffusion.import_human", filepath=str(gallery.samples()[0]))
     yield from wait(lambda: not queue_of(module).busy and bool(armatures()), _MOST_S)
     (armature,) = armatures()
     armature.location = armature.rotation_euler = (0.0, 0.0, 0.0)

@@ -119,7 +119,7 @@ def variations(module: str, python: str) -> Steps:
     yield from wait(lambda: not queue.busy, 120)
     yield "variations_sheet"
     for index in (1, 5):
-        bpy.ops.primdiffusion.select_variation(index=index)
+        bpy.context.window_manager.primdiffusion_selected[index] = True
     yield "variations_selected"
     press("primdiffusion.variations", clear=True)
 

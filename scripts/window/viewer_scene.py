@@ -19,7 +19,7 @@ def viewer(module: str, _python: str) -> Steps:
     yield from sidebar()
     yield "viewer_sidebar"
     gallery = import_module(f"{module}.ui.gallery")
-    press("primdiffusion.add_from_gallery", human=gallery.items()[0][0])
+    press("primdiffusion.import_human", filepath=str(gallery.samples()[0]))
     yield from wait(lambda: not queue_of(module).busy and bool(armatures()), _MOST_S)
     select(armatures()[0])
     yield from at_rest(module)

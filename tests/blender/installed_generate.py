@@ -21,7 +21,8 @@ addon.checkpoint = checkpoint
 bpy.ops.wm.save_as_mainfile(filepath=blend)
 
 started = time.perf_counter()
-outcome = bpy.ops.primdiffusion.generate(seed=int(seed), steps=int(steps))
+bpy.context.scene.primdiffusion.steps = int(steps)
+outcome = bpy.ops.primdiffusion.generate(seed=int(seed))
 seconds = time.perf_counter() - started
 bpy.ops.wm.save_mainfile()
 bpy.ops.wm.open_mainfile(filepath=blend)

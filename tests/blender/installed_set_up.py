@@ -41,7 +41,8 @@ report["about"] = state_of(places.set_up_folder())[1]
 if not wheels:
     bpy.ops.wm.save_as_mainfile(filepath=str(Path(os.environ["BLENDER_USER_RESOURCES"]) / "shot.blend"))
     started = time.perf_counter()
-    report["generated"] = sorted(bpy.ops.primdiffusion.generate(seed=3, steps=3))
+    bpy.context.scene.primdiffusion.steps = 3
+    report["generated"] = sorted(bpy.ops.primdiffusion.generate(seed=3))
     report["seconds_generate"] = round(time.perf_counter() - started, 1)
     report["bones"] = [len(obj.data.bones) for obj in bpy.data.objects if obj.type == "ARMATURE"]
 started = time.perf_counter()

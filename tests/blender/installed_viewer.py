@@ -39,7 +39,7 @@ def centres() -> np.ndarray:
 
 report = {"module": module}
 started = time.perf_counter()
-report["added"] = sorted(press.add_from_gallery(human="Ada.human"))
+report["added"] = sorted(press.import_human(filepath=str(Path(human.__file__).parents[1] / "gallery" / "Ada.human")))
 report["seconds"] = time.perf_counter() - started
 person = human.humans(bpy.context.scene)[0]
 armature = person
@@ -55,7 +55,8 @@ report["reshaped"] = sorted(press.reshape(betas=[2.0] + [0.0] * 9))
 reshaped = centres()
 report["moved"] = [float(np.abs(after - before).max()) for before, after in ((rest, posed), (posed, reshaped))]
 file = folder / "again.human"
-report["exported"] = sorted(press.export(filepath=str(file), compact=True))
+bpy.context.scene.primdiffusion_export.compact = True
+report["exported"] = sorted(press.export(filepath=str(file)))
 report["bytes"] = file.stat().st_size
 report["imported"] = sorted(press.import_human(filepath=str(file)))
 report["humans"] = len(human.humans(bpy.context.scene))
@@ -80,10 +81,10 @@ for operator, words in (
         report["rejected"].append(str(error))
 if program is not None:
     os.environ["PATH"] = str(program.parent)
-    report["generated"] = [sorted(press.generate(seed=7, steps=2))]
+    report["generated"] = [sorted(press.generate(seed=7))]
     os.environ["PATH"] = ""
     bpy.context.preferences.addons[module].preferences.backend_python = str(program)
-    report["generated"].append(sorted(press.generate(seed=8, steps=2)))
+    report["generated"].append(sorted(press.generate(seed=8)))
     made = human.humans(bpy.context.scene)[2:]
     report["boxes"] = [sum(obj.type == "VOLUME" for obj in human.parts_of(one)) for one in made]
     report["provenance"] = [json.loads(one[human.MARK])["seed"] for one in made]

@@ -22,7 +22,7 @@ ops = bpy.ops.primdiffusion
 
 @pytest.fixture
 def person(addon):
-    ops.generate(seed=7, steps=1, attributes="sex=female, height=1.7")
+    ops.generate(seed=7)
     (person,) = humans(addon.scene)
     made = json.loads(person[MARK])
     person[MARK] = json.dumps({**made, "attributes": {"sex": "female", "height": 1.7}})
@@ -98,7 +98,7 @@ def test_another_file_finds_the_data_of_a_person_it_appends_or_links(person, tmp
 def test_what_cannot_be_an_asset_is_reported(addon):
     with refused(RuntimeError, "human"):
         ops.mark_as_asset()
-    ops.generate(seed=7, steps=1)
+    ops.generate(seed=7)
     with refused(RuntimeError, "Eve"):
         ops.mark_as_asset(human="Eve")
     (person,) = humans(addon.scene)

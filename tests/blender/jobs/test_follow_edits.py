@@ -32,7 +32,7 @@ COUNT = 12
 @pytest.fixture
 def person(addon, tmp_path, monkeypatch):
     monkeypatch.setenv("FAKE_HUMAN", str(synthetic_shape.write(tmp_path / "prepared", COUNT)))
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     bpy.ops.ed.undo_push(message="a person")
     return humans(addon.scene)[0]
 

@@ -35,7 +35,8 @@ def panel_texts(context) -> list[str]:
 
 
 def test_generate_builds_a_person_and_keeps_the_backends_file(addon):
-    assert bpy.ops.primdiffusion.generate(seed=7, steps=3) == {"FINISHED"}
+    addon.scene.primdiffusion.steps = 3
+    assert bpy.ops.primdiffusion.generate(seed=7) == {"FINISHED"}
     (person,) = humans(addon.scene)
     assert len(parts_of(person)) == 4
     sent = request_of(person_file(person))
@@ -48,9 +49,12 @@ def test_generate_builds_a_person_and_keeps_the_backends_file(addon):
 
 
 def test_what_the_human_does_not_show_is_said(addon):
-    bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="hat=fedora")
+    wanted = addon.scene.primdiffusion.attributes
+    wanted.hat = "fedora"
+    bpy.ops.primdiffusion.generate(seed=7)
     assert "The human does not show hat." in " ".join(panel_texts(addon))
-    bpy.ops.primdiffusion.generate(seed=8, steps=1, attributes="outfit=suit")
+    wanted.hat, wanted.outfit = "ANY", "suit"
+    bpy.ops.primdiffusion.generate(seed=8)
     assert "not show" not in " ".join(panel_texts(addon))
 
 
@@ -58,14 +62,14 @@ def test_the_view_frames_the_first_human_and_finds_others(addon, monkeypatch):
     asked = []
     monkeypatch.setattr(generate, "bring_into_view", lambda *given: asked.append(given))
     for seed in (7, 8):
-        bpy.ops.primdiffusion.generate(seed=seed, steps=1)
+        bpy.ops.primdiffusion.generate(seed=seed)
     first, second = humans(addon.scene)
     assert asked == [(first, generate.FIRST_HUMAN_SHARE), (second, 0.0)]
 
 
 def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_job(addon):
     bpy.ops.ed.undo_push(message="before")
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     bpy.ops.ed.undo()
     assert not humans(bpy.context.scene)
     assert not bpy.data.objects
@@ -86,7 +90,7 @@ def test_one_undo_removes_the_person_and_one_redo_brings_it_back_without_a_new_j
 def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, tmp_path, seed, sentence):
     objects = len(bpy.data.objects)
     with pytest.raises(RuntimeError, match=sentence) as caught:
-        bpy.ops.primdiffusion.generate(seed=seed, steps=1)
+        bpy.ops.primdiffusion.generate(seed=seed)
     assert str(caught.value).count("Error:") == 1
     assert len(bpy.data.objects) == objects
     assert not session_folder().exists()
@@ -106,7 +110,7 @@ def test_a_killed_child_is_reported(addon):
 
 def test_a_second_click_is_queued_and_does_not_disturb_the_first(addon):
     ask(addon, 7, 2)
-    assert bpy.ops.primdiffusion.generate(seed=8, steps=1) == {"FINISHED"}
+    assert bpy.ops.primdiffusion.generate(seed=8) == {"FINISHED"}
     assert len(humans(addon.scene)) == 2
 
 
@@ -149,7 +153,7 @@ def test_an_interpreter_that_does_not_exist_is_named(saved_scene, monkeypatch):
     blender_primdiffusion.register()
     try:
         with refused(RuntimeError, "/nowhere/python"):
-            bpy.ops.primdiffusion.generate(seed=7, steps=1)
+            bpy.ops.primdiffusion.generate(seed=7)
     finally:
         blender_primdiffusion.unregister()
 

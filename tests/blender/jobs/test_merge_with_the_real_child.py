@@ -20,7 +20,8 @@ ops = bpy.ops.primdiffusion
 
 @pytest.fixture
 def person(real_child):
-    ops.generate(seed=1, steps=2)
+    real_child.scene.primdiffusion.steps = 2
+    ops.generate(seed=1)
     return humans(real_child.scene)[0]
 
 
@@ -37,7 +38,8 @@ def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):
     turns = np.tile(np.eye(3), (24, 1, 1))
     turns[16] = [[np.cos(1.2), np.sin(1.2), 0], [-np.sin(1.2), np.cos(1.2), 0], [0, 0, 1]]
     pose_from_joint_rotations(person, turns)
-    assert ops.merge(voxel=0.02) == {"FINISHED"}
+    bpy.context.scene.primdiffusion_merging.voxel = 0.02
+    assert ops.merge() == {"FINISHED"}
     box = filled_box(volume_path(merged_of(person).data))
     set_representation(person, "VOLUMES")
     bpy.context.view_layer.update()
@@ -52,12 +54,15 @@ def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):
 
 
 def test_frames_come_from_the_child(person):
-    ops.merge(what="FRAMES", frame_start=1, frame_end=3, voxel=0.03)
+    scene = bpy.context.scene
+    scene.frame_start, scene.frame_end, scene.primdiffusion_merging.voxel = 1, 3, 0.03
+    ops.merge(what="FRAMES")
     assert representation_of(person) == "MERGED"
     assert len(sequence_files(merged_of(person).data)) == 3
 
 
 def test_voxels_too_small_for_the_machine_are_rejected_with_a_size_to_choose(person):
+    bpy.context.scene.primdiffusion_merging.voxel = 0.0005
     with pytest.raises(RuntimeError, match=r"choose .* mm or more"):
-        ops.merge(voxel=0.0005)
+        ops.merge()
     assert merged_of(person) is None

@@ -117,7 +117,7 @@ def test_a_child_that_dies_between_jobs_is_noticed(addon):
 
 def test_out_of_memory_names_the_setting_to_lower_and_not_the_steps(addon):
     with refused(RuntimeError, "preferences"):
-        ops.generate(seed=NO_MEMORY, steps=1)
+        ops.generate(seed=NO_MEMORY)
 
 
 def test_each_result_is_one_undo_step_with_the_name_of_the_job(addon, capfd):
@@ -140,7 +140,7 @@ def test_each_result_is_one_undo_step_with_the_name_of_the_job(addon, capfd):
 def test_a_failed_result_leaves_no_undo_step(addon, capfd):
     bpy.ops.ed.undo_push(message="before")
     with pytest.raises(RuntimeError):
-        ops.generate(seed=3, steps=1)
+        ops.generate(seed=3)
     bpy.context.window_manager.print_undo_steps()
     assert [line for line in capfd.readouterr().out.splitlines() if "name=" in line][-1].endswith("'before'")
 

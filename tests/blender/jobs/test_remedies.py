@@ -33,7 +33,7 @@ def test_each_error_has_a_button_where_there_is_something_to_do(addon):
 def test_the_panel_shows_the_error_its_button_and_the_diagnostics(addon):
     for seed, button in ((DIES, "try_again"), (NO_MEMORY, "release_memory")):
         with pytest.raises(RuntimeError):
-            ops.generate(seed=seed, steps=1)
+            ops.generate(seed=seed)
         texts = shown(PRIMDIFFUSION_PT_generate, addon)
         assert f"primdiffusion.{button}" in texts
         assert "primdiffusion.copy_diagnostics" in texts

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import bpy
 import pytest
 from blender_primdiffusion.formats.answers import VariationFiles
 from human_files import person_file
-from jobs_driven import drive, error_of, shown, until_running
+from jobs_driven import Layout, drive, error_of, shown, until_running
 from support.errors import refused
 from support.fake_child import FAILS, TAKES_LONG, request_of
 
@@ -28,13 +29,19 @@ def more_like(**given):
 
 
 def use_seed(**given):
-    return ops.set_seed(to="VARIATION", **given)
+    return ops.variations(use_seed=True, **given)
+
+
+def select(*indices: int) -> None:
+    for index in indices:
+        bpy.context.window_manager.primdiffusion_selected[index] = True
 
 
 @pytest.fixture
 def shown_people(addon):
     """A sheet of seeds 11 to 14."""
-    ops.variations(seed=11, count=4, steps=2)
+    addon.scene.primdiffusion_variations.count = "4"
+    ops.variations(seed=11)
     return sheet
 
 
@@ -60,19 +67,21 @@ def test_variations_are_files_and_nothing_enters_the_scene(addon, shown_people):
 
 
 def test_the_panels_settings_are_requested_and_random_seeds_differ_each_time(addon):
-    addon.scene.primdiffusion.quality = "HIGH"
-    ops.variations(count=4)
+    settings = addon.scene.primdiffusion_variations
+    addon.scene.primdiffusion.quality, settings.count = "HIGH", "4"
+    ops.variations()
     first = seeds()
     asked = sent(sheet.variations[0].person)
     assert (asked["steps"], asked["sampler"], asked["size"]) == (60, "ddim", 256)
-    addon.scene.primdiffusion_variations.quality = "DRAFT"
+    settings.quality, settings.count = "DRAFT", "8"
     ops.variations()
     assert len(set(seeds())) == 8
     assert set(first).isdisjoint(seeds())
     asked = sent(sheet.variations[0].person)
     assert (asked["steps"], asked["sampler"]) == (8, "dpmpp_2m")
-    addon.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
-    ops.variations(count=4, steps=3, sampler="ddpm")
+    settings.seeds, settings.quality, settings.count = "CONSECUTIVE", "PANEL", "4"
+    addon.scene.primdiffusion.sampler = "ddpm"
+    ops.variations()
     assert seeds() == [7, 8, 9, 10]
     assert sent(sheet.variations[0].person)["sampler"] == "ddpm"
 
@@ -82,8 +91,7 @@ def test_the_one_that_is_built_is_the_very_one_seen_and_one_undo_takes_them_away
     assert ops.build_variation(index=2) == {"FINISHED"}
     (person,) = humans(addon.scene)
     assert person_file(person).read_bytes() == sheet.variations[2].person.read_bytes()
-    ops.select_variation(index=0)
-    ops.select_variation(index=3)
+    select(0, 3)
     ops.build_variation()
     assert [sent(person_file(person))["seed"] for person in humans(bpy.context.scene)] == [13, 11, 14]
     assert len({person.location.x for person in humans(bpy.context.scene)}) == 3, "side by side"
@@ -109,32 +117,31 @@ def test_whom_files_are_missing_of_is_not_built_and_those_before_stay(addon, sho
 
 
 def test_nothing_selected_a_wrong_number_and_no_sheet_are_rejected(addon):
-    for operator in (ops.build_variation, ops.select_variation):
-        assert not operator.poll()
+    assert not ops.build_variation.poll()
     for call in (more_like, use_seed):
         with refused(RuntimeError, "Show Variations"):
             call()
-    ops.variations(seed=11, count=2, steps=1)
+    ops.variations(seed=11)
     with refused(RuntimeError, "variation"):
         ops.build_variation()
-    with refused(RuntimeError, "variation 2"):
-        ops.select_variation(index=2)
-    for index in (0, 1):
-        ops.select_variation(index=index)
+    with refused(RuntimeError, "variation 8"):
+        ops.build_variation(index=8)
+    select(0, 1)
     for call in (more_like, use_seed):
         with refused(RuntimeError, "2 variations"):
             call()
-    with refused(RuntimeError, "2 seeds", "2147483647"):
-        ops.variations(seed=2**31 - 1, count=2)
+    with refused(RuntimeError, "8 seeds", "2147483647"):
+        ops.variations(seed=2**31 - 1)
 
 
 def test_more_like_this_requests_variants_of_the_chosen_human(addon, shown_people):
-    ops.select_variation(index=1)
+    select(1)
     kept = sheet.variations[1].person
-    assert more_like(count=3, seed=20, amount=0.25, steps=4) == {"FINISHED"}
+    addon.scene.primdiffusion_variations.amount, addon.scene.primdiffusion.steps = 0.25, 4
+    assert more_like(seed=20) == {"FINISHED"}
     asked = sent(sheet.variations[0].person)
     assert (asked["person"], asked["amount"], asked["steps"]) == (str(kept), 0.25, 4)
-    assert seeds() == [20, 21, 22]
+    assert seeds() == [20, 21, 22, 23]
     assert sheet.title == "Like seed 12"
     with refused(RuntimeError, "generated"):
         use_seed(index=0)
@@ -147,7 +154,7 @@ def test_a_seed_is_put_into_the_panel_and_locked(addon, shown_people):
 
 def test_a_failure_leaves_the_sheet_that_was_there(addon, shown_people):
     with refused(RuntimeError, "checkpoint"):
-        ops.variations(seed=FAILS, count=2, steps=1)
+        ops.variations(seed=FAILS)
     assert seeds() == [11, 12, 13, 14]
     assert all(variation.person.is_file() for variation in sheet.variations)
     assert "damaged" in error_of("variations")
@@ -171,19 +178,28 @@ def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the
 
 
 def test_the_panel_shows_the_sheet_and_what_can_be_done_with_those_selected(addon, shown_people):
-    ops.select_variation(index=1)
-    texts = shown(variations_panel.PRIMDIFFUSION_PT_variations, addon)
-    assert texts.count("primdiffusion.select_variation") == 4
-    assert {"primdiffusion.build_variation", "primdiffusion.set_seed", "New humans: 4"} <= set(texts)
-    assert texts.count("primdiffusion.variations") == 3, "show, clear, more like this"
+    select(1)
+    layout = Layout()
+    variations_panel.PRIMDIFFUSION_PT_variations.draw(SimpleNamespace(layout=layout), addon)
+    assert layout.of("prop").count("primdiffusion_selected") == 4
+    texts = layout.of("text", "button")
+    assert {"primdiffusion.build_variation", "New humans: 4"} <= set(texts)
+    assert texts.count("primdiffusion.variations") == 4, "show, clear, more like this, use seed"
+
+
+def test_a_click_on_a_seed_selects_and_deselects_it(shown_people):
+    selected = bpy.context.window_manager.primdiffusion_selected
+    selected[2] = True
+    assert [variation.chosen for variation in sheet.variations] == [False, False, True, False]
+    assert list(selected)[:4] == [False, False, True, False]
+    selected[2] = False
+    assert not any(variation.chosen for variation in sheet.variations)
 
 
 @pytest.mark.parametrize(("width", "columns"), [(300, 2), (420, 3), (2000, 8), (50, 2)])
 def test_as_many_pictures_stand_side_by_side_as_fit(width, columns):
-    from types import SimpleNamespace as Named
-
-    preferences = Named(system=Named(ui_scale=2.0))
-    number, units = variations_panel._columns(Named(preferences=preferences, region=Named(width=width * 2)))
+    preferences, region = SimpleNamespace(system=SimpleNamespace(ui_scale=2.0)), SimpleNamespace(width=width * 2)
+    number, units = variations_panel._columns(SimpleNamespace(preferences=preferences, region=region))
     assert number == columns
     assert number * units * 20 <= max(width, 100)
 
@@ -230,7 +246,7 @@ def test_a_disk_that_is_full_keeps_the_former_sheet(addon, shown_people, monkeyp
 
     monkeypatch.setattr("blender_primdiffusion.jobs.variations.shutil.move", full)
     with refused(RuntimeError, "space"):
-        ops.variations(seed=40, count=2, steps=1)
+        ops.variations(seed=40)
     assert seeds() == [11, 12, 13, 14]
     assert len(files_left()) == 1
 

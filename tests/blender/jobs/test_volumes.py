@@ -85,7 +85,7 @@ def test_a_full_disk_is_told_and_nothing_is_shown(person, full_disk):
 def test_an_edit_shows_its_own_volumes_at_once(person):
     ops.volumes_in_viewport()
     before = folder_of(person)
-    assert ops.vary(seed=8, steps=1) == {"FINISHED"}
+    assert ops.vary(seed=8) == {"FINISHED"}
     assert folder_of(person) != before
     assert drawn() == COUNT
     bpy.ops.ed.undo()

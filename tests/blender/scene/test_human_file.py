@@ -31,7 +31,7 @@ def person(addon, tmp_path):
 
 
 def exported(person, folder) -> np.ndarray:
-    bpy.ops.primdiffusion.export(human=person.name, filepath=str(folder / "out.human"), motion=False)
+    bpy.ops.primdiffusion.export(human=person.name, filepath=str(folder / "out.human"))
     return sizes_in(folder / "out.human")
 
 

@@ -55,34 +55,21 @@ def test_menus_hold_what_the_checkpoint_knows_and_any(known):
 
 
 def test_unchosen_attributes_are_not_requested(addon, known):
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     assert "attributes" not in sent(addon)
     known.sex, known.use_height, known.height, known.use_weight = "female", True, 1.82, True
-    addon.scene.primdiffusion.sampler = "dpmpp_2m"
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    addon.scene.primdiffusion.sampler, addon.scene.primdiffusion.guidance = "dpmpp_2m", 3.0
+    bpy.ops.primdiffusion.generate(seed=7)
     asked = sent(addon)
     assert asked["attributes"] == {"sex": "female", "height": 1.82}, "the checkpoint knows no weight"
-    assert (asked["guidance"], asked["sampler"]) == (2.0, "dpmpp_2m")
-
-
-def test_a_script_asks_past_the_panel(addon, known):
-    known.sex = "female"
-    wanted = {"attributes": "age=old, outfit=fitted tee and jeans; height=1.9", "guidance": 3.0, "sampler": "ddpm"}
-    bpy.ops.primdiffusion.generate(seed=7, steps=1, **wanted)
-    asked = sent(addon)
-    assert asked["attributes"] == {"age": "old", "outfit": "fitted tee and jeans", "height": 1.9}
-    assert (asked["guidance"], asked["sampler"]) == (3.0, "ddpm")
-    bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="")
-    assert "attributes" not in sent(addon)
-    with refused(RuntimeError, "tall"):
-        bpy.ops.primdiffusion.generate(seed=7, steps=1, attributes="tall")
+    assert (asked["guidance"], asked["sampler"]) == (3.0, "dpmpp_2m")
 
 
 def test_redressing_has_attributes_of_its_own(addon, known):
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     known.sex = "female"
     addon.scene.primdiffusion_edit.attributes.outfit = "suit"
-    bpy.ops.primdiffusion.redress(seed=8, steps=1)
+    bpy.ops.primdiffusion.redress(seed=8)
     asked = sent(addon)
     assert (asked["attributes"], asked["region"]) == ({"outfit": "suit"}, ["top"])
 
@@ -94,14 +81,14 @@ def test_a_choice_survives_saving_and_is_left_out_with_a_checkpoint_that_does_no
     bpy.ops.wm.save_mainfile()
     bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
     group = bpy.context.scene.primdiffusion.attributes
-    assert attributes.asked(group) == {"outfit": "suit"}
+    assert attributes.chosen_attributes(group) == {"outfit": "suit"}
     others = {**VOCABULARY, "categories": {"outfit": ["dress", "robe", "suit"]}}
     path = checkpoint(tmp_path / "others.safetensors", others)
     monkeypatch.setattr(attributes, "preference", lambda _: str(path))
-    assert attributes.asked(group) == {"outfit": "suit"}, "by its name, not by its place"
+    assert attributes.chosen_attributes(group) == {"outfit": "suit"}, "by its name, not by its place"
     checkpoint(path, {**VOCABULARY, "categories": {"outfit": ["robe"]}})
     os.utime(path, (1, 1))
-    assert attributes.asked(group) == {}
+    assert attributes.chosen_attributes(group) == {}
 
 
 @pytest.mark.parametrize("contents", [None, b"", b"no checkpoint at all"])
@@ -115,7 +102,7 @@ def test_a_checkpoint_that_cannot_be_read_or_knows_nothing_leaves_the_menus_empt
     layout = MagicMock()
     PRIMDIFFUSION_PT_attributes.draw(SimpleNamespace(layout=layout), addon)
     assert layout.label.call_args.kwargs["text"] == "This checkpoint has no attributes"
-    assert attributes.asked(addon.scene.primdiffusion.attributes) == {}
+    assert attributes.chosen_attributes(addon.scene.primdiffusion.attributes) == {}
 
 
 @pytest.mark.parametrize("vocabulary", [{"categories": {"sex": ["x" * 70_000]}}, {"scalars": {"height": [0, -1]}}])

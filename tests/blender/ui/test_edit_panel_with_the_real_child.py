@@ -20,8 +20,12 @@ ops = bpy.ops.primdiffusion
 @pytest.fixture
 def people(real_child):
     """Two people of a small model."""
-    ops.generate(seed=1, steps=2, attributes="outfit=suit", sampler="dpmpp_2m")
-    ops.generate(seed=2, steps=2)
+    settings = real_child.scene.primdiffusion
+    settings.steps, settings.sampler, settings.attributes.outfit = 2, "dpmpp_2m", "suit"
+    ops.generate(seed=1)
+    settings.sampler, settings.attributes.outfit = "ddim", "ANY"
+    ops.generate(seed=2)
+    settings.steps = 3
     return humans(real_child.scene)
 
 
@@ -50,8 +54,9 @@ def test_redressing_leaves_everything_outside_the_region_as_it_is(people):
     anna, berta = people
     before, others, first = files(anna), files(berta), payload(person_file(anna))
     assert json.loads(anna[MARK])["attributes"] == {"outfit": "suit"}
-    given = {"human": "Human", "seed": 5, "steps": 3}
-    assert ops.redress(parts={"hair", "shoes"}, attributes="outfit=jeans", **given) == {"FINISHED"}
+    settings = bpy.context.scene.primdiffusion_edit
+    settings.parts, settings.attributes.outfit = {"hair", "shoes"}, "suit"
+    assert ops.redress(human="Human", seed=5) == {"FINISHED"}
     inside = region("hair", "shoes")
     differ = changed(before, files(anna))
     assert differ
@@ -74,7 +79,7 @@ def test_a_painted_head_is_all_that_changes(people):
     for vertex in body.data.vertices:
         if any(element.group == head.index and element.weight > 0.5 for element in vertex.groups):
             painted.add([vertex.index], 1.0, "REPLACE")
-    assert ops.redress(seed=5, steps=3) == {"FINISHED"}
+    assert ops.redress(seed=5) == {"FINISHED"}
     differ = changed(before, files(anna))
     assert differ
     assert differ <= region("head")
@@ -84,17 +89,17 @@ def test_a_painted_head_is_all_that_changes(people):
 def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_them(people):
     anna, berta = people
     bpy.ops.ed.undo_push(message="two people")
-    states = [files(anna)]
-    assert ops.vary(human="Human", amount=0.5, seed=3, steps=4) == {"FINISHED"}
+    settings, states = bpy.context.scene.primdiffusion_edit, [files(anna)]
+    settings.other, settings.parts, settings.fraction = berta, {"top"}, 1.0
+    assert ops.vary(human="Human", seed=3) == {"FINISHED"}
     states.append(files(anna))
-    assert ops.transfer_texture(human="Human", source="Human.001", parts={"top"}, steps=2) == {"FINISHED"}
+    assert ops.transfer_texture(human="Human") == {"FINISHED"}
     states.append(files(anna))
     assert changed(states[1], states[2]) <= region("top")
-    assert ops.transfer_texture(
-        human="Human", source="Human.001", parts={"top"}, what="garment", harmonise=0.5, steps=2
-    ) == {"FINISHED"}
+    settings.what, settings.harmonise = "garment", 0.5
+    assert ops.transfer_texture(human="Human") == {"FINISHED"}
     states.append(files(anna))
-    assert ops.blend(human="Human", other="Human.001", fraction=1.0, steps=4) == {"FINISHED"}
+    assert ops.blend(human="Human") == {"FINISHED"}
     ours, theirs = (json.loads(person[MARK])["betas"] for person in (anna, berta))
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
     for state in reversed(states):

@@ -14,6 +14,7 @@ import pytest
 import synthetic
 from backend_python import use_this_python
 from human_files import lose_data
+from jobs_driven import Layout
 from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
@@ -79,7 +80,7 @@ def assert_rejected(sentence, operator, **properties):
 def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name, given):
     moving(anna)
     before = everything()
-    assert OPERATORS.export(filepath=str(out / name), **given, animation=True, texture_px=64) == {"FINISHED"}
+    assert OPERATORS.export(filepath=str(out / name), **given) == {"FINISHED"}
     assert everything() == before
     assert [path.name for path in out.iterdir()] == [name if "." in name else f"{name}.glb"]
 
@@ -99,7 +100,6 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
         ("export", {"filepath": "OUT/a.stl"}, "another ending"),
         ("export", {"filepath": "OUT/a.glb", "human": "Bert"}, "'Bert' is not in the scene"),
         ("export", {"filepath": "OUT/a.glb", "format": "PLY"}, "another ending than .ply"),
-        ("export", {"filepath": "OUT/a.vdb", "first": 5, "last": 2}, "before the first"),
         ("show_proxy", {"shown": "MESH"}, "no mesh proxy"),
         ("show_proxy", {"shown": "REMOVED"}, "no mesh proxy"),
         ("add_proxy", {"human": "Bert"}, "'Bert' is not in the scene"),
@@ -118,7 +118,7 @@ def test_a_person_without_data_is_named(anna, out):
 
 
 def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
-    OPERATORS.add_proxy(texture_px=64)
+    OPERATORS.add_proxy()
     proxy = proxy_of(anna)
     assert proxy.parent == anna
     assert (proxy.hide_viewport, proxy.hide_render) == (False, True)
@@ -139,7 +139,7 @@ def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
         return {call.args[0]: call.kwargs["text"] for call in made}
 
     assert drawn() == {"primdiffusion.add_proxy": "As Mesh"}
-    OPERATORS.add_proxy(texture_px=64)
+    OPERATORS.add_proxy()
     assert drawn() == {"primdiffusion.show_proxy": "Show Mesh in Viewport"}
     OPERATORS.show_proxy(shown="REMOVED")
     assert drawn() == {"primdiffusion.add_proxy": "As Mesh"}
@@ -149,9 +149,9 @@ def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
 
 def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):
     before = everything()
-    OPERATORS.add_proxy(texture_px=64)
+    OPERATORS.add_proxy()
     once = everything()
-    OPERATORS.add_proxy(texture_px=64)
+    OPERATORS.add_proxy()
     assert {kind: len(names) for kind, names in everything().items()} == {k: len(n) for k, n in once.items()}
     OPERATORS.show_proxy(shown="REMOVED")
     assert everything() == before
@@ -162,9 +162,10 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
     turns = moving(anna)
     bpy.context.scene.frame_set(2)
     anna.location.x = 3.0
-    OPERATORS.export(filepath=str(out / "a.ply"), gaussians=123)
+    bpy.context.scene.primdiffusion_export.gaussians = 1234
+    OPERATORS.export(filepath=str(out / "a.ply"))
     asked = json.loads((out / "a.ply").read_text())
-    assert asked["limit"] == 123
+    assert asked["limit"] == 1234
     assert np.array(asked["object"])[0, 3] == pytest.approx(3.0)
     assert np.array(asked["joints"])[0, :, :3] == pytest.approx(turns[1][0], abs=1e-5)
 
@@ -172,7 +173,8 @@ def test_gaussians_are_requested_in_the_current_pose(anna, out):
 def test_a_vdb_for_each_frame_lies_where_the_person_stands(anna, out):
     moving(anna)
     anna.location = (2.0, 0.0, 0.0)
-    OPERATORS.export(filepath=str(out / "Anna.vdb"), first=1, last=3, voxel=0.01)
+    bpy.context.scene.primdiffusion_export.voxel = 0.01
+    OPERATORS.export(filepath=str(out / "Anna.vdb"))
     assert sorted(path.name for path in out.iterdir()) == [f"Anna_{frame:04d}.vdb" for frame in (1, 2, 3)]
     bpy.utils.expose_bundled_modules()
     import openvdb
@@ -187,7 +189,8 @@ def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
     armature = anna
     shape = np.linspace(-1, 1, 10)
     armature[BETAS] = shape.tolist()
-    OPERATORS.export(filepath=str(out / "Anna Müller.human"), motion=True)
+    bpy.context.scene.primdiffusion_export.motion = True
+    OPERATORS.export(filepath=str(out / "Anna Müller.human"))
     kept = read_tensors(out / "Anna Müller.human")
     assert json.loads(kept.metadata["provenance"]) == json.loads(str(synthetic.arrays(8)["meta"]))
     assert np.frombuffer(kept.arrays["betas"][2], "<f4") == pytest.approx(shape, abs=1e-6)
@@ -204,12 +207,13 @@ def test_a_human_file_goes_out_and_comes_back_with_shape_and_motion(anna, out):
 def test_a_mirrored_bone_is_exported_as_a_turn_that_can_be_imported(anna, out):
     moving(anna)
     anna.pose.bones["left_elbow"].scale = (-1, 2, 1)
-    OPERATORS.export(filepath=str(out / "a.human"), motion=True)
+    bpy.context.scene.primdiffusion_export.motion = True
+    OPERATORS.export(filepath=str(out / "a.human"))
     assert OPERATORS.import_human(filepath=str(out / "a.human")) == {"FINISHED"}
 
 
 def test_a_human_file_without_motion_holds_the_person_alone(anna, out):
-    OPERATORS.export(filepath=str(out / "a"), motion=False)
+    OPERATORS.export(filepath=str(out / "a"))
     kept = read_tensors(out / "a.human")
     assert "motion" not in kept.metadata
     assert set(kept.arrays) == {"rgb", "density", "delta_scale", "betas", "rest_half_extent"}
@@ -256,14 +260,16 @@ def test_another_format_in_the_file_browser_changes_the_extension(anna, format, 
     assert dialog.filepath == after
 
 
-def test_the_file_browser_opens_with_the_panels_format_and_settings(anna):
-    settings = bpy.context.scene.primdiffusion_export
-    settings.format, settings.triangles, settings.texture_px = "FBX", 1234, "512"
+def test_the_file_browser_opens_with_the_panels_format_and_shows_its_settings(anna):
+    bpy.context.scene.primdiffusion_export.format = "FBX"
     window_manager = MagicMock()
     context = SimpleNamespace(scene=bpy.context.scene, view_layer=bpy.context.view_layer, window_manager=window_manager)
     dialog = Dialog(human="")
     assert dialog.invoke(context, None) == {"RUNNING_MODAL"}
-    assert (dialog.format, dialog.triangles, dialog.texture_px) == ("FBX", 1234, 512)
+    dialog.layout = Layout()
+    dialog.draw(context)
+    assert dialog.layout.of("prop") == ["format", "texture_px", "triangles", "animation"]
+    assert dialog.format == "FBX"
     assert dialog.filepath == "Anna.fbx"
     window_manager.fileselect_add.assert_called_once()
 

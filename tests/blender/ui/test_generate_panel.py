@@ -53,29 +53,29 @@ def seeds(context) -> list[int]:
 def test_an_unlocked_seed_is_another_one_after_each_result_and_a_locked_one_stays(addon, panel_settings, monkeypatch):
     monkeypatch.setattr(random, "randrange", lambda _: 99)
     panel_settings.seed = 11
-    bpy.ops.primdiffusion.generate(steps=1)
+    bpy.ops.primdiffusion.generate()
     assert (seeds(addon), panel_settings.seed) == ([11], 99)
     panel_settings.keep_seed, panel_settings.seed = True, 12
-    bpy.ops.primdiffusion.generate(steps=1)
+    bpy.ops.primdiffusion.generate()
     assert panel_settings.seed == 12
 
 
 def test_a_failure_keeps_the_seed_for_another_try(panel_settings):
     panel_settings.seed = FAILS
     with pytest.raises(RuntimeError):
-        bpy.ops.primdiffusion.generate(steps=1)
+        bpy.ops.primdiffusion.generate()
     assert panel_settings.seed == FAILS
 
 
 def test_a_seed_from_a_script_leaves_the_panels_and_is_one_person(addon, panel_settings):
     panel_settings.count = 3
-    bpy.ops.primdiffusion.generate(seed=31, steps=1)
+    bpy.ops.primdiffusion.generate(seed=31)
     assert (seeds(addon), panel_settings.seed) == ([31], 7)
 
 
 def test_pressing_twice_generates_two_different_humans(addon, panel_settings, queued_jobs):
-    bpy.ops.primdiffusion.generate(steps=1)
-    bpy.ops.primdiffusion.generate(steps=1)
+    bpy.ops.primdiffusion.generate()
+    bpy.ops.primdiffusion.generate()
     drive()
     first, second = seeds(addon)
     assert first == 7
@@ -84,7 +84,7 @@ def test_pressing_twice_generates_two_different_humans(addon, panel_settings, qu
 
 def test_a_count_queues_as_many_jobs_with_consecutive_seeds(addon, panel_settings, queued_jobs):
     panel_settings.count = 3
-    bpy.ops.primdiffusion.generate(steps=1)
+    bpy.ops.primdiffusion.generate()
     assert [entry.job.label for entry in queue.waiting] == [f"Human, seed {seed}" for seed in (7, 8, 9)]
     drive()
     assert seeds(addon) == [7, 8, 9]
@@ -92,7 +92,8 @@ def test_a_count_queues_as_many_jobs_with_consecutive_seeds(addon, panel_setting
 
 
 def test_people_stand_side_by_side_and_the_first_at_the_origin(addon):
-    bpy.ops.primdiffusion.generate(seed=7, steps=1, count=3)
+    addon.scene.primdiffusion.count = 3
+    bpy.ops.primdiffusion.generate()
     extents = sorted((posed_extent(person) for person in humans(addon.scene)), key=lambda extent: extent[0][0])
     for (_, left), (right, _) in itertools.pairwise(extents):
         assert right[0] - left[0] >= GAP_M - 1e-6
@@ -103,25 +104,20 @@ def test_people_stand_side_by_side_and_the_first_at_the_origin(addon):
 
 
 def test_a_new_person_takes_the_free_place_in_the_middle(addon):
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     humans(addon.scene)[0].location.x = 30.0
-    bpy.ops.primdiffusion.generate(seed=8, steps=1)
+    bpy.ops.primdiffusion.generate(seed=8)
     assert humans(addon.scene)[1].location.x == 0.0
     humans(addon.scene)[1].location.y = 5.0
-    bpy.ops.primdiffusion.generate(seed=9, steps=1)
+    bpy.ops.primdiffusion.generate(seed=9)
     assert humans(addon.scene)[2].location.x == 0.0, "the one far behind is not in the way"
 
 
-def test_seeds_beyond_blenders_numbers_are_rejected(addon):
+def test_seeds_beyond_blenders_numbers_are_rejected(addon, panel_settings):
+    panel_settings.seed, panel_settings.count = 2**31 - 1, 2
     with refused(RuntimeError, "2 seeds", "2147483647"):
-        bpy.ops.primdiffusion.generate(seed=2**31 - 1, steps=1, count=2)
+        bpy.ops.primdiffusion.generate()
     assert not humans(addon.scene)
-
-
-def test_random_seed_puts_another_one_into_the_panel(panel_settings, monkeypatch):
-    monkeypatch.setattr(random, "randrange", lambda end: end - 1)
-    assert bpy.ops.primdiffusion.set_seed() == {"FINISHED"}
-    assert panel_settings.seed == 2**31 - 1
 
 
 def test_a_quality_stands_for_steps_and_sampler_and_these_name_the_quality(panel_settings):
@@ -167,8 +163,8 @@ def test_the_panel_shows_steps_where_the_quality_is_custom_and_what_is_missing_o
     assert drawn() == ["seed", "keep_seed", "count", "quality", "steps", "sampler"]
     monkeypatch.setattr(generate_panel, "draw_set_up", lambda layout: layout.label(text="not set up"))
     texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
-    assert texts[:2] == ["not set up", "primdiffusion.add_from_gallery"]
-    assert {"primdiffusion.set_seed", "primdiffusion.generate"} <= set(texts)
+    assert texts[:2] == ["not set up", "primdiffusion.import_human"]
+    assert "primdiffusion.generate" in texts
 
 
 @pytest.mark.parametrize(
@@ -186,7 +182,7 @@ def test_after_success_the_panel_has_one_line_the_button_of_the_next_step_and_as
     if camera:
         scene.camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     before = shown(panel, addon)
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     line, next_step, as_mesh = shown(panel, addon)[len(before) :]
     assert re.fullmatch(r"Generated in [0-9.]+ s\.", line)
     assert next_step == button
@@ -197,12 +193,12 @@ def test_limits_of_cycles_are_named_in_the_result_where_cycles_is_chosen_alone(a
     monkeypatch.setattr(cycles, "overlap_of", lambda _: 37)
     for engine, named in (("BLENDER_WORKBENCH", False), ("CYCLES", True)):
         addon.scene.render.engine = engine
-        bpy.ops.primdiffusion.generate(seed=7, steps=1)
+        bpy.ops.primdiffusion.generate(seed=7)
         assert ("Cycles leaves out parts of" in notice_of("generate")) == named
 
 
 def test_the_next_step_waits_until_no_job_is_running(addon):
-    bpy.ops.primdiffusion.generate(seed=7, steps=1)
+    bpy.ops.primdiffusion.generate(seed=7)
     queue.add(addon, GenerateJob(4, {"steps": 5}))
     texts = shown(generate_panel.PRIMDIFFUSION_PT_generate, addon)
     assert "primdiffusion.set_up_engine" not in texts

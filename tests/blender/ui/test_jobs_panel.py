@@ -21,7 +21,7 @@ ops = bpy.ops.primdiffusion
 
 def test_diagnostics_hold_versions_and_the_error(addon):
     with pytest.raises(RuntimeError):
-        ops.generate(seed=FAILS, steps=1)
+        ops.generate(seed=FAILS)
     text = jobs_panel.diagnostics()
     for part in (bpy.app.version_string, "0-fake", "fake device", "seed 2", "CheckpointError", "checkpoint is damaged"):
         assert part in text

@@ -57,7 +57,8 @@ def density_of(person) -> float:
 def test_a_merged_pose_is_one_undo_step_and_unmerging_goes_back(person):
     raise_left_arm(person, 0.5)
     bpy.ops.ed.undo_push(message="posed")
-    assert ops.merge(voxel=0.02) == {"FINISHED"}
+    bpy.context.scene.primdiffusion_merging.voxel = 0.02
+    assert ops.merge() == {"FINISHED"}
     assert representation_of(person) == "MERGED"
     assert density_of(person) == pytest.approx(10 + 10 * np.sin(0.5), rel=2e-3)
     assert merged_state(merged_of(person)).voxel == pytest.approx(0.02)
@@ -94,8 +95,8 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     keyframe_poses(person, frames, synthetic.axis_angle(turns), np.zeros((4, 3)))
     scene = bpy.context.scene
     scene.frame_set(7)
-    scene.frame_start, scene.frame_end = 5, 8
-    assert ops.merge(what="FRAMES", voxel=0.02) == {"FINISHED"}
+    scene.frame_start, scene.frame_end, scene.primdiffusion_merging.voxel = 5, 8, 0.02
+    assert ops.merge(what="FRAMES") == {"FINISHED"}
     assert scene.frame_current == 7
     volume = merged_of(person).data
     files = sequence_files(volume)
@@ -108,15 +109,17 @@ def test_a_frame_range_becomes_a_sequence_and_the_scene_stays_at_its_frame(perso
     for frame in (5, 6, 8):
         scene.frame_set(frame)
         assert not advanced_panel.outdated(person, scene)
-    assert ops.merge(what="FRAMES", frame_start=6, frame_end=7) == {"FINISHED"}
+    scene.frame_start, scene.frame_end = 6, 7
+    assert ops.merge(what="FRAMES") == {"FINISHED"}
     assert merged_of(person).data.frame_duration == 2
     ops.merge()
     assert not merged_of(person).data.is_sequence
 
 
 def test_a_range_that_is_none_is_rejected(person):
+    bpy.context.scene.frame_start = bpy.context.scene.frame_end = 7
     with refused(RuntimeError, "7 to 7"):
-        ops.merge(what="FRAMES", frame_start=7, frame_end=7)
+        ops.merge(what="FRAMES")
     assert merged_of(person) is None
 
 
