@@ -1,4 +1,4 @@
-"""Writes docs/results.md: one table for each file in docs/results, with every number as measured by a benchmark."""
+"""Writes docs/results.md: six tables of what matters most, each number from a record of docs/results."""
 
 from __future__ import annotations
 
@@ -7,111 +7,124 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "docs" / "results"
-SOURCES = {
-    "demo": ("The demo", "benchmarks/demo.py --json docs/results/demo.json"),
-    "people": ("Payloads against their meshes", "benchmarks/people.py --assets DIR --json docs/results/people.json"),
-    "march": ("The marcher", "benchmarks/march.py --json docs/results/march.json --table docs/results/march_table.md"),
-    "march_cuda": ("The marcher on a CUDA device", "benchmarks/march_cuda.py --json docs/results/march_cuda.json"),
-    "extension": ("The extension on Blender 5.0", "benchmarks/extension.py --json docs/results/extension.json"),
-    "splats": (
-        "A human as splats on Blender 5.3",
-        "benchmarks/splats.py --pictures DIR --json docs/results/splats.json",
+TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
+    "Drawing": (
+        ("512 x 512, steps of 4 mm, one core", "march", "cpu_forward_4mm_ms", "ms"),
+        ("the same on two cores", "march", "cpu_forward_4mm_wall_ms", "ms"),
+        ("its gradients, one core", "march", "cpu_backward_4mm_ms", "ms"),
+        ("times as fast as the reference, at 128 x 128", "march", "reference_over_cpu_128", ""),
+        ("largest difference of a colour to the reference", "march", "rgb_error_max", ""),
+        ("512 x 512 on a CUDA device", "march_cuda", "cuda_forward_512_ms", "ms"),
+        ("512 x 512, steps of 1 mm", "march_cuda", "cuda_forward_1mm_ms", "ms"),
+        ("16 humans at once, 512 x 512 each", "march_cuda", "cuda_forward_16_people_ms", "ms"),
+        ("gradients of one", "march_cuda", "cuda_backward_4mm_ms", "ms"),
+        ("F12 with the engine, 512 x 512", "engine", "engine_render_ms", "ms"),
     ),
-    "first_sight": (
-        "From the backend's answer to a human in Blender",
-        "benchmarks/first_sight.py --json docs/results/first_sight.json --window FIGURES ... viewport.json",
+    "In Blender": (
+        ("a human of splats enters the scene", "splats", "add_human_seconds", "s"),
+        ("a human in the .blend", "splats", "blend_mb_a_human", "MB"),
+        ("splats follow a new pose", "splats", "splat_update_ms", "ms"),
+        ("Cycles, 512 x 512, 16 samples", "splats", "splat_cycles_cpu_seconds", "CPU s"),
+        ("splats against the exact picture, whole figure", "splats", "splat_psnr", "dB"),
+        ("a picture of 1024 volumes in Cycles, 1 sample", "extension", "cycles_volumes_seconds", "s"),
+        ("and of one merged volume", "extension", "cycles_merged_seconds", "s"),
+        ("the backend's answer to a human in view, in a window", "first_sight", "in_view_seconds_window", "s"),
+        ("longest pause of the window meanwhile", "first_sight", "longest_stall_s", "s"),
+        ("an opened .blend to its first picture", "first_sight", "open_to_visible_seconds", "s"),
+        ("a motion of 1500 frames becomes keys", "extension", "amass_1500_seconds", "s"),
     ),
-    "engine": ("The engine in Blender", "benchmarks/engine.py --json docs/results/engine.json"),
-    "denoisers": ("Denoisers on held-out people", "benchmarks/denoisers.py --json docs/results/denoisers.json"),
-    "equal_minutes": (
-        "Settings of the local network's training on equal minutes",
-        "benchmarks/equal_minutes.py --data PEOPLE --minutes 18 --json docs/results/equal_minutes.json",
+    "Humans from pictures": (
+        ("8 views, people of the training", "encoder", "psnr_descended", "dB"),
+        ("8 views, other people", "encoder", "psnr_descended_heldout", "dB"),
+        ("the same, new views in new poses", "encoder", "psnr_descended_heldout_novel", "dB"),
+        ("and their SSIM", "encoder", "ssim_descended_heldout_novel", ""),
+        ("time", "encoder", "reconstruct_seconds_cpu", "s"),
+        ("150 steps of descent more, held-out views", "refine", "refine_psnr_heldout_views_from_encoder", "dB"),
+        ("one view, by the prior: eight unseen views", "from_pictures", "one_view_psnr", "dB"),
+        ("one view: the view itself", "from_pictures", "one_view_seen_psnr", "dB"),
+        ("16 frames of one view", "from_pictures", "frames_16_psnr", "dB"),
+        ("a picture without a camera: its joints", "plain_pictures", "camera_error_px", "px"),
     ),
-    "faithful": (
-        "Faithfulness to the released networks and the paper's metrics",
-        "benchmarks/faithful.py --json docs/results/faithful.json",
+    "Generated humans": (
+        ("a human, 30 steps", "diffusion", "generate_seconds_cpu", "s"),
+        ("memory", "diffusion", "peak_gb", "GB"),
+        ("Frechet distance to meshes of other people", "diffusion", "distance_ours", ""),
+        ("the same of other meshes, the floor", "diffusion", "distance_floor", ""),
+        ("the same of training people after our codec", "diffusion", "distance_codec", ""),
+        ("precision", "diffusion", "precision", ""),
+        ("recall", "diffusion", "recall", ""),
+        (
+            "distance to the nearest training person, 1 is that of new people",
+            "diffusion",
+            "nearest_neighbour_ratio",
+            "",
+        ),
+        ("least share of an attribute that was asked for and is there", "attribute_hits", "attribute_hit_min", ""),
+        ("the paper's representation, 4 minutes of training: distance", "tables", "distance_ours", ""),
+        ("one voxel grid, the same minutes", "tables", "distance_voxels", ""),
     ),
-    "captures": ("Captures", "benchmarks/captures.py --assets DIR --json docs/results/captures.json"),
-    "encoder": (
-        "The encoder",
-        "benchmarks/encoder.py --train DIR --heldout DIR --models DIR --json docs/results/encoder.json "
-        "--table docs/results/encoder_table.md",
+    "Training data": (
+        ("people made a second", "captures", "people_per_second", ""),
+        ("a view of 512 x 512 without Blender", "captures", "seconds_a_view_fast_512", "s"),
+        ("the same view in Cycles", "captures", "seconds_a_view_cycles_512", "s"),
+        ("IoU of their masks", "captures", "mask_iou_fast_vs_cycles", ""),
+        ("PSNR between them", "captures", "psnr_fast_vs_cycles", "dB"),
+        ("largest error of a joint in the picture", "captures", "joint_reprojection_px_max", "px"),
+        ("packed views that the loader reads a second", "captures", "loader_views_per_second_packed_512", ""),
+        ("a human fitted to its mesh, whole body", "chain", "payload_body_psnr", "dB"),
+        ("the same after the codec", "chain", "codec_body_psnr", "dB"),
+        ("cosine of fits to two sets of cameras", "chain", "payload_repeat_cosine", ""),
     ),
-    "refine": ("Refining on captures", "benchmarks/refine.py --assets DIR --json docs/results/refine.json"),
-    "encoder_ablations": (
-        "The encoder's ablations, 240 steps each, with boxes of one thickness",
-        "benchmarks/encoder.py --train DIR --heldout DIR --models DIR --json docs/results/encoder_ablations.json "
-        "--table docs/results/encoder_ablations_table.md",
+    "Faithfulness and faults": (
+        ("released network, largest difference to the paper's layers by hand", "faithful", "unet_error_max", ""),
+        ("released encoder, the same", "faithful", "stage1_error_max", ""),
+        ("FID, largest difference to another implementation", "faithful", "fid_equal_error", ""),
+        ("hostile files and settings that were held", "faults", "attack_cases_held", ""),
+        ("of", "faults", "attack_cases", ""),
+        ("programs killed while they wrote; results lost", "faults", "kills_lost", ""),
+        ("backends killed while Blender waited; jobs that hung", "faults", "child_hangs", ""),
+        ("commands on a full disk; files lost", "faults", "disk_full_losses", ""),
+        ("tests under Windows' file rules that fail", "everywhere", "tests_failing_under_windows_rules", ""),
     ),
-    "diffusion": (
-        "Generated people",
-        "benchmarks/diffusion.py --people DIR --reference DIR --voxel FILE --json docs/results/diffusion.json "
-        "--table docs/results/diffusion_table.md",
-    ),
-    "tables": (
-        "The paper's Table 2: other representations, trained for equal time",
-        "benchmarks/tables.py --models DIR --assets DIR --json docs/results/tables.json "
-        "--table docs/results/tables_table.md",
-    ),
-    "from_pictures": (
-        "From one view, by the person prior",
-        "benchmarks/from_pictures.py --assets DIR --json docs/results/from_pictures.json",
-    ),
-    "plain_pictures": (
-        "From one plain picture, whose pose and camera are refined",
-        "benchmarks/plain_pictures.py --assets DIR --json docs/results/plain_pictures.json",
-    ),
-    "encoder_paper_form": (
-        "The paper's Table 3 in the paper's own form",
-        "benchmarks/encoder_paper_form.py --train DIR --novel DIR --out DIR "
-        "--json docs/results/encoder_paper_form.json",
-    ),
-    "attribute_hits": (
-        "Attributes that were asked for",
-        "benchmarks/attribute_hits.py --people DIR --json docs/results/attribute_hits.json",
-    ),
-    "face_boxes": (
-        "256 more boxes on the face",
-        "benchmarks/face_boxes.py --assets DIR --json docs/results/face_boxes.json",
-    ),
-    "faults": ("Faults: hostile files, kills, full disks", "benchmarks/faults.py --json docs/results/faults.json"),
-    "everywhere": (
-        "Other systems, programs and devices",
-        "benchmarks/everywhere.py --json docs/results/everywhere.json",
-    ),
-    "layout": ("The grid on the default body", "scripts/bake_layout"),
-}  # fmt: skip
-ABOUT = ("device", "cores", "memory_gb", "python", "commit", "date")
-"""Facts about the measurement, printed above the table; package versions stay in the JSON file."""
+}
+"""Per table: what was measured, the record, its key, and the unit."""
+TABLES_OF_THEIR_OWN = {
+    "Drawing": ("march_table",),
+    "Humans from pictures": ("encoder_table", "encoder_ablations_table"),
+    "Generated humans": ("diffusion_table", "tables_table"),
+}
+HEAD = """# Results
+
+Numbers by scripts of `benchmarks/`, which write the records that each table names: they hold every other number, the
+versions and the commit. `benchmarks/report.py` makes this page from them.
+"""
 
 
-def section(name: str) -> str:
-    """The table of docs/results/NAME.json, null as "not measured", followed by the benchmark's own table if any."""
-    title, command = SOURCES[name]
-    record = json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8"))
-    about = ", ".join(f"{key} {record[key]}" for key in ABOUT if key in record)
-    lines = [f"## {title}", f"`{command}`", "", about, "", "| figure | value |", "|---|---|"]
-    for key, value in record.items():
-        if key not in ABOUT and not key.startswith("version_"):
-            lines.append(f"| {key} | {_written(value)} |")
-    table = RESULTS / f"{name}_table.md"
-    if table.is_file():
-        lines += ["", table.read_text(encoding="utf-8").rstrip()]
-    return "\n".join(lines)
+def table(title: str) -> str:
+    """A table, the records that it is from, and the tables that benchmarks wrote themselves."""
+    records = {
+        name: json.loads((RESULTS / f"{name}.json").read_text(encoding="utf-8")) for _, name, *_ in TABLES[title]
+    }
+    lines = [f"## {title}", "| | | |", "|---|---|---|"]
+    for what, name, key, unit in TABLES[title]:
+        lines.append(f"| {what} | {_written(records[name][key], unit)} | `{name}.{key}` |")
+    sources = [
+        f"[{name}](results/{name}.json): {record.get('device', '')}, {record.get('date', '')[:10]}"
+        for name, record in records.items()
+    ]
+    longer = [f"[{name}](results/{name}.md)" for name in TABLES_OF_THEIR_OWN.get(title, ())]
+    return "\n".join([*lines, "", "Records: " + "; ".join([*sources, *longer]) + "."])
 
 
 def main() -> None:
-    head = "# Results\n\nMade by `benchmarks/report.py` from `docs/results`; the commands write the files.\n\n"
-    present = [name for name in SOURCES if (RESULTS / f"{name}.json").is_file()]
-    (ROOT / "docs" / "results.md").write_text(head + "\n\n".join(map(section, present)) + "\n", encoding="utf-8")
+    page = "\n".join([HEAD, "\n\n".join(map(table, TABLES)), ""])
+    (ROOT / "docs" / "results.md").write_text(page, encoding="utf-8")
 
 
-def _written(value: object) -> str:
+def _written(value: float | int | None, unit: str) -> str:
     if value is None:
         return "not measured"
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    return json.dumps(value) if isinstance(value, (dict, list)) else str(value)
+    return f"{value:.4g} {unit}".strip() if isinstance(value, float) else f"{value} {unit}".strip()
 
 
 if __name__ == "__main__":
