@@ -47,7 +47,7 @@ OF_FILES = ("capture/scan_files.py", "primdiffusion")
 """A key in a file that captures read."""
 OPERATORS_OWN = {
     "scene/blend_values.py",
-    "ui/captures_panel.py", "ui/captures_settings.py", "ui/export_operators.py", "ui/export_panel.py",
+    "ui/captures_panel.py", "ui/captures_settings.py", "ui/export_operators.py",
     "ui/import_motion.py", "ui/picture_panel.py", "ui/reconstruct_panel.py",
     "ui/setup.py",
 }  # fmt: skip
