@@ -18,7 +18,7 @@ def classes(kind: type) -> list[type]:
     return sorted({cls for cls in found if cls.is_registered}, key=lambda cls: cls.__name__)
 
 
-_WAYS = {"what", "to", "choose", "clear", "delete", "finish", "frame", "like", "repair"}
+_WAYS = {"what", "to", "choose", "clear", "delete", "finish", "frame", "like", "repair", "use_seed"}
 """Properties by which one operator does several things."""
 
 

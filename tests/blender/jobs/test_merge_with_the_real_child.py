@@ -8,6 +8,7 @@ import bpy
 import numpy as np
 import pytest
 from human_files import sequence_files, volume_path
+from oracle import evaluated_matrices
 
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.human import humans
@@ -42,10 +43,7 @@ def test_a_merged_person_fills_the_space_of_the_volumes_on_the_surface(person):
     assert ops.merge() == {"FINISHED"}
     box = filled_box(volume_path(merged_of(person).data))
     set_representation(person, "VOLUMES")
-    bpy.context.view_layer.update()
-    graph = bpy.context.evaluated_depsgraph_get()
-    lift = np.array(person.matrix_world)[:3, 3]
-    places_of = [np.array(i.matrix_world)[:3, 3] - lift for i in graph.object_instances if i.is_instance]
+    places_of = evaluated_matrices(person)[:, :3, 3] - np.array(person.matrix_world)[:3, 3]
     assert len(places_of) == 1024
     centres = np.array([np.min(places_of, 0), np.max(places_of, 0)])
     assert (box[0] < centres[0] + 0.02).all()

@@ -1,4 +1,4 @@
-"""The edits from the operator to the volumes, with the real child and a small model."""
+"""The edits from the operator to the human's file, with the real child and a small model."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from human_files import person_file
 
-from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
+from blender_primdiffusion.scene.human import MARK, body_of, humans
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 ops = bpy.ops.primdiffusion
@@ -29,13 +29,14 @@ def people(real_child):
     return humans(real_child.scene)
 
 
-def files(person) -> dict[int, str]:
-    paths = [Path(obj.data.filepath).name for obj in parts_of(person) if obj.type == "VOLUME"]
-    return {int(name[5:9]): name for name in paths}
+def voxels(person) -> np.ndarray:
+    """Those of each primitive [K, n]."""
+    tensors = payload(person_file(person))
+    return np.concatenate([tensors[name].reshape(len(tensors[name]), -1) for name in ("rgb", "density")], 1)
 
 
-def changed(before: dict[int, str], after: dict[int, str]) -> set[int]:
-    return {k for k in before if before[k] != after[k]}
+def changed(before: np.ndarray, after: np.ndarray) -> set[int]:
+    return set(np.flatnonzero((before != after).any(1)).tolist())
 
 
 def region(*parts: str) -> set[int]:
@@ -52,18 +53,18 @@ def payload(path: Path) -> dict[str, np.ndarray]:
 
 def test_redressing_leaves_everything_outside_the_region_as_it_is(people):
     anna, berta = people
-    before, others, first = files(anna), files(berta), payload(person_file(anna))
+    before, others, first = voxels(anna), voxels(berta), payload(person_file(anna))
     assert json.loads(anna[MARK])["attributes"] == {"outfit": "suit"}
     settings = bpy.context.scene.primdiffusion_edit
     settings.parts, settings.attributes.outfit = {"hair", "shoes"}, "suit"
     assert ops.redress(human="Human", seed=5) == {"FINISHED"}
     inside = region("hair", "shoes")
-    differ = changed(before, files(anna))
+    differ = changed(before, voxels(anna))
     assert differ
     assert differ <= inside
-    assert files(berta) == others
+    assert not changed(voxels(berta), others)
     second = payload(person_file(anna))
-    outside = sorted(set(before) - inside)
+    outside = sorted(set(range(len(before))) - inside)
     assert all(np.array_equal(first[name][outside], second[name][outside]) for name in ("rgb", "density"))
     assert np.array_equal(first["betas"], second["betas"])
 
@@ -71,7 +72,7 @@ def test_redressing_leaves_everything_outside_the_region_as_it_is(people):
 def test_a_painted_head_is_all_that_changes(people):
     anna, _ = people
     body = body_of(anna)
-    before = files(anna)
+    before = voxels(anna)
     head = body.vertex_groups[JOINT_NAMES.index("head")]
     bpy.context.view_layer.objects.active = anna
     ops.paint_region()
@@ -80,7 +81,7 @@ def test_a_painted_head_is_all_that_changes(people):
         if any(element.group == head.index and element.weight > 0.5 for element in vertex.groups):
             painted.add([vertex.index], 1.0, "REPLACE")
     assert ops.redress(seed=5) == {"FINISHED"}
-    differ = changed(before, files(anna))
+    differ = changed(before, voxels(anna))
     assert differ
     assert differ <= region("head")
     ops.paint_region(finish=True)
@@ -89,21 +90,20 @@ def test_a_painted_head_is_all_that_changes(people):
 def test_vary_transfer_and_blend_follow_one_another_and_undo_goes_back_through_them(people):
     anna, berta = people
     bpy.ops.ed.undo_push(message="two people")
-    settings, states = bpy.context.scene.primdiffusion_edit, [files(anna)]
+    settings, states = bpy.context.scene.primdiffusion_edit, [voxels(anna)]
     settings.other, settings.parts, settings.fraction = berta, {"top"}, 1.0
     assert ops.vary(human="Human", seed=3) == {"FINISHED"}
-    states.append(files(anna))
+    states.append(voxels(anna))
     assert ops.transfer_texture(human="Human") == {"FINISHED"}
-    states.append(files(anna))
+    states.append(voxels(anna))
     assert changed(states[1], states[2]) <= region("top")
     settings.what, settings.harmonise = "garment", 0.5
     assert ops.transfer_texture(human="Human") == {"FINISHED"}
-    states.append(files(anna))
+    states.append(voxels(anna))
     assert ops.blend(human="Human") == {"FINISHED"}
     ours, theirs = (json.loads(person[MARK])["betas"] for person in (anna, berta))
     np.testing.assert_allclose(ours, theirs, atol=1e-4)
     for state in reversed(states):
         bpy.ops.ed.undo()
         anna = humans(bpy.context.scene)[0]
-        assert files(anna) == state
-        assert all(Path(bpy.path.abspath(volume.filepath)).is_file() for volume in bpy.data.volumes)
+        assert not changed(voxels(anna), state)
