@@ -45,6 +45,7 @@ import blender_primdiffusion
 from blender_primdiffusion.engine import engine
 from blender_primdiffusion.scene.armature import pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
+from blender_primdiffusion.scene.human import body_of
 
 SIZE = 512
 WARM_UP, FRAMES = 3, 15
@@ -249,9 +250,9 @@ def over_cycles(person: bpy.types.Object, folder: Path) -> np.ndarray:
     scene.render.film_transparent = False
     scene.render.engine = "CYCLES"
     scene.cycles.samples, scene.cycles.device = CYCLES_SAMPLES, "CPU"
-    layer = bpy.context.view_layer.layer_collection.children[person.name]
-    next(child for child in layer.children if child.name.endswith("_primitives")).exclude = True
-    body = next(obj for obj in person.children if obj.type == "MESH")
+    for part in person.children:
+        part.hide_render = True
+    body = body_of(person)
     body.hide_render = body.visible_camera = False
     below = picture(folder)
     return above + (1 - above[..., 3:]) * below

@@ -108,8 +108,7 @@ def test_the_installed_zip_generates_and_renders_a_human_and_blender_exits(archi
     report = json.loads(reports[0].removeprefix("REPORT "))
     assert report["outcome"] == ["FINISHED"]
     assert report["module"] == "bl_ext.user_default.primdiffusion"
-    volumes = 0 if SPLATS_AVAILABLE else 1024
-    assert (report["volumes"], report["loaded"], report["files"]) == (volumes, volumes, volumes)
+    assert (report["volumes"], report["files"]) == (not SPLATS_AVAILABLE, 0), "no render has needed their files"
     assert (report["splats"] > 50_000) == SPLATS_AVAILABLE
     assert report["bones"] == 24
     assert report["backend_in_zip"]

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from engine_stage import add_human, cube, material, pixels, render_exr, set_up_render
 
+from blender_primdiffusion.scene.volume_nodes import volumes_of
+
 SIDE = 96
 BEFORE, BEHIND, TORSO = (37, 48), (37, 60), (44, 43)
 """Pixels (row, column) of the cube before the person, of the one behind that looks out beside it, of bare torso."""
@@ -33,8 +35,7 @@ def shot(extension, saved_scene, folder, tmp_path):
     people.render.engine = "PRIMDIFFUSION"
     people.primdiffusion_render.solids = "HOLDOUT"
     people.render.film_transparent = True
-    in_solid = solid.view_layers[0].layer_collection.children[person.name]
-    next(child for child in in_solid.children if child.name.endswith("_primitives")).exclude = True
+    volumes_of(person).hide_render = True
     return SimpleNamespace(solid=solid, people=people, out=tmp_path / "picture")
 
 
