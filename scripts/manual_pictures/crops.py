@@ -16,14 +16,12 @@ PANELS = {
     "attributes": ("generate_attributes",),
     "variations": ("variations_empty", "variations_denoising", "variations_selected"),
     "shape": ("human_shape_before", "human_shape_after"),
-    "pose_library": ("human_poses",),
     "details": ("human_details", "human_assets"),
     "edits": ("edit_parts", "edit_two_people"),
     "motion": ("motion_empty", "motion_imported"),
-    "render": ("render_cycles", "render_surface", "render_merged", "render_outdated"),
+    "render": ("render_cycles", "render_merged", "render_outdated"),
     "captures": ("captures_cameras", "captures_output", "captures_human"),
     "export": ("export_before", "export_proxy"),
-    "missing": ("missing_files",),
 }
 """Rows of sidebars, cropped to their panels."""
 WINDOWS = {
@@ -33,6 +31,7 @@ WINDOWS = {
     "window_person": ("first_person", "window 0"),
     "window_redressed": ("edit_redressed", "window 0"),
     "window_painting": ("edit_painting", "window 0"),
+    "pose_library": ("human_poses", "window 0"),
     "window_proxy": ("export_proxy", "window 0"),
     "window_motion": ("motion_imported", "window 0"),
 }

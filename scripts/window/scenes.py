@@ -130,7 +130,7 @@ def variations(module: str, python: str) -> Steps:
 
 
 def human(module: str, python: str) -> Steps:
-    """Shape before and after, memory, poses, files and assets."""
+    """Shape before and after, facts, poses, assets."""
     yield from with_people(module, python, FIRST_SEED)
     armature = armatures()[0]
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_shape")
@@ -142,7 +142,7 @@ def human(module: str, python: str) -> Steps:
     yield "human_shape_after"
     press("primdiffusion.reshape", to="GENERATED")
     yield 4.0
-    yield from show("PRIMDIFFUSION_PT_advanced/memory")
+    yield from show("PRIMDIFFUSION_PT_advanced/facts")
     yield "human_details"
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
     press("object.posemode_toggle")
@@ -152,7 +152,7 @@ def human(module: str, python: str) -> Steps:
     yield 6.0
     yield "human_poses"
     press("object.posemode_toggle")
-    yield from show("PRIMDIFFUSION_PT_export/assets", "PRIMDIFFUSION_PT_advanced/files")
+    yield from show("PRIMDIFFUSION_PT_export/assets")
     yield "human_assets"
 
 

@@ -73,7 +73,7 @@ def test_the_panels_settings_are_requested_and_random_seeds_differ_each_time(add
     assert (asked["steps"], asked["sampler"]) == (8, "dpmpp_2m")
     addon.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
     ops.variations(count=4, steps=3, sampler="ddpm")
-    assert seeds() == [7, 8, 9, 10]
+    assert seeds() == [10, 11, 12, 13]
     assert sent(sheet.variations[0].person)["sampler"] == "ddpm"
 
 
