@@ -198,12 +198,16 @@ def motion(module: str, python: str) -> Steps:
     """The empty panel, the dialog with what was detected in a file, after the import."""
     yield from with_people(module, python, FIRST_SEED)
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_motion")
+    yield from at_rest(module)
     yield "motion_empty"
     path = Path(bpy.app.tempdir) / "walk_01.npz"
     press("primdiffusion.add_motion", motion="WALK", rounds=3)
     press("primdiffusion.export_motion", "EXEC_DEFAULT", filepath=str(path))
-    bpy.context.active_object.animation_data_clear()
-    yield 1.0
+    armature = armatures()[0]
+    armature.animation_data_clear()
+    for bone in armature.pose.bones:
+        bone.matrix_basis.identity()  # the view is as in motion_empty, but for the dialog
+    yield from at_rest(module)
     yield {"point": [500, 500]}
     invoke("primdiffusion.import_motion", filepath=str(path))
     yield 1.0
