@@ -62,7 +62,9 @@ def _draw_humans() -> None:
     context = bpy.context
     if shows_humans(context):
         overlay.overlay.draw(context)
-    elif _shows_overlays(context) and (picture := viewport.picture_above_overlays(context)):
+        return
+    overlay.overlay.leave(context.region)
+    if _shows_overlays(context) and (picture := viewport.picture_above_overlays(context)):
         overlay.draw_above_overlays(context, picture)
 
 

@@ -144,7 +144,7 @@ def overlap_warning(person: bpy.types.Object) -> str | None:
         return None
     return (
         f"Cycles leaves out parts of {person.name!r}, where {most} volumes overlap and it draws only "
-        f"{CYCLES_LIMIT}; render with PrimDiffusion (Exact)"
+        f"{CYCLES_LIMIT}; render with the PrimDiffusion engine"
     )
 
 

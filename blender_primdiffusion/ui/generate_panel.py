@@ -81,7 +81,7 @@ SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in SAMPLERS]
 class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
     """`scene.primdiffusion`."""
 
-    seed: declared(GenerateRequest, "seed", default=7)
+    seed: declared(GenerateRequest, "seed", default=10)
     keep_seed: bpy.props.BoolProperty(
         name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each human"
     )

@@ -16,14 +16,12 @@ PANELS = {
     "attributes": ("generate_attributes",),
     "variations": ("variations_empty", "variations_denoising", "variations_selected"),
     "shape": ("human_shape_before", "human_shape_after"),
-    "pose_library": ("human_poses",),
     "details": ("human_details", "human_assets"),
     "edits": ("edit_parts", "edit_two_people"),
     "motion": ("motion_empty", "motion_imported"),
-    "render": ("render_cycles", "render_surface", "render_merged", "render_outdated"),
+    "render": ("render_cycles", "render_merged", "render_outdated"),
     "captures": ("captures_cameras", "captures_output", "captures_human"),
     "export": ("export_before", "export_proxy"),
-    "missing": ("missing_files",),
 }
 """Rows of sidebars, cropped to their panels."""
 WINDOWS = {
@@ -33,10 +31,11 @@ WINDOWS = {
     "window_person": ("first_person", "window 0"),
     "window_redressed": ("edit_redressed", "window 0"),
     "window_painting": ("edit_painting", "window 0"),
+    "pose_library": ("human_poses", "view"),
     "window_proxy": ("export_proxy", "window 0"),
     "window_motion": ("motion_imported", "window 0"),
 }
-"""Whole windows, or the part of the main window in WINDOW_PART."""
+"""Whole windows, or one of PARTS."""
 STACKS = {"set_up_progress": ("set_up_real_0", "set_up_real_1", "set_up_real_2")}
 """The extension's part of the preferences, one below the other."""
 ROWS = {"window_picture": ("picture_posed", "picture_fitted", "picture_posed_made")}
@@ -44,6 +43,8 @@ ROWS = {"window_picture": ("picture_posed", "picture_fitted", "picture_posed_mad
 DIALOGS = {"motion_dialog": "motion_dialog"}
 WINDOW_PART = (0, 24, 1320, 1190)
 """Pixels of the main window: without the properties and the timeline."""
+PARTS = {"window 0": WINDOW_PART, "view": (0, 24, 1320, 1274)}
+"""Of the main window; "view" goes down to the asset shelf."""
 PREFERENCES_PART = (172, 240, 872, 548)
 """Pixels of the preferences' window: the extension's part, down to a whole row."""
 ROW_PART = (320, 80, 1300, 1100)
@@ -67,9 +68,8 @@ def crop_all(shots: Path, out: Path) -> None:
     for name, (shot, window) in WINDOWS.items():
         if _are_there(shots, shot):
             picture, boxes = _read(shots, shot)
-            box = WINDOW_PART if window == "window 0" else boxes[window]
-            part = picture.crop(box)
-            if window == "window 0":
+            part = picture.crop(PARTS.get(window) or boxes[window])
+            if window in PARTS:
                 size = (_WINDOW_WIDTH, round(part.height * _WINDOW_WIDTH / part.width))
                 save_jpeg(part.resize(size, Image.Resampling.LANCZOS), out / f"{name}.jpg")
             else:

@@ -82,7 +82,8 @@ def do(request: dict, out: Path, display: str) -> list[int] | None:
     environment = {**os.environ, "DISPLAY": f":{display}"}
     if "picture" in request:
         path = out / f"{request['picture']}.png"
-        subprocess.run(["import", "-display", f":{display}", "-window", "root", str(path)], check=True)
+        little = ["-define", "png:compression-level=1"]  # 9 takes seconds of a busy processor
+        subprocess.run(["import", "-display", f":{display}", "-window", "root", *little, str(path)], check=True)
         path.with_suffix(".json").write_text(json.dumps(request["where"]), encoding="utf-8")
         print(f"saved {path.name}", flush=True)
     if "figures" in request:

@@ -68,7 +68,7 @@ def drawn(module: str, python: str, seed: int, name: str) -> Steps:
     scene.render.resolution_x, scene.render.resolution_y = _SIZE
     scene.view_settings.view_transform = "Standard"
     scene.render.image_settings.color_mode = "RGBA"
-    path = Path(bpy.app.tempdir) / f"{pose.lower()}.png"
+    path = Path(bpy.app.tempdir) / f"{name.lower()}.png"
     bpy.ops.render.render()
     bpy.data.images["Render Result"].save_render(str(path))
     yield 1.0

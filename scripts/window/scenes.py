@@ -69,7 +69,7 @@ def first_human(module: str, python: str) -> Steps:
     yield from wait(lambda: not queue.busy, 240)
     yield from at_rest(module)
     yield "first_solid"
-    yield from rendered_view()
+    yield from rendered_view(module)
     yield "first_person"
 
 
@@ -125,29 +125,32 @@ def variations(module: str, python: str) -> Steps:
 
 
 def human(module: str, python: str) -> Steps:
-    """Shape before and after, memory, poses, files and assets."""
+    """Shape before and after, facts, poses, assets."""
     yield from with_people(module, python, FIRST_SEED)
     armature = armatures()[0]
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_shape")
-    yield from rendered_view()
+    yield from rendered_view(module)
     yield "human_shape_before"
     settings = armature.primdiffusion_human
     settings.betas[0], settings.betas[1] = 1.5, -2.0
-    yield 6.0
+    yield from at_rest(module)
     yield "human_shape_after"
     press("primdiffusion.reshape", to="GENERATED")
     yield 4.0
-    yield from show("PRIMDIFFUSION_PT_advanced/memory")
+    yield from show("PRIMDIFFUSION_PT_advanced/facts")
     yield "human_details"
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
+    space = view()[1].spaces.active
+    space.shading.type, space.overlay.show_bones = "SOLID", True
+    press("view3d.view_selected", "EXEC_DEFAULT")
     press("object.posemode_toggle")
     yield 1.0  # until it is drawn in Pose Mode, the view has no asset shelf
-    view()[1].spaces.active.show_region_asset_shelf = True
+    space.show_region_asset_shelf = True
     pose(bpy.context.active_object, "Waving")
-    yield 6.0
+    yield from at_rest(module)
     yield "human_poses"
     press("object.posemode_toggle")
-    yield from show("PRIMDIFFUSION_PT_export/assets", "PRIMDIFFUSION_PT_advanced/files")
+    yield from show("PRIMDIFFUSION_PT_export/assets")
     yield "human_assets"
 
 
@@ -172,7 +175,7 @@ def edits(module: str, python: str) -> Steps:
     yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
     yield "edit_working"
     yield from wait(lambda: not queue.busy, 180)
-    yield from rendered_view()
+    yield from rendered_view(module)
     yield "edit_redressed"
     settings.region = "PAINTED"
     press("primdiffusion.paint_region")
@@ -190,12 +193,16 @@ def motion(module: str, python: str) -> Steps:
     """The empty panel, the dialog with what was detected in a file, after the import."""
     yield from with_people(module, python, FIRST_SEED)
     yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_motion")
+    yield from at_rest(module)
     yield "motion_empty"
     path = Path(bpy.app.tempdir) / "walk_01.npz"
     press("primdiffusion.add_motion", motion="WALK", rounds=3)
     press("primdiffusion.export_motion", "EXEC_DEFAULT", filepath=str(path))
-    bpy.context.active_object.animation_data_clear()
-    yield 1.0
+    armature = armatures()[0]
+    armature.animation_data_clear()
+    for bone in armature.pose.bones:
+        bone.matrix_basis.identity()  # the view is as in motion_empty, but for the dialog
+    yield from at_rest(module)
     yield {"point": [500, 500]}
     invoke("primdiffusion.import_motion", filepath=str(path))
     yield 1.0
@@ -203,9 +210,9 @@ def motion(module: str, python: str) -> Steps:
     yield {"key": "Escape"}
     yield 0.5
     press("primdiffusion.import_motion", "EXEC_DEFAULT", filepath=str(path))
-    yield from rendered_view()
+    yield from rendered_view(module)
     bpy.context.scene.frame_set(14)
-    yield 5.0
+    yield from at_rest(module)
     yield "motion_imported"
 
 

@@ -14,7 +14,6 @@ _EVERY_S = 0.005
 _SHOWN = 5
 _NOTICED_S = 0.1
 _OURS = (
-    ("jobs.follow", "Building", "advance"),
     ("jobs.follow", "", "enter"),
     ("jobs.volumes", "VolumesJob", "advance"),
     ("engine.gpu.overlay", "Overlay", "advance"),

@@ -16,6 +16,7 @@ from panels import show, view, wide_view
 from press import Steps, press, wait
 from stalls import Stalls, measure_extension
 from start import FIRST_SEED, SECOND_SEED, armatures, begin, clear_of_the_sidebar, queue_of, select, with_people
+from visible_scene import at_rest
 
 REDRAW_ROUNDS, REDRAWS = 5, 6
 """Rounds of all states, and redraws in each."""
@@ -102,7 +103,7 @@ def rendered(module: str, python: str) -> Steps:
     for location, size in (((0.5, -0.2, 0.4), 0.8), ((0.0, 0.0, 0.0), 0.1)):
         bpy.ops.mesh.primitive_cube_add(size=size, location=location)
     bpy.context.object.scale = (30.0, 30.0, 0.01)
-    yield from rendered_view()
+    yield from rendered_view(module)
     yield "rendered_still"
     _, area = view()
     around = area.spaces.active.region_3d
@@ -234,10 +235,10 @@ def finish() -> None:
     gpu.state.active_framebuffer_get().read_color(0, 0, 1, 1, 4, 0, "UBYTE")
 
 
-def rendered_view() -> Steps:
-    """The engine in the viewport, with a large view of the person."""
+def rendered_view(module: str) -> Steps:
+    """The engine in the viewport, with a large view of the person, at its finest."""
     scene = bpy.context.scene
     scene.render.engine = "PRIMDIFFUSION"
     scene.view_settings.view_transform = "Standard"
     wide_view()
-    yield 25.0
+    yield from at_rest(module)

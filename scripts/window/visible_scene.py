@@ -101,10 +101,11 @@ def layers() -> list[bpy.types.LayerCollection]:
 
 
 def at_rest(module: str) -> Steps:
-    """Until the views show their finest pictures."""
+    """Until the views show their finest pictures, those that the engine draws too."""
     overlay = import_module(f"{module}.engine.gpu.overlay").overlay
+    rendered = import_module(f"{module}.engine.viewport")._viewports
     yield 1.0
-    yield from wait(lambda: overlay.resting, _MOST_S)
+    yield from wait(lambda: overlay.resting and all(view.resting for view in rendered), _MOST_S)
     yield 1.0
 
 

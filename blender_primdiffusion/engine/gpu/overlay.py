@@ -62,6 +62,10 @@ class Overlay:
         if self._fault:
             self.error = f"{self._fault}: show the volumes instead (Advanced > Show As > Show Volumes in Viewport)"
 
+    def leave(self, region: bpy.types.Region) -> None:
+        """Drop the picture of a region that is drawn otherwise now: it would be refined beside the engine's."""
+        self._regions.pop(region.as_pointer(), None)
+
     def _draw(self, context: bpy.types.Context) -> None:
         reading = self.reading(context)
         self.error = reading.error

@@ -82,7 +82,7 @@ def test_the_panels_settings_are_requested_and_random_seeds_differ_each_time(add
     settings.seeds, settings.quality, settings.count = "CONSECUTIVE", "PANEL", "4"
     addon.scene.primdiffusion.sampler = "ddpm"
     ops.variations()
-    assert seeds() == [7, 8, 9, 10]
+    assert seeds() == [10, 11, 12, 13]
     assert sent(sheet.variations[0].person)["sampler"] == "ddpm"
 
 

@@ -13,10 +13,12 @@ from engine_stage import cube
 from human_files import lose_data
 from mathutils import Matrix
 
+from blender_primdiffusion import engine
 from blender_primdiffusion.engine.boxes import Boxes
 from blender_primdiffusion.engine.gpu import overlay as module
 from blender_primdiffusion.engine.gpu import scene_reading
 from blender_primdiffusion.engine.gpu.overlay import Overlay
+from blender_primdiffusion.engine.gpu.refine import MarchRequest
 from blender_primdiffusion.engine.view import NO_SURFACE_M, clip_of
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_backend
@@ -376,3 +378,15 @@ def test_each_redraw_of_a_moving_view_shows_all_of_the_new_one(people, monkeypat
     assert len(turns) == 5
     step, (first, _) = bpy.context.scene.primdiffusion_render.step, drawn[0]
     assert (first.view.width, first.step) == (SIZE[0] // 8, 8 * step)
+
+
+def test_a_view_that_the_engine_draws_now_is_not_refined_beside_it(monkeypatch):
+    shown, overlay = context(), Overlay()
+    overlay._picture_of(shown.region).want(MarchRequest("before", None, None))
+    assert not overlay.resting
+    monkeypatch.setattr(module, "overlay", overlay)
+    for name in ("shows_humans", "_shows_overlays"):
+        monkeypatch.setattr(engine, name, lambda _context: False)
+    monkeypatch.setattr(engine, "bpy", SimpleNamespace(context=shown))
+    engine._draw_humans()
+    assert overlay.resting
