@@ -29,7 +29,7 @@ TABLES: dict[str, tuple[tuple[str, str, str, str], ...]] = {
         ("a picture of 1024 volumes in Cycles, 1 sample", "extension", "cycles_volumes_seconds", "s"),
         ("and of one merged volume", "extension", "cycles_merged_seconds", "s"),
         ("the backend's answer to a human in view, in a window", "first_sight", "in_view_seconds_window", "s"),
-        ("longest pause of the window meanwhile", "first_sight", "longest_stall_s", "s"),
+        ("longest pause of the window while it enters", "first_sight", "longest_stall_s", "s"),
         ("an opened .blend to its first picture", "first_sight", "open_to_visible_seconds", "s"),
         ("a motion of 1500 frames becomes keys", "extension", "amass_1500_seconds", "s"),
     ),

@@ -16,11 +16,11 @@ from ..scene.cycles import overlap_warning_in
 from ..scene.edit import Replaced, replace_person
 from ..scene.payload import session_file
 from ..scene.representation import in_viewport, representation_of
-from ..scene.volume_files import write_volumes
 from ..scene.volume_nodes import set_folder
 from ..scene.volumes import free_unused_grids
 from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .target import HumanTarget
+from .volumes import write_or_report
 
 _STEP_PICTURE_PX = 256
 """Of the picture after each step, for the panel."""
@@ -30,7 +30,7 @@ def show_in_place(context: bpy.types.Context, person: bpy.types.Object, result: 
     """Show the human of the child's `result` in place of `person`. Raises as `replace_person` does."""
     done = replace_person(person, result.person)
     if representation_of(person) == "VOLUMES" and in_viewport(person):
-        write_volumes(person)
+        write_or_report(person)
         set_folder(person, session_file(person).parent, again=True)
         context.view_layer.update()  # evaluated data holds the old grids
         free_unused_grids()

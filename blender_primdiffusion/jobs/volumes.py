@@ -1,4 +1,4 @@
-"""Volumes are written when they are to be seen: in 3D views by a job in slices, in renders before they begin."""
+"""Volumes are written when something shows them: for 3D views by a job in slices, for renders before they begin."""
 
 from __future__ import annotations
 
@@ -65,10 +65,7 @@ class VolumesJob(Job):
         if self._error is not None:
             raise self._error
         person = self.target.found()
-        mesh_too = shown(person)
-        show_in_viewport(person, True)
-        if mesh_too != "VOLUMES":
-            show(person, mesh_too)
+        show_volumes(person, True)
         set_folder(person, session_file(person).parent, again=True)
         return f"3D views show the volumes of {person.name}"
 
@@ -86,6 +83,22 @@ class Faults:
 
 
 faults = Faults()
+
+
+def write_or_report(person: bpy.types.Object) -> None:
+    """Write a human's volumes; says why where that fails."""
+    try:
+        write_volumes(person)
+    except (OSError, ValueError) as error:
+        faults.report(str(error))
+
+
+def show_volumes(person: bpy.types.Object, in_viewport: bool) -> None:
+    """Show a human's volumes in viewports or hide them; what is shown of its mesh proxy stays. Makes no undo step."""
+    what = shown(person)
+    show_in_viewport(person, in_viewport)
+    if what != "VOLUMES":
+        show(person, what)
 
 
 @persistent
@@ -110,12 +123,9 @@ def write_before_rendering(scene: bpy.types.Scene, *_: object) -> None:
         return
     faults.text = ""
     for person in all_humans():  # scenes may hold instances of them alone
-        try:
-            volumes = volumes_of(person)
-            if volumes is not None and not volumes.hide_render:
-                write_volumes(person)
-        except (OSError, ValueError) as error:
-            faults.report(str(error))
+        volumes = volumes_of(person)
+        if volumes is not None and not volumes.hide_render:
+            write_or_report(person)
 
 
 HANDLERS = (

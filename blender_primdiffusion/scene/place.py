@@ -36,6 +36,7 @@ def stand_at_cursor(context: bpy.types.Context, person: bpy.types.Object) -> Non
     solids = list(_solids(context.evaluated_depsgraph_get(), extent))
     away = _nearest(_ways_out(extent, solids), extent, solids)
     moved = extent + away
+    solids = [box for box in solids if not _too_close(moved, box)]  # not the hills that it stands on after all
     along_x = [move for box in people for move in _past(moved, box)] + _ways_out(moved, solids)
     away += _nearest([(x, y) for x, y in along_x if y == 0], moved, [*solids, *people])
     person.location.xy += Vector(away[:2])

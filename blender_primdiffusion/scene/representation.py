@@ -8,13 +8,11 @@ from .blend_values import stored_choice, stored_flag
 from .human import check_editable
 from .merged import merged_of
 from .splats import SPLATS_AVAILABLE, build_splats, cloud_of
-from .volume_nodes import build_volumes, volumes_of
+from .volume_nodes import IN_VIEWPORT, build_volumes, volumes_of
 
 REPRESENTATION = "primdiffusion_representation"
 """Custom property of a human: one of REPRESENTATIONS."""
 REPRESENTATIONS = ("VOLUMES", "MERGED", "SPLATS")
-IN_VIEWPORT = "primdiffusion_volumes_in_viewport"
-"""Custom property of a human: whether viewports show its volumes, too."""
 
 
 def representation_of(person: bpy.types.Object) -> str:

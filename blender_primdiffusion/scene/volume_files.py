@@ -16,7 +16,7 @@ from ..formats.whole_files import remove_abandoned
 from .human import all_humans, body_of, write_error
 from .payload import session_file
 from .rest_human import read_human, shape_model_of
-from .volume_nodes import FILES, set_folder, volumes_of
+from .volume_nodes import FILES, hide_in_viewport, set_folder, volumes_of
 from .volumes import write_volume
 
 
@@ -24,7 +24,8 @@ def open_humans() -> list[str]:
     """Point the volumes of all humans to the files of this session; returns what is wrong with humans, in sentences.
 
     For files that were opened and humans that were appended or linked, before undo takes note of them. A human whose
-    data are missing or damaged shows its body mesh.
+    data are missing or damaged shows its body mesh. Viewports hide volumes whose files are yet to be written: Blender
+    would remember that they were missing (see `set_folder`).
     """
     faults = []
     for person in all_humans():
@@ -37,6 +38,9 @@ def open_humans() -> list[str]:
                 body.hide_viewport = False
             continue
         set_folder(person, folder)
+        volumes = volumes_of(person)
+        if volumes is not None and not volumes.hide_viewport and not are_written(person):
+            hide_in_viewport(person, volumes)
     return faults
 
 
@@ -52,8 +56,8 @@ def are_written(person: bpy.types.Object) -> bool:
 
 
 def writing(person: bpy.types.Object) -> Generator[None, None, None]:
-    """Write the files of a human's volumes, one a step; those that are there stay. Holds no Blender objects meanwhile,
-    since undo may replace them. Raises as `read_human`, also for what cannot be written.
+    """Write the files of a human's volumes, one a step; those that are there stay. It holds no Blender objects, since
+    undo may replace them. Raises as `read_human`, also for what cannot be written.
     """
     return _writing(session_file(person), files_of(person))
 

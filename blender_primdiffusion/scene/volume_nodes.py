@@ -15,6 +15,8 @@ from .shape import betas_of, generated_betas
 
 VOLUMES_MARK = "primdiffusion_volumes"
 """Custom property of the object of a human that shows its volumes."""
+IN_VIEWPORT = "primdiffusion_volumes_in_viewport"
+"""Custom property of a human: whether viewports show its volumes, too."""
 GROUP_NAME = "PrimDiffusion Volumes on Body"
 BODY, FOLDER, MATERIAL = "Body", "Folder", "Material"
 """Inputs of the group."""
@@ -45,6 +47,13 @@ def build_volumes(person: bpy.types.Object) -> bpy.types.Object:
 def volumes_of(person: bpy.types.Object) -> bpy.types.Object | None:
     """The object that shows the human's volumes; None for humans without."""
     return next((obj for obj in parts_of(person) if VOLUMES_MARK in obj), None)
+
+
+def hide_in_viewport(person: bpy.types.Object, volumes: bpy.types.Object) -> None:
+    """Hide the human's volumes in viewports. Those of a linked human or an override come back with the next loading."""
+    volumes.hide_viewport = True
+    if person.library is None and person.override_library is None:
+        person[IN_VIEWPORT] = False
 
 
 def set_folder(person: bpy.types.Object, folder: Path, *, again: bool = False) -> None:

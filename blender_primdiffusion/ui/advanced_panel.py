@@ -6,11 +6,10 @@ import bpy
 
 from ..backend.requests import sentence
 from ..formats.requests import VOXEL
-from ..jobs.export import show, shown
 from ..jobs.follow import submit
 from ..jobs.merge import MergeFramesJob, MergeJob, Moment
 from ..jobs.target import HumanTarget, selected_person
-from ..jobs.volumes import VolumesJob
+from ..jobs.volumes import VolumesJob, show_volumes
 from ..places import backend_is_named
 from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_of, overlap_warning_in
@@ -21,7 +20,6 @@ from ..scene.representation import (
     in_viewport,
     representation_of,
     set_representation,
-    show_in_viewport,
     without_merged,
 )
 from ..scene.splats import SPLATS_AVAILABLE, cloud_of
@@ -70,10 +68,7 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(HumanOperator, bpy.types.Operator):
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         if not in_viewport(person) and representation_of(person) == "VOLUMES":
             return submit(self, context, VolumesJob(HumanTarget.of(person)))
-        what = shown(person)
-        show_in_viewport(person, not in_viewport(person))
-        if what != "VOLUMES":
-            show(person, what)
+        show_volumes(person, not in_viewport(person))
         bpy.ops.ed.undo_push(message=self.bl_label)
         return {"FINISHED"}
 

@@ -12,7 +12,6 @@ import bpy
 from ..formats.schema import Range, Slider, descriptions, field_types, split
 
 SKIP = {"SKIP_SAVE"}
-PANELS = "Defaults to the setting in the panel"
 _LARGEST = 2**31 - 1
 """Blender's integers are shorter than the backend's."""
 _MAKERS = {int: bpy.props.IntProperty, float: bpy.props.FloatProperty, bool: bpy.props.BoolProperty}
@@ -45,8 +44,3 @@ def declared(record: type, field: str, **changes: Any) -> Any:
         elif isinstance(mark, Slider):
             settings |= {"soft_min": kind(mark.least), "soft_max": kind(mark.most)}
     return maker(**settings | changes)
-
-
-def not_given(record: type, field: str, **changes: Any) -> Any:
-    """As `declared`, for an operator that takes the panel's value if a call leaves it out."""
-    return declared(record, field, **{"description": PANELS, "options": SKIP, **changes})

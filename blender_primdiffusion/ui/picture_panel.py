@@ -88,8 +88,6 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
         description="Name of the human posed over the picture; empty: the selected one, if any",
         options=SKIP,
     )
-    mask: bpy.props.StringProperty(name="Mask", description="Empty: the panel's", subtype="FILE_PATH", options=SKIP)
-    seed: bpy.props.IntProperty(name="Seed", description="-2: the panel's", default=-2, min=-2, options=SKIP)
 
     @classmethod
     def description(cls, _context: bpy.types.Context, properties: bpy.types.OperatorProperties) -> str:
@@ -100,7 +98,7 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> set[str]:
         complete()
         asked = context.scene.primdiffusion_picture
-        mask = bpy.path.abspath(self.mask) or setting_path(asked.mask, "Mask")
+        mask = setting_path(asked.mask, "Mask")
         person = named_person(context, self.human) if self.human else _posed(context)
         if self.only_fit and person is None:
             raise ValueError("select the human that is posed over the picture: there is none to fit")
@@ -108,8 +106,7 @@ class PRIMDIFFUSION_OT_human_from_picture(Reporting, bpy.types.Operator):
         task = PictureTask.of(context, mask, asked.mask_label, person)
         if target is not None:
             return submit(self, context, FitPictureJob(task, target))
-        seed = asked.seed if self.seed == -2 else self.seed
-        return submit(self, context, PictureJob(task, seed, 0 if person is None else person.session_uid))
+        return submit(self, context, PictureJob(task, asked.seed, 0 if person is None else person.session_uid))
 
 
 def _posed(context: bpy.types.Context) -> bpy.types.Object | None:

@@ -14,7 +14,7 @@ from ..jobs.follow import Reporting, submit
 from ..jobs.generate import ReconstructJob
 from ..scene.blend_values import setting_path
 from .captures_panel import DataPanel
-from .declared import PANELS, SKIP, declared, not_given
+from .declared import declared
 from .drawing import draw_job, property_columns
 
 _CAMERAS_FILE = "cameras.json"
@@ -22,7 +22,6 @@ _BY = (
     ("encoder", "Encoder", "A network turns several views into a human within seconds"),
     ("prior", "Prior", "The human is fitted to the views, and what they do not show is guessed: one view is enough"),
 )
-_BY_DESCRIPTION = "How the views become a human"
 
 
 def subjects_in(folder: Path) -> list[str]:
@@ -61,7 +60,7 @@ class PRIMDIFFUSION_PG_reconstruct(bpy.types.PropertyGroup):
     )
     frame: declared(ReconstructRequest, "frame")
     views: declared(ReconstructRequest, "views")
-    by: bpy.props.EnumProperty(name="By", description=_BY_DESCRIPTION, items=_BY)
+    by: bpy.props.EnumProperty(name="By", description="How the views become a human", items=_BY)
 
 
 class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
@@ -72,12 +71,6 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
 
     directory: bpy.props.StringProperty(
         name="Captures", description="Empty: the panel's", subtype="DIR_PATH", options={"SKIP_SAVE"}
-    )
-    subject: bpy.props.StringProperty(name="Subject", description="Empty: the panel's", options={"SKIP_SAVE"})
-    frame: not_given(ReconstructRequest, "frame", default=-1, min=-1, description="-1: the panel's")
-    views: not_given(ReconstructRequest, "views", default=0, min=0, description="0: the panel's")
-    by: bpy.props.EnumProperty(
-        name="By", description=_BY_DESCRIPTION, items=[("PANEL", "As in the Panel", PANELS), *_BY], options=SKIP
     )
     filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
 
@@ -91,14 +84,12 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
     def act(self, context: bpy.types.Context) -> set[str]:
         asked = context.scene.primdiffusion_reconstruct
         folder = bpy.path.abspath(self.directory) or setting_path(asked.capture, "Captures")
-        subject = self.subject or ("" if self.directory else asked.subject)  # the panel's belongs to its own folder
+        subject = "" if self.directory else asked.subject  # which belongs to the panel's own folder
         if not folder:
             raise ValueError("choose the folder of captures first")
         if not os.path.isdir(folder):
             raise FileNotFoundError(f"there is no folder {folder!r:.200}: choose one of captures")
-        frame, views = self.frame if self.frame >= 0 else asked.frame, self.views or asked.views
-        by = asked.by if self.by == "PANEL" else self.by
-        return submit(self, context, ReconstructJob(folder, subject, frame, views, by))
+        return submit(self, context, ReconstructJob(folder, subject, asked.frame, asked.views, asked.by))
 
 
 class PRIMDIFFUSION_PT_human_from_captures(DataPanel, bpy.types.Panel):

@@ -46,7 +46,7 @@ def surface_frames(human: dict, rotations: np.ndarray, translation: np.ndarray) 
 
 
 def evaluated_matrices(person: bpy.types.Object) -> np.ndarray:
-    """World matrices [K, 4, 4] of a human's volumes as Blender draws them; shows them meanwhile, and writes files."""
+    """World matrices [K, 4, 4] of a human's volumes as Blender draws them; shows them for that."""
     write_volumes(person)
     volumes = volumes_of(person)
     hidden, volumes.hide_viewport = volumes.hide_viewport, False

@@ -140,7 +140,7 @@ class TableOptions:
     table: Literal["1", "2"] | None = None
     """Measure what this table of the paper has, at 512 x 512, and the same by our own network. Needs no --people."""
     fake: Path | None = None
-    """Folder of generated pictures of anybody, instead of a checkpoint's: square, over white or with alpha."""
+    """Folder of generated pictures of any people, instead of a checkpoint's: square, over white or with alpha."""
     real: Path | None = None
     """Folder of real pictures; without it, renders of the meshes of MakeHuman's --assets."""
     poses: Count = 5

@@ -16,6 +16,7 @@ from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import humans
+from blender_primdiffusion.scene.payload import forget_session_files
 from blender_primdiffusion.scene.representation import in_viewport
 from blender_primdiffusion.scene.volume_files import are_written
 from blender_primdiffusion.scene.volume_nodes import volumes_of
@@ -33,11 +34,12 @@ def person(addon, tmp_path, monkeypatch):
     return person
 
 
+def full(*_: object) -> None:
+    raise OSError(28, "No space left on device")
+
+
 @pytest.fixture
 def full_disk(monkeypatch):
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
-
     monkeypatch.setattr(volumes, "write_vdb", full)
     return monkeypatch
 
@@ -151,3 +153,38 @@ def test_cycles_merges_humans_that_stand_still_and_leaves_those_that_move(person
     assert ops.set_up_engine(engine="CYCLES") == {"FINISHED"}
     assert [representation_of(one) for one in (person, moving)] == ["MERGED", "VOLUMES"]
     bpy.context.scene.render.engine = "BLENDER_WORKBENCH"
+
+
+def test_volumes_that_an_opened_file_shows_are_hidden_until_they_are_written_again(person):
+    ops.volumes_in_viewport()
+    bpy.ops.wm.save_mainfile()
+    forget_session_files()
+    bpy.ops.wm.open_mainfile(filepath=bpy.data.filepath)
+    (human,) = humans(bpy.context.scene)
+    assert drawn() == 0
+    assert not in_viewport(human)
+    write_before_rendering(bpy.context.scene)
+    volumes_of(human).hide_viewport = False
+    assert drawn() == COUNT, "no view has looked for the files before they were there"
+
+
+def test_an_edit_on_a_full_disk_is_made_and_its_missing_volumes_are_told(person, monkeypatch):
+    ops.volumes_in_viewport()
+    before = folder_of(person)
+    with monkeypatch.context() as patched:
+        patched.setattr(volumes, "write_vdb", full)
+        assert ops.vary(seed=8) == {"FINISHED"}
+    assert folder_of(person) != before
+    assert "No space left" in faults.text
+    write_before_rendering(bpy.context.scene)
+    assert are_written(person)
+
+
+def test_volumes_that_renders_hide_are_not_written_and_those_of_other_scenes_are(person):
+    volumes_of(person).hide_render = True
+    write_before_rendering(bpy.context.scene)
+    assert not are_written(person)
+    volumes_of(person).hide_render = False
+    bpy.ops.scene.new(type="EMPTY")
+    write_before_rendering(bpy.context.scene)  # it may hold an instance of the human
+    assert are_written(person)

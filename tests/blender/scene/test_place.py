@@ -113,3 +113,11 @@ def test_inside_a_room_a_human_stays_clear_of_furniture_and_inside(saved_scene, 
 def test_where_nothing_within_reach_is_free_a_human_stands_at_the_cursor(saved_scene, source):
     bpy.ops.mesh.primitive_plane_add(size=10 * REACH_M, location=(0, 0, 1))
     assert tuple(standing(source).location) == (0, 0, 0)
+
+
+def test_on_uneven_ground_humans_stand_side_by_side(saved_scene, source):
+    bpy.ops.mesh.primitive_cube_add(size=1)
+    bpy.context.object.scale = (60, 60, 1)  # half a metre above the soles, as a hill elsewhere would be
+    first, second = standing(source), standing(source)
+    assert tuple(first.location) == (0, 0, 0)
+    assert apart(_extent(second), _extent(first)) == pytest.approx(GAP_M, abs=1e-5)

@@ -142,10 +142,11 @@ def test_handles_are_baked_before_a_human_is_fitted(chosen):
 def test_make_human_starts_from_a_standing_one_where_none_is_posed(chosen, picture, tmp_path):
     mask = tmp_path / "mask.png"
     write_png(mask, np.full((HEIGHT, WIDTH), 255, np.uint8))
-    chosen.scene.primdiffusion_picture.mask_label = 3
+    settings = chosen.scene.primdiffusion_picture
+    settings.mask, settings.mask_label, settings.seed = str(mask), 3, 5
     camera = chosen.scene.camera
     before = np.array(camera.matrix_world.translation)
-    assert bpy.ops.primdiffusion.human_from_picture(mask=str(mask), seed=5) == {"FINISHED"}
+    assert bpy.ops.primdiffusion.human_from_picture() == {"FINISHED"}
     (person,) = humans(chosen.scene)
     sent = request_of(person_file(person))
     assert (sent["pictures"], sent["masks"], sent["seed"]) == ([str(picture)], [str(mask)], 5)
