@@ -133,3 +133,8 @@ HANDLERS = (
     ("blend_import_post", open_after_importing),
     ("render_init", write_before_rendering),
 )
+
+
+def unregister() -> None:
+    """Forget what was wrong: another file may be open when the extension is enabled again."""
+    faults.text = ""

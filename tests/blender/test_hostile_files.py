@@ -27,8 +27,6 @@ WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb",
 """Operators that write the file of their `filepath`."""
 FOLDERS = {"human_from_captures", "set_up_backend"}
 """Operators on the folder of their `directory`."""
-SENT = {"human_from_picture": {"mask"}}
-"""Files that the backend alone reads: tests/contract/test_bad_files.py tries its reader."""
 PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
 
 
@@ -129,7 +127,7 @@ def anna(addon, tmp_path, monkeypatch):
 def test_every_operator_with_a_path_gets_hostile_files():
     expected = {name.partition(" ")[0]: {shown} for name, (shown, _) in READS.items()}
     expected |= {name: {"filepath"} for name, _ in WRITES} | {name: {"directory"} for name in FOLDERS}
-    assert with_paths() == expected | SENT
+    assert with_paths() == expected
 
 
 @pytest.mark.parametrize("name", READS)
