@@ -41,7 +41,7 @@ VIEWER = {
 """Entries of the viewer's manifest that differ."""
 VIEWER_LACKS = ("backend/setup.py", "backend/packages.py", "requirements/", "ui/setup.py", "bundled/")
 """What downloads or is downloaded for: files and folders that the viewer does not have."""
-VIEWER_BUNDLES = ("bundled/primdiffusion/formats/", "bundled/primdiffusion/body/data/")
+VIEWER_BUNDLES = tuple(f"bundled/primdiffusion/{part}/" for part in ("files", "formats", "body/data"))
 """Parts of the backend that the viewer does have."""
 LARGEST_IN_GALLERY = 3_000_000
 """Bytes of a .human file; compact ones have 2.1 MB."""

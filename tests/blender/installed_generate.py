@@ -48,7 +48,11 @@ report = {
     "bones": len(armature.data.bones),
     "files": len(list(Path(bpy.app.tempdir).rglob("*.vdb"))),
     "written_into_the_addon": [p.name for p in installed.rglob("*") if p.suffix in (".nbi", ".nbc")]
-    + [str(p) for p in (installed / "bundled").rglob("*.pyc") if "formats" not in p.parts],  # which Blender imports
+    + [
+        str(p)
+        for p in (installed / "bundled").rglob("*.pyc")
+        if not {"files", "formats"} & {*p.parts}  # which Blender imports
+    ],
     "backend_in_zip": (installed / "bundled" / "primdiffusion" / "human.py").is_file(),
     "seconds": seconds,
 }

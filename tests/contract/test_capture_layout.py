@@ -12,29 +12,33 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion.formats import camera_rig, capture_layout, picture_files
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files import picture_files
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.formats import camera_rig, capture_layout
 from primdiffusion.geometry.camera import look_at
 from scipy.spatial.transform import Rotation
 from support.errors import refused
 
 ROOT = Path(__file__).resolve().parents[2]
+BACKEND = ROOT / "backend" / "primdiffusion"
 SMALL = camera_rig.Rig(count=7, width=40, height=60)
 
 
 def test_the_extension_imports_the_backends_formats_and_nothing_else_of_it():
-    names = [path.stem for path in (ROOT / "backend/primdiffusion/formats").glob("[a-z]*.py")]
+    torch_alone = {"files.folder_lock", "files.tensor_file", "files.torch_file"}
+    paths = [path for room in ("files", "formats") for path in (BACKEND / room).glob("[a-z]*.py")]
+    names = sorted({f"{path.parent.name}.{path.stem}" for path in paths} - torch_alone)
     program = f"""
 import importlib, sys
 sys.modules["torch"] = sys.modules["primdiffusion"] = None  # importing them fails
 for name in {names}:
-    module = importlib.import_module(f"blender_primdiffusion.formats.{{name}}")
+    module = importlib.import_module(f"blender_primdiffusion.{{name}}")
     print(name, module.__file__)
 """
     done = subprocess.run([sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True)
     files = dict(line.split(maxsplit=1) for line in done.stdout.splitlines())
-    assert files == {name: str(ROOT / f"backend/primdiffusion/formats/{name}.py") for name in names}
-    assert "capture_layout" in files
+    assert files == {name: str(BACKEND / f"{name.replace('.', '/')}.py") for name in names}
+    assert {"files.arrays", "formats.capture_layout"} <= files.keys()
 
 
 @pytest.mark.parametrize("arrangement", ["rings", "sphere", "hemisphere"])

@@ -24,10 +24,10 @@ def share() -> None:
 
 def share_with_installed(user_folder: Path) -> None:
     """Let a zip that is installed into this user folder of Blender find the kernels of the checkout."""
-    for folder in (path for path in BACKEND.iterdir() if path.is_dir()):
+    for folder in {path.parent for path in BACKEND.rglob("*.py")}:
         own = _cache_of(folder)
         own.mkdir(parents=True, exist_ok=True)
-        installed = _cache_of(user_folder.resolve() / INSTALLED / folder.name)
+        installed = _cache_of(user_folder.resolve() / INSTALLED / folder.relative_to(BACKEND))
         if not installed.exists():  # pytest counts its folders anew where /tmp was emptied; the cache may be older
             installed.symlink_to(own)
 

@@ -10,6 +10,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 UNDER_THE_RULES = (
     "tests/support/windows_rules_hold.py",
+    "tests/backend/files",
     "tests/backend/formats",
     "tests/contract/test_capture_layout.py",
     "tests/contract/test_client.py",
