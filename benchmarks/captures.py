@@ -55,7 +55,6 @@ from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.raster.multisample import render_view
 from record import command_line, report
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -258,9 +257,9 @@ def compare(captures: Captures, people: dict, samples: int) -> list[Difference]:
         poses = BodyPose.from_axis_angle(torch.from_numpy(smpl.theta), torch.from_numpy(smpl.translation))
         sitting = set_up_capture(read_person(people[name]), poses, subject.views)
         for frame in range(subject.frames):
-            posed = sitting.figure.posed(sitting.skinning[frame])
+            draw = sitting.person.posed(sitting.skinning[frame])
             for camera, view in enumerate(subject.views):
-                differences.append(_difference(subject, frame, camera, render_view(posed, view, samples)))
+                differences.append(_difference(subject, frame, camera, draw(view, samples)))
     return differences
 
 
@@ -273,12 +272,12 @@ def joint_error_px(subject: Subject) -> float:
 
 def _difference(subject: Subject, frame: int, camera: int, shot) -> Difference:
     stored = {kind: subject.picture(kind, frame, camera) for kind in ("img", "mask", "depth", "part")}
-    colours, coverage = srgb_bytes(shot.rgb), np.round(shot.coverage * 255)
+    colours, coverage = srgb_bytes(shot.rgb), np.round(shot.alpha * 255)
     ours, theirs = coverage > 127, stored["mask"] > 127
     covered = (coverage > 0) | (stored["mask"] > 0)
     difference = _as_blender_stores(colours)[covered].astype(float) - stored["img"][covered]
     depth = stored["depth"] * DEPTH_UNIT
-    either = (depth > 0) | (shot.depth > 0)
+    either = (depth > 0) | np.isfinite(shot.depth)
     return Difference(
         mask_iou=float((ours & theirs).sum() / (ours | theirs).sum()),
         squared=float((difference**2).mean()),

@@ -26,6 +26,7 @@ import torch
 from PIL import Image
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.geometry import image
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -35,7 +36,7 @@ from primdiffusion.people.person import Person, make_person
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.raster.rasterise import RasterImage, rasterise
+from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.raster.shade import TriangleSoup, draw, flatten, shade
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
@@ -83,7 +84,7 @@ def camera_at(bounds: np.ndarray, yaw: float, pitch: float) -> Camera:
     return look_at(position, target, vertical_fov=FIELD_OF_VIEW, width=SIZE, height=SIZE)
 
 
-def compare(drawn: RasterImage, marched: Rendering) -> dict[str, float]:
+def compare(drawn: image.Image, marched: Rendering) -> dict[str, float]:
     first, second = drawn.alpha > 0.5, marched.alpha.numpy() > 0.5
     squared = (encoded(drawn.rgb) - encoded(marched.rgb.numpy())) ** 2
     rows, columns = np.nonzero(first)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,13 +12,15 @@ import torch
 from jaxtyping import Float
 
 from primdiffusion.body.model import BodyModel
-from primdiffusion.capture.people_files import SUBJECT_NAME, SkinnedPerson, find_people, read_person
+from primdiffusion.capture.people_files import SUBJECT_NAME, find_people, read_person
 from primdiffusion.capture.reader import as_camera
+from primdiffusion.capture.render import Renderable
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.geometry.image import Image
 from primdiffusion.human import Human, body_of, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives, S
-from primdiffusion.raster.multisample import RenderedView
+from primdiffusion.raster.multisample import Draw, check_samples
 from primdiffusion.render.march import march
 
 ENDINGS = (".human.safetensors", ".human")
@@ -47,80 +50,48 @@ class VolumetricPerson:
         """The human's own body."""
         return body_of(self.human)[0]
 
-    def figure(self) -> VolumetricFigure:
-        """Find the visible voxels. Raises ValueError if there are none."""
-        shown = visible_voxels(place_skinned(self.human, torch.eye(4).repeat(24, 1, 1), torch.eye(4)))
+    @functools.cached_property
+    def _visible(self) -> torch.Tensor:
+        shown = visible_voxels(self._boxes(np.tile(np.eye(4), (24, 1, 1))))
         if not shown.any():
             raise ValueError("the human is empty, no voxel is visible: generate it again")
-        return VolumetricFigure(self.human, shown)
+        return shown
 
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class VolumetricFigure:
-    """A generated human whose visible voxels are known."""
-
-    human: Human
-    shown: torch.Tensor
-    """[K, S, S, S], bool."""
-
-    def primitives(self, skinning: Float[np.ndarray, "J 4 4"]) -> Primitives:
-        """The human's boxes in a pose, world <- rest."""
+    def _boxes(self, skinning: Float[np.ndarray, "J 4 4"]) -> Primitives:
         return place_skinned(self.human, torch.from_numpy(skinning).float(), torch.eye(4))
 
     def points(self, skinning: Float[np.ndarray, "J 4 4"]) -> Float[np.ndarray, "n 3"]:
-        """Centres of the visible voxels in the world, metres."""
-        boxes = self.primitives(skinning)
-        box, depth, row, column = self.shown.nonzero(as_tuple=True)
+        """Centres of the visible voxels in the world, metres. Raises ValueError if no voxel is visible."""
+        boxes = self._boxes(skinning)
+        box, depth, row, column = self._visible.nonzero(as_tuple=True)
         places = torch.linspace(-1, 1, S)
         local = torch.stack([places[column], places[row], places[depth]], dim=-1) * boxes.half_extent[box]
         turned = (boxes.rotation[box] * local[:, None]).sum(-1)
         return (boxes.position[box] + turned).double().numpy()
 
-    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> PosedVolume:
-        """Pose the human."""
-        return PosedVolume(self.primitives(skinning))
+    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> Draw:
+        """Pose the human; depth is the first hit of the ray through the pixel's centre, at opacity one half."""
+        return functools.partial(_draw, self._boxes(skinning))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PosedVolume:
-    """A generated human in a pose."""
-
-    primitives: Primitives
-
-    def seen_from(self, view: View, samples: int) -> RenderedView:
-        """Draw with `samples` x `samples` rays per pixel; depth is the first hit of the ray through its centre.
-
-        Colour is linear and premultiplied by coverage; a pixel without a hit, of opacity below one half, has no depth.
-        Normals and parts are not drawn and stay 0.
-
-        Raises:
-            ValueError: `samples` is not odd and positive, so that no ray would be at the pixel's centre.
-        """
-        if samples < 1 or samples % 2 == 0:
-            raise ValueError(f"samples is {samples}: give an odd number, 1, 3, 5, ...")
-        rendered = RenderedView(
-            rgb=np.zeros((view.height, view.width, 3), np.float32),
-            coverage=np.zeros((view.height, view.width), np.float32),
-            depth=np.zeros((view.height, view.width), np.float32),
-            normal=np.zeros((view.height, view.width, 3), np.float32),
-            part=np.zeros((view.height, view.width), np.uint8),
-        )
-        rows = max(1, RAYS_AT_ONCE // (view.width * samples**2))
-        for top in range(0, view.height, rows):
-            _draw_band(self.primitives, view, samples, slice(top, min(top + rows, view.height)), rendered)
-        return rendered
+def _draw(primitives: Primitives, view: View, samples: int) -> Image:
+    check_samples(samples)
+    image = Image.blank(view.width, view.height)
+    rows = max(1, RAYS_AT_ONCE // (view.width * samples**2))
+    for top in range(0, view.height, rows):
+        _draw_band(primitives, view, samples, slice(top, min(top + rows, view.height)), image)
+    return image
 
 
-def _draw_band(primitives: Primitives, view: View, samples: int, rows: slice, rendered: RenderedView) -> None:
+def _draw_band(primitives: Primitives, view: View, samples: int, rows: slice, image: Image) -> None:
     height = rows.stop - rows.start
     finer = np.array([[samples, 0, 0], [0, samples, -rows.start * samples], [0, 0, 1.0]]) @ view.intrinsics
     fine = View(finer, view.rotation, view.translation, view.width * samples, height * samples)
     drawn = march(primitives, as_camera(fine))
     blocks = height, samples, view.width, samples
-    rendered.rgb[rows] = drawn.rgb.numpy().reshape(*blocks, 3).mean((1, 3)).clip(0, 1)
-    rendered.coverage[rows] = drawn.alpha.numpy().reshape(blocks).mean((1, 3))
-    hit = drawn.first_hit.numpy()[samples // 2 :: samples, samples // 2 :: samples]
-    rendered.depth[rows] = np.where(np.isfinite(hit), hit, 0) / _secants(view)[rows]
+    image.rgb[rows] = drawn.rgb.numpy().reshape(*blocks, 3).mean((1, 3)).clip(0, 1)
+    image.alpha[rows] = drawn.alpha.numpy().reshape(blocks).mean((1, 3))
+    image.depth[rows] = drawn.first_hit.numpy()[samples // 2 :: samples, samples // 2 :: samples] / _secants(view)[rows]
 
 
 def _secants(view: View) -> Float[np.ndarray, "H W"]:
@@ -185,7 +156,7 @@ def renderer_of(paths: Sequence[Path]) -> str:
     return " and ".join(name for kind, name in ((False, "rasteriser"), (True, "marcher")) if kind in generated)
 
 
-def read_subject(path: Path) -> SkinnedPerson | VolumetricPerson:
+def read_subject(path: Path) -> Renderable:
     """Read a human for captures. Raises as `load_human` and `read_person`."""
     return VolumetricPerson(load_human(path)) if is_generated(path) else read_person(path)
 

@@ -86,12 +86,12 @@ def test_depth_and_mask_are_what_rays_cast_at_the_boxes_hit():
         view, pose = setup.views[camera], poses().map(lambda values, frame=frame: values[frame])
         boxes = place(human, pose)  # by the pose, not by matrices
         outer, inner = hit(boxes, 1.0, view), hit(boxes, 0.8, view)
-        drawn = setup.figure.posed(setup.skinning[frame]).seen_from(view, 1)
-        seen, sure = drawn.depth > 0, np.isfinite(inner)
+        drawn = setup.person.posed(setup.skinning[frame])(view, 1)
+        seen, sure = np.isfinite(drawn.depth), np.isfinite(inner)
         assert sure.sum() > 1500
         assert np.isfinite(outer[seen]).all()
         assert seen[sure].mean() > 0.995
-        assert np.array_equal(drawn.coverage >= 0.5, seen)
+        assert np.array_equal(drawn.alpha >= 0.5, seen)
         assert (drawn.depth[seen] > outer[seen] - 0.001).all()
         assert (drawn.depth - inner)[seen & sure].max() < 0.05
         assert (drawn.depth < inner + 0.005)[seen & sure].mean() > 0.99
@@ -100,26 +100,26 @@ def test_depth_and_mask_are_what_rays_cast_at_the_boxes_hit():
 
 def test_more_samples_average_the_edges_and_keep_the_depth_of_the_centres():
     setup = set_up_capture(VolumetricPerson(dense_human()), poses(), Rig(count=1, width=SIZE, height=SIZE))
-    posed = setup.figure.posed(setup.skinning[1])
-    one, nine = (posed.seen_from(setup.views[0], samples) for samples in (1, 3))
+    draw = setup.person.posed(setup.skinning[1])
+    one, nine = (draw(setup.views[0], samples) for samples in (1, 3))
     np.testing.assert_allclose(nine.depth, one.depth, atol=1e-3)
-    inside = nine.coverage > 0.999
+    inside = nine.alpha > 0.999
     np.testing.assert_allclose(nine.rgb[inside], np.tile(COLOUR, (inside.sum(), 1)), atol=0.01)
-    edges = (nine.coverage > 0.05) & (nine.coverage < 0.95)
-    np.testing.assert_allclose(nine.rgb[edges], nine.coverage[edges][:, None] * COLOUR, atol=0.02)
+    edges = (nine.alpha > 0.05) & (nine.alpha < 0.95)
+    np.testing.assert_allclose(nine.rgb[edges], nine.alpha[edges][:, None] * COLOUR, atol=0.02)
     assert edges.sum() > 30
     for samples in (0, 2):
         with refused(ValueError, "samples"):
-            posed.seen_from(setup.views[0], samples)
+            draw(setup.views[0], samples)
 
 
 def test_bands_make_one_picture(monkeypatch):
     setup = set_up_capture(VolumetricPerson(dense_human()), poses(), Rig(count=1, width=SIZE, height=SIZE))
-    posed = setup.figure.posed(setup.skinning[0])
-    at_once = posed.seen_from(setup.views[0], 1)
+    draw = setup.person.posed(setup.skinning[0])
+    at_once = draw(setup.views[0], 1)
     monkeypatch.setattr("primdiffusion.captured_humans.RAYS_AT_ONCE", SIZE * 7)
-    in_bands = posed.seen_from(setup.views[0], 1)
-    np.testing.assert_allclose(in_bands.coverage, at_once.coverage, atol=0.05)
+    in_bands = draw(setup.views[0], 1)
+    np.testing.assert_allclose(in_bands.alpha, at_once.alpha, atol=0.05)
     np.testing.assert_allclose(in_bands.depth, at_once.depth, atol=0.002)
 
 
@@ -200,7 +200,7 @@ def test_a_generated_human_stands_beside_a_mesh(tmp_path):
     people = [read_subject(tmp_path / "people" / name) for name in ("ada/person.human.safetensors", "box.glb")]
     setup = set_up_together(people, 0, poses(), Rig(count=CAMERAS, width=SIZE, height=SIZE), np.random.default_rng(1))
     for matrices in setup.skinning:
-        assert setup.figure.points(matrices)[:, 1].min() == pytest.approx(0, abs=1e-4)
+        assert setup.person.points(matrices)[:, 1].min() == pytest.approx(0, abs=1e-4)
     cli.main(["captures", "coco", str(tmp_path / "captures")])
     written = json.loads((tmp_path / "captures" / "annotations.json").read_text())
     assert [image["subjects"] for image in written["images"]] == [["ada", "box"]] * (FRAMES * CAMERAS)

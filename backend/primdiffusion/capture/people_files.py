@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
 import re
 import struct
@@ -25,7 +26,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.pictures import MOST_PIXELS, decoded, decoded_bytes, opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.raster.multisample import Figure, figure_from_mesh
+from primdiffusion.raster.multisample import Draw, Figure, figure_from_mesh
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\x00"
 NUMBERS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}
@@ -147,8 +148,16 @@ class SkinnedPerson:
         """The default body."""
         return default_body()
 
-    def figure(self) -> Figure:
-        """Prepare the mesh for rendering. Raises ValueError as `figure_from_mesh`."""
+    def points(self, skinning: Float[np.ndarray, "J 4 4"]) -> Float[np.ndarray, "n 3"]:
+        """See `Figure.points`. Raises ValueError as `figure_from_mesh`."""
+        return self._figure.points(skinning)
+
+    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> Draw:
+        """See `Figure.posed`. Raises ValueError as `figure_from_mesh`."""
+        return self._figure.posed(skinning)
+
+    @functools.cached_property
+    def _figure(self) -> Figure:
         return figure_from_mesh(self.mesh)
 
 

@@ -1,6 +1,6 @@
 """Render captures of humans in several processes; skip complete subjects and views.
 
-Textured meshes are drawn by the rasteriser. What else can be posed and drawn is a `Drawable` too.
+Textured meshes are drawn by the rasteriser; whatever is a `Renderable` can be captured.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 import torch
 from jaxtyping import Float
-from PIL import Image
+from PIL.Image import fromarray
 
 from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.people_files import read_person
@@ -32,8 +32,9 @@ from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.group_places import extent, first_frames, stand_together
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
+from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
-from primdiffusion.raster.multisample import RenderedView
+from primdiffusion.raster.multisample import Draw
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.runtime.failures import describe
 from primdiffusion.runtime.worker_process import begin_worker
@@ -41,28 +42,11 @@ from primdiffusion.runtime.worker_process import begin_worker
 JPEG_QUALITY = 95
 
 
-class PosedDrawable(Protocol):
-    """A human in a pose."""
+class Renderable(Protocol):
+    """A human who can be posed and drawn; `skinning` [J, 4, 4] maps the rest pose to the world.
 
-    def seen_from(self, view: View, samples: int) -> RenderedView:
-        """Draw with `samples` x `samples` samples per pixel, an odd number each; deterministic."""
-        ...
-
-
-class Drawable(Protocol):
-    """A human prepared for drawing in many poses; `skinning` [J, 4, 4] maps the rest pose to the world."""
-
-    def points(self, skinning: Float[np.ndarray, "J 4 4"]) -> Float[np.ndarray, "n 3"]:
-        """Points in the world around which everything visible is."""
-        ...
-
-    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> PosedDrawable:
-        """Pose the human."""
-        ...
-
-
-class Person(Protocol):
-    """A human of a file."""
+    What drawing needs is prepared on first use: `points` and `posed` raise ValueError if the human cannot be drawn.
+    """
 
     @property
     def betas(self) -> Float[np.ndarray, "n"]:
@@ -74,8 +58,12 @@ class Person(Protocol):
         """The body that is posed."""
         ...
 
-    def figure(self) -> Drawable:
-        """Prepare for drawing. Raises ValueError if the human cannot be drawn."""
+    def points(self, skinning: Float[np.ndarray, "J 4 4"]) -> Float[np.ndarray, "n 3"]:
+        """Points in the world around which everything visible is."""
+        ...
+
+    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> Draw:
+        """Pose the human."""
         ...
 
 
@@ -83,8 +71,7 @@ class Person(Protocol):
 class CaptureSetup:
     """A subject, its poses and its cameras."""
 
-    figure: Drawable
-    betas: Float[np.ndarray, "n"]
+    person: Renderable
     poses: BodyPose
     """[F]."""
     skinning: Float[np.ndarray, "F J 4 4"]
@@ -94,27 +81,26 @@ class CaptureSetup:
     views: list[View]
 
 
-def set_up_capture(person: Person, poses: BodyPose, rig: Rig | Sequence[View]) -> CaptureSetup:
+def set_up_capture(person: Renderable, poses: BodyPose, rig: Rig | Sequence[View]) -> CaptureSetup:
     """Pose the subject in all `poses` [F] and place the cameras: a rig that shows every pose whole, or given views.
 
     Raises:
         ValueError: the human cannot be drawn; the poses are not finite.
     """
-    figure = person.figure()
     with _one_thread():
         shaped = person.body.to(dtype=torch.float64).shape(torch.from_numpy(person.betas).double())
         body = shaped.pose(poses.to(dtype=torch.float64))
     skinning, joints = body.skinning.numpy(), body.joints[..., :3, 3].numpy()
     if isinstance(rig, Rig):
-        moved = [figure.points(matrices) for matrices in skinning]
+        moved = [person.points(matrices) for matrices in skinning]
         views = rig.views(*bounding_sphere(np.concatenate(moved)))
     else:
         views = list(rig)
-    return CaptureSetup(figure, person.betas, poses, skinning, joints, views)
+    return CaptureSetup(person, poses, skinning, joints, views)
 
 
 def set_up_together(
-    people: Sequence[Person], own: int, poses: BodyPose, rig: Rig, rng: np.random.Generator
+    people: Sequence[Renderable], own: int, poses: BodyPose, rig: Rig, rng: np.random.Generator
 ) -> CaptureSetup:
     """The setup of one of several humans who stand together, at other places in every pose, in front of one rig.
 
@@ -139,9 +125,7 @@ def set_up_together(
         own_poses.append(turned(BodyPose(rolled, torch.zeros_like(poses.translation)), yaw))
         setup = set_up_capture(person, own_poses[-1], [])
         pelvis.append(setup.joints[:, 0])
-        extents.append(
-            [extent(setup.figure.points(s), joint) for s, joint in zip(setup.skinning, pelvis[-1], strict=True)]
-        )
+        extents.append([extent(person.points(s), joint) for s, joint in zip(setup.skinning, pelvis[-1], strict=True)])
     moves, corners = stand_together(np.array(pelvis), np.array(extents), rng)
     moved = BodyPose(own_poses[own].joint_rotation, torch.from_numpy(moves[own]).to(poses.translation))
     return set_up_capture(people[own], moved, rig.views(*bounding_sphere(corners)))
@@ -166,7 +150,7 @@ def write_parameters(subject: Path, setup: CaptureSetup) -> None:
         OSError: a file cannot be written.
     """
     theta = matrix_to_axis_angle(setup.poses.joint_rotation).numpy().reshape(len(setup.skinning), -1)
-    capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], setup.betas, setup.poses.translation.numpy())
+    capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], setup.person.betas, setup.poses.translation.numpy())
     capture_layout.write_joints(subject, setup.views, setup.joints)
     capture_layout.write_layouts(subject, setup.views, len(theta))
 
@@ -180,31 +164,33 @@ def render_frames(
         OSError: an image cannot be written.
     """
     for frame in frames:
-        posed = None
+        draw = None
         for camera, view in enumerate(setup.views):
             if not is_complete_view(subject, passes, camera, frame):
-                posed = setup.figure.posed(setup.skinning[frame]) if posed is None else posed
-                write_view(subject, passes, camera, frame, posed.seen_from(view, samples))
+                draw = draw or setup.person.posed(setup.skinning[frame])
+                write_view(subject, passes, camera, frame, draw(view, samples))
             yield frame, camera
 
 
-def write_view(subject: Path, passes: Sequence[str], camera: int, frame: int, rendered: RenderedView) -> None:
+def write_view(subject: Path, passes: Sequence[str], camera: int, frame: int, drawn: Image) -> None:
     """Write the images of one view atomically."""
     for kind in passes:
         path = capture_layout.picture_path(subject, kind, camera, frame)
         if kind == "img":
             with replacing(path) as partial:
-                Image.fromarray(srgb_bytes(rendered.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
+                fromarray(srgb_bytes(drawn.rgb)).save(partial, quality=JPEG_QUALITY, subsampling=0)
         elif kind == "mask":
-            picture_files.write_png(path, np.round(rendered.coverage.clip(0, 1) * 255).astype(np.uint8))
+            picture_files.write_png(path, np.round(drawn.alpha.clip(0, 1) * 255).astype(np.uint8))
         elif kind == "depth_float":
-            picture_files.write_exr(path, rendered.depth)
+            picture_files.write_exr(path, np.where(np.isfinite(drawn.depth), drawn.depth, np.float32(0)))
         elif kind == "depth":
-            picture_files.write_png(path, picture_files.depth_steps(rendered.depth))
+            picture_files.write_png(path, picture_files.depth_steps(drawn.depth))
+        elif drawn.normal is None or drawn.part is None:
+            raise ValueError(f"{kind} is not drawn of this human: leave it out of the passes")
         elif kind == "normal":
-            picture_files.write_png(path, picture_files.normal_bytes(rendered.normal, rendered.depth > 0))
+            picture_files.write_png(path, picture_files.normal_bytes(drawn.normal, np.isfinite(drawn.depth)))
         else:
-            picture_files.write_png(path, rendered.part)
+            picture_files.write_png(path, drawn.part)
 
 
 def srgb_bytes(linear: np.ndarray) -> np.ndarray:
@@ -234,7 +220,7 @@ class RenderJob:
     """Errors of skipped pose files, for the report."""
     together: tuple[Mapping[str, Path], ...] = ()
     """Groups of humans who stand together, files by name; every subject is in one of them, or there are none."""
-    read: Callable[[Path], Person] = read_person
+    read: Callable[[Path], Renderable] = read_person
     """Reads a human's file; a function of a module, as other processes call it too."""
     renderer: str = "rasteriser"
     """Name in dataset.json of what draws the humans."""

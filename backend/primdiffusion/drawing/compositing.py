@@ -17,8 +17,9 @@ from numpy import ndarray
 
 from primdiffusion.drawing.scene import NOTHING, Picture
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.image import Image
 from primdiffusion.raster.z_buffer import nearest_triangles
-from primdiffusion.render.solids import ImageLayer, Solids, shade_solids
+from primdiffusion.render.solids import Solids, shade_solids
 
 FINER = 2
 """Samples per pixel along each axis for solids."""
@@ -31,7 +32,7 @@ pixel widths at that depth (a slope of 80 degrees). In pixels, so that it also h
 class Backdrop:
     """The rasterised solids of an image."""
 
-    solids: ImageLayer
+    solids: Image
     """At FINER times the image resolution."""
     hole: Bool[ndarray, "fh fw"]
     """Samples that hit a holdout, at the same resolution."""
@@ -56,7 +57,7 @@ def backdrop(solids: Solids, camera: Camera, clip: tuple[float, float]) -> Backd
     return Backdrop(shaded, np.zeros(shaded.alpha.shape, np.bool_) if hole is None else hole, end, outline)
 
 
-def over_background(picture: Picture, people: ImageLayer, background: tuple[float, float, float] | None) -> None:
+def over_background(picture: Picture, people: Image, background: tuple[float, float, float] | None) -> None:
     """Write humans over the background into `picture`."""
     wall = np.float32(background is not None)
     colour = np.array(background or (0, 0, 0), np.float32)
@@ -65,7 +66,7 @@ def over_background(picture: Picture, people: ImageLayer, background: tuple[floa
 
 def over_solids(
     picture: Picture,
-    people: ImageLayer,
+    people: Image,
     expected: Float32[ndarray, "h w"],
     behind: Backdrop,
     background: tuple[float, float, float] | None,

@@ -20,12 +20,13 @@ from numpy import ndarray
 from primdiffusion.drawing.compositing import Backdrop, backdrop, over_background, over_solids
 from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.lattice import check_camera
 from primdiffusion.render.march import Span, march
-from primdiffusion.render.solids import ImageLayer, draw_boxes
+from primdiffusion.render.solids import draw_boxes
 
 
 def draw(scene: Scene, camera: Camera, look: ViewSettings = ViewSettings()) -> Picture:  # noqa: B008
@@ -47,7 +48,8 @@ def draw_into(picture: Picture, scene: Scene, camera: Camera, look: ViewSettings
     behind = None if scene.solids is None else backdrop(scene.solids, camera, look.clip)
     end = None if behind is None else behind.end
     if scene.primitives is None or scene.primitives.position.shape[0] == 0:
-        people = People(ImageLayer.nothing(camera), ImageLayer.nothing(camera).depth, 0.0)
+        nobody = Image.blank(camera.width, camera.height)
+        people = People(nobody, nobody.depth, 0.0)
     elif look.view == "boxes":
         people = _boxes(draw_boxes(scene.primitives, camera, scene.chart, look.clip), end)
     else:
@@ -85,7 +87,7 @@ def depth_span(primitives: Primitives | None, camera: Camera, clip: tuple[float,
 class People:
     """The rendered humans, before compositing."""
 
-    layer: ImageLayer
+    layer: Image
     expected: Float32[ndarray, "h w"]
     """Expected depth along the optical axis; inf where no human is hit."""
     seconds: float
@@ -102,16 +104,16 @@ def _marched(primitives: Primitives, camera: Camera, look: ViewSettings, end: nd
     )
     seconds = time.perf_counter() - began
     needed = end is not None or look.view == "depth"
-    return People(ImageLayer(rgb, alpha, first_hit / secant), depth / secant if needed else depth, seconds)
+    return People(Image(rgb, alpha, first_hit / secant), depth / secant if needed else depth, seconds)
 
 
-def _boxes(boxes: ImageLayer, end: ndarray | None) -> People:
+def _boxes(boxes: Image, end: ndarray | None) -> People:
     """The boxes that are not hidden by solids."""
     if end is None:
         return People(boxes, boxes.depth, 0.0)
     seen = boxes.depth < end
     depth = np.where(seen, boxes.depth, np.float32(np.inf))
-    return People(ImageLayer(boxes.rgb * seen[..., None], boxes.alpha * seen, depth), depth, 0.0)
+    return People(Image(boxes.rgb * seen[..., None], boxes.alpha * seen, depth), depth, 0.0)
 
 
 def _in_depth(people: People, span: tuple[float, float]) -> People:

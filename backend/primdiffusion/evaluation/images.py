@@ -126,7 +126,8 @@ def primitive_images(
         camera = body_camera(posed.vertices, 2 * math.pi * view / views)
         seen = march(primitives, camera.to(primitives.position.device), settings).to("cpu")
         image = image_over(1, subject, seen.rgb, seen.alpha, frame, view)
-        yield _with_truth(image, seen.depth, posed.joints, camera)
+        cosine = camera.rays()[1] @ camera.world_to_camera[2, :3]  # the marcher's distances are along rays
+        yield _with_truth(image, seen.depth * cosine, posed.joints, camera)
 
 
 def mesh_images(
@@ -153,10 +154,9 @@ def mesh_images_of_seeds(assets: Assets, seeds: Sequence[int], poses: BodyPose, 
 
 
 def _with_truth(
-    image: TestImage, distance: Float[Tensor, "h w"], joints: Float[Tensor, "24 4 4"], camera: Camera
+    image: TestImage, depth: Float[Tensor, "h w"], joints: Float[Tensor, "24 4 4"], camera: Camera
 ) -> TestImage:
-    cosine = camera.rays()[1] @ camera.world_to_camera[2, :3]  # distances are along rays
-    depth = torch.where(image.mask, distance * cosine, torch.inf)
+    depth = torch.where(image.mask, depth, torch.inf)
     pixels, _ = camera.project(joints[:, :3, 3])
     return dataclasses.replace(image, depth=depth, **_known_joints(pixels))
 

@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 
 import numba
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32, UInt8
+from jaxtyping import Float, Float64, Int32, UInt8
 
 from primdiffusion.body.model import J
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.raster.shade import NEAR, TriangleSoup, draw, flatten, shade
 
 SAME_PLACE = 1e-6
 """Vertices of a part closer than this in the rest pose (metres) share a normal, so texture seams stay smooth."""
-PASSES = (((), np.float32), ((3,), np.float32), ((), np.uint8))
-"""Channels and kind of depth, normal and part."""
+Draw = Callable[[View, int], Image]
+"""Draws a posed human from a view with an odd number of samples along each side of a pixel; deterministic.
+
+Colour and opacity are means over each pixel, the other passes samples at its centre. Raises ValueError for an even
+number of samples, of which none is at the centre.
+"""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -32,10 +39,10 @@ class Figure:
     corner: Int32[np.ndarray, "V"]
     """Index shared by coincident vertices of a part, over which normals are averaged."""
 
-    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> PosedFigure:
+    def posed(self, skinning: Float[np.ndarray, "J 4 4"]) -> Draw:
         """Pose the figure by linear blend skinning, world <- rest."""
         vertices = self.points(skinning)
-        return PosedFigure(self, vertices, self._normals(vertices))
+        return functools.partial(_draw, self, vertices, self._normals(vertices))
 
     def points(self, skinning: Float[np.ndarray, "J 4 4"]) -> Float64[np.ndarray, "V 3"]:
         """The vertices of all parts in a pose."""
@@ -57,23 +64,8 @@ class Figure:
         return total[self.corner].astype(np.float32)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class PosedFigure:
-    """A figure in a pose."""
-
-    figure: Figure
-    vertices: Float64[np.ndarray, "V 3"]
-    """Metres."""
-    normals: Float32[np.ndarray, "V 3"]
-    """Unit, outwards from the front of faces."""
-
-    def seen_from(self, view: View, samples: int) -> RenderedView:
-        """See `render_view`."""
-        return render_view(self, view, samples)
-
-
 def figure_from_mesh(mesh: TexturedMesh) -> Figure:
-    """Prepare a mesh for `render_view`.
+    """Prepare a mesh for posing and drawing.
 
     Raises:
         ValueError: as `flatten`.
@@ -101,41 +93,29 @@ def _joints_of_faces(part: TexturedPart) -> UInt8[np.ndarray, "F"]:
     return sums.argmax(1).astype(np.uint8)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class RenderedView:
-    """The passes of a view. Colour and coverage are means over each pixel; the others are samples at its centre."""
-
-    rgb: Float32[np.ndarray, "H W 3"]
-    """Linear, premultiplied by `coverage`."""
-    coverage: Float32[np.ndarray, "H W"]
-    depth: Float32[np.ndarray, "H W"]
-    """Metres along the optical axis; 0 for background."""
-    normal: Float32[np.ndarray, "H W 3"]
-    """World space, unit, towards the camera; 0 for background."""
-    part: UInt8[np.ndarray, "H W"]
-    """1 + the joint that moves the face most; 0 for background."""
-
-
-def render_view(posed: PosedFigure, view: View, samples: int = 3) -> RenderedView:
-    """Render the figure with `samples` x `samples` samples per pixel; deterministic.
-
-    Raises:
-        ValueError: `samples` is not odd and positive, so that no sample would be at the pixel's centre.
-    """
+def check_samples(samples: int) -> None:
+    """Raise ValueError unless `samples` is odd and positive, so that one sample is at the pixel's centre."""
     if samples < 1 or samples % 2 == 0:
         raise ValueError(f"samples is {samples}: give an odd number, 1, 3, 5, ...")
-    figure, size = posed.figure, (view.height, view.width)
-    depth, normal, part = (np.zeros((*size, *more), kind) for more, kind in PASSES)
-    left, top, right, bottom = _extent(posed.vertices @ view.rotation.T + view.translation, view)
+
+
+def _draw(figure: Figure, vertices: np.ndarray, normals: np.ndarray, view: View, samples: int) -> Image:
+    """Draw the figure with these vertices (metres) and unit normals, which point out from the front of faces."""
+    check_samples(samples)
+    size = (view.height, view.width)
+    normal, part = np.zeros((*size, 3), np.float32), np.zeros(size, np.uint8)
+    image = dataclasses.replace(Image.blank(view.width, view.height), normal=normal, part=part)
+    left, top, right, bottom = _extent(vertices @ view.rotation.T + view.translation, view)
     if left >= right or top >= bottom:
-        return RenderedView(np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), depth, normal, part)
-    soup = dataclasses.replace(figure.soup, vertices=posed.vertices)
+        return image
+    soup = dataclasses.replace(figure.soup, vertices=vertices)
     fragments = draw(soup, view, samples, (left, top, right, bottom))
     _look_up(
-        fragments.face, fragments.depth, samples, left, top, fragments.edges, soup.faces, figure.joint, posed.normals,
-        posed.vertices, view.position, depth, normal, part,
+        fragments.face, fragments.depth, samples, left, top, fragments.edges, soup.faces, figure.joint, normals,
+        vertices, view.position, image.depth, normal, part,
     )  # fmt: skip
-    return RenderedView(*shade(fragments, soup.textures, *size), depth, normal, part)
+    rgb, alpha = shade(fragments, soup.textures, *size)
+    return dataclasses.replace(image, rgb=rgb, alpha=alpha)
 
 
 def _extent(in_camera: np.ndarray, view: View) -> tuple[int, int, int, int]:

@@ -13,6 +13,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.z_buffer import NearestTriangle, nearest_triangles
@@ -45,31 +46,12 @@ class Solids:
                 raise ValueError(f"{name} of the solids holds NaN or infinite values: repair the meshes")
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class ImageLayer:
-    """An image to be composited."""
-
-    rgb: Float32[ndarray, "h w 3"]
-    """Linear, premultiplied by alpha."""
-    alpha: Float32[ndarray, "h w"]
-    depth: Float32[ndarray, "h w"]
-    """Metres along the optical axis; inf for background."""
-
-    @classmethod
-    def nothing(cls, camera: Camera) -> ImageLayer:
-        """An empty, read-only layer."""
-        size = (camera.height, camera.width)
-        zero, infinity = np.float32(0), np.float32(np.inf)
-        return cls(np.broadcast_to(zero, (*size, 3)), np.broadcast_to(zero, size), np.broadcast_to(infinity, size))
-
-
-def shade_solids(solids: Solids, nearest: NearestTriangle, camera: Camera) -> ImageLayer:
+def shade_solids(solids: Solids, nearest: NearestTriangle, camera: Camera) -> Image:
     """Shade the solids with a sky and a headlight, flat per triangle; holdouts are empty, with infinite depth.
 
     colour * (SKY (1 + n_up) / 2 + HEADLIGHT |n . ray|), with the normal n towards the viewer. No antialiasing.
     """
-    nothing = ImageLayer.nothing(camera)
-    layer = ImageLayer(nothing.rgb.copy(), nothing.alpha.copy(), nothing.depth.copy())
+    layer = Image.blank(camera.width, camera.height)
     _, direction = eye_of(camera)
     seen = (nearest.triangle, nearest.depth, direction)
     _shade(solids.corners, solids.colour, solids.holdout, *seen, layer.rgb, layer.alpha, layer.depth)
@@ -125,7 +107,7 @@ def draw_boxes(
     camera: Camera,
     group: Int[Tensor, "k"] | None = None,
     clip: tuple[float, float] = (0.0, np.inf),
-) -> ImageLayer:
+) -> Image:
     """Render the boxes themselves, as in the paper's figure: a colour for each, faces lit, edges darkened.
 
     `primitives` are unbatched. Boxes of one `group` (such as a UV chart) share a hue and differ in lightness; without
@@ -141,7 +123,7 @@ def draw_boxes(
     rgb = np.zeros((camera.height, camera.width, 3), np.float32)
     pixel = 1 / float(camera.intrinsics[0, 0])
     _shade_boxes(nearest.triangle, nearest.depth, position, rotation, half_extent, colour, *eye_of(camera), pixel, rgb)
-    return ImageLayer(rgb, (nearest.triangle >= 0).astype(np.float32), nearest.depth)
+    return Image(rgb, (nearest.triangle >= 0).astype(np.float32), nearest.depth)
 
 
 def box_colours(count: int, group: Int[Tensor, "k"] | None = None) -> Float32[ndarray, "k 3"]:

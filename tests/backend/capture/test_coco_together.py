@@ -71,7 +71,7 @@ def test_bodies_stand_on_the_floor_apart_in_front_of_the_same_cameras(whole):
         for view, same in zip(first.views, setups[0].views, strict=True):
             assert np.array_equal(view.rotation, same.rotation)
             assert np.array_equal(view.translation, same.translation)
-    bodies = [[setup.figure.posed(matrices).vertices for matrices in setup.skinning] for setup in setups]
+    bodies = [[setup.person.points(matrices) for matrices in setup.skinning] for setup in setups]
     for frame in range(3):
         for number in range(3):
             points = bodies[number][frame]

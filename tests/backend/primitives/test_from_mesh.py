@@ -5,10 +5,11 @@ import numpy as np
 import torch
 import trimesh
 from primdiffusion.geometry.camera import look_at
+from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, from_mesh, nearest, surface_field, voxel_centres
 from primdiffusion.primitives.primitives import Frames, Primitives
-from primdiffusion.raster.rasterise import RasterImage, rasterise
+from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.march import march
 from support.errors import refused
@@ -64,12 +65,12 @@ def frames_on_ball(count: int = 800, radius: float = RADIUS) -> Frames:
     return frames_on(radius * normals, normals, [0.9 * spacing, 0.9 * spacing, 0.035])
 
 
-def side_by_side(
-    mesh: TexturedMesh, frames: Frames, yaw: float = 0.6, pitch: float = 0.3
-) -> tuple[RasterImage, Rendering]:
+def side_by_side(mesh: TexturedMesh, frames: Frames, yaw: float = 0.6, pitch: float = 0.3) -> tuple[Image, Rendering]:
     direction = torch.tensor([math.sin(yaw) * math.cos(pitch), math.sin(pitch), math.cos(yaw) * math.cos(pitch)])
     camera = look_at(2 * direction, torch.zeros(3), vertical_fov=0.5, width=200, height=200)
-    return rasterise(mesh, camera, 2), march(Primitives.place(frames, from_mesh(mesh, frames)), camera)
+    marched = march(Primitives.place(frames, from_mesh(mesh, frames)), camera)
+    cosine = camera.rays()[1] @ camera.world_to_camera[2, :3]
+    return rasterise(mesh, camera, 2), dataclasses.replace(marched, depth=marched.depth * cosine)
 
 
 def overlap(first: np.ndarray, second: np.ndarray) -> float:

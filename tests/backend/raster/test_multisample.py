@@ -11,7 +11,7 @@ from primdiffusion.capture.reader import as_camera
 from primdiffusion.formats.camera_rig import View, look_at
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.raster.multisample import figure_from_mesh, render_view
+from primdiffusion.raster.multisample import figure_from_mesh
 from primdiffusion.raster.rasterise import rasterise
 from support.errors import refused
 
@@ -20,7 +20,7 @@ HOLE = (9, 9, 9, 0)
 
 
 def shot_of(*parts: TexturedPart, view: View, samples: int = 3):
-    return render_view(figure_from_mesh(TexturedMesh(parts)).posed(REST), view, samples)
+    return figure_from_mesh(TexturedMesh(parts)).posed(REST)(view, samples)
 
 
 def front(distance: float, focal: float, size: int) -> View:
@@ -34,12 +34,12 @@ def test_a_cubes_front_covers_what_the_pinhole_says():
     shot = shot_of(box(), view=front(2.5, 40, 40))
     expected = np.zeros((40, 40))
     expected[10:30, 10:30] = 1
-    np.testing.assert_array_equal(shot.coverage, expected)
-    inside = shot.coverage > 0
+    np.testing.assert_array_equal(shot.alpha, expected)
+    inside = shot.alpha > 0
     np.testing.assert_allclose(shot.depth[inside], 2, atol=1e-6)
     np.testing.assert_allclose(shot.rgb[inside], [[1, 0, 0]] * 400, atol=1e-6)
     assert (shot.part[inside] == 1).all()
-    assert not shot.depth[~inside].any()
+    assert np.isinf(shot.depth[~inside]).all()
     assert not shot.part[~inside].any()
     assert (shot.normal[inside][:, 2] > 0).all()
     np.testing.assert_allclose(np.linalg.norm(shot.normal[inside], axis=-1), 1, atol=1e-6)
@@ -48,8 +48,8 @@ def test_a_cubes_front_covers_what_the_pinhole_says():
 def test_coverage_is_the_share_of_samples_and_colour_is_linear_and_premultiplied():
     # The square ends at pixel 10 + 1/3 on each side: one of three columns of samples.
     shot = shot_of(square([[(188, 188, 188, 255)]], side=1 + 1 / 30), view=front(2, 40, 40))
-    assert shot.coverage[20, 9] == pytest.approx(1 / 3)
-    assert shot.coverage[9, 9] == pytest.approx(1 / 9)
+    assert shot.alpha[20, 9] == pytest.approx(1 / 3)
+    assert shot.alpha[9, 9] == pytest.approx(1 / 9)
     linear = ((188 / 255 + 0.055) / 1.055) ** 2.4
     np.testing.assert_allclose(shot.rgb[20, [9, 20], 0], [linear / 3, linear], rtol=1e-5)
 
@@ -61,21 +61,21 @@ def test_textures_are_upright_and_holes_show_what_is_behind():
     np.testing.assert_allclose(corners, [[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1]], atol=1e-6)
     assert shot.depth[25, 25] == pytest.approx(3)
     assert shot.depth[25, 14] == pytest.approx(2)
-    assert shot.coverage.min() == 1
+    assert shot.alpha.min() == 1
 
 
 def test_the_edge_of_a_hole_lies_where_interpolated_alpha_is_one_half():
     texture = np.full((1, 2, 4), 255, np.uint8)
     texture[0, 0, 3], texture[0, 1, 3] = 51, 255  # from 0.2 to 1 between u = 1/4 and 3/4: one half at 0.4375
     shot = shot_of(square(texture), view=front(1, 400, 400), samples=1)
-    assert np.flatnonzero(shot.coverage[200, 100:300])[0] + 100 == pytest.approx(400 * 0.4375, abs=1)
+    assert np.flatnonzero(shot.alpha[200, 100:300])[0] + 100 == pytest.approx(400 * 0.4375, abs=1)
 
 
 def test_holes_tint_nothing():
     texture = np.array([[RED, HOLE]]).repeat(4, 0).repeat(4, 1)
     shot = shot_of(square(texture), view=front(1, 30, 30))
-    seen = shot.coverage > 0
-    np.testing.assert_allclose(shot.rgb[seen] / shot.coverage[seen][:, None], [[1, 0, 0]] * int(seen.sum()), atol=1e-6)
+    seen = shot.alpha > 0
+    np.testing.assert_allclose(shot.rgb[seen] / shot.alpha[seen][:, None], [[1, 0, 0]] * int(seen.sum()), atol=1e-6)
 
 
 def knot() -> TexturedPart:
@@ -113,7 +113,7 @@ def test_silhouette_depth_and_colour_agree_with_embrees_rays_and_a_texture_read_
     places, rays, faces = caster.intersects_location(
         np.broadcast_to(origin, directions.shape), directions, multiple_hits=False
     )
-    seen = shot.coverage.ravel() > 0
+    seen = shot.alpha.ravel() > 0
     hit = np.zeros(len(directions), bool)
     hit[rays] = True
     assert hit.mean() > 0.2
@@ -135,8 +135,8 @@ def test_captures_and_pictures_of_meshes_have_the_same_pixels(samples):
         shot_of(part, view=view, samples=samples),
         rasterise(TexturedMesh((part,)), as_camera(view), samples),
     )
-    assert np.mean(np.abs(shot.coverage - picture.alpha) > 1e-6) < 1e-3
-    both = (shot.coverage == 1) & (picture.alpha == 1)
+    assert np.mean(np.abs(shot.alpha - picture.alpha) > 1e-6) < 1e-3
+    both = (shot.alpha == 1) & (picture.alpha == 1)
     assert both.mean() > 0.2
     assert np.abs(shot.rgb - picture.rgb)[both].mean() < 1e-4
 
@@ -146,7 +146,7 @@ def test_a_triangle_across_the_cameras_plane_is_seen_as_far_as_it_is_in_front():
         square([[RED]]), vertices=np.array([[-9, -1, -9], [9, -1, -9], [9, -1, 9], [-9, -1, 9.0]])
     )
     shot = shot_of(part, view=front(0, 20, 40), samples=1)  # stands inside of a floor one metre below
-    assert not shot.coverage[:20].any()
+    assert not shot.alpha[:20].any()
     rows = np.arange(23, 40)  # beyond row 22 the floor has ended
     np.testing.assert_allclose(shot.depth[rows, 20], 20 / (rows + 0.5 - 20), rtol=1e-5)
 
@@ -154,12 +154,12 @@ def test_a_triangle_across_the_cameras_plane_is_seen_as_far_as_it_is_in_front():
 def test_nothing_behind_the_camera_or_beside_the_picture_is_seen():
     for centre in ((0, 0, 9), (50, 0, 0)):
         shot = shot_of(box(centre=centre), view=front(3, 40, 40))
-        assert not shot.coverage.any()
+        assert not shot.alpha.any()
 
 
 def test_no_ray_slips_between_triangles():
     shot = shot_of(box(half=3), view=look_at(np.array([0.1, 0.2, 0.3]), np.array([1.0, 2, 3]), 1.5, 64, 64))
-    assert shot.coverage.min() == 1
+    assert shot.alpha.min() == 1
 
 
 def test_fine_textures_are_averaged_not_sampled():
@@ -179,7 +179,7 @@ def test_normals_are_smooth_across_seams_and_face_the_camera():
     )  # fmt: skip
     view = front(3, 60, 60)
     shot = shot_of(part, view=view, samples=1)
-    seen = shot.depth > 0
+    seen = np.isfinite(shot.depth)
     place = np.stack([(np.indices((60, 60))[1] + 0.5 - 30) / 60, -(np.indices((60, 60))[0] + 0.5 - 30) / 60], -1)
     at = np.concatenate([place * shot.depth[..., None], 3 - shot.depth[..., None]], -1)
     cosine = (at * shot.normal).sum(-1)[seen] / np.linalg.norm(at, axis=-1)[seen]
@@ -195,6 +195,6 @@ def test_even_samples_are_rejected():
 def test_skinning_moves_vertices_with_their_joints():
     moved = torch.eye(4).repeat(24, 1, 1).numpy().astype(np.float64)
     moved[3, :3, 3] = 1, 2, 3
-    posed = figure_from_mesh(TexturedMesh((box(joint=3), box("still")))).posed(moved)
-    np.testing.assert_allclose(posed.vertices[:8].mean(0), [1, 2, 3])
-    np.testing.assert_allclose(posed.vertices[8:].mean(0), 0, atol=1e-12)
+    points = figure_from_mesh(TexturedMesh((box(joint=3), box("still")))).points(moved)
+    np.testing.assert_allclose(points[:8].mean(0), [1, 2, 3])
+    np.testing.assert_allclose(points[8:].mean(0), 0, atol=1e-12)
