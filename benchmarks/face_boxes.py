@@ -42,8 +42,9 @@ from primdiffusion.primitives.anchors import default_texels
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
 from primdiffusion.primitives.primitives import GRID, Frames, K, Payload, Primitives, S
 from primdiffusion.raster.rasterise import rasterise
-from primdiffusion.render.inverse import TargetImage, fit_colours, fit_payload
+from primdiffusion.render.inverse import fit_colours, fit_payload
 from primdiffusion.render.march import march
+from primdiffusion.render.view import PosedView
 from record import command_line, report
 from torch import Tensor
 
@@ -95,7 +96,7 @@ def measure(person: Person, measured: dict[str, list[float]]) -> list[np.ndarray
     true, shown, boxes, seconds = {view: scene.true(view) for view in views}, [], {}, {}
     images = images_of(person)
     for name, frames in layouts.items():
-        targets = [TargetImage(frames, *image) for image in images]
+        targets = [PosedView(frames, *image) for image in images]
         start = from_mesh(person.mesh, frames)
         fit_payload(start, targets[:1], FULL_DENSITY)  # the first compiles
         begun = time.process_time()
@@ -148,10 +149,12 @@ def joined(first: Frames, second: Frames) -> Frames:
     return Frames(*(torch.cat([getattr(first, name), getattr(second, name)]) for name in names))
 
 
-def images_of(person: Person) -> list[tuple[Camera, np.ndarray, float]]:
+def images_of(person: Person) -> list[tuple[Camera, torch.Tensor, float]]:
     """Cameras, images and weights that `payloads` fits to."""
     views = [(*view, rasterise(person.mesh, view[0], SUPERSAMPLE)) for view in views_of(person.mesh, person.betas)]
-    return [(camera, np.dstack([picture.rgb, picture.alpha]), weight) for camera, weight, picture in views]
+    return [
+        (camera, torch.from_numpy(np.dstack([picture.rgb, picture.alpha])), weight) for camera, weight, picture in views
+    ]
 
 
 def march_ratio(few: Primitives, many: Primitives, camera: Camera) -> float:

@@ -2,7 +2,7 @@
 
 python examples/fit_boxes.py --out fitted
 
-The pictures are eight views of a generated human. For your own, fill `pictures` with `TargetImage`s: frames of the body
+The pictures are eight views of a generated human. For your own, fill `pictures` with `PosedView`s: frames of the body
 in its pose, a camera, and linear colours premultiplied by the mask.
 """
 
@@ -19,7 +19,8 @@ from matplotlib.figure import Figure
 from primdiffusion.human import frames_of
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_payload
+from primdiffusion.render.inverse import InverseSettings, fit_payload
+from primdiffusion.render.view import PosedView
 from primdiffusion.training.refine import bare_body
 from torch import Tensor
 
@@ -39,7 +40,7 @@ def main() -> None:
     human = pd.generate(pd.load_checkpoint(arguments.checkpoint), seed=7)
     boxes, frames = pd.place(human), frames_of(human)
     cameras = [pd.framing(boxes, 360 * turn / VIEWS, arguments.size, arguments.size) for turn in range(VIEWS)]
-    pictures = [TargetImage(frames, camera, rgba(boxes, camera).numpy()) for camera in cameras]
+    pictures = [PosedView(frames, camera, rgba(boxes, camera)) for camera in cameras]
 
     start = bare_body(human.betas).payload
     fits = {
@@ -57,7 +58,7 @@ def main() -> None:
     figure.savefig(arguments.out / "fit.png")
 
 
-def by_gradients(start: Payload, pictures: Sequence[TargetImage], steps: int) -> Iterator[tuple[float, Payload]]:
+def by_gradients(start: Payload, pictures: Sequence[PosedView], steps: int) -> Iterator[tuple[float, Payload]]:
     """Yield seconds and payload every ten steps of Adam, each on two pictures in turn."""
     rgb, share = start.rgb.clone().requires_grad_(), (start.density / FULL_DENSITY).requires_grad_()
     adam, began = torch.optim.Adam([rgb, share], lr=0.03), time.perf_counter()
@@ -66,7 +67,7 @@ def by_gradients(start: Payload, pictures: Sequence[TargetImage], steps: int) ->
         errors = []
         for picture in (pictures[2 * step % len(pictures)], pictures[(2 * step + 5) % len(pictures)]):
             drawn = rgba(pd.Primitives.place(picture.frames, payload), picture.camera)
-            errors.append((drawn - torch.from_numpy(picture.rgba)).square().mean())
+            errors.append((drawn - picture.rgba).square().mean())
         adam.zero_grad()
         torch.stack(errors).sum().backward()
         adam.step()
@@ -77,7 +78,7 @@ def by_gradients(start: Payload, pictures: Sequence[TargetImage], steps: int) ->
             yield time.perf_counter() - began, payload.map(lambda tensor: tensor.detach().clone())
 
 
-def by_linear_solve(start: Payload, pictures: Sequence[TargetImage]) -> Iterator[tuple[float, Payload]]:
+def by_linear_solve(start: Payload, pictures: Sequence[PosedView]) -> Iterator[tuple[float, Payload]]:
     """Yield seconds and payload of one, two and three Gauss-Newton steps."""
     for steps in (1, 2, 3):
         began = time.perf_counter()
@@ -91,10 +92,10 @@ def rgba(boxes: pd.Primitives, camera: pd.Camera) -> Tensor:
     return torch.cat([drawn.rgb, drawn.alpha[..., None]], dim=-1)
 
 
-def psnr(payload: Payload, pictures: Sequence[TargetImage]) -> float:
+def psnr(payload: Payload, pictures: Sequence[PosedView]) -> float:
     """Of all pictures together, linear colours and alpha, dB."""
     squares = [
-        np.square(rgba(pd.Primitives.place(picture.frames, payload), picture.camera).numpy() - picture.rgba)
+        np.square(rgba(pd.Primitives.place(picture.frames, payload), picture.camera).numpy() - picture.rgba.numpy())
         for picture in pictures
     ]
     return -10 * math.log10(np.mean(squares))

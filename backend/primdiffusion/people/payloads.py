@@ -45,7 +45,8 @@ from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.raster.rasterise import rasterise_colourings
-from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_colours, fit_payload
+from primdiffusion.render.inverse import InverseSettings, fit_colours, fit_payload
+from primdiffusion.render.view import PosedView
 from primdiffusion.runtime.worker_process import each
 
 VARIANT_STRIDE = 1 << 32
@@ -261,15 +262,13 @@ def orbit_camera(middle: Float[ndarray, "3"], extent: float, yaw: float, pitch: 
     return look_at(position, target, vertical_fov=fov, width=size, height=size)
 
 
-def _targets(
-    colourings: Sequence[TexturedMesh], frames: Frames, betas: ndarray, turn: float
-) -> list[list[TargetImage]]:
+def _targets(colourings: Sequence[TexturedMesh], frames: Frames, betas: ndarray, turn: float) -> list[list[PosedView]]:
     """Renders of each colouring, all from the same cameras."""
-    targets: list[list[TargetImage]] = [[] for _ in colourings]
+    targets: list[list[PosedView]] = [[] for _ in colourings]
     views = views_of(colourings[0], betas, turn)
     drawn = rasterise_colourings(colourings, [camera for camera, _ in views], SUPERSAMPLE)
     for (camera, weight), pictures in zip(views, drawn, strict=True):
         for own, picture in zip(targets, pictures, strict=True):
             rgba = np.concatenate([picture.rgb, picture.alpha[..., None]], axis=-1)
-            own.append(TargetImage(frames, camera, rgba, weight))
+            own.append(PosedView(frames, camera, torch.from_numpy(rgba), weight))
     return targets

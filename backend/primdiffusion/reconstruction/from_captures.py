@@ -37,8 +37,9 @@ from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.human import Human, default_frames, made_by
 from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.render.cpu.linear import apply_to_codes
-from primdiffusion.render.descent import DescentSettings, PosedView, descend
-from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
+from primdiffusion.render.descent import DescentSettings, descend
+from primdiffusion.render.inverse import InverseSettings, LinearisedView, fit_payload
+from primdiffusion.render.view import PosedView
 from primdiffusion.version import __version__
 
 
@@ -118,7 +119,7 @@ def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"])
 def _shows(image: PosedView) -> bool:
     """Whether an image shows the subject, and its camera faces it."""
     depth = image.camera.project(image.frames.position)[1]
-    return bool(image.target[..., 3].any()) and bool((depth > 0).any())
+    return bool(image.rgba[..., 3].any()) and bool((depth > 0).any())
 
 
 def reconstruct_by_prior(
@@ -304,7 +305,7 @@ class PersonComponents:
         return self.prior.outside(rest.cpu().clone())
 
     def closer(
-        self, explanation: Explanation, targets: Sequence[TargetImage], generator: torch.Generator | None = None
+        self, explanation: Explanation, targets: Sequence[PosedView], generator: torch.Generator | None = None
     ) -> Explanation:
         """A step of Gauss-Newton from these weights, to their posterior mean or, with a generator, to a draw."""
         prior, codec = self.prior, self.codec
@@ -347,7 +348,7 @@ def best(candidates: Sequence[Explanation], count: int) -> list[Explanation]:
     return sorted(candidates, key=lambda one: one.evidence, reverse=True)[:count]
 
 
-def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[TargetImage]:
+def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[PosedView]:
     """The views as linear pictures with sides of at most `largest` pixels, averaged over blocks."""
     targets = []
     for number, (rgba, boxes) in enumerate(zip(views.rgba.cpu(), frames, strict=True)):
@@ -358,7 +359,7 @@ def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[Tar
         picture = picture[: height * block, : width * block].unflatten(1, (width, block)).unflatten(0, (height, block))
         intrinsics = torch.cat([camera.intrinsics[:2] / block, camera.intrinsics[2:]])
         camera = dataclasses.replace(camera, intrinsics=intrinsics, width=width, height=height)
-        targets.append(TargetImage(boxes, camera, picture.mean((1, 3)).numpy()))
+        targets.append(PosedView(boxes, camera, picture.mean((1, 3))))
     return targets
 
 

@@ -30,7 +30,7 @@ from primdiffusion.reconstruction.posture_start import (
     standing,
     turned_to_camera,
 )
-from primdiffusion.render.inverse import TargetImage
+from primdiffusion.render.view import PosedView
 
 
 class Round(NamedTuple):
@@ -156,5 +156,5 @@ def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:
     return Views(rgba_of(photographs), posture.camera, posture.pose)
 
 
-def _targets(photographs: Sequence[Photograph], posture: Posture, side: int) -> list[TargetImage]:
+def _targets(photographs: Sequence[Photograph], posture: Posture, side: int) -> list[PosedView]:
     return targets_of(_views(photographs, posture), posture.frames(), side)

@@ -27,8 +27,9 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import default_frames
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.render.inverse import BACKGROUND, TargetImage
+from primdiffusion.render.inverse import BACKGROUND
 from primdiffusion.render.march import MarchSettings, march
+from primdiffusion.render.view import PosedView
 
 Record = TypeVar("Record", bound=TensorRecord)
 
@@ -105,7 +106,7 @@ class PostureFit:
     def refine(
         self,
         payload: Payload,
-        targets: Sequence[TargetImage],
+        targets: Sequence[PosedView],
         stage: Stage,
         on_step: Callable[[], None] | None = None,
     ) -> None:
@@ -117,7 +118,7 @@ class PostureFit:
         unknowns = [self._turn, self._move, self._lens, self._shape]
         first, cameras = targets[0].camera, self.posture().camera
         scale = float(first.intrinsics[0, 0] / cameras.intrinsics[0, 0, 0])
-        pictures = [_encoded(*torch.from_numpy(target.rgba).split((3, 1), -1)) for target in targets]
+        pictures = [_encoded(*target.rgba.split((3, 1), -1)) for target in targets]
         for value in unknowns:
             value.requires_grad_()
         optimiser = torch.optim.Adam(unknowns, RATE, betas=(0.8, 0.95))
@@ -170,25 +171,23 @@ def _difference(
     return _blurred(_encoded(seen.rgb, seen.alpha[..., None]) - picture, blur).square().sum() / picture[3].sum()
 
 
-def outline_error(payload: Payload, targets: Sequence[TargetImage]) -> float:
+def outline_error(payload: Payload, targets: Sequence[PosedView]) -> float:
     """Mean squared difference of opacity."""
     drawn, masks = _outlines(payload, targets)
     return float((drawn - masks).square().mean())
 
 
-def overlap(payload: Payload, targets: Sequence[TargetImage]) -> float:
+def overlap(payload: Payload, targets: Sequence[PosedView]) -> float:
     """Intersection over union of the human and the masks."""
     drawn, masks = _outlines(payload, targets)
     return float(torch.minimum(drawn, masks).sum() / torch.maximum(drawn, masks).sum())
 
 
 @torch.no_grad()
-def _outlines(
-    payload: Payload, targets: Sequence[TargetImage]
-) -> tuple[Float[Tensor, "v H W"], Float[Tensor, "v H W"]]:
+def _outlines(payload: Payload, targets: Sequence[PosedView]) -> tuple[Float[Tensor, "v H W"], Float[Tensor, "v H W"]]:
     """Opacity of the human, and that of the pictures."""
     drawn = [march(Primitives.place(target.frames, payload), target.camera, COARSE).alpha for target in targets]
-    return torch.stack(drawn), torch.stack([torch.from_numpy(target.rgba[..., 3]) for target in targets])
+    return torch.stack(drawn), torch.stack([target.rgba[..., 3] for target in targets])
 
 
 def _encoded(rgb: Float[Tensor, "H W 3"], alpha: Float[Tensor, "H W 1"]) -> Float[Tensor, "4 H W"]:

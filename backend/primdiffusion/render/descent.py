@@ -26,6 +26,7 @@ from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.cuda.graph import Recorded
 from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.render.view import PosedView
 from primdiffusion.runtime.failures import PictureOutOfMemory, out_of_memory
 
 BETAS = (0.7, 0.9)
@@ -84,15 +85,6 @@ class Descent(NamedTuple):
     seconds: float
 
 
-class PosedView(NamedTuple):
-    """An image with its camera and the frames of the primitives."""
-
-    frames: Frames
-    camera: Camera
-    target: Tensor
-    """uint8 [H, W, 4]."""
-
-
 def descend(
     start: Payload,
     views: Sequence[PosedView],
@@ -105,16 +97,18 @@ def descend(
     raises cancels.
 
     Raises:
-        ValueError: the optimisation diverges.
+        ValueError: the views are not sRGB bytes; the optimisation diverges.
         PictureOutOfMemory: images of this size do not fit into memory.
     """
+    if not all(view.rgba.dtype == torch.uint8 for view in views):
+        raise ValueError("the views to descend on are not sRGB bytes: encode them")
     start = start.map(lambda values: values.detach().float())
     leaves = _Leaves.of(start)
     groups = zip(leaves, (settings.colour_rate, settings.density_rate, settings.scale_rate), strict=True)
     adam = torch.optim.Adam([{"params": [leaf], "lr": rate} for leaf, rate in groups], betas=BETAS, fused=True)
     fall = torch.optim.lr_scheduler.LambdaLR(adam, lambda done: _share_of_rate(done, settings))
     chosen = _chosen(views, settings)
-    covered = sum(float(view.target[..., 3].sum()) for view in views) / 255 / len(views) / settings.stride**2
+    covered = sum(float(view.rgba[..., 3].sum()) for view in views) / 255 / len(views) / settings.stride**2
 
     def gradients(*tensors: Tensor) -> tuple[Tensor, ...]:
         own = _Leaves(*(leaf.detach().requires_grad_() for leaf in tensors[:3]))
@@ -189,20 +183,20 @@ def _chosen(views: Sequence[PosedView], settings: DescentSettings) -> Iterator[P
         for number in draws.permutation(len(views)):
             view = views[number]
             left, top = draws.integers(stride, size=2).tolist()
-            yield PosedView(view.frames, view.camera.every(stride, left, top), view.target[top::stride, left::stride])
+            yield PosedView(view.frames, view.camera.every(stride, left, top), view.rgba[top::stride, left::stride])
 
 
 def _tensors(view: PosedView) -> tuple[Tensor, ...]:
-    return *vars(view.frames).values(), view.camera.intrinsics, view.camera.world_to_camera, view.target
+    return *vars(view.frames).values(), view.camera.intrinsics, view.camera.world_to_camera, view.rgba
 
 
 def _view(
-    position: Tensor, rotation: Tensor, half_extent: Tensor, intrinsics: Tensor, world_to_camera: Tensor, target: Tensor
+    position: Tensor, rotation: Tensor, half_extent: Tensor, intrinsics: Tensor, world_to_camera: Tensor, rgba: Tensor
 ) -> PosedView:
     """The view of these `_tensors`."""
-    height, width = target.shape[:2]
+    height, width = rgba.shape[:2]
     camera = Camera(intrinsics, world_to_camera, width, height)
-    return PosedView(Frames(position, rotation, half_extent), camera, target)
+    return PosedView(Frames(position, rotation, half_extent), camera, rgba)
 
 
 def _share_of_rate(done: int, settings: DescentSettings) -> float:
@@ -213,7 +207,7 @@ def _share_of_rate(done: int, settings: DescentSettings) -> float:
 def _loss(view: PosedView, payload: Payload, settings: DescentSettings) -> Tensor:
     """L_rgb + silhouette * L_sil, summed over pixels; L_rgb is the mean over channels."""
     rendering = render_view(view, payload, settings.step)
-    target = view.target.float() / 255
+    target = view.rgba.float() / 255
     colour = (encode_srgb(rendering.rgb) - target[..., :3]).square().mean(-1)
     return (colour + settings.silhouette * (rendering.alpha - target[..., 3]).square()).sum()
 

@@ -25,9 +25,8 @@ from torch import Tensor
 
 from primdiffusion.formats.requests import Count, NotNegative
 from primdiffusion.formats.schema import Checked
-from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
-from primdiffusion.primitives.primitives import Frames, Payload, Primitives, S
+from primdiffusion.primitives.primitives import Payload, Primitives, S
 from primdiffusion.render.cpu.linear import (
     ColourMatrix,
     PictureJacobian,
@@ -38,6 +37,7 @@ from primdiffusion.render.cpu.linear import (
     apply_colours,
     linearise,
 )
+from primdiffusion.render.view import PosedView
 
 BACKGROUND = float(decode_srgb(torch.tensor(0.5)))
 """Linear grey behind target and image, in contrast to dark and light humans."""
@@ -45,26 +45,6 @@ BACKGROUND = float(decode_srgb(torch.tensor(0.5)))
 
 Dot = Callable[[ndarray, ndarray], Any]
 """A scalar product of voxels."""
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class TargetImage:
-    """An image to fit."""
-
-    frames: Frames
-    """The boxes in the pose of the image, unbatched."""
-    camera: Camera
-    rgba: Float32[ndarray, "height width 4"]
-    """Linear, premultiplied by alpha."""
-    weight: float = 1.0
-    """Weight of the image's mean square error."""
-
-    def __post_init__(self) -> None:
-        expected = (self.camera.height, self.camera.width, 4)
-        if self.rgba.shape != expected or not np.isfinite(self.rgba).all():
-            raise ValueError(
-                f"a target of shape {self.rgba.shape} does not fit its camera, or is not finite: give {expected}"
-            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,7 +69,7 @@ class InverseSettings(Checked):
 
 def fit_payload(
     start: Payload,
-    targets: Sequence[TargetImage],
+    targets: Sequence[PosedView],
     full_density: float,
     settings: InverseSettings = InverseSettings(),
 ) -> Payload:
@@ -98,7 +78,7 @@ def fit_payload(
     Delta scales do not change. Costs about 0.1 s and 15 MB per image of 176 x 176 pixels in each step.
 
     Raises:
-        ValueError: there are no targets, or `start` is a batch.
+        ValueError: there are no targets, they are sRGB bytes, or `start` is a batch.
     """
     _check(start, targets)
     first = _voxels(start)
@@ -129,7 +109,7 @@ def fit_payload(
 
 def influence(
     payload: Payload,
-    targets: Sequence[TargetImage],
+    targets: Sequence[PosedView],
     full_density: float,
     settings: InverseSettings = InverseSettings(),
 ) -> Float32[Tensor, "K 2 8 8 8"]:
@@ -139,7 +119,7 @@ def influence(
     weighs as in the fit: its error is the mean over the figure.
 
     Raises:
-        ValueError: there are no targets, or `payload` is a batch.
+        ValueError: there are no targets, they are sRGB bytes, or `payload` is a batch.
     """
     _check(payload, targets)
     diagonal = np.zeros_like(_voxels(payload))
@@ -153,7 +133,7 @@ def influence(
 def fit_colours(
     starts: Sequence[Payload],
     density: Payload,
-    targets: Sequence[Sequence[TargetImage]],
+    targets: Sequence[Sequence[PosedView]],
     settings: InverseSettings = InverseSettings(),
 ) -> list[Payload]:
     """Fit the colours of several colourings of one geometry, with the densities of `density`.
@@ -212,7 +192,7 @@ class LinearisedView:
     """1 where alpha follows density, 0 where the ray is opaque."""
 
     @classmethod
-    def of(cls, target: TargetImage, payload: Payload, settings: InverseSettings) -> LinearisedView:
+    def of(cls, target: PosedView, payload: Payload, settings: InverseSettings) -> LinearisedView:
         """Linearise at a payload on the CPU."""
         rendering, jacobian = linearise(Primitives.place(target.frames, payload), target.camera, BACKGROUND)
         rgb, alpha = rendering.rgb.numpy().reshape(-1, 3), rendering.alpha.numpy().reshape(-1, 1)
@@ -251,14 +231,14 @@ class _ColourView:
     weight: Float32[ndarray, "r c"]
 
     @classmethod
-    def of(cls, targets: Sequence[TargetImage], density: Payload, z: ndarray, settings: InverseSettings) -> _ColourView:
+    def of(cls, targets: Sequence[PosedView], density: Payload, z: ndarray, settings: InverseSettings) -> _ColourView:
         target = targets[0]
         rendering, jacobian = linearise(Primitives.place(target.frames, density), target.camera, BACKGROUND)
         matrix, alpha = ColourMatrix.of(jacobian), rendering.alpha.numpy().reshape(-1, 1)
         drawn = apply_colours([matrix], z)[0] + (1 - alpha) * BACKGROUND
         wanted = np.concatenate([_over_background(one)[0] for one in targets], axis=1)
         weight = _encoding_slope(wanted, settings.darkest) ** 2
-        weight *= target.weight / max(1.0, float(target.rgba[..., 3].sum()))
+        weight *= target.weight / max(1.0, float(target.rgba[..., 3].numpy().sum()))
         return cls(matrix, (wanted - drawn).astype(np.float32), weight.astype(np.float32))
 
 
@@ -318,17 +298,19 @@ def laplacian(x: Float32[ndarray, "v c"]) -> Float32[ndarray, "v c"]:
     return out.reshape(x.shape)
 
 
-def _check(start: Payload, targets: Sequence[TargetImage]) -> None:
+def _check(start: Payload, targets: Sequence[PosedView]) -> None:
     if not targets:
         raise ValueError("there are no images to fit: give at least one target")
+    if not all(target.rgba.is_floating_point() for target in targets):
+        raise ValueError("the images to fit are sRGB bytes: give linear colours, premultiplied by alpha")
     start.validate()
     if start.density.ndim != 4:
         raise ValueError(f"the start is a batch {tuple(start.density.shape[:-4])}: give one human")
 
 
-def _over_background(target: TargetImage) -> tuple[ndarray, ndarray]:
+def _over_background(target: PosedView) -> tuple[ndarray, ndarray]:
     """Colours over the background, and alpha; one row per pixel."""
-    rgba = target.rgba.reshape(-1, 4)
+    rgba = target.rgba.numpy().reshape(-1, 4)
     return rgba[:, :3] + (1 - rgba[:, 3:]) * BACKGROUND, rgba[:, 3:]
 
 

@@ -30,7 +30,8 @@ from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import K, Payload, S
 from primdiffusion.reconstruction.from_captures import targets_of
-from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_payload, influence
+from primdiffusion.render.inverse import InverseSettings, fit_payload, influence
+from primdiffusion.render.view import PosedView
 from primdiffusion.training.fit_losses import RESIDUAL
 
 SETTINGS = InverseSettings(iterations=8, pull=0.003, smoothness=0.02)
@@ -124,7 +125,7 @@ def fit_subject(captures: Captures, name: str, encoder: EncoderConfig) -> Fitted
     first = conditioning_views(captures, name, 0, spread_cameras(subject, 0, START_VIEWS))
     start = untrained.encode(first, betas)
     shown = _spread(subject.frames * len(subject.views), MOST_IMAGES)
-    targets: list[TargetImage] = []
+    targets: list[PosedView] = []
     for frame in range(subject.frames):
         cameras = [int(i) % len(subject.views) for i in shown if i // len(subject.views) == frame]
         if cameras:

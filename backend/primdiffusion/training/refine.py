@@ -29,8 +29,9 @@ from primdiffusion.people.payloads import rest_frames
 from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.render.descent import DescentSettings, DescentStep, PosedView, descend, render_view
+from primdiffusion.render.descent import DescentSettings, DescentStep, descend, render_view
 from primdiffusion.render.march import MarchSettings
+from primdiffusion.render.view import PosedView
 from primdiffusion.version import __version__
 
 MEASURED = 32
@@ -134,7 +135,7 @@ def psnr_of(scenes: Sequence[PosedView], payload: Payload) -> Float[Tensor, "n"]
     found = []
     for scene in scenes:
         image = encode_srgb(render_view(scene, payload, MarchSettings().step).rgb.clamp(0, 1))
-        found.append(psnr(image, scene.target[..., :3].float() / 255))
+        found.append(psnr(image, scene.rgba[..., :3].float() / 255))
     return torch.stack(found).cpu()
 
 

@@ -76,7 +76,7 @@ def test_the_more_views_the_nearer_the_human_is_to_what_they_show():
         found = reconstruct_by_prior(MODEL, person)
         target = targets_of(person.views, [frames_of(found)] * count, 128)[0]
         drawn = march(place(found), target.camera).rgb
-        errors.append(float((encode_srgb(drawn) - encode_srgb(torch.from_numpy(target.rgba[..., :3]))).abs().mean()))
+        errors.append(float((encode_srgb(drawn) - encode_srgb(target.rgba[..., :3])).abs().mean()))
     assert errors[1] < 0.85 * errors[0]
 
 
@@ -88,7 +88,7 @@ def test_smaller_pictures_are_what_their_cameras_see():
         seen = march(place(human), target.camera)
         drawn = torch.cat([seen.rgb, seen.alpha[..., None]], -1)
         assert (target.camera.height, target.camera.width) == drawn.shape[:2] == size
-        assert (drawn - torch.from_numpy(target.rgba)).abs().mean() < 0.012
+        assert (drawn - target.rgba).abs().mean() < 0.012
 
 
 def test_steps_are_reported_and_an_exception_cancels():
@@ -186,7 +186,7 @@ def test_the_fit_after_the_encoder_draws_the_views_closer():
             march(Primitives.place(frames[0], payload), one.camera) for one in targets_of(person.views, frames, 128)
         ]
         pairs = zip(drawn, targets_of(person.views, frames, 128), strict=True)
-        return float(sum((one.rgb - torch.from_numpy(target.rgba[..., :3])).square().mean() for one, target in pairs))
+        return float(sum((one.rgb - target.rgba[..., :3]).square().mean() for one, target in pairs))
 
     encoded = model.encode(person.views, person.betas)
     fitted = encode_and_fit(model, person.views, person.betas)

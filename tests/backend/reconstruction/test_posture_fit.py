@@ -29,8 +29,8 @@ from primdiffusion.reconstruction.posture_start import (
     turned_to_camera,
     views_of,
 )
-from primdiffusion.render.inverse import TargetImage
 from primdiffusion.render.march import march
+from primdiffusion.render.view import PosedView
 from support.errors import refused
 from tiny_model import tiny_model
 
@@ -38,13 +38,13 @@ MODEL = tiny_model()
 PAYLOAD = MODEL.decode(MODEL.denoiser.prior.mean).map(torch.Tensor.clone)
 
 
-def seen(posture: Posture) -> list[TargetImage]:
+def seen(posture: Posture) -> list[PosedView]:
     """Pictures of a posture by its own cameras."""
     targets = []
     for frames, camera in zip(posture.frames(), each(posture.camera), strict=True):
         with torch.no_grad():
             picture = march(Primitives.place(frames, PAYLOAD), camera)
-        targets.append(TargetImage(frames, camera, torch.cat([picture.rgb, picture.alpha[..., None]], -1).numpy()))
+        targets.append(PosedView(frames, camera, torch.cat([picture.rgb, picture.alpha[..., None]], -1)))
     return targets
 
 
@@ -99,7 +99,7 @@ def test_what_pictures_do_not_show_stays_where_it_was():
 
 def test_shapes_stay_within_those_of_people():
     true = a_posture()
-    tall = [dataclasses.replace(target, rgba=np.ones_like(target.rgba)) for target in seen(true)]
+    tall = [dataclasses.replace(target, rgba=torch.ones_like(target.rgba)) for target in seen(true)]
     fit = PostureFit(true, STANDARD_SHAPES)
     fit.refine(PAYLOAD, tall, Stage(60, 0.1))
     assert fit.posture().betas.abs().max() <= STANDARD_SHAPES.limit.max()
@@ -117,7 +117,7 @@ def test_an_exception_cancels():
 
 def photographed(posture: Posture, window: Window, width: int, height: int) -> Photograph:
     (target,) = seen(posture)
-    return Photograph(Path("a.png"), (255 * target.rgba).round().astype(np.uint8), window, width, height, None)
+    return Photograph(Path("a.png"), (255 * target.rgba).round().byte().numpy(), window, width, height, None)
 
 
 def test_a_framed_body_covers_the_mask_and_cameras_of_windows_are_those_of_pictures():

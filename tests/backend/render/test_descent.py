@@ -1,5 +1,6 @@
 """Descent on views of which each step draws some pixels, and the free sizes of boxes."""
 
+import dataclasses
 import math
 
 import numpy as np
@@ -9,7 +10,9 @@ from march_scenes import sheet_frames
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people.payloads import orbit_camera
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.render.descent import LARGEST_CHANGE, DescentSettings, PosedView, descend, render_view
+from primdiffusion.render.descent import LARGEST_CHANGE, DescentSettings, descend, render_view
+from primdiffusion.render.view import PosedView
+from support.errors import refused
 
 SIDE = 3
 """Boxes along a side of the sheet that is fitted."""
@@ -33,7 +36,7 @@ def views_of(payload: Payload, count: int = 4, size: int = 33) -> list[PosedView
     for number in range(count):
         camera = orbit_camera(np.zeros(3), 0.3, 40 * number - 60, 20 * math.sin(3 * number), math.radians(30), size)
         blank = PosedView(FRAMES, camera, torch.zeros(size, size, 4, dtype=torch.uint8))
-        views.append(blank._replace(target=drawn(blank, payload)))
+        views.append(dataclasses.replace(blank, rgba=drawn(blank, payload)))
     return views
 
 
@@ -46,7 +49,7 @@ def drawn(view: PosedView, payload: Payload) -> torch.Tensor:
 
 def errors(views: list[PosedView], payload: Payload) -> torch.Tensor:
     """Mean square error of each pixel over the views, sRGB-encoded in 0 ... 1."""
-    pairs = [(drawn(view, payload).float() / 255, view.target.float() / 255) for view in views]
+    pairs = [(drawn(view, payload).float() / 255, view.rgba.float() / 255) for view in views]
     return torch.stack([(one - other)[..., :3].square().mean(-1) for one, other in pairs]).mean(0)
 
 
@@ -67,11 +70,17 @@ def test_no_pixel_is_left_out():
     grey = Payload(torch.full_like(grey.rgb, 0.5), grey.density, grey.delta_scale)
     views = views_of(grey)
     for view in views:
-        view.target[::2, ::2, :3] = 0
+        view.rgba[::2, ::2, :3] = 0
     fitted = descend(grey, views, DescentSettings(steps=STEPS, stride=2, step=0.004, density_rate=0, scale_rate=0))
     middle = slice(12, 21)
-    brightness = drawn(views[1], fitted.payload)[middle, middle, :3].float().mean() / views[1].target[..., :3].max()
+    brightness = drawn(views[1], fitted.payload)[middle, middle, :3].float().mean() / views[1].rgba[..., :3].max()
     assert 0.6 < brightness < 0.9  # three quarters of the pixels are grey
+
+
+def test_linear_pictures_are_refused():
+    view = views_of(smooth_payload(1), count=1)[0]
+    with refused(ValueError, "sRGB"):
+        descend(smooth_payload(1), [dataclasses.replace(view, rgba=view.rgba / 255)])
 
 
 def test_boxes_of_wrong_sizes_find_theirs():

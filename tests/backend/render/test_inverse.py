@@ -16,11 +16,11 @@ from primdiffusion.render.inverse import (
     BACKGROUND,
     InverseSettings,
     LinearisedView,
-    TargetImage,
     fit_colours,
     fit_payload,
     influence,
 )
+from primdiffusion.render.view import PosedView
 from support.errors import refused
 
 FULL = 200.0
@@ -45,20 +45,22 @@ def cameras(count: int, turn: float = 0.0, size: int = 32) -> list[Camera]:
     ]
 
 
-def pictures(payload: Payload, views: list[Camera]) -> list[TargetImage]:
+def pictures(payload: Payload, views: list[Camera]) -> list[PosedView]:
     targets = []
     for camera in views:
         drawn = march_cpu(Primitives.place(FRAMES, payload), camera)
-        targets.append(TargetImage(FRAMES, camera, torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy()))
+        targets.append(PosedView(FRAMES, camera, torch.cat([drawn.rgb, drawn.alpha[..., None]], -1)))
     return targets
 
 
-def error(payload: Payload, targets: list[TargetImage]) -> float:
+def error(payload: Payload, targets: list[PosedView]) -> float:
     """Mean square error of colours over black and alpha."""
     squares = []
     for target in targets:
         drawn = march_cpu(Primitives.place(target.frames, payload), target.camera)
-        squares.append(np.square(torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy() - target.rgba).mean())
+        squares.append(
+            np.square(torch.cat([drawn.rgb, drawn.alpha[..., None]], -1).numpy() - target.rgba.numpy()).mean()
+        )
     return float(np.mean(squares))
 
 
@@ -127,6 +129,8 @@ def test_input_that_cannot_be_fitted_is_named():
         dataclasses.replace(targets[0], rgba=targets[0].rgba * np.nan)
     with refused(ValueError, "camera"):
         dataclasses.replace(targets[0], rgba=targets[0].rgba[1:])
+    with refused(ValueError, "linear"):
+        fit_payload(start, [dataclasses.replace(targets[0], rgba=targets[0].rgba.byte())], FULL)
     with refused(ValueError, "human"):
         fit_payload(start.map(lambda field: field[None]), targets, FULL)
     with refused(ValueError, "cameras"):

@@ -67,7 +67,7 @@ def image_error(payload: Payload, path: Path, name: str) -> float:
         frames = frames_of(config, betas, views.pose)[1]
         for target in targets_of(views, [frames] * len(views.rgba), 48):
             image = march(Primitives.place(frames, payload), target.camera)
-            squares.append(torch.cat([image.rgb, image.alpha[..., None]], -1).numpy() - target.rgba)
+            squares.append(torch.cat([image.rgb, image.alpha[..., None]], -1).numpy() - target.rgba.numpy())
     return float(np.square(squares).mean())
 
 
