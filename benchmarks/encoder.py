@@ -39,10 +39,10 @@ from matplotlib.figure import Figure
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.conditioning import captured_person, conditioning_views, default_betas, spread_cameras
-from primdiffusion.capture.dataset import Views, batches
+from primdiffusion.capture.dataset import batches
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
-from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.capture.reader import Captures, Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings

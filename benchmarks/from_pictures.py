@@ -53,10 +53,9 @@ from figure_metrics import figure_psnr
 from jaxtyping import Float, UInt8
 from PIL import Image
 from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views, default_betas
-from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
-from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.capture.reader import Captures, Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import ast
 import json
+import re
 import subprocess
 import sys
 import tempfile
@@ -27,6 +28,7 @@ TESTS = {"backend": ROOT / "tests" / "backend", "extension": ROOT / "tests" / "b
 """tests/contract tests both programs together, so it mirrors neither."""
 BLENDERS = ("5.0", "5.2", "5.3")
 THREAD_MODULES = {"threading", "_thread", "concurrent.futures", "multiprocessing"}
+COLOURS = re.compile(r"(rgba?|image|img|combined|target): .*\b([hH]\w* [wW]\w* [34]|side side 4)\b|rgb: .*'\*r 3'")
 FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda)
 
 
@@ -72,6 +74,7 @@ def main() -> None:
         "hidden_imports": hidden_imports(modules),
         "threads_in_extension": threads_in_extension(modules),
         "names_with_two_meanings": names_with_two_meanings(modules),
+        "picture_records": picture_records(modules),
         "tests_without_source": tests_without_source(),
     }
     for name, found in findings.items():
@@ -160,6 +163,18 @@ def names_with_two_meanings(modules: list[Module]) -> list[str]:
             if not name.startswith("_"):
                 homes[name].append(module.name)
     return [f"{name}: {', '.join(where)}" for name, where in sorted(homes.items()) if len(where) > 1]
+
+
+def picture_records(modules: list[Module]) -> list[str]:
+    """Public classes of the backend with a field of an image's colours: [rows, columns, 3 or 4], or [*r, 3]."""
+    return [
+        f"{module.name}.{node.name}"
+        for module in modules
+        if module.program == "backend"
+        for node in ast.walk(ast.parse(module.source))
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+        if any(isinstance(line, ast.AnnAssign) and COLOURS.match(ast.unparse(line)) for line in node.body)
+    ]
 
 
 def tests_without_source() -> list[str]:

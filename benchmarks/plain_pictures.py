@@ -40,8 +40,8 @@ from from_pictures import GREY, POSES, VIEW, Case, captured, case_of, over_grey
 from jaxtyping import Float
 from PIL import Image
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.photograph import Photograph, read_photographs
+from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.geometry.camera import Camera

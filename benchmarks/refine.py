@@ -22,10 +22,9 @@ from pathlib import Path
 import torch
 from PIL import Image
 from primdiffusion.capture.conditioning import CapturedPerson, conditioning_views, default_betas
-from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
-from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.reader import Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.commands.reconstruct import ENCODER_VIEWS, split_cameras
 from primdiffusion.encoder.model import load_encoder

@@ -70,6 +70,23 @@ def test_a_public_class_name_in_two_modules_has_two_meanings(tree):
     assert house.names_with_two_meanings(modules) == ["Picture: ours.a, theirs.b"]
 
 
+def test_a_record_of_pictures_has_their_colours(tree):
+    source = """
+class Image:
+    rgb: Float32[ndarray, "h w 3"]
+class Rendering:
+    rgb: Float[Tensor, "*r 3"]
+class Payload:
+    rgb: Float[Tensor, "*k 3 8 8 8"]
+class Part:
+    texture: UInt8[ndarray, "H W 4"]
+class _Own:
+    rgba: UInt8[ndarray, "H W 4"]
+"""
+    found = house.picture_records(tree({"ours/a.py": source, "theirs/a.py": source}))
+    assert found == ["ours.a.Image", "ours.a.Rendering"]
+
+
 def test_a_test_is_found_by_the_path_of_its_source(tree):
     tree({"ours/render/march.py": "", "tests/render/test_march.py": "", "tests/render/test_march_gradients.py": "",
           "tests/test_march.py": "", "tests/render/test_marching.py": "", "tests/test_render.py": ""})  # fmt: skip

@@ -13,12 +13,13 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.people_files import LARGEST_BETA
 from primdiffusion.capture.reader import (
     CAMERAS_FILE,
     Captures,
     Subject,
+    Views,
     as_camera,
     full_window,
     open_captures,

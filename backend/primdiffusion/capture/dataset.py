@@ -26,15 +26,22 @@ from jaxtyping import Float32, Int64, UInt8
 from torch import Tensor
 from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
 
-from primdiffusion.body.model import BodyPose
-from primdiffusion.capture.reader import Captures, Subject, Window, as_camera, full_window, resample, windowed_view
+from primdiffusion.capture.reader import (
+    Captures,
+    Subject,
+    Views,
+    Window,
+    as_camera,
+    full_window,
+    resample,
+    windowed_view,
+)
 from primdiffusion.files.arrays import map_npy
 from primdiffusion.files.json_files import LARGEST_BYTES, read_json
 from primdiffusion.files.regular_files import FileError, read_regular
 from primdiffusion.files.whole_files import replacing, write_atomically
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 
 PACK_FOLDER, PACK_FORMAT, PACK_VERSION = "packed", "primdiffusion-packed-captures", 1
@@ -162,28 +169,6 @@ class SampleSettings:
         for name in ("conditioning", "targets", "size"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} of the samples is {getattr(self, name)}: give 1 or more")
-
-
-@dataclasses.dataclass(frozen=True)
-class Views(TensorRecord):
-    """Images of one subject in one pose, or a batch."""
-
-    rgba: UInt8[Tensor, "*b v H W 4"]
-    """sRGB-encoded over black, and the mask; one tensor, because workers send it by copying."""
-    camera: Camera
-    """A batch of views [*b, v]."""
-    pose: BodyPose
-    """[*b]."""
-
-    @property
-    def image(self) -> UInt8[Tensor, "*b v H W 3"]:
-        """sRGB-encoded, over black."""
-        return self.rgba[..., :3]
-
-    @property
-    def mask(self) -> UInt8[Tensor, "*b v H W"]:
-        """Coverage of the pixel by the subject, of 255."""
-        return self.rgba[..., 3]
 
 
 @dataclasses.dataclass(frozen=True)

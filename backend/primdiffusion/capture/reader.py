@@ -112,22 +112,31 @@ VIEW_OF_FILES = 2
 
 
 @dataclasses.dataclass(frozen=True)
-class CapturedView(TensorRecord):
-    """One image of a subject with its camera, pose and passes."""
+class Views(TensorRecord):
+    """Images of one subject in one pose with their cameras, or a batch; one image has no dimension v."""
 
-    image: UInt8[Tensor, "H W 3"]
-    """sRGB-encoded, over black."""
-    mask: UInt8[Tensor, "H W"]
-    """Coverage of the pixel by the subject, of 255."""
+    rgba: UInt8[Tensor, "*b v H W 4"]
+    """sRGB-encoded over black, and the mask; one tensor, because workers send it by copying."""
     camera: Camera
+    """A batch of views [*b, v]."""
     pose: BodyPose
-    betas: Float32[Tensor, "B"]
-    depth: Float32[Tensor, "H W"] | None = None
+    """[*b]."""
+    depth: Float32[Tensor, "*b v H W"] | None = None
     """Metres along the optical axis; 0 for background."""
-    normal: Float32[Tensor, "H W 3"] | None = None
+    normal: Float32[Tensor, "*b v H W 3"] | None = None
     """World space; 0 for background."""
-    part: UInt8[Tensor, "H W"] | None = None
+    part: UInt8[Tensor, "*b v H W"] | None = None
     """1 + the joint with the largest skin weight; 0 for background."""
+
+    @property
+    def image(self) -> UInt8[Tensor, "*b v H W 3"]:
+        """sRGB-encoded, over black."""
+        return self.rgba[..., :3]
+
+    @property
+    def mask(self) -> UInt8[Tensor, "*b v H W"]:
+        """Coverage of the pixel by the subject, of 255."""
+        return self.rgba[..., 3]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -214,8 +223,8 @@ class Captures:
             self._read[name] = Subject(folder, tuple(_read_views(folder)), read_smpl(folder))
         return self._read[name]
 
-    def view(self, subject: str, frame: int, camera: int) -> CapturedView:
-        """One image with all its passes.
+    def view(self, subject: str, frame: int, camera: int) -> Views:
+        """One image with all its passes, without a dimension v.
 
         Raises:
             KeyError, IndexError: there is no such subject, frame or camera.
@@ -231,14 +240,11 @@ class Captures:
         pictures = person.pictures(known, frame, camera)
         values = {kind: torch.from_numpy(_KINDS[kind](pictures.pop(kind))) for kind in known}  # one by one: less memory
         view = person.views[camera]
-        return CapturedView(
-            image=values.pop("img") if "img" in values else torch.zeros(view.height, view.width, 3, dtype=torch.uint8),
-            mask=values.pop("mask") if "mask" in values else _no_mask(view),
-            camera=person.camera(camera),
-            pose=person.smpl.pose(frame),
-            betas=torch.from_numpy(person.smpl.betas),
-            **values,
-        )
+        size = (view.height, view.width)
+        image = values.pop("img", torch.zeros(*size, 3, dtype=torch.uint8))
+        mask = values.pop("mask", torch.full(size, 255, dtype=torch.uint8))
+        rgba = torch.cat([image, mask[..., None]], dim=-1)
+        return Views(rgba, person.camera(camera), person.smpl.pose(frame), **values)
 
 
 def open_captures(root: str | Path) -> Captures:
@@ -372,10 +378,6 @@ def _size(folder: Path, camera: int) -> tuple[int, int]:
     raise FileNotFoundError(f"{folder} has no images of camera {camera}: render the subject again")
 
 
-def _no_mask(view: View) -> Tensor:
-    return torch.full((view.height, view.width), 255, dtype=torch.uint8)
-
-
 def _depth(steps: np.ndarray) -> np.ndarray:
     metres = steps.astype(np.float32)
     metres *= np.float32(DEPTH_UNIT)
@@ -390,10 +392,6 @@ def _normal(values: np.ndarray) -> np.ndarray:
     return normals
 
 
-def _as_stored(values: np.ndarray) -> np.ndarray:
-    return values
-
-
 _BYTES_OF_A_PIXEL = {"img": 4, "mask": 1, "depth": 4, "normal": 12, "part": 1}
 """Of a view in memory."""
-_KINDS = {"img": _as_stored, "mask": _as_stored, "depth": _depth, "normal": _normal, "part": _as_stored}
+_KINDS = {"img": np.asarray, "mask": np.asarray, "depth": _depth, "normal": _normal, "part": np.asarray}

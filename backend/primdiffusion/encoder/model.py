@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, BodyPose, default_body
-from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.capture.dataset import stack
+from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.checkpoint import (
     ENCODER_FORMAT,
     anchor_tensors,

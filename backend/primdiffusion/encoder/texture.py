@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.capture.dataset import Views
+from primdiffusion.capture.reader import Views
 from primdiffusion.encoder.unproject import SIDE, TOLERANCE, Unprojected, body_depth, check
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import default_texels

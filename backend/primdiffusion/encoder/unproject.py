@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils.data import get_worker_info
 
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.capture.dataset import Views
+from primdiffusion.capture.reader import Views
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.surface import surface_points, vertex_normals
 from primdiffusion.primitives.anchors import default_texels

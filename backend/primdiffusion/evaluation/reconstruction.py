@@ -16,8 +16,7 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.conditioning import body_betas, conditioning_views, spread_cameras
-from primdiffusion.capture.dataset import Views
-from primdiffusion.capture.reader import Captures
+from primdiffusion.capture.reader import Captures, Views
 from primdiffusion.evaluation.image_metrics import Lpips, bounding_box, overlap, psnr, ssim
 from primdiffusion.evaluation.images import TestImage, image_over
 from primdiffusion.evaluation.markdown import markdown_table

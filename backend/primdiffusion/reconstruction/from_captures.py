@@ -25,7 +25,7 @@ from numpy import ndarray
 from torch import Tensor
 
 from primdiffusion.capture.conditioning import CapturedPerson
-from primdiffusion.capture.dataset import Views
+from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.codec import VOXEL_VALUES, CellCodec, LinearCodec, payload_from_cells
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import GaussianOfKinds, PersonPrior

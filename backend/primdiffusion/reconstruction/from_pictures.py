@@ -13,8 +13,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.photograph import Photograph, rgba_of
+from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.human import Human, made_by

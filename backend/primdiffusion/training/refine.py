@@ -19,8 +19,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import default_body
-from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.people_files import read_person
+from primdiffusion.capture.reader import Views
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart

@@ -47,7 +47,7 @@ def test_a_view_comes_back_as_it_was_drawn(root):
         assert np.array_equal(view.part.numpy(), shot.part)
         assert torch.allclose(view.pose.joint_rotation, poses.joint_rotation[frame], atol=1e-5)
         assert view.image.shape == (32, 32, 3)
-        assert view.betas.shape == (10,)
+        assert subject.smpl.betas.shape == (10,)
 
 
 def test_depth_and_camera_put_points_on_the_persons_surface(root):

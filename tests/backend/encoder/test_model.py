@@ -6,7 +6,8 @@ import itertools
 import pytest
 import torch
 from primdiffusion.body.model import BodyPose
-from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.capture.dataset import stack
+from primdiffusion.capture.reader import Views
 from primdiffusion.encoder.model import encode, frames_of, look_up
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.encoder.unproject import unproject_voxels

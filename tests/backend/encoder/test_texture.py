@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyModel, BodyPose, J
-from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.capture.dataset import stack
+from primdiffusion.capture.reader import Views
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.model import look_up
 from primdiffusion.encoder.texture import BESIDE, TEXTURE_SIDE, eroded, sample_both_sides, unproject_texture

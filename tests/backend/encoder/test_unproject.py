@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
-from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.capture.dataset import stack
+from primdiffusion.capture.reader import Views
 from primdiffusion.encoder.unproject import (
     COVERED,
     HULL_MARGIN,

@@ -100,7 +100,9 @@ def test_scores_are_those_of_the_drawn_pictures(scored, captures):
     score = scores[6]
     seen = captures.view(score.subject, score.frame, score.camera)
     model = Grey()
-    primitives = model.place(model.encode(None, None), seen.betas, seen.pose)
+    primitives = model.place(
+        model.encode(None, None), torch.from_numpy(captures.subject(score.subject).smpl.betas), seen.pose
+    )
     image = encode_srgb(march(primitives, seen.camera, COARSE).rgb.clamp(0, 1))
     error = (image - seen.image / 255).square().mean()
     assert score.likeness.psnr == pytest.approx(float(-10 * error.log10()), abs=1e-3)

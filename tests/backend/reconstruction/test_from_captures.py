@@ -6,7 +6,8 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.conditioning import CapturedPerson
-from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.capture.dataset import stack
+from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import sample
 from primdiffusion.encoder.model import EncoderModel

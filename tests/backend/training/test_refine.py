@@ -10,9 +10,9 @@ from capture_scenes import body_mesh, captured, save_person
 from primdiffusion import cli
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.capture.conditioning import conditioning_views
-from primdiffusion.capture.dataset import Views, stack
+from primdiffusion.capture.dataset import stack
 from primdiffusion.capture.poses import built_in_poses
-from primdiffusion.capture.reader import open_captures
+from primdiffusion.capture.reader import Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.commands.reconstruct import split_cameras
 from primdiffusion.formats.camera_rig import Rig
