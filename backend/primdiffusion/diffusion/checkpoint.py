@@ -53,10 +53,10 @@ SYMMETRIC = 1e-4
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class ModelConfig(Open):
-    """What a checkpoint says of its model, under "architecture" in its metadata."""
+    """Architecture of a checkpoint's model, under "architecture" in its metadata."""
 
     kind: Literal["person", "slab", "released"]
-    """Which denoiser it holds: a PersonDenoiser, a SlabUNet, or the authors' U-Net on a body of the user."""
+    """Denoiser: a PersonDenoiser, a SlabUNet, or the authors' U-Net on a body of the user."""
     schedule: Literal["linear", "sqrt_linear", "fine_linear"]
     """Noise schedule."""
     chain: Literal["trailing", "dense", "early", "released"] = "trailing"

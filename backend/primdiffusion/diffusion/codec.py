@@ -36,7 +36,7 @@ DEAD_ZONE = (0.08, 0.84)
 """Decoded relative density a becomes clip((a - start) / width), which removes the haze that truncation leaves around a
 person. The default for codecs that store none: fitted to payloads from meshes, at 96 numbers a primitive."""
 FITTED_DEAD_ZONE = (0.03, 0.94)
-"""For codecs of fitted payloads, whose densities are exact enough for silhouettes."""
+"""Dead zone of codecs of fitted payloads, whose densities are exact enough for silhouettes."""
 HAZE = (0.12, 0.22)
 """Largest relative density among a voxel and its neighbours: a voxel below the first is haze and becomes empty, one
 above the second stays as it is. Voxels of a surface have a dense neighbour, specks beside a person have none."""
@@ -62,7 +62,7 @@ class LinearCodec(TensorRecord):
     region: Int[Tensor, "k"]
     """Index of the basis of every primitive; equal to its own mirror image."""
     weight: Float[Tensor, "v"] = dataclasses.field(default_factory=lambda: torch.ones(VALUES))
-    """How visible each value is in a picture; equal to its own mirror image."""
+    """Visibility of each value in a picture; equal to its own mirror image."""
     dead_zone: Float[Tensor, "2"] = dataclasses.field(default_factory=lambda: torch.tensor(DEAD_ZONE))
     """Start and width, see DEAD_ZONE."""
 
@@ -94,7 +94,7 @@ class LinearCodec(TensorRecord):
         return values / self.weight + self.mean
 
     def voxel_basis(self, channels: int) -> Float[Tensor, "b 512 4 c"]:
-        """What decoding adds to encoded colour and relative density of each voxel per unit of the leading channels."""
+        """Change of each voxel's encoded colour and relative density per unit of the leading channels."""
         basis = self.basis[:, :channels] / (self.weight * SLAB_UNIT)
         return basis[..., :VOXEL_VALUES].unflatten(-1, (4, S**3)).permute(0, 3, 2, 1)
 

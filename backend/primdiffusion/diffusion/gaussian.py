@@ -54,9 +54,9 @@ class PersonPrior(PersonComponents):
     left: Float[Tensor, "g"]
     """Variance in all directions without an axis."""
     head: Int[Tensor, "g m"]
-    """Which of the F heads each kind has."""
+    """Index of each kind's head among the F heads."""
     head_axes: Float[Tensor, "f e s"]
-    """As `axes`, of heads, among the last s = R - o coefficients; s may be 0."""
+    """Principal axes of each head, among the last s = R - o coefficients; s may be 0."""
     head_variance: Float[Tensor, "f e"]
     head_left: Float[Tensor, "f"]
     shared: Float[Tensor, "g q r"]

@@ -34,7 +34,7 @@ class Block(NamedTuple):
 
 
 class _Evidence(NamedTuple):
-    """What the noisy coefficients of a block say, under the Gaussian signal^2 covariance + noise^2 of each kind."""
+    """Statistics of a block's noisy coefficients under the Gaussian signal^2 covariance + noise^2 of each kind."""
 
     distance: Float[Tensor, "b n"]
     """Squared Mahalanobis distance to the kind's centre plus the logarithm of the determinant."""

@@ -1,4 +1,4 @@
-"""Which of the attributes that were asked for a sample does not show, as the person prior reads it."""
+"""Requested attributes that a sample does not show, as the person prior reads it."""
 
 from __future__ import annotations
 

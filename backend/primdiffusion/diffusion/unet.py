@@ -35,7 +35,7 @@ class UNetConfig:
     heads: int = 8
     """Attention heads of every transformer."""
     attention_context: Literal["tokens", "input"] = "tokens"
-    """What the second attention of a transformer block reads: the block's own input tokens, as in the released code
+    """Input of the second attention of a transformer block: the block's own input tokens, as in the released code
     (SPEC 3); or the transformer's raw input, as in runs of the first versions of this package."""
 
 

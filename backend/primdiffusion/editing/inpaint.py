@@ -37,7 +37,7 @@ JUMP = 1
 """Steps of each jump back to a higher noise level. Lugmayr et al. jump 10 of 250 steps; with a few dozen longer steps,
 jumps of one fit best for the same number of denoiser calls (tests/backend/editing)."""
 RESAMPLES = 2
-"""How often each jump's steps are sampled; 1 disables resampling."""
+"""Number of times that each jump's steps are sampled; 1 disables resampling."""
 
 
 def repaint(

@@ -33,7 +33,7 @@ MOTION = 3 * (J - 1)
 CONSTANT_BASE = 100 / 255
 """Base value of the paper's networks (SPEC 2: relu(25 x + 100))."""
 RELEASED_EPSILON = 1e-6
-"""Of the released code's group norm (SPEC 2)."""
+"""Epsilon of the released code's group norm (SPEC 2)."""
 B_AXIS = -2
 """The voxels' axes D, H, W run along N, B, T."""
 HULL_BASE = (0.8, -0.5)

@@ -67,7 +67,7 @@ class MeshProxy:
     """sRGB, top row first."""
     skeleton: Skeleton
     sole_height: float
-    """Of the body (`human.sole_height`)."""
+    """Height of the body's soles in the rest pose, metres (`human.sole_height`)."""
 
     def on_floor(self) -> MeshProxy:
         """The same with its soles at y = 0, as other programs expect it."""

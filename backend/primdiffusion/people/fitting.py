@@ -35,7 +35,7 @@ DRAPE, LOOSE = 6, 0.6
 OVERLAP = 0.012
 """Overlap of socks with trousers, metres."""
 HEM_DEPTH = 0.02
-"""How far above its hem a skirt is closed between the legs, metres."""
+"""Height above its hem at which a skirt is closed between the legs, metres."""
 
 
 @functools.lru_cache(maxsize=64)
@@ -188,7 +188,7 @@ STRIP = 0.012
 GAP_SHARE = 1.0
 """Additional width of the strip per metre of gap between skin and cloth: wide openings reveal more."""
 SINK, CLEARANCE = 0.006, 0.003
-"""How far the strip is sunk at its inner edge, and below cloth that lies inside the skin, metres."""
+"""Depth of the strip's inner edge, and of the strip below cloth that lies inside the skin, metres."""
 GRID = 1e-4
 """Distances are rounded to this many metres before comparisons, so that results do not depend on the machine."""
 

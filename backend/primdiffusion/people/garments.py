@@ -256,7 +256,7 @@ def fades(position: Float[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
 PRINTED_SHARE: dict[str, float] = {"top": 0.22, "denim": 0.15}
 """Probability that a piece is printed: about one garment in six."""
 FADING = 0.25
-"""How far worn denim is from its colour to white."""
+"""Share of white in worn denim's colour."""
 PATTERNS: dict[str, tuple[Kind, Pattern]] = {
     "narrow stripes": ("top", functools.partial(stripes, period=0.08)),
     "wide stripes": ("top", functools.partial(stripes, period=0.14)),

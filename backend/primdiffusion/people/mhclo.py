@@ -51,7 +51,7 @@ class Proxy:
     weight: Float[np.ndarray, "V 3"]
     offset: Float[np.ndarray, "V 3"]
     scales: tuple[Scale | None, Scale | None, Scale | None]
-    """For x, y and z; None leaves the offset in the base's unit."""
+    """Scales along x, y and z; None leaves the offset in the base's unit."""
     z_depth: int
     """Layer, larger is further out: hidden vertices are hidden on the body and on proxies of smaller depth."""
     delete_vertices: Int[np.ndarray, " D"]

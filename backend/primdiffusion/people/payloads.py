@@ -127,7 +127,7 @@ def _model(checkpoint: Path | None) -> DiffusionModel:
 
 
 def _method(making: Making, checkpoint: Path | None) -> str:
-    """What a file says of how it was made."""
+    """Method and version for a file, with the checkpoint of a fit."""
     of_model = f" from {_model(checkpoint).card['sha256'][:12]}" if making == "fitted" else ""
     return VERSIONS[making] + of_model
 
@@ -181,8 +181,7 @@ HEAD_PITCHES = (0, 10, -10, 20, -5)
 """Camera elevations in degrees, cycled over the views."""
 SUPERSAMPLE = 3
 SETTINGS = InverseSettings(pull=0.2)
-"""Of fits that start from a model's guess. A stronger pull than usual: what pictures do not determine should stay as
-the model has it."""
+"""Settings of fits that start from a model's guess: a strong pull keeps the guess where pictures say nothing."""
 
 
 def fitted_payloads(
@@ -216,7 +215,7 @@ def fitted_payloads(
 
 
 def guess(model: DiffusionModel, payload: Payload) -> Payload:
-    """What a model of the default body takes a payload for: its detail as this model would draw it."""
+    """The payload as a model of the default body would draw it: denoised once from t = GUESS_LEVEL."""
     x = model.schedule.signal(GUESS_LEVEL) * model.encode(payload)
     decoded = model.decode(model.denoise(x[None], GUESS_LEVEL)[0])
     return Payload(decoded.rgb, decoded.density.clamp(max=FULL_DENSITY), payload.delta_scale)

@@ -67,7 +67,7 @@ UNISEX = (
     Garment("male_elegantsuit01", (Piece("suit", trim=True), Piece("suit"))),
     Garment("male_worksuit01", (Piece("overall"), PLAIN_TOP, DETAIL, DETAIL, DETAIL, DETAIL)),
 )
-"""For both sexes, whichever the pack made them for: they fit both."""
+"""Garments for both sexes, whichever the pack made them for."""
 OUTFITS: dict[Sex, tuple[Garment, ...]] = {
     "female": (
         *UNISEX,

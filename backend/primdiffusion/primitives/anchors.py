@@ -38,7 +38,7 @@ RELEASED_DISTANCE_LIMITS = (0.005, 0.050)
 
 @dataclasses.dataclass(frozen=True)
 class Anchors(TensorRecord):
-    """Where the primitives are attached to a mesh, independent of pose (paper sec. 3.1)."""
+    """Places of the primitives on a mesh, independent of pose (paper sec. 3.1)."""
 
     face: Int[Tensor, "k"]
     barycentric: Float[Tensor, "k 3"]
@@ -49,7 +49,7 @@ class Anchors(TensorRecord):
     stencil_du: Float[Tensor, "k m"]
     """dP/du = sum over m of stencil_du[k, m] * vertices[stencil_vertex[k, m]], metres per cell of the grid."""
     stencil_dv: Float[Tensor, "k m"]
-    """As `stencil_du`, for dP/dv; signed so that du x dv points out of the body."""
+    """The same for dP/dv; signed so that du x dv points out of the body."""
     chart: Int[Tensor, "k"]
     """Index into CHARTS."""
 
@@ -210,7 +210,7 @@ def build_anchors(body: BodyModel, rule: Literal["paper", "released"] = "paper")
 
 
 def grid_points_outside(body: BodyModel) -> int:
-    """How many of the K grid points lie outside of every UV chart."""
+    """Number of the K grid points that lie outside of every UV chart."""
     corner_uv = body.uv[body.uv_faces].double().cpu().numpy()
     return int((~rasterise_uv(corner_uv, GRID * S, GRID * S).every(S, S // 2).covered).sum())
 

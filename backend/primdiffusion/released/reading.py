@@ -30,7 +30,7 @@ class TensorEntry:
     shape: tuple[int, ...]
     fate: Fate
     note: str
-    """What it was checked against, its new name, or why it is not used."""
+    """Result of its check, its new name, or the reason why it is not used."""
 
 
 @dataclasses.dataclass(frozen=True)

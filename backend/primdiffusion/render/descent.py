@@ -71,7 +71,7 @@ class DescentStep(NamedTuple):
     """Progress after a step."""
 
     number: int
-    """From 1."""
+    """Number of completed steps, from 1."""
     loss: float
 
 
@@ -144,7 +144,7 @@ class _Leaves(NamedTuple):
     colour: Tensor
     """sRGB-encoded."""
     density: Tensor
-    """In units of FULL_DENSITY."""
+    """Densities in units of FULL_DENSITY."""
     log_scale: Tensor
     """Logarithm of box sizes relative to the start."""
 

@@ -180,7 +180,7 @@ def add_transposed(
 
 
 Arrays = tuple[ndarray, ...]
-"""Of a matrix, as its kernels take them; the first are the first segments of boxes."""
+"""Arrays of a matrix, as its kernels take them; the first are the first segments of boxes."""
 
 
 def _applied(kernel: Any, matrices: Sequence[Arrays], x: ndarray, rays: Sequence[int]) -> list[ndarray]:

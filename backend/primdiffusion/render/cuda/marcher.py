@@ -141,7 +141,7 @@ class _Size:
 
 
 _marchers: dict[tuple, Marcher | None] = {}
-"""By what kind of scene they draw; None after the first picture of a kind."""
+"""Marchers by the kind of their scenes; None after the first picture of a kind."""
 
 
 def prepared(primitives: Primitives, settings: MarchSettings, shapes: Shapes) -> Marcher | None:

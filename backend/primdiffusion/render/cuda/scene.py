@@ -104,7 +104,7 @@ class Scene(NamedTuple):
 
     @property
     def kind(self) -> tuple:
-        """What scenes that share a plan have in common."""
+        """Properties that scenes with a common plan share."""
         position, size = self.primitives.position, (self.camera.width, self.camera.height)
         return (*position.shape[:2], len(self.camera.intrinsics), *size, self.settings, self.shapes, position.device)
 
@@ -115,7 +115,7 @@ class Scene(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """What kernels are launched with that depends on the scene."""
+    """Launch parameters of the kernels that depend on the scene."""
 
     bins: int
     """Entries of the lists of bins."""
