@@ -6,21 +6,10 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
+from primdiffusion.encoder.config import Ablation, EncoderConfig, Preset, encoder_config
 from primdiffusion.formats.requests import Count, NotNegative, Positive
 from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.training.config import Decay, RunSettings
-
-Preset = Literal[
-    "default",
-    "shared_scale",
-    "template_rt",
-    "no_attention",
-    "paper",
-    "paper_shared_scale",
-    "paper_template_rt",
-    "paper_no_attention",
-    "released",
-]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,11 +57,13 @@ class FitConfig(RunSettings):
     """Folder of voxels fitted to all images of each subject, for loss.voxels; those that it lacks are made first, half
     a minute each."""
     encoder: Preset = "default"
-    """default, its ablations shared_scale, template_rt and no_attention, the same four in the paper's form (paper,
-    paper_shared_scale, ...), or the architecture released."""
+    """The shipped architecture, the paper's, or that of the authors' code."""
+    ablation: Ablation | None = None
+    """An ablation of the paper's Table 3: one delta scale for all boxes (shared_scale), boxes on a body of mean shape
+    (template_rt), or branches that are only concatenated (no_attention)."""
     start: Path | None = None
-    """Encoder of the same preset whose weights training starts from, for instance the default one; without it, random
-    weights, which draw the hull of the masks."""
+    """Encoder of the same architecture whose weights training starts from, for instance the default one; without
+    it, random weights, which draw the hull of the masks."""
     steps: Count = 20_000
     """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: Count = 4
@@ -115,6 +106,11 @@ class FitConfig(RunSettings):
     """Steps between evaluations on a few subjects of `data` and `held`."""
     pictures_every: Count = 500
     """Steps between images."""
+
+    @property
+    def architecture(self) -> EncoderConfig:
+        """Settings of the encoder."""
+        return encoder_config(self.encoder, self.ablation)
 
     def __post_init__(self) -> None:
         """Raise ValueError for values out of range."""
