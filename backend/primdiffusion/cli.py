@@ -40,7 +40,7 @@ COMMANDS = {
     "info": ("commands.info:run", "Describe this installation, a checkpoint or a human, as JSON"),
     "people": ("commands.people:run_people", "Make dressed, rigged humans (glTF) from a MakeHuman asset folder"),
     "payloads": ("commands.people:run_payloads", "Make primitives to train on, of such humans or captures; pack them"),
-    "captures": ("commands.captures:run", "Multi-view captures: render, verify, info, pack, sheet, farm"),
+    "captures": ("commands.captures:run", "Multi-view captures: render, verify, info, pack, sheet, export, farm"),
     "fit": ("training.fit:run", "Train the encoder on captures: from images to primitives"),
     "train": ("training.diffuse:run", "Train the diffusion model on primitives"),
     "evaluate": ("commands.evaluate:run", "Evaluate trained models"),

@@ -1,4 +1,4 @@
-"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet, coco and farm."""
+"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet, export, coco and farm."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.capture.camera_files import Project, export_cameras
 from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
 from primdiffusion.capture.composed import Backgrounds
 from primdiffusion.capture.dataset import open_pack, pack
@@ -254,6 +255,24 @@ class SheetOfCaptures:
 
 
 @dataclasses.dataclass(frozen=True)
+class ExportCaptures:
+    """Write camera files of NeRF (transforms.json), OpenCV and COLMAP beside the images."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder of a capture dataset, of this program or in the released layout; the files go there."""
+    projects: tuple[Project, ...] = ("nerf", "opencv", "colmap")
+    """Whose files to write."""
+
+    def run(self) -> None:
+        """Write, and print a line for each subject."""
+        captures = open_captures(self.root)
+        for name in tqdm(
+            export_cameras(captures, self.projects), total=len(captures.subjects), unit="human", disable=None
+        ):
+            print(f"{self.root / name}  {', '.join(self.projects)}", flush=True)
+
+
+@dataclasses.dataclass(frozen=True)
 class AnnotateCaptures:
     """Write annotations in COCO's format (boxes, masks, 17 keypoints, SMPL) and a table of all images."""
 
@@ -317,6 +336,7 @@ Command = (
     | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
     | Annotated[PackCaptures, tyro.conf.subcommand("pack")]
     | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
+    | Annotated[ExportCaptures, tyro.conf.subcommand("export")]
     | Annotated[AnnotateCaptures, tyro.conf.subcommand("coco")]
     | Annotated[FarmCaptures, tyro.conf.subcommand("farm")]
 )
