@@ -296,8 +296,8 @@ class AnnotateCaptures:
         print(f"{self.root / ANNOTATIONS_FILE}\n{self.root / TABLE_FILE}")
 
 
-@dataclasses.dataclass(frozen=True)
-class FarmCaptures:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FarmCaptures(Farm):
     """Render a dataset with Blender on a Ray cluster, one human per task (needs the extra `farm`).
 
     `primdiffusion captures farm --workers 4 -- blender -c primdiffusion capture --people scans --out captures`
@@ -305,16 +305,6 @@ class FarmCaptures:
 
     command: tyro.conf.Positional[tuple[str, ...]]
     """The renderer and its options; paths must be the same on all machines."""
-    address: str | None = None
-    """Address of a Ray cluster; "auto" for the one of this machine; the default starts one here."""
-    workers: int = 1
-    """Renderers at a time, if the cluster is started here."""
-    processors_each: float = 1
-    """Cores of each renderer."""
-    gpus_each: float = 0
-    """GPUs of each renderer; with 0.5 two share one."""
-    attempts: int = 3
-    """Attempts for a human whose worker or renderer is killed."""
 
     def run(self) -> None:
         """Render, and print a line for each human. Raises ValueError if the cluster cannot start or a human fails."""
@@ -323,8 +313,7 @@ class FarmCaptures:
             said = outcome.error or f"{outcome.seconds:.0f} s"
             print(printable(f"{done}/{total}  {outcome.subject}  {said}"), flush=True)
 
-        farm = Farm(self.address, self.workers, self.processors_each, self.gpus_each, self.attempts)
-        outcomes = render_on(farm, self.command, show)
+        outcomes = render_on(self, self.command, show)
         failed = [outcome.subject for outcome in outcomes if outcome.exit_code]
         if failed:
             raise ValueError(f"{len(failed)} of {len(outcomes)} humans are not finished: {', '.join(failed[:5])}")

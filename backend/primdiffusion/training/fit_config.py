@@ -6,10 +6,11 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
+from primdiffusion.capture.dataset import SampleSettings
 from primdiffusion.encoder.config import Ablation, EncoderConfig, Preset, encoder_config
 from primdiffusion.formats.requests import Count, NotNegative, Positive
 from primdiffusion.formats.schema import Checked, Range
-from primdiffusion.training.config import Decay, RunSettings
+from primdiffusion.training.config import Decay, OptimiserSettings, RunSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +47,7 @@ class LossConfig(Checked):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FitConfig(RunSettings):
+class FitConfig(OptimiserSettings, SampleSettings, RunSettings):
     """A run of `primdiffusion fit`."""
 
     data: Path
@@ -68,16 +69,6 @@ class FitConfig(RunSettings):
     """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: Count = 4
     """Subjects per step and process."""
-    views: Count = 8
-    """Input images; if a subject has fewer, some are used twice."""
-    targets: Count = 1
-    """Target images of each subject."""
-    size: Count = 512
-    """Width and height of the targets, pixels: what is learned from smaller ones is blurred in larger ones."""
-    framing: Literal["whole", "crop"] = "crop"
-    """crop: squares around the subject, of `size` pixels or more; whole: whole images, as in the paper."""
-    conditioning_frame: Literal["first", "same", "any"] = "any"
-    """Frame of the input images: the first, near T (released), that of the targets, or any."""
     step: Positive = 0.004
     """Metres between samples of a ray."""
     learning_rate: Positive = 1e-4
@@ -86,8 +77,6 @@ class FitConfig(RunSettings):
     """Factor on the learning rate of untied biases."""
     weight_decay: NotNegative = 0.0
     """Weight decay of AdamW."""
-    gradient_clip: Positive = 1.0
-    """Largest norm of the gradient."""
     ema: Decay = 0.998
     """Decay of the averaged weights, which are evaluated and saved."""
     hold_scale: Annotated[int, Range(0)] = 1_000_000
@@ -102,8 +91,6 @@ class FitConfig(RunSettings):
     """Seconds between checkpoints; 0 saves after every step."""
     log_every: Count = 25
     """Steps between lines of metrics.jsonl, which are running means."""
-    evaluate_every: Count = 500
-    """Steps between evaluations on a few subjects of `data` and `held`."""
     pictures_every: Count = 500
     """Steps between images."""
 

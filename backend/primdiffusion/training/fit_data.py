@@ -16,7 +16,6 @@ from primdiffusion.capture.dataset import (
     Position,
     ProcessRank,
     SampleSet,
-    SampleSettings,
     Views,
     batches,
 )
@@ -103,9 +102,8 @@ def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
 
 def fit_dataset(captures: Captures, config: FitConfig) -> FitDataset:
     """Return the dataset of a run."""
-    settings = SampleSettings(config.views, config.targets, config.size, config.framing, config.conditioning_frame)
     fitted = config.fitted if config.loss.voxels else None
-    return FitDataset(CaptureDataset(captures, settings, config.seed), config.architecture, fitted)
+    return FitDataset(CaptureDataset(captures, config, config.seed), config.architecture, fitted)
 
 
 def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: ProcessRank) -> Iterator[Batch]:

@@ -24,14 +24,14 @@ import accelerate
 import torch
 from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
 from primdiffusion.failures import optional_package
 from primdiffusion.folder_lock import lock_folder
 from primdiffusion.formats.json_files import parse_json
+from primdiffusion.formats.picture_files import write_png
 from primdiffusion.formats.regular_files import as_file_error, check_unlinked, open_to_append, read_regular, real_path
-from primdiffusion.formats.whole_files import remove_abandoned, replacing, write_atomically
+from primdiffusion.formats.whole_files import remove_abandoned, write_atomically
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.state import accelerator_of, saved_step
 from primdiffusion.version import __version__
@@ -66,9 +66,7 @@ def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accel
 
 def write_picture(path: Path, picture: Float[Tensor, "H W 3"]) -> None:
     """Write an sRGB-encoded picture as a PNG, atomically; its folder is created if missing. Raises OSError."""
-    values = (picture.clamp(0, 1) * 255).round().to(torch.uint8).contiguous().numpy()
-    with replacing(path) as unfinished:
-        Image.fromarray(values).save(unfinished, format="PNG")
+    write_png(path, (picture.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
 
 
 def state_path(run: Path, phase: str) -> Path:
@@ -197,9 +195,7 @@ def _is_kept(line: str, steps: Mapping[str, int]) -> bool:
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True
-    )  # fmt: skip
+    done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True)
     return done.stdout.strip()
 
 
