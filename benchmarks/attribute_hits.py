@@ -20,8 +20,8 @@ from jaxtyping import Float, Int
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import CellCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.latents import encode_people
-from primdiffusion.training.stored_people import PersonFolder
 from record import command_line, report
 from torch import Tensor
 from torch.nn import functional

@@ -36,6 +36,7 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.payloads import rest_frames
+from primdiffusion.people.stored_people import PersonFolder, find_people, read_outline, read_person
 from primdiffusion.training.cells import CellTask, prepare
 from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, split_people, vocabulary_of
@@ -43,7 +44,6 @@ from primdiffusion.training.loop import step_seed
 from primdiffusion.training.losses import PersonObjective, RestObjective
 from primdiffusion.training.prior import fit_prior, fit_shapes
 from primdiffusion.training.state import TrainingState, accelerator_of
-from primdiffusion.training.stored_people import PersonFolder, find_people, read_outline, read_person
 from safetensors.torch import load_file, save
 from torch import Tensor
 from voxel_baseline import (

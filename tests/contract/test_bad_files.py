@@ -45,8 +45,8 @@ from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.geometry.pictures import decoded, opened_picture
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
+from primdiffusion.people.stored_people import read_person
 from primdiffusion.pose_file import read_pose
-from primdiffusion.training.stored_people import read_person
 from tiny_model import save_tiny_checkpoint, tiny_model
 
 LONGEST_SENTENCE, LONGEST_S, MOST_MEMORY = 300, 5.0, 500 * 2**20

@@ -22,13 +22,13 @@ from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.people.stored_people import PersonFolder, one_density
 from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of
 from primdiffusion.training.loop import Step
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
-from primdiffusion.training.stored_people import PersonFolder, one_density
 
 PREPARED = "prepared.safetensors"
 

@@ -15,6 +15,7 @@ from primdiffusion.device import device_info
 from primdiffusion.diffusion.checkpoint import file_hash, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training import loop
 from primdiffusion.training.cells import CellTask, load_base, prepare
 from primdiffusion.training.config import TrainingConfig
@@ -22,7 +23,6 @@ from primdiffusion.training.latents import split_people
 from primdiffusion.training.run_folder import begin, open_run, versions
 from primdiffusion.training.slabs import SlabTask
 from primdiffusion.training.state import TrainingState
-from primdiffusion.training.stored_people import PersonFolder
 from primdiffusion.version import __version__
 
 MODEL = "model.safetensors"

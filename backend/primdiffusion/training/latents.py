@@ -16,8 +16,8 @@ from torch import Tensor
 from primdiffusion.diffusion.codec import LinearCodec, cells_from_voxels, fit_codec
 from primdiffusion.diffusion.conditioning import Attributes, AttributeVocabulary
 from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.config import CodecConfig
-from primdiffusion.training.stored_people import PersonFolder
 
 Item = TypeVar("Item", int, Path)
 CHUNK = 256

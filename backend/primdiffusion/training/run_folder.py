@@ -32,6 +32,7 @@ from primdiffusion.formats.json_files import parse_json
 from primdiffusion.formats.picture_files import write_png
 from primdiffusion.formats.regular_files import as_file_error, check_unlinked, open_to_append, read_regular, real_path
 from primdiffusion.formats.whole_files import remove_abandoned, write_atomically
+from primdiffusion.geometry.srgb import to_bytes
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.state import accelerator_of, saved_step
 from primdiffusion.version import __version__
@@ -66,7 +67,7 @@ def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accel
 
 def write_picture(path: Path, picture: Float[Tensor, "H W 3"]) -> None:
     """Write an sRGB-encoded picture as a PNG, atomically; its folder is created if missing. Raises OSError."""
-    write_png(path, (picture.clamp(0, 1) * 255).round().to(torch.uint8).numpy())
+    write_png(path, to_bytes(picture).numpy())
 
 
 def state_path(run: Path, phase: str) -> Path:

@@ -15,12 +15,12 @@ from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet
+from primdiffusion.people.stored_people import PersonFolder, payload_of_bytes
 from primdiffusion.primitives.slab import pack
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.loop import Step
 from primdiffusion.training.losses import level_weight, random_steps, x0_errors
-from primdiffusion.training.stored_people import PersonFolder, payload_of_bytes
 
 NETWORK = "slab"
 MEASURED = 4

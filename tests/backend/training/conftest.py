@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from diffuse_runs import settings
 from diffusion_people import write_people
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.cells import prepare
 from primdiffusion.training.latents import split_people
-from primdiffusion.training.stored_people import PersonFolder
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import codec_regions
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.human import generate
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import S
 from primdiffusion.training import slabs
@@ -29,7 +30,6 @@ from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
 from primdiffusion.training.loop import Interrupt, Step, StepTimer, step_seed
 from primdiffusion.training.losses import LEVELS
 from primdiffusion.training.slabs import SlabTask
-from primdiffusion.training.stored_people import PersonFolder
 from support.errors import refused
 from support.runs import child_environment, rows, same_tensors, sentence, timeless
 

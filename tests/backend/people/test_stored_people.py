@@ -8,10 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from diffusion_people import write_people
 from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.people.stored_people import PersonFolder, find_people, read_outline, read_person
 from primdiffusion.primitives.primitives import K
-from primdiffusion.training.stored_people import PersonFolder, find_people, read_outline, read_person
 from support.errors import refused
+
+
+@pytest.fixture(scope="module")
+def people(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("people")
+    write_people(folder, geometries=2, variants=2)
+    return folder
 
 
 def test_an_empty_folder_is_rejected(tmp_path):

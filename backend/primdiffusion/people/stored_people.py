@@ -56,14 +56,6 @@ def payload_of_bytes(
     return Payload(decode_srgb(values[..., :3, :, :, :]), values[..., 3, :, :, :] * full_density, delta_scale.float())
 
 
-def attributes_of(stored: Mapping[str, Any], betas: Float[Tensor, "10"], count: int) -> tuple[Attributes, ...]:
-    """Return attributes of each of `count` colourings, from the file and the body's measures."""
-    variants = stored.get("variants", [stored] * count)
-    measures = measure(default_body().shape(betas))
-    body = {"height": measures.height, "weight": measures.weight}
-    return tuple({**words_of(variant), **body} for variant in variants)
-
-
 def read_person(path: Path) -> PersonVariants:
     """Read a file. Raises ValueError if it is damaged or of another shape."""
     with _damage_named(path):
@@ -98,9 +90,15 @@ class Outline:
     """Stored attributes."""
     full_density: float
 
+    def colourings(self) -> list[dict[str, Any]]:
+        """Stored attributes of each colouring."""
+        return list(self.stored.get("variants", [self.stored] * self.variants))
+
     def known(self) -> tuple[Attributes, ...]:
         """`PersonVariants.attributes`."""
-        return attributes_of(self.stored, self.betas, self.variants)
+        measures = measure(default_body().shape(self.betas))
+        body = {"height": measures.height, "weight": measures.weight}
+        return tuple({**words_of(colouring), **body} for colouring in self.colourings())
 
 
 def _damage_named(path: Path) -> contextlib.AbstractContextManager[None]:
