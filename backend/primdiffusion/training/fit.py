@@ -22,7 +22,8 @@ from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.formats.picture_files import write_png
+from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
@@ -30,7 +31,7 @@ from primdiffusion.training.fit_data import Batch, FitSample, betas_of, fit_batc
 from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
 from primdiffusion.training.fit_voxels import fit_missing, voxel_loss
 from primdiffusion.training.loop import Step, StepTimer, Task, train
-from primdiffusion.training.run_folder import begin, open_run, versions, write_picture
+from primdiffusion.training.run_folder import begin, open_run, versions
 from primdiffusion.training.state import TrainingState, adamw
 from primdiffusion.version import __version__
 
@@ -235,7 +236,7 @@ def write_pictures(path: Path, model: EncoderModel, captures: Captures, people: 
     for image, target, given in _compared(model, captures, people, "crop"):
         pairs = [side for pair in zip(image, target, strict=True) for side in pair]
         rows.append(torch.cat([given, *pairs], dim=1))
-    write_picture(path, torch.cat(rows))
+    write_png(path, to_bytes(torch.cat(rows)).numpy())
 
 
 @torch.no_grad()

@@ -23,16 +23,12 @@ from typing import Any
 import accelerate
 import torch
 from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
-from jaxtyping import Float
-from torch import Tensor
 
 from primdiffusion.failures import optional_package
 from primdiffusion.folder_lock import lock_folder
 from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.picture_files import write_png
 from primdiffusion.formats.regular_files import as_file_error, check_unlinked, open_to_append, read_regular, real_path
 from primdiffusion.formats.whole_files import remove_abandoned, write_atomically
-from primdiffusion.geometry.srgb import to_bytes
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.state import accelerator_of, saved_step
 from primdiffusion.version import __version__
@@ -41,9 +37,7 @@ log = logging.getLogger(__name__)
 
 CONFIG, RUN, METRICS, PICTURES = "config.json", "run.json", "metrics.jsonl", "pictures"
 LARGEST_TEXT = 2**30
-"""Bytes of any of them."""
-PROJECT = "primdiffusion"
-"""Name in Weights & Biases."""
+"""Largest size of one of them, bytes."""
 
 
 @contextlib.contextmanager
@@ -63,11 +57,6 @@ def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accel
         accelerator = accelerator_of(mixed_precision)
         yield accelerator
         accelerator.end_training()
-
-
-def write_picture(path: Path, picture: Float[Tensor, "H W 3"]) -> None:
-    """Write an sRGB-encoded picture as a PNG, atomically; its folder is created if missing. Raises OSError."""
-    write_png(path, to_bytes(picture).numpy())
 
 
 def state_path(run: Path, phase: str) -> Path:
@@ -138,7 +127,7 @@ def open_metrics(config: RunSettings) -> Iterator[Metrics]:
         yield Metrics(config.run)
         return
     if config.tracker == "wandb":
-        tracker: GeneralTracker = WandBTracker(PROJECT, name=config.run.name, dir=str(config.run))
+        tracker: GeneralTracker = WandBTracker("primdiffusion", name=config.run.name, dir=str(config.run))
     else:
         tracker = TensorBoardTracker("tensorboard", logging_dir=config.run)
     tracker.start()
