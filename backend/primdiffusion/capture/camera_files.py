@@ -17,9 +17,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from primdiffusion.capture.reader import Captures, Subject
+from primdiffusion.files.regular_files import check_inside
+from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.formats.capture_layout import npz_bytes, picture_path
-from primdiffusion.formats.regular_files import check_inside
-from primdiffusion.formats.whole_files import write_atomically
 
 Project = Literal["nerf", "opencv", "colmap"]
 _FROM_OPENGL = np.diag([1.0, -1.0, -1.0])

@@ -14,7 +14,7 @@ from torch.nn import functional
 
 from primdiffusion.evaluation.images import SIDE, TestImage
 from primdiffusion.evaluation.pretrained_networks import IMAGENET
-from primdiffusion.failures import optional_package
+from primdiffusion.runtime.failures import optional_package
 
 Normalisation = Literal["imagenet", "half"]
 """Mean and standard deviation of a network's inputs: of ImageNet (RTMPose, ViTPose, MiDaS, Depth Anything), or 0.5 and

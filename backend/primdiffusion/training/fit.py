@@ -21,8 +21,8 @@ from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import psnr
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.picture_files import write_png
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.picture_files import write_png
 from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, march

@@ -9,8 +9,8 @@ from capture_scenes import captured
 from primdiffusion.capture.camera_files import export_cameras
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.cli import run
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.capture_repair import verify
-from primdiffusion.formats.regular_files import FileError
 from scipy.spatial.transform import Rotation
 from support.errors import refused
 
