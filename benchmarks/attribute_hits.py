@@ -20,8 +20,8 @@ from jaxtyping import Float, Int
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import CellCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.latents import encode_people
-from primdiffusion.training.shards import open_people
 from record import command_line, report
 from torch import Tensor
 from torch.nn import functional
@@ -50,7 +50,7 @@ class Stored(NamedTuple):
 
 
 def read_stored(folder: Path, codec: CellCodec, vocabulary: AttributeVocabulary) -> Stored:
-    people = open_people(folder)
+    people = PersonFolder(folder)
     found = encode_people(people, range(len(people.names)), codec.codec, vocabulary)
     latents = found.latents.flatten(1).float()
     mean = latents.mean(0)

@@ -222,7 +222,7 @@ def _loader_figures(folder: Path, seconds: float) -> dict[str, float]:
 
 
 def _views_per_second(captures: Captures, size: int, seconds: float) -> float:
-    dataset = CaptureDataset(captures, SampleSettings(4, 4, size))
+    dataset = CaptureDataset(captures, SampleSettings(4, 4, size, "whole", "first"))
     stream = batches(dataset, 2, workers=1)
     with contextlib.closing(stream):
         for _ in range(2):

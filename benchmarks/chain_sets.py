@@ -34,12 +34,12 @@ from primdiffusion.people.payloads import (
     voxels_from_payload,
 )
 from primdiffusion.people.person import Person, make_person, recolour
+from primdiffusion.people.stored_people import PersonVariants, read_person
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.march import march
-from primdiffusion.training.stored_people import PersonVariants, read_person
 from torch import Tensor
 
 FIRST_SEED = 10_000_000

@@ -65,10 +65,10 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import place
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.payloads import rest_frames
+from primdiffusion.people.stored_people import find_people, read_person
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
 from primdiffusion.training.latents import split_people
-from primdiffusion.training.stored_people import find_people, read_person
 from record import report, run
 from torch import Tensor
 from voxel_baseline import load_voxel_model
@@ -243,7 +243,7 @@ def latent_ratio(model: DiffusionModel, train: list[Path], held: list[Path]) -> 
 
     made = [encode(human.payload).flatten() for human in generated(model, seeds_of(len(held)))]
     real = [encode(read_person(path).payload(0)).flatten() for path in held]
-    found = nearest_stored(torch.stack([*made, *real]), train, read_person, encode, progress("latents"))
+    found = nearest_stored(torch.stack([*made, *real]), train, encode, progress("latents"))
     return float(found.distance[: len(made)].median() / found.distance[len(made) :].median())
 
 
@@ -331,7 +331,7 @@ def neighbours(model: DiffusionModel, train: Sequence[Path], held: Sequence[Path
     people = list(generated(model, seeds_of(count)))
     references = [read_person(path).payload(0) for path in held[:: max(len(held) // 32, 1)]]
     queries = torch.stack([encode(payload).flatten() for payload in (*(h.payload for h in people), *references)])
-    found = nearest_stored(queries, train, read_person, encode, progress("latents"))
+    found = nearest_stored(queries, train, encode, progress("latents"))
     new = found.distance[count:].median()
     rows: list[tuple[str, list[tuple[Primitives, str]]]] = [("generated", []), ("nearest in training", [])]
     for number, human in enumerate(people):

@@ -17,10 +17,10 @@ from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.person import make_person
+from primdiffusion.people.stored_people import read_person
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
-from primdiffusion.training.stored_people import read_person
 from torch import Tensor
 from voxel_baseline import VoxelModel, primitives_of, voxelise_payload
 

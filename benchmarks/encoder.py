@@ -46,7 +46,6 @@ from primdiffusion.capture.reader import Captures, Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings
-from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import EncoderModel, load_encoder, look_up
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
@@ -349,7 +348,7 @@ def step_seconds(captures: Captures, steps: int) -> dict[str, float | int]:
     """Processor seconds of the parts of a training step with the default settings: medians of `steps` steps."""
     config = FitConfig(data=captures.root, run=Path("unused"))
     torch.manual_seed(0)
-    encoder = Encoder(PRESETS[config.encoder]).train()
+    encoder = Encoder(config.architecture).train()
     optimiser = torch.optim.AdamW(encoder.parameters(), config.learning_rate)
     stream = batches(fit_dataset(captures, config), config.batch)
     taken: list[dict[str, float]] = []

@@ -1,10 +1,10 @@
 """The ablations of the paper's Table 3 in the paper's own form: texel look-up, no skips, a constant base.
 
 `python benchmarks/encoder_paper_form.py --train CAPTURES --novel CAPTURES --out DIR --minutes 7 --json
-docs/results/encoder_paper_form.json` trains the presets paper, paper_shared_scale, paper_template_rt and
-paper_no_attention for equal time of the processor on small pictures, and compares them with captures in poses and
-views that training had not: --novel is of the same people from other sides, and its first poses, --given of them, are
-those of --train. The first pose is encoded, from eight sides. Encoders that are there are not trained again.
+docs/results/encoder_paper_form.json` trains the preset paper and its ablations for equal time of the processor on small
+pictures, and compares them with captures in poses and views that training had not: --novel is of the same people from
+other sides, and its first poses, --given of them, are those of --train. The first pose is encoded, from eight sides.
+Encoders that are there are not trained again.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import NamedTuple
 
 import torch
 from primdiffusion.capture.reader import Captures, open_captures
+from primdiffusion.encoder.config import Ablation
 from primdiffusion.encoder.model import load_encoder, save_encoder
 from primdiffusion.evaluation.reconstruction import EvaluationSettings, Means, evaluate, summary
 from primdiffusion.training.fit import EncoderTask
@@ -26,11 +27,11 @@ from primdiffusion.training.loop import begin_phase, take_step
 from primdiffusion.training.state import TrainingState, accelerator_of
 from record import command_line, report
 
-FORMS = {
-    "full": "paper",
-    "shared_scale": "paper_shared_scale",
-    "template_rt": "paper_template_rt",
-    "no_attention": "paper_no_attention",
+FORMS: dict[str, Ablation | None] = {
+    "full": None,
+    "shared_scale": "shared_scale",
+    "template_rt": "template_rt",
+    "no_attention": "no_attention",
 }
 PAPER_PSNR = {"full": 32.15, "shared_scale": 18.35, "template_rt": 31.70, "no_attention": 28.39}
 TRIED = 7
@@ -44,10 +45,10 @@ def main() -> None:
     arguments.out.mkdir(parents=True, exist_ok=True)
     captures, novel = open_captures(arguments.train), open_captures(arguments.novel)
     figures: Figures = {}
-    for name, preset in FORMS.items():
+    for name, ablation in FORMS.items():
         path = arguments.out / f"{name}.safetensors"
         if not path.is_file():
-            train(arguments, preset, captures, path)
+            train(arguments, ablation, captures, path)
         figures |= figures_of(name, path, measured(path, novel, arguments))
         print(name, {key: value for key, value in figures.items() if key.endswith(f"_{name}")}, flush=True)
     report(figures, arguments.json)
@@ -66,12 +67,13 @@ def parsed() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def settings(arguments: argparse.Namespace, preset: str, count: int) -> FitConfig:
+def settings(arguments: argparse.Namespace, ablation: Ablation | None, count: int) -> FitConfig:
     """Few small pictures a step, and rates for few steps."""
     return FitConfig(
         data=arguments.train,
-        run=arguments.out / preset,
-        encoder=preset,  # pyright: ignore[reportArgumentType] - one of FORMS
+        run=arguments.out / (ablation or "full"),
+        encoder="paper",
+        ablation=ablation,
         steps=count,
         batch=2,
         views=6,
@@ -85,16 +87,17 @@ def settings(arguments: argparse.Namespace, preset: str, count: int) -> FitConfi
     )
 
 
-def train(arguments: argparse.Namespace, preset: str, captures: Captures, path: Path) -> None:
+def train(arguments: argparse.Namespace, ablation: Ablation | None, captures: Captures, path: Path) -> None:
     """Trains for the processor's time and writes the encoder. A few steps that are thrown away plan the others."""
-    tried = list(timed_steps(settings(arguments, preset, TRIED), captures))
+    tried = list(timed_steps(settings(arguments, ablation, TRIED), captures))
     seconds = 60 * arguments.minutes
     planned = max(TRIED, round(seconds / statistics.median([one.seconds for one in tried[2:]])))
     taken, total = tried[-1], 0.0
-    for taken in timed_steps(settings(arguments, preset, planned), captures):
+    for taken in timed_steps(settings(arguments, ablation, planned), captures):
         total += taken.seconds
         if taken.state.step % 50 == 0:
-            print(preset, taken.state.step, "of", planned, f"{total:.0f} s, loss {taken.loss:.4f}", flush=True)
+            done = f"{taken.state.step} of {planned} {total:.0f} s, loss {taken.loss:.4f}"
+            print(ablation or "full", done, flush=True)
         if total > seconds:
             break
     taken.state.seconds = total

@@ -49,7 +49,7 @@ TESTS = ROOT / "tests"
 SEED = 7
 THREADS = (1, 2, 4)
 BATCHES = (1, 8)
-KILLED = ("captures render", "captures pack", "train", "fit", "payloads", "payloads encode", "payloads pack",
+KILLED = ("captures render", "captures pack", "train", "fit", "payloads", "payloads encode",
           "export .glb", "export .obj", "export .ply")  # fmt: skip
 """Programs that write what took long, as `tests/chaos/programs.py` names them."""
 ATTACKS = (

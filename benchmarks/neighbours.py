@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
-from primdiffusion.evaluation.gallery import ReadPerson, Report, silent
+from primdiffusion.evaluation.gallery import Report, silent
+from primdiffusion.people.stored_people import read_person
 from primdiffusion.primitives.primitives import Payload
 from torch import Tensor
 
@@ -27,7 +28,7 @@ class NearestStored(NamedTuple):
 
 
 def nearest_stored(
-    queries: Float[Tensor, "q d"], paths: Sequence[Path], read: ReadPerson, encode: Encode, report: Report = silent
+    queries: Float[Tensor, "q d"], paths: Sequence[Path], encode: Encode, report: Report = silent
 ) -> NearestStored:
     """Search all colourings of all files for the nearest to each flattened latent. Raises ValueError for no paths."""
     if not paths:
@@ -35,7 +36,7 @@ def nearest_stored(
     best = torch.full((len(queries),), torch.inf)
     file, colouring = (torch.zeros(len(queries), dtype=torch.int64) for _ in range(2))
     for number, path in enumerate(paths):
-        encoded = encoded_person(path, read, encode)
+        encoded = encoded_person(path, encode)
         found = torch.cdist(queries, encoded).min(1)
         nearer = found.values < best
         best = torch.where(nearer, found.values, best)
@@ -45,7 +46,7 @@ def nearest_stored(
     return NearestStored(best / queries.shape[1] ** 0.5, file, colouring)
 
 
-def encoded_person(path: Path, read: ReadPerson, encode: Encode) -> Float[Tensor, "n d"]:
+def encoded_person(path: Path, encode: Encode) -> Float[Tensor, "n d"]:
     """Flattened latents of all colourings in a file."""
-    person = read(path)
+    person = read_person(path)
     return torch.stack([encode(person.payload(one)).flatten().cpu() for one in range(len(person.voxels))])

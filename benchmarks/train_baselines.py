@@ -36,15 +36,14 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.payloads import rest_frames
+from primdiffusion.people.stored_people import PersonFolder, find_people, read_outline, read_person
 from primdiffusion.training.cells import CellTask, prepare
 from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.latents import LatentSet, split_people, vocabulary_of
 from primdiffusion.training.loop import step_seed
 from primdiffusion.training.losses import PersonObjective, RestObjective
 from primdiffusion.training.prior import fit_prior, fit_shapes
-from primdiffusion.training.shards import open_people
 from primdiffusion.training.state import TrainingState, accelerator_of
-from primdiffusion.training.stored_people import find_people, read_outline, read_person
 from safetensors.torch import load_file, save
 from torch import Tensor
 from voxel_baseline import (
@@ -224,7 +223,7 @@ def primitives() -> None:
 
 def train_model(config: TrainingConfig, kind: str, out: Path, minutes: float, threads: int) -> None:
     """Trains both networks of a model; the prepared parts are those of `config.run`."""
-    people = open_people(config.data)
+    people = PersonFolder(config.data)
     prepared = prepare(config, people, *split_people(range(len(people.names)), config.holdout, config.seed))
     task = CellTask(config, prepared, torch.device("cpu"))
     denoiser = task.denoiser

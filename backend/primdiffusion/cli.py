@@ -39,8 +39,8 @@ COMMANDS = {
     "serve": ("serve.server:run", "Be the backend of the Blender extension: answer JSON-RPC requests"),
     "info": ("commands.info:run", "Describe this installation, a checkpoint or a human, as JSON"),
     "people": ("commands.people:run_people", "Make dressed, rigged humans (glTF) from a MakeHuman asset folder"),
-    "payloads": ("commands.people:run_payloads", "Make primitives to train on, of such humans or captures; pack them"),
-    "captures": ("commands.captures:run", "Multi-view captures: render, verify, info, pack, sheet, farm"),
+    "payloads": ("commands.people:run_payloads", "Make primitives to train on, of such humans or captures"),
+    "captures": ("commands.captures:run", "Multi-view captures: render, verify, info, pack, sheet, export, farm"),
     "fit": ("training.fit:run", "Train the encoder on captures: from images to primitives"),
     "train": ("training.diffuse:run", "Train the diffusion model on primitives"),
     "evaluate": ("commands.evaluate:run", "Evaluate trained models"),
@@ -54,8 +54,6 @@ COMMANDS = {
 It gets the record of `OPTIONS`, or the arguments of a command that is not there."""
 SUBCOMMANDS = {
     "payloads encode": "commands.people:run_encode",
-    "payloads pack": "commands.people:run_pack",
-    "payloads verify": "commands.people:run_verify",
 }
 """Functions of commands with two names, which the help of the first lists."""
 

@@ -40,7 +40,7 @@ from ..files.regular_files import FileError, as_file_error, printable
 from ..formats.camera_rig import Rig, View
 from ..formats.capture_repair import repair, verify
 from ..formats.poses.files import ENDINGS
-from ..formats.requests import LAYOUTS, PASSES
+from ..formats.requests import PASSES
 from .job import CaptureProgress, run
 from .scan import ScanFile, find_scans
 from .settings import CaptureSettings
@@ -87,7 +87,6 @@ def parser() -> CommandParser:
     declared(CaptureSettings, "denoise")
     declared(CaptureSettings, "device")
     declared(CaptureSettings, "threads")
-    declared(CaptureSettings, "layouts", type=str, nargs="*", choices=LAYOUTS)
     declared(CaptureSettings, "released_reference")
     add("--list", action="store_true", help="list the subjects of the shard, render nothing")
     add("--yes", action="store_true", help=f"do not ask before {ASK_FROM} views or more; only a terminal is asked")

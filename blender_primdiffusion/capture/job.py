@@ -26,8 +26,8 @@ from ..formats.capture_layout import (
     complete,
     damage,
     view_seed,
+    write_cameras,
     write_joints,
-    write_layouts,
     write_smpl,
 )
 from ..formats.capture_repair import is_complete_view, list_subjects, remove_damaged
@@ -220,7 +220,7 @@ def _capture(
         theta = poses.axis_angle().reshape(len(poses), 72)
         write_smpl(folder, theta[:, :3], theta[:, 3:], scan.betas, poses.translations)
         write_joints(folder, views, joints, _body_joints(body, scan.betas, poses))
-        write_layouts(folder, views, len(poses), settings.layouts)
+        write_cameras(folder, views)
         for frame in range(len(poses)):
             missing = [
                 camera for camera in range(len(views)) if not is_complete_view(folder, settings.kinds, camera, frame)

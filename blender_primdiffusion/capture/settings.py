@@ -13,7 +13,7 @@ from ..formats.camera_rig import Rig, View
 from ..formats.capture_layout import ENDINGS
 from ..formats.group_places import MOST
 from ..formats.joints import JOINT_NAMES
-from ..formats.requests import FLOAT_DEPTH, LAYOUTS, PASSES, Count, Seed
+from ..formats.requests import FLOAT_DEPTH, PASSES, Count, Seed
 from ..formats.schema import Range, Slider, check
 
 Light = Literal["uniform", "dome", "hdri"]
@@ -63,8 +63,6 @@ class CaptureSettings:
     """Number of people who stand together on a floor, in front of the same cameras; each is rendered alone."""
     shadows: bool = False
     """People who stand together shade each other under a dome or HDRI light; the pictures differ in colours alone."""
-    layouts: tuple[str, ...] = LAYOUTS
-    """Other projects whose camera files are written too."""
     released_reference: bool = False
     """Also store the first subject under the name that the released code expects."""
     body: Path | None = None
@@ -76,7 +74,6 @@ class CaptureSettings:
         wrong = {
             f"pass {next((kind for kind in self.passes if kind not in PASSES), 'none')}: choose of {', '.join(PASSES)}":
                 not self.passes or not set(self.passes) <= set(PASSES),
-            f"layouts {self.layouts}: choose of {', '.join(LAYOUTS)}": not set(self.layouts) <= set(LAYOUTS),
             "the HDRI light needs a picture: name its file": self.light == "hdri" and self.hdri is None,
             "the background hdri needs the light hdri": self.background == "hdri" and self.light != "hdri",
             f"{self.hdri} holds no HDRI: choose a folder with .hdr or .exr pictures":

@@ -165,7 +165,7 @@ def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], flo
 
 
 _SHOWN_LINES = 4
-_OUTPUT = ("width", "height", "background", "passes", "float_depth", "layouts", "released_reference")
+_OUTPUT = ("width", "height", "background", "passes", "float_depth", "released_reference")
 
 
 class DataPanel(SidebarPanel):

@@ -12,7 +12,7 @@ import bpy
 from ..capture.cameras import view_of
 from ..capture.settings import CaptureSettings
 from ..formats.camera_rig import Rig
-from ..formats.requests import LAYOUTS, PASSES
+from ..formats.requests import PASSES
 from ..scene.blend_values import setting_path
 from .declared import declared
 
@@ -23,10 +23,8 @@ _PASS_NAMES = {
     "normal": ("Normal", "Surface normal in world space"),
     "part": ("Part", "Which of the 24 joints moves the surface"),
 }
-_LAYOUT_NAMES = {"nerf": "NeRF", "opencv": "OpenCV", "colmap": "COLMAP"}
 _FLAGS = ("denoise", "float_depth", "released_reference")
 _PASS_ITEMS = [(kind, *_PASS_NAMES[kind], 1 << i) for i, kind in enumerate(PASSES)]
-_LAYOUT_ITEMS = [(name, _LAYOUT_NAMES[name], "", 1 << i) for i, name in enumerate(LAYOUTS)]
 
 
 class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
@@ -111,13 +109,6 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         default=set(PASSES),
     )
     float_depth: declared(CaptureSettings, "float_depth")
-    layouts: bpy.props.EnumProperty(
-        name="Also for",
-        description="Also write camera files in the layouts of other projects",
-        options={"ENUM_FLAG"},
-        items=_LAYOUT_ITEMS,
-        default=set(LAYOUTS),
-    )
     released_reference: declared(CaptureSettings, "released_reference")
 
     def elevations(self) -> list[float]:
@@ -168,7 +159,6 @@ def command_args(
     args += ["--shadows"] if shadows else []
     args += [f"--{name.replace('_', '-')}" for name in _FLAGS if getattr(asked, name)]
     args += ["--passes", *(kind for kind in PASSES if kind in asked.passes)]
-    args += ["--layouts", *(name for name in LAYOUTS if name in asked.layouts)]
     return args + (_camera_args(asked, context, folder) if asked.arrangement == "custom" else _rig_args(asked.rig()))
 
 

@@ -254,7 +254,7 @@ for line in ["", *OPTIONS]:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert "primdiffusion payloads pack" in done.stdout
+    assert "primdiffusion payloads encode" in done.stdout
 
 
 @pytest.mark.skipif(os.name == "nt", reason="names of files are text there")

@@ -8,13 +8,14 @@ import pytest
 from capture_scenes import captured
 from encoder_paper_form import FORMS, figures_of, measured, train
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.encoder.config import PAPER, PRESETS
+from primdiffusion.encoder.config import PAPER, PRESETS, encoder_config
 from tiny_encoder import TINY
 
 
 def test_forms_differ_from_the_papers_in_one_setting():
-    found = {name: {key for key, value in vars(PRESETS[preset]).items() if value != getattr(PAPER, key)}
-             for name, preset in FORMS.items()}  # fmt: skip
+    forms = {name: vars(encoder_config("paper", ablation)) for name, ablation in FORMS.items()}
+    paper = vars(PAPER)
+    found = {name: {key for key in paper if form[key] != paper[key]} for name, form in forms.items()}
     expected = {
         "full": set(),
         "shared_scale": {"delta_scale"},
@@ -33,14 +34,14 @@ def test_a_form_is_trained_and_compared(captures, tmp_path, monkeypatch):
     monkeypatch.setitem(PRESETS, "paper", TINY)
     few = {**fit_scenes.FEW, "threads": 1}
 
-    def settings(arguments, preset, count):
-        return fit_scenes.settings(captures, tmp_path / preset, **{**few, "steps": count, "encoder": preset})
+    def settings(arguments, ablation, count):
+        return fit_scenes.settings(captures, tmp_path / "run", **{**few, "steps": count, "encoder": "paper"})
 
     monkeypatch.setattr(encoder_paper_form, "settings", settings)
     fit_scenes.forget_processes()
     arguments = argparse.Namespace(minutes=0.001, given=1, cameras=1, compared_size=16)
     path = tmp_path / "full.safetensors"
-    train(arguments, "paper", open_captures(captures), path)
+    train(arguments, None, open_captures(captures), path)
     figures = figures_of("full", path, measured(path, open_captures(captures), arguments))
     assert figures["steps_full"] >= 1
     assert 0 < figures["psnr_full"] < 60

@@ -187,11 +187,6 @@ def all_programs(given: Inputs) -> list[Program]:
                          "--out", out],
             resumes=True,
         ),
-        Program(
-            "payloads pack",
-            lambda out: ["payloads", "pack", given.people, "--people-each", "3", "--out", out],
-            resumes=True,
-        ),
         Program("fit", lambda out: fit_words(given.captures, out), small="fit_scenes", resumes=True),
         Program("train", lambda out: train_words(given.people, out), small="diffuse_runs", resumes=True),
         Program(

@@ -13,7 +13,7 @@ from chaos.surroundings import broken_environment, try_broken
 from safetensors.torch import save_file
 from support.errors import refused
 
-QUICK = ("payloads pack", "serve merge")
+QUICK = ("captures pack", "serve merge")
 
 pytestmark = pytest.mark.skipif(os.name == "nt", reason="needs fork and SIGKILL")
 

@@ -45,9 +45,8 @@ from primdiffusion.formats.poses.skeleton import REST_JOINTS
 from primdiffusion.geometry.pictures import decoded, opened_picture
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
+from primdiffusion.people.stored_people import read_person
 from primdiffusion.runtime.failures import describe
-from primdiffusion.training.shards import PackedPeople, pack_people
-from primdiffusion.training.stored_people import read_person
 from tiny_model import save_tiny_checkpoint, tiny_model
 
 LONGEST_SENTENCE, LONGEST_S, MOST_MEMORY = 300, 5.0, 500 * 2**20
@@ -110,12 +109,6 @@ def payload(folder: Path) -> Path:
     return next(folder.glob("person_*.npz"))
 
 
-def index(folder: Path) -> Path:
-    diffusion_people.write_people(folder / "people", 2, variants=1)
-    list(pack_people(folder / "people", folder / "packed"))
-    return folder / "packed" / "index.json"
-
-
 def picture(folder: Path) -> Path:
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (24, 24, 3), np.uint8)).save(folder / "a.png")
     return folder / "a.png"
@@ -142,7 +135,6 @@ KINDS = {
     "AMASS": Kind(amass, read_motion),
     "depth": Kind(depth, read_npy),
     "payload": Kind(payload, read_person),
-    "packed people": Kind(index, lambda path: PackedPeople(path.parent).person(0)),
     "picture": Kind(picture, read_picture),
     "glb": Kind(glb, read_glb),
 }
@@ -272,7 +264,6 @@ CLAIMS: dict[tuple[str, str], Callable[[Path], object]] = {
     ("payload", "wrong shape"): lambda path: with_array(path, "betas", lambda values: values[:3]),
     ("payload", "NaN"): lambda path: with_array(path, "betas", nan),
     ("payload", "huge size"): lambda path: with_member(path, "betas.npy", npy("(9999999999,)")),
-    ("packed people", "name outside"): replaced(b"shard_0000", b"../shard_0"),
     ("picture", "huge size"): lambda path: path.write_bytes(png_of(60_000, 60_000)),
 }
 """What a valid file of a kind is changed to."""

@@ -16,7 +16,6 @@ from primdiffusion.files import picture_files
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import camera_rig, capture_layout
 from primdiffusion.geometry.camera import look_at
-from scipy.spatial.transform import Rotation
 from support.errors import refused
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -78,25 +77,6 @@ def test_a_camera_straight_above_is_possible():
 def test_impossible_rigs_are_rejected(wrong):
     with refused(ValueError, next(iter(wrong))):
         camera_rig.Rig(**wrong)
-
-
-def test_colmaps_quaternions_and_nerfs_matrices_are_the_same_cameras(tmp_path):
-    subject = tmp_path / "one"
-    views = camera_rig.Rig("sphere", 9).views(np.zeros(3), 1.0)
-    capture_layout.write_colmap(subject, views, 3)
-    capture_layout.write_nerf(subject, views, 3)
-    lines = (subject / "colmap/0003/images.txt").read_text().splitlines()[1::2]
-    frames = json.loads((subject / "nerf/0003/transforms.json").read_text())["frames"]
-    for i, (view, line, frame) in enumerate(zip(views, lines, frames, strict=True)):
-        _, w, x, y, z, *translation, _, name = line.split()
-        rotation = Rotation.from_quat([float(value) for value in (x, y, z, w)]).as_matrix()
-        assert np.allclose(rotation, view.rotation, atol=1e-12)
-        assert np.allclose(np.array(translation, float), view.translation)
-        assert name == f"camera{i:04d}/0003.jpg"
-        assert (subject / "nerf/0003" / frame["file_path"]).resolve() == subject / "img" / name
-        to_world = np.array(frame["transform_matrix"])
-        in_opengl = np.linalg.inv(to_world) @ [0.3, 0.2, 0.1, 1]
-        assert np.allclose(in_opengl[:3] * (1, -1, -1), view.rotation @ [0.3, 0.2, 0.1] + view.translation)
 
 
 def test_pngs_are_what_another_reader_reads(tmp_path):

@@ -57,9 +57,11 @@ THICKNESS = {"nose": 0.04, "eye": 0.04, "ear": 0.04, "shoulder": 0.16, "elbow": 
              "knee": 0.16, "ankle": 0.16}  # fmt: skip
 """Metres: a keypoint deeper behind the nearest surface is hidden. More than from the joint to the surface around the
 limb, in wide clothes, and less than to the far side of a limb in front of it, or from one hip across to the other."""
-KEYPOINTS = (*FACE, *(
+JOINTS = tuple(
     f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")
-))  # fmt: skip
+)
+"""The joints that SMPL and COCO share, in COCO's order."""
+KEYPOINTS = (*FACE, *JOINTS)
 """COCO's 17 keypoints in their order."""
 SKELETON = (
     (16, 14), (14, 12), (17, 15), (15, 13), (12, 13), (6, 12), (7, 13), (6, 7), (6, 8), (7, 9), (8, 10), (9, 11),
@@ -70,7 +72,7 @@ CATEGORY = {"id": 1, "name": "person", "supercategory": "person", "keypoints": K
 SAME_BODY = 0.002
 """Metres between the joints of the captures' body and the default body's up to which it is the default body."""
 _HEAD = JOINT_NAMES.index("head")
-_JOINTS = [JOINT_NAMES.index(name) for name in KEYPOINTS[len(FACE) :]]
+_JOINTS = [JOINT_NAMES.index(name) for name in JOINTS]
 _HIPS = [KEYPOINTS.index("left_hip"), KEYPOINTS.index("right_hip")]
 _THICKNESS = np.array([THICKNESS[name.rpartition("_")[2]] for name in KEYPOINTS])
 _FARTHEST = DEPTH_UNIT * np.iinfo(np.uint16).max

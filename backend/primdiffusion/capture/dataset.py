@@ -42,6 +42,8 @@ from primdiffusion.files.regular_files import FileError, read_regular
 from primdiffusion.files.whole_files import replacing, write_atomically
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
+from primdiffusion.formats.requests import Count
+from primdiffusion.formats.schema import Checked
 from primdiffusion.geometry.records import TensorRecord
 
 PACK_FOLDER, PACK_FORMAT, PACK_VERSION = "packed", "primdiffusion-packed-captures", 1
@@ -150,25 +152,20 @@ SINGLE_PROCESS = ProcessRank()
 
 
 @dataclasses.dataclass(frozen=True)
-class SampleSettings:
+class SampleSettings(Checked):
     """Settings of training samples."""
 
-    conditioning: int = 4
-    """Views to encode the subject from."""
-    targets: int = 4
-    """Views to compare with, distinct from the conditioning views if there are enough cameras."""
-    size: int = 512
-    """Width and height of the images, pixels."""
-    framing: Literal["whole", "crop"] = "whole"
-    """whole: entire images; crop: targets are random squares around the subject, at least `size` pixels wide."""
-    conditioning_frame: Literal["first", "same", "any"] = "first"
-    """Frame of the conditioning views: the first (near the T pose), that of the targets, or a random one."""
-
-    def __post_init__(self) -> None:
-        """Raise ValueError if a count is not positive."""
-        for name in ("conditioning", "targets", "size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} of the samples is {getattr(self, name)}: give 1 or more")
+    views: Count = 8
+    """Input images; if a subject has fewer, some are used twice."""
+    targets: Count = 1
+    """Target images of each subject, of other cameras than the input's if there are enough."""
+    size: Count = 512
+    """Width and height of the images, pixels: what is learned from smaller ones is blurred in larger ones."""
+    framing: Literal["whole", "crop"] = "crop"
+    """crop: targets are random squares around the subject, of `size` pixels or more; whole: whole images, as in the
+    paper."""
+    conditioning_frame: Literal["first", "same", "any"] = "any"
+    """Frame of the input images: the first, near T (released), that of the targets, or any."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -195,9 +192,9 @@ class SampleSet(Dataset[Record], abc.ABC):
 class CaptureDataset(SampleSet[TrainingSample]):
     """Samples indexed by `Position`; an epoch shows every pose of every subject once."""
 
-    def __init__(self, captures: Captures, settings: SampleSettings | None = None, seed: int = 0) -> None:
+    def __init__(self, captures: Captures, settings: SampleSettings, seed: int = 0) -> None:
         """Raises as `Captures.subject` if frames must be counted, in datasets without dataset.json."""
-        self.captures, self.settings, self.seed = captures, settings or SampleSettings(), seed
+        self.captures, self.settings, self.seed = captures, settings, seed
         frames = captures.about.get("frames")
         counts = [frames or captures.subject(name).frames for name in captures.subjects]
         self._pairs = np.array([(s, f) for s, count in enumerate(counts) for f in range(count)], np.int64)
@@ -233,7 +230,7 @@ class CaptureDataset(SampleSet[TrainingSample]):
         )
 
     def _choose_cameras(self, count: int, draws: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-        given, wanted = self.settings.conditioning, self.settings.targets
+        given, wanted = self.settings.views, self.settings.targets
         order = draws.permutation(count)
         return np.resize(order, given), np.resize(np.roll(order, -given), wanted)
 

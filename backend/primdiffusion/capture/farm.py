@@ -47,14 +47,15 @@ class Farm:
     """The cluster, and the resources of each renderer."""
 
     address: str | None = None
-    """Address of a Ray cluster, "auto" for the one this machine belongs to; None starts a local one."""
+    """Address of a Ray cluster; "auto" for the one of this machine; the default starts one here."""
     workers: int = 1
-    """Concurrent renderers of a local cluster."""
+    """Renderers at a time, if the cluster is started here."""
     processors_each: float = 1
+    """Cores of each renderer."""
     gpus_each: float = 0
-    """GPUs per renderer; Ray hides the others from it."""
+    """GPUs of each renderer; with 0.5 two share one. Ray hides the others from it."""
     attempts: int = 3
-    """Attempts per subject if its worker or renderer is killed."""
+    """Attempts for a human whose worker or renderer is killed."""
 
 
 def subjects_of(command: Sequence[str]) -> list[str]:

@@ -152,7 +152,7 @@ def write_parameters(subject: Path, setup: CaptureSetup) -> None:
     theta = matrix_to_axis_angle(setup.poses.joint_rotation).numpy().reshape(len(setup.skinning), -1)
     capture_layout.write_smpl(subject, theta[:, :3], theta[:, 3:], setup.person.betas, setup.poses.translation.numpy())
     capture_layout.write_joints(subject, setup.views, setup.joints)
-    capture_layout.write_layouts(subject, setup.views, len(theta))
+    capture_layout.write_cameras(subject, setup.views)
 
 
 def render_frames(

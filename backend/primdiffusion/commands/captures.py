@@ -1,4 +1,4 @@
-"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet, coco and farm."""
+"""Multi-view captures: `primdiffusion captures` render, verify, info, pack, sheet, export, coco and farm."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.body.pose_file import read_motion
+from primdiffusion.capture.camera_files import Project, export_cameras
 from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
 from primdiffusion.capture.composed import Backgrounds
 from primdiffusion.capture.dataset import open_pack, pack
@@ -254,6 +255,24 @@ class SheetOfCaptures:
 
 
 @dataclasses.dataclass(frozen=True)
+class ExportCaptures:
+    """Write camera files of NeRF (transforms.json), OpenCV and COLMAP beside the images."""
+
+    root: tyro.conf.Positional[Path]
+    """Folder of a capture dataset, of this program or in the released layout; the files go there."""
+    projects: tuple[Project, ...] = ("nerf", "opencv", "colmap")
+    """Whose files to write."""
+
+    def run(self) -> None:
+        """Write, and print a line for each subject."""
+        captures = open_captures(self.root)
+        for name in tqdm(
+            export_cameras(captures, self.projects), total=len(captures.subjects), unit="human", disable=None
+        ):
+            print(f"{self.root / name}  {', '.join(self.projects)}", flush=True)
+
+
+@dataclasses.dataclass(frozen=True)
 class AnnotateCaptures:
     """Write annotations in COCO's format (boxes, masks, 17 keypoints, SMPL) and a table of all images."""
 
@@ -277,8 +296,8 @@ class AnnotateCaptures:
         print(f"{self.root / ANNOTATIONS_FILE}\n{self.root / TABLE_FILE}")
 
 
-@dataclasses.dataclass(frozen=True)
-class FarmCaptures:
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class FarmCaptures(Farm):
     """Render a dataset with Blender on a Ray cluster, one human per task (needs the extra `farm`).
 
     `primdiffusion captures farm --workers 4 -- blender -c primdiffusion capture --people scans --out captures`
@@ -286,16 +305,6 @@ class FarmCaptures:
 
     command: tyro.conf.Positional[tuple[str, ...]]
     """The renderer and its options; paths must be the same on all machines."""
-    address: str | None = None
-    """Address of a Ray cluster; "auto" for the one of this machine; the default starts one here."""
-    workers: int = 1
-    """Renderers at a time, if the cluster is started here."""
-    processors_each: float = 1
-    """Cores of each renderer."""
-    gpus_each: float = 0
-    """GPUs of each renderer; with 0.5 two share one."""
-    attempts: int = 3
-    """Attempts for a human whose worker or renderer is killed."""
 
     def run(self) -> None:
         """Render, and print a line for each human. Raises ValueError if the cluster cannot start or a human fails."""
@@ -304,8 +313,7 @@ class FarmCaptures:
             said = outcome.error or f"{outcome.seconds:.0f} s"
             print(printable(f"{done}/{total}  {outcome.subject}  {said}"), flush=True)
 
-        farm = Farm(self.address, self.workers, self.processors_each, self.gpus_each, self.attempts)
-        outcomes = render_on(farm, self.command, show)
+        outcomes = render_on(self, self.command, show)
         failed = [outcome.subject for outcome in outcomes if outcome.exit_code]
         if failed:
             raise ValueError(f"{len(failed)} of {len(outcomes)} humans are not finished: {', '.join(failed[:5])}")
@@ -317,6 +325,7 @@ Command = (
     | Annotated[InfoOfCaptures, tyro.conf.subcommand("info")]
     | Annotated[PackCaptures, tyro.conf.subcommand("pack")]
     | Annotated[SheetOfCaptures, tyro.conf.subcommand("sheet")]
+    | Annotated[ExportCaptures, tyro.conf.subcommand("export")]
     | Annotated[AnnotateCaptures, tyro.conf.subcommand("coco")]
     | Annotated[FarmCaptures, tyro.conf.subcommand("farm")]
 )

@@ -69,10 +69,10 @@ from primdiffusion.formats.requests import Count, Sampling
 from primdiffusion.formats.schema import Range, check
 from primdiffusion.human import generate, place
 from primdiffusion.people.assets import open_assets
+from primdiffusion.people.stored_people import find_people
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.runtime.device import best_device
 from primdiffusion.training.latents import split_people
-from primdiffusion.training.stored_people import find_people, read_person
 from primdiffusion.version import __version__
 
 DESCRIPTION = "Measure the quality of trained models."
@@ -362,7 +362,7 @@ def real_sources(people: Path, assets: Path | None, holdout: float, seed: int) -
     """
     split = split_people(find_people(people), holdout, seed)
     if assets is None:
-        train, held = (payload_sources(paths, read_person) for paths in split)
+        train, held = (payload_sources(paths) for paths in split)
         return train, held
     opened = open_assets(assets)
     train, held = (mesh_sources(opened, [read_seed(path) for path in paths], COLOURINGS) for paths in split)

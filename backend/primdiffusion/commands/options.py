@@ -219,8 +219,7 @@ class PeopleCommand(MadePeople):
 class PayloadsCommand(MadePeople):
     """Make dressed humans as primitives: the training set of the diffusion model.
 
-    `payloads encode` makes them from captures instead; `payloads pack` stores either in few files, whose checksums
-    `payloads verify` compares (each with its own --help).
+    `payloads encode` makes them from captures instead (with its own --help).
     """
 
     out: Path
@@ -264,26 +263,6 @@ class EncodePayloadsCommand:
     """Seed of the order of images in refinement."""
 
 
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PackPayloadsCommand:
-    """Pack payloads into a few files with checksums that training maps into memory: large, but quick to read."""
-
-    folder: Annotated[Path, Option(positional=True)]
-    """Folder of payloads, one file each."""
-    out: Path
-    """Output folder of shards and their index, for `primdiffusion train --data`."""
-    people_each: Count = 32
-    """Payloads in a shard; one with four colour variants takes 8 MiB."""
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class VerifyPayloadsCommand:
-    """Verify the checksums of packed payloads."""
-
-    folder: Annotated[Path, Option(positional=True)]
-    """Folder of shards."""
-
-
 OPTIONS: dict[str, type] = {
     "generate": GenerateCommand,
     "vary": VaryRequest,
@@ -300,7 +279,5 @@ OPTIONS: dict[str, type] = {
     "people": PeopleCommand,
     "payloads": PayloadsCommand,
     "payloads encode": EncodePayloadsCommand,
-    "payloads pack": PackPayloadsCommand,
-    "payloads verify": VerifyPayloadsCommand,
 }
 """Command lines that are read before the command's module, which loads torch, is imported."""

@@ -10,10 +10,8 @@ from tqdm import tqdm
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.commands.options import (
     EncodePayloadsCommand,
-    PackPayloadsCommand,
     PayloadsCommand,
     PeopleCommand,
-    VerifyPayloadsCommand,
 )
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.files.folder_lock import lock_folder
@@ -24,8 +22,6 @@ from primdiffusion.people.payloads import make_payloads
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.runtime.device import best_device
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, read_cards
-from primdiffusion.training.shards import damaged_shards, pack_people
-from primdiffusion.training.stored_people import find_people
 
 
 def run_people(command: PeopleCommand) -> None:
@@ -86,22 +82,3 @@ def run_encode(command: EncodePayloadsCommand) -> None:
             print(printable(f"{outcome.subject}  {outcome.status}  {note}").rstrip(), flush=True)
     if outcomes["failed"]:
         raise ValueError(f"{outcomes['failed']} of {len(captures.subjects)} humans failed: see the lines above")
-
-
-def run_pack(command: PackPayloadsCommand) -> None:
-    """Pack, and print the folder."""
-    done = 0
-    with tqdm(total=len(find_people(command.folder)), unit="human", desc="pack", disable=None) as bar:
-        for done in pack_people(command.folder, command.out, command.people_each):
-            bar.update(done - bar.n)
-    print(f"{command.out}  {done} humans")
-
-
-def run_verify(command: VerifyPayloadsCommand) -> None:
-    """Print a line for each damaged shard; raises ValueError if there is any."""
-    found = damaged_shards(command.folder)
-    for sentence in found:
-        print(printable(sentence))
-    if found:
-        raise ValueError(f"{len(found)} shards of {command.folder} are damaged: pack the humans again")
-    print(f"{command.folder}: nothing wrong")

@@ -1,4 +1,4 @@
-"""Settings of the encoder, and presets: ours, the paper's, the released code's, and the paper's ablations."""
+"""Settings of the encoder: ours, the paper's, the released code's, and the ablations of the paper's Table 3."""
 
 from __future__ import annotations
 
@@ -154,18 +154,25 @@ RELEASED = dataclasses.replace(
     scale_outputs=9,
 )
 """The authors' stage 1 (SPEC 2)."""
-PRESETS: Mapping[str, EncoderConfig] = {
-    "default": DEFAULT,
-    "shared_scale": dataclasses.replace(DEFAULT, delta_scale="shared", thickness="constant", extent=(0.85, 0.85, 0.6)),
-    "template_rt": dataclasses.replace(DEFAULT, frames="template"),
-    "no_attention": dataclasses.replace(DEFAULT, attention="none"),
-    "paper": PAPER,
-    "paper_shared_scale": dataclasses.replace(PAPER, delta_scale="shared"),
-    "paper_template_rt": dataclasses.replace(PAPER, frames="template"),
-    "paper_no_attention": dataclasses.replace(PAPER, attention="none"),
-    "released": RELEASED,
-}
-"""Encoders by name: ours and the paper's, each with three ablations (paper Table 3), and that of the paper's code."""
+Preset = Literal["default", "paper", "released"]
+PRESETS: dict[Preset, EncoderConfig] = {"default": DEFAULT, "paper": PAPER, "released": RELEASED}
+Ablation = Literal["shared_scale", "template_rt", "no_attention"]
+
+
+def encoder_config(preset: Preset, ablation: Ablation | None = None) -> EncoderConfig:
+    """Return the settings of a preset, with one of the ablations of the paper's Table 3."""
+    config = PRESETS[preset]
+    match ablation:
+        case "shared_scale" if config.thickness == "hull":  # boxes of one size cannot follow the hull: thicker ones
+            thicker = (*config.extent[:2], 0.6)
+            return dataclasses.replace(config, delta_scale="shared", thickness="constant", extent=thicker)
+        case "shared_scale":
+            return dataclasses.replace(config, delta_scale="shared")
+        case "template_rt":
+            return dataclasses.replace(config, frames="template")
+        case "no_attention":
+            return dataclasses.replace(config, attention="none")
+    return config
 
 
 _ADDED: Mapping[str, Any] = {"masks": "whole", "compat": "none", "grid_outputs": 0, "thickness": "constant"}

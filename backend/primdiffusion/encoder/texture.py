@@ -19,6 +19,7 @@ from torch.nn import functional
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.capture.reader import Views
 from primdiffusion.encoder.unproject import SIDE, TOLERANCE, Unprojected, body_depth, check
+from primdiffusion.geometry.srgb import to_bytes
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import default_texels
 from primdiffusion.primitives.primitives import K
@@ -56,7 +57,7 @@ def unproject_texture(views: Views, vertices: Float[Tensor, "V 3"], body: BodyMo
     rgb, share = sample_both_sides(views, body_depth(views, vertices, body.faces), points)
     picture = torch.cat([rgb.T, share[None]]).unflatten(-1, (TEXTURE_SIDE, TEXTURE_SIDE))
     picture = functional.interpolate(picture[None], size=(SIDE, SIDE), mode="bilinear", align_corners=True)
-    seen = (picture[:, 3] * 255).round().to(torch.uint8)
+    seen = to_bytes(picture[:, 3])
     return Unprojected(picture[:, :3], seen, torch.full_like(seen, 255), torch.ones(K, 3)).to(views.rgba.device)
 
 

@@ -9,23 +9,23 @@ import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int, UInt8
+from jaxtyping import Int, UInt8
 from torch import Tensor
 
 from primdiffusion.evaluation.images import image_over
 from primdiffusion.files.arrays import read_arrays
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
-from primdiffusion.primitives.primitives import Payload, Primitives
+from primdiffusion.people.stored_people import read_outline, read_person
+from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.march import MarchSettings, march
 
@@ -84,25 +84,6 @@ def mesh_portraits(colourings: Sequence[TexturedMesh]) -> UInt8[Tensor, "n v h w
     return torch.stack([torch.stack(own) for own in zip(*views, strict=True)])
 
 
-class StoredPerson(Protocol):
-    """One geometry in n colourings: `training.stored_people.PersonVariants` (evaluation imports no training)."""
-
-    @property
-    def voxels(self) -> UInt8[Tensor, "n k 8 8 8 4"]:
-        """sRGB-encoded colour and relative density."""
-        ...
-
-    @property
-    def betas(self) -> Float[Tensor, "10"]:
-        """Body shape."""
-        ...
-
-    def payload(self, variant: int) -> Payload:
-        """Return one colouring."""
-        ...
-
-
-ReadPerson = Callable[[Path], StoredPerson]
 Report = Callable[[int, int], None]
 """Progress callback: done, total."""
 
@@ -136,18 +117,19 @@ class Source:
     """Reads the attributes of each colouring."""
 
 
-def payload_sources(paths: Sequence[Path], read: ReadPerson) -> list[Source]:
+def payload_sources(paths: Sequence[Path]) -> list[Source]:
     """Payload files, drawn by the marcher."""
 
     def draw(path: Path) -> UInt8[Tensor, "n v h w 4"]:
-        person = read(path)
+        person = read_person(path)
         frames = rest_frames(person.betas.numpy())
         return torch.stack(
             [portraits(Primitives.place(frames, person.payload(number))) for number in range(len(person.voxels))]
         )
 
     return [
-        Source(path.name, functools.partial(draw, path), functools.partial(read_attributes, path)) for path in paths
+        Source(path.name, lambda path=path: draw(path), lambda path=path: read_outline(path).colourings())
+        for path in paths
     ]
 
 
@@ -191,14 +173,6 @@ def _cached(path: Path) -> tuple[Tensor, list[dict[str, Any]]] | None:
         return None
     fits = tuple(pictures.shape[1:]) == (len(PORTRAITS), SIDE, SIDE, 4) and len(attributes) == len(pictures)
     return (pictures, attributes) if fits else None
-
-
-def read_attributes(path: Path) -> list[dict[str, Any]]:
-    """Read the attributes of each colouring in a payload file. Raises ValueError if they are unreadable."""
-    arrays = read_arrays(path, ("attributes", "voxels"))
-    with as_file_error(path, "has damaged attributes", "make it again"):
-        stored = parse_json(str(arrays["attributes"]))
-        return list(stored.get("variants", [stored] * len(arrays["voxels"])))
 
 
 def read_seed(path: Path) -> int:

@@ -16,13 +16,14 @@ from torch import Tensor
 from torch.nn import functional
 
 from primdiffusion.body.model import BodyPose, PosedBody, default_body
+from primdiffusion.capture.coco import JOINTS
 from primdiffusion.files.arrays import read_npy
 from primdiffusion.files.json_files import read_json
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.pictures import opened_picture, strips
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.human import VERTICAL_FOV, Human, body_of, pose_body
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
@@ -32,10 +33,6 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.render.march import MarchSettings, march
 
-JOINTS = tuple(
-    f"{side}_{joint}" for joint in ("shoulder", "elbow", "wrist", "hip", "knee", "ankle") for side in ("left", "right")
-)
-"""The joints that SMPL and COCO share, in COCO's order."""
 HEAD = ("neck", "head")
 """SMPL's joints whose distance in the picture is the head size of PCKh."""
 SIDE = 512
@@ -83,12 +80,12 @@ class TestImage:
     @property
     def pixels(self) -> UInt8[Tensor, "h w 3"]:
         """The colours as a file stores them."""
-        return _bytes(self.rgb)
+        return to_bytes(self.rgb)
 
     @property
     def rgba(self) -> UInt8[Tensor, "h w 4"]:
         """Colours over the same background, and alpha, as a file stores them."""
-        return torch.cat([self.pixels, _bytes(self.alpha)[..., None]], -1)
+        return torch.cat([self.pixels, to_bytes(self.alpha)[..., None]], -1)
 
 
 def image_over(
@@ -222,10 +219,6 @@ def _over_white(picture: Image.Image) -> tuple[Float[Tensor, "s s 4"], bool]:
         values[..., :3] = values[..., :3] * values[..., 3:] + (1 - values[..., 3:])
         narrow[top : top + len(values)] = _resized(values, (len(values), SIDE))
     return _resized(narrow, (SIDE, SIDE)).clamp(0, 1), has_alpha
-
-
-def _bytes(values: Float[Tensor, "*s"]) -> UInt8[Tensor, "*s"]:
-    return (values.clamp(0, 1) * 255).round().to(torch.uint8)
 
 
 def _resized(values: Float[Tensor, "h w c"], size: tuple[int, int]) -> Float[Tensor, "h2 w2 c"]:

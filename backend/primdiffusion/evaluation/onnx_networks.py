@@ -13,6 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from primdiffusion.evaluation.images import SIDE, TestImage
+from primdiffusion.evaluation.pretrained_networks import IMAGENET
 from primdiffusion.runtime.failures import optional_package
 
 Normalisation = Literal["imagenet", "half"]
@@ -21,7 +22,7 @@ Normalisation = Literal["imagenet", "half"]
 DepthValues = Literal["inverted", "depth"]
 """Whether larger values of a depth network are nearer (MiDaS, DPT, Depth Anything) or farther."""
 MEAN_STD = {
-    "imagenet": ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)),
+    "imagenet": IMAGENET,
     "half": ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
 }
 BOX_PADDING = 1.25

@@ -64,6 +64,10 @@ ALEXNET = Architecture(
 """Krizhevsky 2014, the one-column form."""
 
 
+IMAGENET = ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225))
+"""Mean and standard deviation of sRGB-encoded values in [0, 1], with which torchvision's networks were trained."""
+
+
 class PictureFeatures(nn.Module):
     """VGG or AlexNet up to the last requested layer, frozen: gradients reach the input, not the weights.
 

@@ -1,4 +1,4 @@
-"""Captures on disk: the folders of the released code (SPEC 5), plus passes, joints and camera files of other projects.
+"""Captures on disk: the folders of the released code (SPEC 5), plus passes and joints.
 
     root/dataset.json                              what the captures are: settings, axes, passes, names of parts
     root/release_human_list.txt                    one subject a line
@@ -16,9 +16,7 @@
     root/{id}/joints.npz                           world [F,24,3], pixel [C,F,24,2], depth [C,F,24], fitted
     root/{id}/outputs_re_fitting/refit_smpl_2nd.npz        "smpl": the released code's pickled dictionary
     root/{id}/outputs_re_fitting/refit_smpl_2nd_plain.npz  the same as plain arrays: read this one
-    root/{id}/nerf/FFFF/transforms.json            camera to world, OpenGL axes; one static scene a frame
-    root/{id}/opencv/cameras.npz                   K [C,3,3], R [C,3,3], T [C,3], width, height
-    root/{id}/colmap/FFFF/{cameras,images,points3D}.txt    picture names relative to root/{id}/img
+    root/{id}/nerf, opencv, colmap                 cameras for other projects: `captures export`
     root/{id}/complete.json                        every file's size and CRC-32: written last
 
 World: metres, y up, the person faces +z. Files are written under a temporary name, then renamed; several processes may
@@ -44,7 +42,6 @@ from ..files.json_files import parse_json, read_json
 from ..files.regular_files import FileError, check_inside, open_regular, read_regular, remove_file
 from ..files.whole_files import remove_abandoned, temporary_name, write_atomically
 from .camera_rig import View
-from .requests import LAYOUTS
 
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {
@@ -58,7 +55,6 @@ RELEASED_REFERENCE = "seq_000016-rp_alison_rigged_002"
 LIST_FILE, DATASET_FILE, COMPLETE_FILE = "release_human_list.txt", "dataset.json", "complete.json"
 LARGEST_FILE, LARGEST_LIST = 512 * 2**20, 32 * 2**20
 """Bytes of a file of a subject, and of the list of subjects."""
-_FROM_OPENGL = np.diag([1.0, -1.0, -1.0])
 
 
 def picture_path(subject: Path, kind: str, camera: int, frame: int) -> Path:
@@ -72,11 +68,16 @@ def view_seed(seed: int, subject: str, frame: int, camera: int) -> int:
     return int.from_bytes(digest[:4], "big") >> 1
 
 
-def write_npz(path: Path, **arrays: NDArray) -> None:
-    """Write an .npz atomically, built in memory: numpy's writer leaves an open archive behind if the disk is full."""
+def npz_bytes(**arrays: NDArray) -> bytes:
+    """Content of an .npz, built in memory: numpy's writer leaves an open archive behind if the disk is full."""
     made = io.BytesIO()
     np.savez(made, **arrays)  # type: ignore[arg-type]
-    write_atomically(path, made.getvalue())
+    return made.getvalue()
+
+
+def write_npz(path: Path, **arrays: NDArray) -> None:
+    """Write an .npz atomically."""
+    write_atomically(path, npz_bytes(**arrays))
 
 
 def claim(root: Path, about: Mapping[str, Any]) -> None:
@@ -245,18 +246,6 @@ def _crc(path: Path) -> int:
     return crc
 
 
-def write_layouts(subject: Path, views: Sequence[View], frames: int, layouts: Sequence[str] = LAYOUTS) -> None:
-    """Write cameras.json, and the files of other `layouts` for all frames. Raises OSError."""
-    write_cameras(subject, views)
-    if "opencv" in layouts:
-        write_opencv(subject, views)
-    for frame in range(frames):
-        if "nerf" in layouts:
-            write_nerf(subject, views, frame)
-        if "colmap" in layouts:
-            write_colmap(subject, views, frame)
-
-
 def write_cameras(subject: Path, views: Sequence[View]) -> None:
     """Write cameras.json for the released code."""
     named = {
@@ -264,71 +253,3 @@ def write_cameras(subject: Path, views: Sequence[View]) -> None:
         for i, v in enumerate(views)
     }
     write_atomically(subject / "cameras.json", json.dumps(named, indent=1))
-
-
-def write_opencv(subject: Path, views: Sequence[View]) -> None:
-    """Write K, R, T of all cameras as arrays."""
-    write_npz(
-        subject / "opencv" / "cameras.npz",
-        K=np.stack([view.intrinsics for view in views]),
-        R=np.stack([view.rotation for view in views]),
-        T=np.stack([view.translation for view in views]),
-        width=np.array([view.width for view in views]),
-        height=np.array([view.height for view in views]),
-    )
-
-
-def write_nerf(subject: Path, views: Sequence[View], frame: int) -> None:
-    """Write transforms.json of one frame, for instant-ngp and nerfstudio."""
-    frames = []
-    for i, view in enumerate(views):
-        matrix = np.eye(4)
-        matrix[:3, :3], matrix[:3, 3] = view.rotation.T @ _FROM_OPENGL, view.position
-        path = os.path.relpath(picture_path(subject, "img", i, frame), subject / "nerf" / f"{frame:04d}")
-        k = view.intrinsics
-        frames.append(
-            {
-                "file_path": Path(path).as_posix(),
-                "transform_matrix": matrix.tolist(),
-                **{"fl_x": k[0, 0], "fl_y": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]},
-                **{"w": view.width, "h": view.height},
-            }
-        )
-    first = views[0]
-    angle = 2 * float(np.arctan(first.width / (2 * first.intrinsics[0, 0])))
-    record = {"camera_model": "OPENCV", "camera_angle_x": angle, "frames": frames}
-    write_atomically(subject / "nerf" / f"{frame:04d}" / "transforms.json", json.dumps(record, indent=1))
-
-
-def write_colmap(subject: Path, views: Sequence[View], frame: int) -> None:
-    """Write COLMAP's text model of one frame, without points; image names are relative to the folder img."""
-    cameras, images = (
-        ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"],
-        ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, ID, NAME"],
-    )
-    for i, view in enumerate(views, start=1):
-        k, q, t = view.intrinsics, _quaternion(view.rotation), view.translation
-        size = f"{view.width} {view.height}"
-        cameras.append(f"{i} PINHOLE {size} {k[0, 0]:.17g} {k[1, 1]:.17g} {k[0, 2]:.17g} {k[1, 2]:.17g}")
-        pose = " ".join(f"{value:.17g}" for value in (*q, *t))
-        name = picture_path(subject, "img", i - 1, frame).relative_to(subject / "img").as_posix()
-        images += [f"{i} {pose} {i} {name}", ""]
-    files = {"cameras.txt": cameras, "images.txt": images, "points3D.txt": ["# no points"]}
-    for file, lines in files.items():
-        write_atomically(subject / "colmap" / f"{frame:04d}" / file, "\n".join(lines) + "\n")
-
-
-def _quaternion(rotation: NDArray) -> NDArray[np.float64]:
-    """Convert to w, x, y, z with w >= 0: the eigenvector of Bar-Itzhack's matrix with the largest eigenvalue."""
-    m = rotation
-    matrix = np.array(
-        [
-            [m[0, 0] - m[1, 1] - m[2, 2], 0, 0, 0],
-            [m[0, 1] + m[1, 0], m[1, 1] - m[0, 0] - m[2, 2], 0, 0],
-            [m[0, 2] + m[2, 0], m[1, 2] + m[2, 1], m[2, 2] - m[0, 0] - m[1, 1], 0],
-            [m[2, 1] - m[1, 2], m[0, 2] - m[2, 0], m[1, 0] - m[0, 1], m[0, 0] + m[1, 1] + m[2, 2]],
-        ]
-    )
-    x, y, z, w = np.linalg.eigh(matrix)[1][:, -1]
-    q = np.array([w, x, y, z])
-    return -q if w < 0 else q

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import numpy as np
 import torch
+from jaxtyping import Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor
 
@@ -34,3 +35,8 @@ def decode_srgb(encoded: Colours) -> Colours:
         return torch.where(encoded <= knee, encoded / 12.92, power)
     power = ((np.maximum(encoded, knee) + 0.055) / 1.055) ** 2.4
     return np.where(encoded <= knee, encoded / 12.92, power).astype(encoded.dtype, copy=False)
+
+
+def to_bytes(values: Float[Tensor, "*shape"]) -> UInt8[Tensor, "*shape"]:
+    """Values in 0 ... 1 as bytes, rounded; those beyond are clamped."""
+    return (values.detach().clamp(0, 1) * 255).round().to(torch.uint8)

@@ -36,7 +36,7 @@ from primdiffusion.files.arrays import read_arrays, write_deflated
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.requests import Making
 from primdiffusion.geometry.camera import Camera, look_at
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets
 from primdiffusion.people.base_mesh import load_base_mesh
@@ -157,7 +157,7 @@ def voxels_from_payload(payload: Payload) -> UInt8[np.ndarray, "K 8 8 8 4"]:
     """Quantise a payload to bytes: sRGB-encoded colour, and density with 255 for FULL_DENSITY."""
     encoded = encode_srgb(payload.rgb.clamp(0, 1)).movedim(1, -1)
     density = (payload.density / FULL_DENSITY).clamp(0, 1)[..., None]
-    return (torch.cat([encoded, density], dim=-1) * 255).round().to(torch.uint8).numpy()
+    return to_bytes(torch.cat([encoded, density], dim=-1)).numpy()
 
 
 def is_complete(path: Path, variants: int, seed: int, method: str) -> bool:

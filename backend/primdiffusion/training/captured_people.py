@@ -27,11 +27,11 @@ from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.human import Human
 from primdiffusion.people.folder import CARD
 from primdiffusion.people.payloads import store_person, voxels_from_payload
+from primdiffusion.people.stored_people import read_person
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.runtime.failures import describe
 from primdiffusion.training.refine import refine
-from primdiffusion.training.stored_people import read_person
 
 
 @dataclasses.dataclass(frozen=True)

@@ -21,6 +21,7 @@ from primdiffusion.files import tensor_file
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.files.whole_files import write_atomically
+from primdiffusion.people.stored_people import PersonFolder, one_density
 from primdiffusion.runtime.device import has_fast_bfloat16
 from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
@@ -28,7 +29,6 @@ from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_t
 from primdiffusion.training.loop import Step
 from primdiffusion.training.losses import PersonObjective, RestObjective, closed_form, x0_errors
 from primdiffusion.training.prior import fit_prior, fit_shapes
-from primdiffusion.training.stored_people import PersonDataset, one_density
 
 PREPARED = "prepared.safetensors"
 
@@ -48,11 +48,11 @@ class Prepared:
 
 def prepare(
     config: TrainingConfig,
-    people: PersonDataset,
+    people: PersonFolder,
     train: Sequence[int],
     held: Sequence[int],
     base: DiffusionModel | None = None,
-    more: PersonDataset | None = None,
+    more: PersonFolder | None = None,
 ) -> Prepared:
     """Return codec, latents, prior and shape prior of a run; loaded from the run folder if they are saved there.
 
@@ -106,10 +106,10 @@ def load_base(path: Path) -> DiffusionModel:
 
 
 def _encoded(
-    people: PersonDataset,
+    people: PersonFolder,
     train: Sequence[int],
     held: Sequence[int],
-    more: PersonDataset | None,
+    more: PersonFolder | None,
     codec: LinearCodec,
     vocabulary: AttributeVocabulary,
 ) -> tuple[LatentSet, LatentSet]:
@@ -122,10 +122,10 @@ def _encoded(
 
 def _prepared_with(
     base: DiffusionModel,
-    people: PersonDataset,
+    people: PersonFolder,
     train: Sequence[int],
     held: Sequence[int],
-    more: PersonDataset | None,
+    more: PersonFolder | None,
 ) -> Prepared:
     assert isinstance(base.codec, CellCodec)
     assert isinstance(base.denoiser, PersonDenoiser)

@@ -58,16 +58,13 @@ class PriorConfig:
 
 
 @dataclasses.dataclass(frozen=True)
-class PhaseConfig(Checked):
-    """Training of one network."""
+class OptimiserSettings(Checked):
+    """Optimisation of one network."""
 
     steps: Count
     """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: Count
-    """Samples per step, each at a random noise level."""
-    optimiser: Literal["adamw", "muon"] = "adamw"
-    """adamw; or muon, Muon for hidden layers at three times the learning rate, AdamW for the rest. Muon is for the
-    default preset, and computes in bfloat16: devices without instructions for it take AdamW."""
+    """Samples per step and process."""
     learning_rate: Positive = 1e-3
     """Learning rate of AdamW after a warm-up of 100 steps."""
     weight_decay: NotNegative = 0.01
@@ -76,6 +73,17 @@ class PhaseConfig(Checked):
     """Largest norm of the gradient."""
     ema: Decay = 0.999
     """Decay of the averaged weights, which are evaluated and saved."""
+    evaluate_every: Count = 500
+    """Steps between evaluations on held-out people."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PhaseConfig(OptimiserSettings):
+    """Training of one network of a diffusion model, each sample at a random noise level."""
+
+    optimiser: Literal["adamw", "muon"] = "adamw"
+    """adamw; or muon, Muon for hidden layers at three times the learning rate, AdamW for the rest. Muon is for the
+    default preset, and computes in bfloat16: devices without instructions for it take AdamW."""
     weighting: Weighting = "whitened"
     """Weighting of x0 errors: whitened, in units of the posterior std of the closed form; plain, as in the paper;
     min_snr, plain times min(SNR, gamma) (Hang et al. 2023)."""
@@ -94,8 +102,6 @@ class PhaseConfig(Checked):
     """Fraction of samples that blend the colour variants of one geometry. Default preset only."""
     unasked: Share = 0.5
     """Fraction of samples trained without attributes; the others have a random subset. Default preset only."""
-    evaluate_every: Count = 500
-    """Steps between evaluations on held-out people."""
     bfloat16: bool = False
     """Run the network in bfloat16 where the device multiplies it faster than float32."""
 
@@ -130,7 +136,7 @@ class TrainingConfig(RunSettings):
     """Train a diffusion model; the same command line resumes (docs/design/diffusion_training.md)."""
 
     data: Path
-    """Training set of `primdiffusion payloads`: a folder of files, or of shards from `payloads pack`."""
+    """Training set: a folder of `primdiffusion payloads`."""
     holdout: Annotated[float, Range(1e-6, 0.999999)] = 0.05
     """Fraction of geometries, with all their colour variants, held out for evaluation."""
     more_data: Path | None = None

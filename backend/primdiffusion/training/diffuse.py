@@ -14,16 +14,15 @@ from accelerate import PartialState
 from primdiffusion.diffusion.checkpoint import file_hash, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.runtime.device import device_info
 from primdiffusion.training import loop
 from primdiffusion.training.cells import CellTask, load_base, prepare
 from primdiffusion.training.config import TrainingConfig
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.run_folder import begin, open_run, versions
-from primdiffusion.training.shards import open_people
 from primdiffusion.training.slabs import SlabTask
 from primdiffusion.training.state import TrainingState
-from primdiffusion.training.stored_people import PersonDataset
 from primdiffusion.version import __version__
 
 MODEL = "model.safetensors"
@@ -63,7 +62,7 @@ def train(config: TrainingConfig) -> DiffusionModel:
         OSError: the disk is full; the last saved state remains.
     """
     with open_run(config) as accelerator:
-        people = open_people(config.data)
+        people = PersonFolder(config.data)
         chosen, held = split_people(range(len(people.names)), config.holdout, config.seed)
         with accelerator.main_process_first():
             if accelerator.is_main_process:
@@ -80,18 +79,18 @@ def train(config: TrainingConfig) -> DiffusionModel:
 
 
 def _task(
-    config: TrainingConfig, people: PersonDataset, chosen: Sequence[int], held: Sequence[int], device: torch.device
+    config: TrainingConfig, people: PersonFolder, chosen: Sequence[int], held: Sequence[int], device: torch.device
 ) -> CellTask | SlabTask:
     if config.preset == "paper":
         return SlabTask(config, people, chosen, held, device)
     base = None if config.start_from is None else load_base(config.start_from)
-    more = None if config.more_data is None else open_people(config.more_data)
+    more = None if config.more_data is None else PersonFolder(config.more_data)
     return CellTask(config, prepare(config, people, chosen, held, base, more), device, base)
 
 
 def _card(
     config: TrainingConfig,
-    people: PersonDataset,
+    people: PersonFolder,
     chosen: Sequence[int],
     held: Sequence[int],
     task: CellTask | SlabTask,

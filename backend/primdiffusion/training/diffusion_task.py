@@ -10,22 +10,21 @@ import torch
 from torch import nn
 
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.files.picture_files import write_png
 from primdiffusion.formats import requests
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.human import framing, generate_batch, place
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.runtime.device import has_bfloat16
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.loop import Task
 from primdiffusion.training.muon import MuonAdamW
-from primdiffusion.training.run_folder import write_picture
 from primdiffusion.training.state import TrainingState
 
 SEEDS = (0, 1, 2, 3)
 """Seeds of the samples in pictures."""
 WIDTH, HEIGHT = 256, 256
 YAW_DEGREES = 23
-"""Radians."""
 STEP = 0.006
 """Metres between samples of a ray."""
 
@@ -79,4 +78,4 @@ def write_samples(
         camera = framing(primitives, YAW_DEGREES, WIDTH, HEIGHT).to(model.device)
         rendering = march(primitives.to(model.device), camera, MarchSettings(step=STEP))
         pictures.append(encode_srgb(rendering.rgb.clamp(0, 1)).cpu())
-    write_picture(path, torch.cat(pictures, dim=1))
+    write_png(path, to_bytes(torch.cat(pictures, dim=1)).numpy())

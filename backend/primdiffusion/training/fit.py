@@ -17,12 +17,13 @@ from primdiffusion.capture.conditioning import default_betas
 from primdiffusion.capture.dataset import CaptureDataset, Position, ProcessRank, SampleSettings
 from primdiffusion.capture.reader import Captures, open_captures
 from primdiffusion.encoder.blocks import UntiedConv
-from primdiffusion.encoder.config import PRESETS
+from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.geometry.srgb import encode_srgb
+from primdiffusion.files.picture_files import write_png
+from primdiffusion.geometry.srgb import encode_srgb, to_bytes
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
@@ -30,7 +31,7 @@ from primdiffusion.training.fit_data import Batch, FitSample, betas_of, fit_batc
 from primdiffusion.training.fit_losses import Features, load_perceptual, loss_terms
 from primdiffusion.training.fit_voxels import fit_missing, voxel_loss
 from primdiffusion.training.loop import Step, StepTimer, Task, train
-from primdiffusion.training.run_folder import begin, open_run, versions, write_picture
+from primdiffusion.training.run_folder import begin, open_run, versions
 from primdiffusion.training.state import TrainingState, adamw
 from primdiffusion.version import __version__
 
@@ -87,7 +88,7 @@ class EncoderTask(Task):
     def __init__(self, config: FitConfig, captures: Captures, accelerator: Accelerator) -> None:
         """Open the data: raises as `fit` for captures, held-out ones, the start and weights of the perceptual loss."""
         self.config, self.captures, self.accelerator = config, captures, accelerator
-        self.start = None if config.start is None else _start(config.start, config.encoder)
+        self.start = None if config.start is None else _start(config.start, config.architecture)
         self.perceptual = _features(config, accelerator.device)
         self.held = None if config.held is None else open_captures(config.held)
         if self.held is not None:
@@ -97,7 +98,7 @@ class EncoderTask(Task):
             raise ValueError(f"the captures in {config.data} have no frames: render some")
         if config.fitted is not None and config.loss.voxels:
             with accelerator.main_process_first():
-                fit_missing(captures, PRESETS[config.encoder], config.fitted)
+                fit_missing(captures, config.architecture, config.fitted)
         self._batches: Iterator[Batch] | None = None
 
     @property
@@ -110,7 +111,7 @@ class EncoderTask(Task):
         if self.start is not None:
             return self.start.encoder.float().requires_grad_(True).train()
         torch.manual_seed(self.config.seed)
-        return Encoder(PRESETS[self.config.encoder])
+        return Encoder(self.config.architecture)
 
     def put(self, phase: str, network: nn.Module) -> None:
         """Use an encoder."""
@@ -147,7 +148,7 @@ class EncoderTask(Task):
             payload = dataclasses.replace(payload, delta_scale=sample.found.extent + 0 * payload.delta_scale)
         timer.lap("forward")
         if sample.fitted is not None:
-            fitted = voxel_loss(payload, sample.fitted, PRESETS[config.encoder].full_density)
+            fitted = voxel_loss(payload, sample.fitted, config.architecture.full_density)
             terms["voxels"] = config.loss.voxels * fitted + 0 * payload.delta_scale.sum()
         if not config.loss.of_images:
             return terms
@@ -180,10 +181,11 @@ class EncoderTask(Task):
     def model(self, state: TrainingState) -> EncoderModel:
         """Return the averaged weights with their card."""
         config, captures = self.config, self.captures
+        name = config.encoder if config.ablation is None else f"{config.encoder}, {config.ablation}"
         card = {
-            "name": f"PrimDiffusion encoder, {config.encoder}",
+            "name": f"PrimDiffusion encoder, {name}",
             "version": __version__,
-            "encoder": config.encoder,
+            "encoder": name,
             "people": len(captures.subjects),
             "captures": {name: value for name, value in captures.about.items() if name != "part_names"},
             "views": config.views,
@@ -195,7 +197,7 @@ class EncoderTask(Task):
             "device": str(self.accelerator.device),
             "seed": config.seed,
             "loss": parse_json(json.dumps(dataclasses.asdict(config.loss), default=str)),
-            "full_density": PRESETS[config.encoder].full_density,
+            "full_density": config.architecture.full_density,
             "start": None if self.start is None else self.start.card,
             **versions(),
         }
@@ -205,10 +207,10 @@ class EncoderTask(Task):
         return EncoderModel(_encoder(self.encoder), {})
 
 
-def _start(path: Path, preset: str) -> EncoderModel:
+def _start(path: Path, config: EncoderConfig) -> EncoderModel:
     start = load_encoder(path)
-    if start.config != PRESETS[preset]:
-        raise ValueError(f"{path} is an encoder of other settings than {preset}: choose its own preset with --encoder")
+    if start.config != config:
+        raise ValueError(f"{path} is an encoder of other settings: choose its own with --encoder and --ablation")
     return start
 
 
@@ -234,7 +236,7 @@ def write_pictures(path: Path, model: EncoderModel, captures: Captures, people: 
     for image, target, given in _compared(model, captures, people, "crop"):
         pairs = [side for pair in zip(image, target, strict=True) for side in pair]
         rows.append(torch.cat([given, *pairs], dim=1))
-    write_picture(path, torch.cat(rows))
+    write_png(path, to_bytes(torch.cat(rows)).numpy())
 
 
 @torch.no_grad()

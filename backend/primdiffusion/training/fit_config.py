@@ -6,21 +6,11 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal
 
+from primdiffusion.capture.dataset import SampleSettings
+from primdiffusion.encoder.config import Ablation, EncoderConfig, Preset, encoder_config
 from primdiffusion.formats.requests import Count, NotNegative, Positive
 from primdiffusion.formats.schema import Checked, Range
-from primdiffusion.training.config import Decay, RunSettings
-
-Preset = Literal[
-    "default",
-    "shared_scale",
-    "template_rt",
-    "no_attention",
-    "paper",
-    "paper_shared_scale",
-    "paper_template_rt",
-    "paper_no_attention",
-    "released",
-]
+from primdiffusion.training.config import Decay, OptimiserSettings, RunSettings
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,7 +47,7 @@ class LossConfig(Checked):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class FitConfig(RunSettings):
+class FitConfig(OptimiserSettings, SampleSettings, RunSettings):
     """A run of `primdiffusion fit`."""
 
     data: Path
@@ -68,25 +58,17 @@ class FitConfig(RunSettings):
     """Folder of voxels fitted to all images of each subject, for loss.voxels; those that it lacks are made first, half
     a minute each."""
     encoder: Preset = "default"
-    """default, its ablations shared_scale, template_rt and no_attention, the same four in the paper's form (paper,
-    paper_shared_scale, ...), or the architecture released."""
+    """The shipped architecture, the paper's, or that of the authors' code."""
+    ablation: Ablation | None = None
+    """An ablation of the paper's Table 3: one delta scale for all boxes (shared_scale), boxes on a body of mean shape
+    (template_rt), or branches that are only concatenated (no_attention)."""
     start: Path | None = None
-    """Encoder of the same preset whose weights training starts from, for instance the default one; without it, random
-    weights, which draw the hull of the masks."""
+    """Encoder of the same architecture whose weights training starts from, for instance the default one; without
+    it, random weights, which draw the hull of the masks."""
     steps: Count = 20_000
     """Optimiser steps; the learning rate decays to a tenth along a cosine."""
     batch: Count = 4
     """Subjects per step and process."""
-    views: Count = 8
-    """Input images; if a subject has fewer, some are used twice."""
-    targets: Count = 1
-    """Target images of each subject."""
-    size: Count = 512
-    """Width and height of the targets, pixels: what is learned from smaller ones is blurred in larger ones."""
-    framing: Literal["whole", "crop"] = "crop"
-    """crop: squares around the subject, of `size` pixels or more; whole: whole images, as in the paper."""
-    conditioning_frame: Literal["first", "same", "any"] = "any"
-    """Frame of the input images: the first, near T (released), that of the targets, or any."""
     step: Positive = 0.004
     """Metres between samples of a ray."""
     learning_rate: Positive = 1e-4
@@ -95,8 +77,6 @@ class FitConfig(RunSettings):
     """Factor on the learning rate of untied biases."""
     weight_decay: NotNegative = 0.0
     """Weight decay of AdamW."""
-    gradient_clip: Positive = 1.0
-    """Largest norm of the gradient."""
     ema: Decay = 0.998
     """Decay of the averaged weights, which are evaluated and saved."""
     hold_scale: Annotated[int, Range(0)] = 1_000_000
@@ -111,10 +91,13 @@ class FitConfig(RunSettings):
     """Seconds between checkpoints; 0 saves after every step."""
     log_every: Count = 25
     """Steps between lines of metrics.jsonl, which are running means."""
-    evaluate_every: Count = 500
-    """Steps between evaluations on a few subjects of `data` and `held`."""
     pictures_every: Count = 500
     """Steps between images."""
+
+    @property
+    def architecture(self) -> EncoderConfig:
+        """Settings of the encoder."""
+        return encoder_config(self.encoder, self.ablation)
 
     def __post_init__(self) -> None:
         """Raise ValueError for values out of range."""

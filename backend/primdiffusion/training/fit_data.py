@@ -16,12 +16,11 @@ from primdiffusion.capture.dataset import (
     Position,
     ProcessRank,
     SampleSet,
-    SampleSettings,
     Views,
     batches,
 )
 from primdiffusion.capture.reader import Captures
-from primdiffusion.encoder.config import PRESETS, EncoderConfig
+from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import frames_of, look_up
 from primdiffusion.encoder.network import motion_of
 from primdiffusion.encoder.texture import eroded
@@ -103,9 +102,8 @@ def betas_of(captures: Captures) -> Float[Tensor, "people 10"]:
 
 def fit_dataset(captures: Captures, config: FitConfig) -> FitDataset:
     """Return the dataset of a run."""
-    settings = SampleSettings(config.views, config.targets, config.size, config.framing, config.conditioning_frame)
     fitted = config.fitted if config.loss.voxels else None
-    return FitDataset(CaptureDataset(captures, settings, config.seed), PRESETS[config.encoder], fitted)
+    return FitDataset(CaptureDataset(captures, config, config.seed), config.architecture, fitted)
 
 
 def fit_batches(dataset: FitDataset, config: FitConfig, start: Position, share: ProcessRank) -> Iterator[Batch]:

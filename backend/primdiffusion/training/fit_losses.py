@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from primdiffusion.evaluation.pretrained_networks import VGG19, PictureFeatures, load_matching, read_weights
+from primdiffusion.evaluation.pretrained_networks import IMAGENET, VGG19, PictureFeatures, load_matching, read_weights
 from primdiffusion.training.fit_config import LossConfig
 
 RESIDUAL = 255 / 16
@@ -21,8 +21,6 @@ VGG_LAYERS = ("relu1_2", "relu2_2", "relu3_2", "relu4_2", "relu5_2")
 """SPEC 2 names weights but no layers: the second of each block, as perceptual losses in image synthesis take them."""
 VGG_LAYER_WEIGHTS = (20.0, 5.0, 0.9, 0.5, 0.5)
 """SPEC 2."""
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
-"""Of sRGB-encoded values in [0, 1]: what torchvision's networks were trained on."""
 
 Picture = Float[Tensor, "*b H W 3"]
 Features = Callable[[Picture, Picture], Tensor]
@@ -97,7 +95,7 @@ class PerceptualLoss(nn.Module):
             raise ValueError(f"{len(layers)} layers and {len(weights)} weights: give a weight for each layer")
         self.network = PictureFeatures(VGG19, layers)
         self.layer_weights = tuple(weights)
-        for name, values in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
+        for name, values in zip(("mean", "std"), IMAGENET, strict=True):
             self.register_buffer(name, torch.tensor(values)[:, None, None], persistent=False)
 
     def forward(self, image: Float[Tensor, "*b H W 3"], target: Float[Tensor, "*b H W 3"]) -> Float[Tensor, ""]:

@@ -16,8 +16,8 @@ from torch import Tensor
 from primdiffusion.diffusion.codec import LinearCodec, cells_from_voxels, fit_codec
 from primdiffusion.diffusion.conditioning import Attributes, AttributeVocabulary
 from primdiffusion.geometry.records import TensorRecord
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.config import CodecConfig
-from primdiffusion.training.stored_people import PersonDataset
 
 Item = TypeVar("Item", int, Path)
 CHUNK = 256
@@ -78,7 +78,7 @@ def split_people(people: Sequence[Item], holdout: float, seed: int) -> tuple[lis
 
 
 def fit_codec_to(
-    people: PersonDataset, indices: Sequence[int], config: CodecConfig, generator: torch.Generator
+    people: PersonFolder, indices: Sequence[int], config: CodecConfig, generator: torch.Generator
 ) -> LinearCodec:
     """Fit the codec to `config.people` random geometries among `indices`, one colouring each."""
     chosen = torch.randint(len(indices), (config.people,), generator=generator).tolist()
@@ -93,7 +93,7 @@ def fit_codec_to(
 
 
 def encode_people(
-    people: PersonDataset, indices: Sequence[int], codec: LinearCodec, vocabulary: AttributeVocabulary
+    people: PersonFolder, indices: Sequence[int], codec: LinearCodec, vocabulary: AttributeVocabulary
 ) -> LatentSet:
     """Encode all colourings of the geometries `indices`."""
     latents, geometry, betas, conditions = [], [], [], []

@@ -31,9 +31,9 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from primdiffusion.files.json_files import parse_message
 from primdiffusion.runtime.failures import out_of_memory
-from primdiffusion.training.config import RunSettings
+from primdiffusion.training.config import OptimiserSettings, RunSettings
 from primdiffusion.training.run_folder import PICTURES, Metrics, open_metrics, state_path
-from primdiffusion.training.state import PhaseSettings, TrainingState, adamw, agreed
+from primdiffusion.training.state import TrainingState, adamw, agreed
 
 log = logging.getLogger(__name__)
 
@@ -96,7 +96,7 @@ class Task(ABC):
 
     @property
     @abstractmethod
-    def phases(self) -> Mapping[str, PhaseSettings]:
+    def phases(self) -> Mapping[str, OptimiserSettings]:
         """Return the settings of each network by its name, in the order of training; a single one may be named ""."""
 
     @abstractmethod

@@ -23,14 +23,11 @@ from typing import Any
 import accelerate
 import torch
 from accelerate.tracking import GeneralTracker, TensorBoardTracker, WandBTracker
-from jaxtyping import Float
-from PIL import Image
-from torch import Tensor
 
 from primdiffusion.files.folder_lock import lock_folder
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error, check_unlinked, open_to_append, read_regular, real_path
-from primdiffusion.files.whole_files import remove_abandoned, replacing, write_atomically
+from primdiffusion.files.whole_files import remove_abandoned, write_atomically
 from primdiffusion.runtime.failures import optional_package
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.state import accelerator_of, saved_step
@@ -40,9 +37,7 @@ log = logging.getLogger(__name__)
 
 CONFIG, RUN, METRICS, PICTURES = "config.json", "run.json", "metrics.jsonl", "pictures"
 LARGEST_TEXT = 2**30
-"""Bytes of any of them."""
-PROJECT = "primdiffusion"
-"""Name in Weights & Biases."""
+"""Largest size of one of them, bytes."""
 
 
 @contextlib.contextmanager
@@ -62,13 +57,6 @@ def open_run(config: RunSettings, mixed_precision: str = "no") -> Iterator[accel
         accelerator = accelerator_of(mixed_precision)
         yield accelerator
         accelerator.end_training()
-
-
-def write_picture(path: Path, picture: Float[Tensor, "H W 3"]) -> None:
-    """Write an sRGB-encoded picture as a PNG, atomically; its folder is created if missing. Raises OSError."""
-    values = (picture.clamp(0, 1) * 255).round().to(torch.uint8).contiguous().numpy()
-    with replacing(path) as unfinished:
-        Image.fromarray(values).save(unfinished, format="PNG")
 
 
 def state_path(run: Path, phase: str) -> Path:
@@ -139,7 +127,7 @@ def open_metrics(config: RunSettings) -> Iterator[Metrics]:
         yield Metrics(config.run)
         return
     if config.tracker == "wandb":
-        tracker: GeneralTracker = WandBTracker(PROJECT, name=config.run.name, dir=str(config.run))
+        tracker: GeneralTracker = WandBTracker("primdiffusion", name=config.run.name, dir=str(config.run))
     else:
         tracker = TensorBoardTracker("tensorboard", logging_dir=config.run)
     tracker.start()
@@ -197,9 +185,7 @@ def _is_kept(line: str, steps: Mapping[str, int]) -> bool:
 
 
 def _git(folder: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        ["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True
-    )  # fmt: skip
+    done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, timeout=10, check=True)
     return done.stdout.strip()
 
 

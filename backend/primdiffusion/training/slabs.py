@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import torch
 from jaxtyping import Float
@@ -13,13 +14,13 @@ from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet
+from primdiffusion.people.stored_people import PersonFolder, payload_of_bytes
 from primdiffusion.primitives.slab import pack
 from primdiffusion.runtime.device import has_fast_bfloat16
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.loop import Step
 from primdiffusion.training.losses import level_weight, random_steps, x0_errors
-from primdiffusion.training.stored_people import PersonDataset, payload_of_bytes
 
 NETWORK = "slab"
 MEASURED = 4
@@ -32,7 +33,7 @@ class SlabTask(DiffusionTask):
     def __init__(
         self,
         config: TrainingConfig,
-        people: PersonDataset,
+        people: PersonFolder,
         train: Sequence[int],
         held: Sequence[int],
         device: torch.device,
@@ -59,7 +60,9 @@ class SlabTask(DiffusionTask):
 
     def slabs(self, places: Sequence[tuple[int, int]]) -> Float[Tensor, "b 56 256 256"]:
         """Load slabs. Raises ValueError, naming a damaged file, and OSError."""
-        voxels, scales = zip(*(self.people.variant(*place) for place in places), strict=True)
+        with ThreadPoolExecutor() as threads:  # unpacking releases the interpreter
+            read = threads.map(self.people.variant, *zip(*places, strict=True))
+            voxels, scales = zip(*read, strict=True)
         density = self.people.full_density
         payload = payload_of_bytes(torch.stack(voxels).to(self.device), torch.stack(scales).to(self.device), density)
         return pack(payload, density)

@@ -7,7 +7,6 @@ import datetime
 import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Protocol
 
 import torch
 from accelerate import Accelerator
@@ -18,29 +17,11 @@ from primdiffusion.files import tensor_file
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.runtime.device import best_device
+from primdiffusion.training.config import OptimiserSettings
 from primdiffusion.training.muon import BETAS, MuonAdamW
 
 PATIENCE = datetime.timedelta(hours=3)
 """How long processes wait for the main process, which alone evaluates, renders and prepares data."""
-
-
-class PhaseSettings(Protocol):
-    """Settings of the training of one network, as in `PhaseConfig` and `FitConfig`."""
-
-    @property
-    def steps(self) -> int: ...
-    @property
-    def batch(self) -> int: ...
-    @property
-    def learning_rate(self) -> float: ...
-    @property
-    def weight_decay(self) -> float: ...
-    @property
-    def gradient_clip(self) -> float: ...
-    @property
-    def ema(self) -> float: ...
-    @property
-    def evaluate_every(self) -> int: ...
 
 
 class TrainingState:
@@ -52,7 +33,7 @@ class TrainingState:
     def __init__(
         self,
         network: nn.Module,
-        settings: PhaseSettings,
+        settings: OptimiserSettings,
         accelerator: Accelerator,
         optimiser: torch.optim.Optimizer | None = None,
     ) -> None:
@@ -136,7 +117,7 @@ class TrainingState:
 
 
 def adamw(
-    settings: PhaseSettings, parameters: Iterable[nn.Parameter], *others: tuple[list, float]
+    settings: OptimiserSettings, parameters: Iterable[nn.Parameter], *others: tuple[list, float]
 ) -> torch.optim.AdamW:
     """AdamW of a network's parameters; `others` are further ones, each with a factor on their learning rate."""
     groups = [{"params": list(group), "factor": factor} for group, factor in ((parameters, 1.0), *others)]

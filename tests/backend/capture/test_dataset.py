@@ -14,7 +14,7 @@ from primdiffusion.formats.camera_rig import View
 from primdiffusion.geometry.records import TensorRecord
 from support.errors import refused
 
-SETTINGS = SampleSettings(conditioning=2, targets=1, size=16)
+SETTINGS = SampleSettings(2, 1, 16, "whole", "first")
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_a_batch_holds_views_cameras_poses_and_shapes(captures):
 
 
 def test_a_sample_is_what_the_reader_reads(captures):
-    sample = CaptureDataset(captures, SampleSettings(1, 3, size=32, conditioning_frame="same"))[0, 4]
+    sample = CaptureDataset(captures, SampleSettings(1, 3, 32, "whole", "same"))[0, 4]
     name, frame = captures.subjects[int(sample.subject)], int(sample.frame)
     views = [captures.view(name, frame, camera) for camera in range(4)]
     shown = torch.cat([sample.conditioning.image, sample.target.image])
@@ -58,7 +58,7 @@ def test_a_sample_is_what_the_reader_reads(captures):
     assert torch.equal(sample.target.pose.joint_rotation, views[0].pose.joint_rotation)
 
 
-def test_conditioning_views_show_the_near_t_pose_by_default(captures):
+def test_conditioning_views_of_the_first_frame_show_the_near_t_pose(captures):
     near_t = captures.subject(captures.subjects[0]).smpl.pose(0)
     samples = [CaptureDataset(captures, SETTINGS)[0, index] for index in range(9)]
     assert all(torch.equal(sample.conditioning.pose.joint_rotation, near_t.joint_rotation) for sample in samples)
@@ -149,7 +149,7 @@ def test_crops_lie_in_the_picture_and_see_the_person(captures):
     assert np.mean([bool(s.target.mask.any()) for s in samples]) > 0.9
 
 
-@pytest.mark.parametrize("wrong", [{"conditioning": 0}, {"targets": -1}, {"size": 0}])
+@pytest.mark.parametrize("wrong", [{"views": 0}, {"targets": -1}, {"size": 0}])
 def test_samples_without_views_are_rejected(wrong):
     with refused(ValueError, next(iter(wrong))):
         SampleSettings(**wrong)

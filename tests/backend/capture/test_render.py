@@ -49,8 +49,6 @@ def test_captures_have_the_layouts_files_and_are_whole(whole):
             ]
             assert all(path.is_file() for path in pictures)
             assert sum(path.is_file() for path in (subject / kind).rglob("*")) == 12
-        frames = {p.name for p in (subject / "nerf").iterdir()} & {p.name for p in (subject / "colmap").iterdir()}
-        assert frames == {"0000", "0001", "0002"}
         with np.load(subject / "joints.npz") as joints:
             assert joints["pixel"].shape == (4, 3, 24, 2)
     assert json.loads((whole / "report.json").read_text()) == {"done": NAMES, "failed": [], "skipped": []}
@@ -108,7 +106,7 @@ list(render(small_job(Path({str(tmp_path)!r}), frames=12)))
     assert verify(job.out) == {}
 
 
-@pytest.mark.parametrize("folder", ["img", "colmap", "outputs_re_fitting", ""])
+@pytest.mark.parametrize("folder", ["img", "outputs_re_fitting", ""])
 def test_no_worker_writes_through_a_link_in_the_folder_of_a_human(tmp_path, folder):
     outside, job = tmp_path / "outside", small_job(tmp_path)
     outside.mkdir()

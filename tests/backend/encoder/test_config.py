@@ -4,7 +4,7 @@ import dataclasses
 import json
 
 import pytest
-from primdiffusion.encoder.config import PRESETS, config_from_json
+from primdiffusion.encoder.config import PRESETS, config_from_json, encoder_config
 from support.errors import refused
 from tiny_encoder import TINY
 
@@ -46,6 +46,7 @@ def test_impossible_settings_are_rejected(settings):
 def test_each_ablation_differs_from_the_default_in_one_thing():
     default = dataclasses.asdict(PRESETS["default"])
     one_size = {"delta_scale", "thickness", "extent"}
-    for preset, ablated in (("shared_scale", one_size), ("template_rt", {"frames"}), ("no_attention", {"attention"})):
-        changed = {name for name, value in dataclasses.asdict(PRESETS[preset]).items() if default[name] != value}
+    for ablation, ablated in (("shared_scale", one_size), ("template_rt", {"frames"}), ("no_attention", {"attention"})):
+        config = dataclasses.asdict(encoder_config("default", ablation))
+        changed = {name for name, value in config.items() if default[name] != value}
         assert changed == ablated

@@ -6,7 +6,7 @@ import pytest
 import torch
 from primdiffusion.body.model import BodyPose, J
 from primdiffusion.encoder.blocks import ConcatenatedAttention, CrossModalAttention, UntiedConv
-from primdiffusion.encoder.config import PRESETS, EncoderConfig
+from primdiffusion.encoder.config import PRESETS, EncoderConfig, encoder_config
 from primdiffusion.encoder.model import frames_of
 from primdiffusion.encoder.network import Encoder, clamp, fill, voxels
 from primdiffusion.encoder.unproject import Unprojected
@@ -22,9 +22,16 @@ SMALL = {
 }  # fmt: skip
 
 
-def small(preset: str, **more) -> EncoderConfig:
-    """A preset with few channels."""
-    return dataclasses.replace(PRESETS[preset], **{**SMALL, **more})
+ARCHITECTURES = {
+    **PRESETS,
+    **{ablation: encoder_config("default", ablation) for ablation in ("shared_scale", "template_rt", "no_attention")},
+    "paper without attention": encoder_config("paper", "no_attention"),
+}
+
+
+def small(name: str, **more) -> EncoderConfig:
+    """An architecture with few channels."""
+    return dataclasses.replace(ARCHITECTURES[name], **{**SMALL, **more})
 
 
 def seen_from(config: EncoderConfig, people: int = 1, seed: int = 0) -> Unprojected:
@@ -56,9 +63,9 @@ def differs(a: Payload, b: Payload) -> bool:
     return any((x - y).abs().max() > 1e-6 for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", ARCHITECTURES)
 def test_every_preset_gives_a_payload(preset):
-    config = PRESETS[preset]
+    config = ARCHITECTURES[preset]
     torch.manual_seed(0)
     with torch.no_grad():
         payload = Encoder(config)(seen_from(config), poses())
@@ -72,7 +79,7 @@ def test_every_preset_gives_a_payload(preset):
     assert torch.allclose(payload.delta_scale, torch.tensor(config.extent).expand(1, K, 3), rtol=0.1)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", ARCHITECTURES)
 def test_gradients_reach_every_parameter(preset):
     config = small(preset)
     encoder = encoder_of(config)
@@ -146,7 +153,7 @@ def test_a_change_at_one_place_reaches_far_ones_only_through_attention(preset, e
     assert (max(far) > 1e-9) == reaches
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", ARCHITECTURES)
 def test_the_pose_matters_but_not_the_turn_of_the_pelvis(preset):
     config = small(preset)
     encoder, found, pose = encoder_of(config), seen_from(config), poses()
@@ -173,7 +180,7 @@ def test_a_shared_scale_is_shared_by_all_boxes_and_differs_between_people():
 
 def test_template_frames_ignore_betas_and_personal_ones_do_not():
     betas, pose = torch.linspace(-2, 2, 10), BodyPose.rest()
-    template, mean = (frames_of(PRESETS["template_rt"], b, pose)[1] for b in (betas, torch.zeros(10)))
+    template, mean = (frames_of(ARCHITECTURES["template_rt"], b, pose)[1] for b in (betas, torch.zeros(10)))
     person = frames_of(PRESETS["default"], betas, pose)[1]
     assert torch.equal(template.position, mean.position)
     assert (person.position - mean.position).norm(dim=-1).max() > 0.01
@@ -279,7 +286,7 @@ def test_the_papers_layers_have_the_sizes_of_the_reference():
 )
 def test_presets_have_the_size_that_the_documents_state(preset, parameters):
     with torch.device("meta"):
-        encoder = Encoder(PRESETS[preset])
+        encoder = Encoder(ARCHITECTURES[preset])
     assert sum(parameter.numel() for parameter in encoder.parameters()) == parameters
 
 
@@ -341,7 +348,7 @@ def test_bf16_autocast_trains():
     assert all(torch.isfinite(p.grad).all() for p in encoder.parameters() if p.grad is not None)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", ARCHITECTURES)
 def test_nothing_in_the_network_chooses_a_device(preset):
     config = small(preset)
     with torch.device("meta"):

@@ -21,10 +21,10 @@ from primdiffusion.evaluation.gallery import (
 from primdiffusion.evaluation.generation import COLUMNS, compare, open_reference_set, real_vs_real, table
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.payloads import coloured_people, rest_frames
+from primdiffusion.people.stored_people import find_people, read_person
 from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.training.latents import split_people
-from primdiffusion.training.stored_people import find_people, read_person
 from support.errors import refused
 from tiny_model import tiny_model
 
@@ -56,7 +56,7 @@ def reference_folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def reference(people, reference_folder):
     train, held = split_people(find_people(people), 0.34, 0)
-    sources = [payload_sources(paths, read_person) for paths in (train, held)]
+    sources = [payload_sources(paths) for paths in (train, held)]
     train_reference(*sources, reference_folder)
     return open_reference_set(*sources, reference_folder)
 
@@ -75,7 +75,7 @@ def test_cameras_see_the_parts_they_are_named_for():
 
 def test_portraits_of_stored_people_are_kept_and_not_drawn_again(people, tmp_path):
     paths = find_people(people)[:2]
-    first = open_gallery(payload_sources(paths, read_person), tmp_path)
+    first = open_gallery(payload_sources(paths), tmp_path)
     again = open_gallery([Source(path.name, never, never) for path in paths], tmp_path)
     assert torch.equal(first.pictures, again.pictures)
     assert first.geometry.tolist() == [0, 0, 1, 1]
@@ -88,7 +88,7 @@ def never():
 
 def test_damaged_portraits_are_drawn_again(people, tmp_path):
     paths = find_people(people)[:1]
-    sources = payload_sources(paths, read_person)
+    sources = payload_sources(paths)
     first = open_gallery(sources, tmp_path)
     (tmp_path / paths[0].name).write_bytes(b"half a file")
     assert torch.equal(open_gallery(sources, tmp_path).pictures, first.pictures)
@@ -98,7 +98,7 @@ def test_stored_portraits_are_of_the_stored_payload(people, tmp_path):
     path = find_people(people)[3]
     person = read_person(path)
     drawn = made_gallery([Primitives.place(rest_frames(person.betas.numpy()), person.payload(1))])
-    assert torch.equal(open_gallery(payload_sources([path], read_person), tmp_path).pictures[1], drawn[0])
+    assert torch.equal(open_gallery(payload_sources([path]), tmp_path).pictures[1], drawn[0])
     assert int((drawn[..., 3] > 128).sum()) > 500
 
 

@@ -18,10 +18,10 @@ from primdiffusion.files import tensor_file
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
+from primdiffusion.people.stored_people import read_person
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.released.imported import Reference, reference_extents
 from primdiffusion.released.stage_one import account_stage_one, encoder_tensors
-from primdiffusion.training.stored_people import read_person
 from released_files import (
     SMALL,
     body_arrays,

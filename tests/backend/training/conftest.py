@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 from diffuse_runs import settings
 from diffusion_people import write_people
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.training.cells import prepare
 from primdiffusion.training.latents import split_people
-from primdiffusion.training.shards import open_people
 
 
 @pytest.fixture(scope="module")
@@ -19,5 +19,5 @@ def people(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prepared_once(people, tmp_path_factory):
-    config, found = settings(people, tmp_path_factory.mktemp("prepared")), open_people(people)
+    config, found = settings(people, tmp_path_factory.mktemp("prepared")), PersonFolder(people)
     return config, prepare(config, found, *split_people(range(16), config.holdout, config.seed))

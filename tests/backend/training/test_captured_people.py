@@ -6,16 +6,14 @@ import numpy as np
 import pytest
 import torch
 from capture_scenes import captured
-from diffusion_people import write_people
 from primdiffusion import cli
 from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.capture_layout import picture_path
+from primdiffusion.people.stored_people import PersonFolder, read_person
 from primdiffusion.primitives.primitives import K, S
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, frames_of_looks, read_cards
-from primdiffusion.training.shards import INDEX
-from primdiffusion.training.stored_people import PersonFolder, read_person
 from support.errors import refused
 from tiny_encoder import save_tiny_encoder, tiny_encoder
 
@@ -115,15 +113,3 @@ def test_one_who_fails_is_named_and_the_others_are_made(tmp_path, fails):
 def test_settings_that_cannot_be_are_rejected(settings):
     with refused(ValueError, next(iter(settings))):
         EncodeSettings(**settings)
-
-
-def test_packing_and_verifying_on_the_command_line(tmp_path, capsys, fails):
-    write_people(tmp_path / "people", geometries=3, variants=1)
-    cli.main(["payloads", "pack", str(tmp_path / "people"), "--out", str(tmp_path / "packed"), "--people-each", "2"])
-    cli.main(["payloads", "verify", str(tmp_path / "packed")])
-    output = capsys.readouterr().out.splitlines()
-    assert output == [f"{tmp_path / 'packed'}  3 humans", f"{tmp_path / 'packed'}: nothing wrong"]
-    shard = tmp_path / "packed" / "shard_0000.safetensors"
-    shard.write_bytes(shard.read_bytes()[:-1])
-    assert "shard_0000.safetensors is damaged" in fails("payloads", "verify", tmp_path / "packed").out
-    assert (tmp_path / "packed" / INDEX).exists()

@@ -20,6 +20,7 @@ from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import codec_regions
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.human import generate
+from primdiffusion.people.stored_people import PersonFolder
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import S
 from primdiffusion.training import slabs
@@ -28,9 +29,7 @@ from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConf
 from primdiffusion.training.diffuse import DISTANCE_LIMIT, MODEL, train
 from primdiffusion.training.loop import Interrupt, Step, StepTimer, step_seed
 from primdiffusion.training.losses import LEVELS
-from primdiffusion.training.shards import pack_people
 from primdiffusion.training.slabs import SlabTask
-from primdiffusion.training.stored_people import PersonFolder
 from support.errors import refused
 from support.runs import child_environment, rows, same_tensors, sentence, timeless
 
@@ -206,12 +205,6 @@ def test_a_kill_in_the_middle_of_a_save_loses_one_interval(people, whole, run):
     assert same_tensors(run / MODEL, whole / MODEL)
     assert same_tensors(run / "person.state.safetensors", whole / "person.state.safetensors")
     assert timeless(run) == timeless(whole)
-
-
-def test_shards_train_as_the_files_they_were_made_of(people, whole, tmp_path):
-    list(pack_people(people, tmp_path / "packed", people_each=5))
-    train(settings(tmp_path / "packed", tmp_path / "run"))
-    assert same_tensors(tmp_path / "run" / MODEL, whole / MODEL)
 
 
 def test_other_people_or_settings_in_the_same_folder_are_rejected(people, few, run):

@@ -90,8 +90,8 @@ def test_training_goes_on_from_another_run(captures, tmp_path):
     assert all(torch.equal(a, b) for a, b in zip(second.encoder.parameters(), kept.parameters(), strict=True))
     assert second.card["start"]["steps"] == 2
     assert first.card["start"] is None
-    with refused(ValueError, str(path), "no_attention"):
-        fit(settings(captures, tmp_path / "third", start=path, encoder="no_attention"))
+    with refused(ValueError, str(path), "--ablation"):
+        fit(settings(captures, tmp_path / "third", start=path, ablation="no_attention"))
 
 
 def test_without_minutes_left_the_encoder_is_that_of_the_last_step(captures, tmp_path, monkeypatch):

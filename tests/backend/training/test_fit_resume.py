@@ -168,9 +168,9 @@ def test_captures_and_run_may_move(captures, begun, tmp_path):
 
 
 def test_a_state_of_another_encoder_is_rejected_in_one_sentence(captures, begun, tmp_path):
-    other = settings(captures, tmp_path / "other", steps=1, encoder="no_attention")
+    other = settings(captures, tmp_path / "other", steps=1, encoder="paper")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "no_attention", TINY)
+        patch.setitem(PRESETS, "paper", TINY)
         fit(other)
     (begun.run / STATE).write_bytes((other.run / STATE).read_bytes())
     with refused(ValueError, "network") as error:

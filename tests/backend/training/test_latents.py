@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+from primdiffusion.people.stored_people import find_people
 from primdiffusion.training.latents import split_people
-from primdiffusion.training.stored_people import find_people
 
 
 def test_held_out_geometries_are_never_trained_on(people):

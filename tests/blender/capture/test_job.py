@@ -84,9 +84,7 @@ def test_the_layout_is_complete_and_verified(whole):
         for camera in range(2)
         for frame in range(2)
     }
-    others = {"cameras.json", "joints.npz", "opencv/cameras.npz", COMPLETE_FILE}
-    others |= {f"nerf/{frame:04d}/transforms.json" for frame in range(2)}
-    others |= {f"colmap/{frame:04d}/{name}.txt" for frame in range(2) for name in ("cameras", "images", "points3D")}
+    others = {"cameras.json", "joints.npz", COMPLETE_FILE}
     others |= {f"outputs_re_fitting/refit_smpl_2nd{plain}.npz" for plain in ("", "_plain")}
     assert names == pictures | others
     report = json.loads((whole / "report.json").read_text())

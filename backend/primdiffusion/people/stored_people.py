@@ -1,4 +1,4 @@
-"""The training set of stage 2: payloads as bytes, in a folder of files or in shards."""
+"""The training set of stage 2: payloads as bytes, in a folder with one file a person."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from jaxtyping import Float, UInt8
@@ -25,6 +25,7 @@ from primdiffusion.people.wardrobe import words_of
 from primdiffusion.primitives.primitives import K, Payload, S
 
 _ABOUT = ("betas", "attributes", "full_density")
+_COLOURINGS = ("voxels",), ("delta_scale",)
 _VOXELS = (K, S, S, S, 4)
 
 
@@ -47,37 +48,6 @@ class PersonVariants:
         return payload_of_bytes(self.voxels[variant], self.delta_scale[variant], self.full_density)
 
 
-class PersonDataset(Protocol):
-    """A dataset, read on demand; its order depends on the files only."""
-
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of all people, sorted."""
-        ...
-
-    @property
-    def variants(self) -> Sequence[int]:
-        """Number of colourings of each."""
-        ...
-
-    @property
-    def full_density(self) -> float:
-        """Density of a byte value of 255, 1/m, the same for all."""
-        ...
-
-    def known(self, index: int) -> tuple[Attributes, ...]:
-        """Return `PersonVariants.attributes` without reading voxels. Raises as `person`."""
-        ...
-
-    def person(self, index: int) -> PersonVariants:
-        """Read a person. Raises ValueError, naming a damaged file, and OSError."""
-        ...
-
-    def variant(self, index: int, number: int) -> tuple[UInt8[Tensor, "k 8 8 8 4"], Float[Tensor, "k 3"]]:
-        """Read voxels and delta scales of one colouring. Raises as `person`."""
-        ...
-
-
 def payload_of_bytes(
     voxels: UInt8[Tensor, "*b k 8 8 8 4"], delta_scale: Float[Tensor, "*b k 3"], full_density: float
 ) -> Payload:
@@ -86,31 +56,28 @@ def payload_of_bytes(
     return Payload(decode_srgb(values[..., :3, :, :, :]), values[..., 3, :, :, :] * full_density, delta_scale.float())
 
 
-def attributes_of(stored: Mapping[str, Any], betas: Float[Tensor, "10"], count: int) -> tuple[Attributes, ...]:
-    """Return attributes of each of `count` colourings, from the file and the body's measures."""
-    variants = stored.get("variants", [stored] * count)
-    measures = measure(default_body().shape(betas))
-    body = {"height": measures.height, "weight": measures.weight}
-    return tuple({**words_of(variant), **body} for variant in variants)
-
-
 def read_person(path: Path) -> PersonVariants:
     """Read a file. Raises ValueError if it is damaged or of another shape."""
     with _damage_named(path):
-        arrays = read_arrays(path, (*_ABOUT, "voxels"), ("delta_scale",))
+        arrays = read_arrays(path, (*_ABOUT, *_COLOURINGS[0]), _COLOURINGS[1])
         outline = _outline_of(arrays, arrays["voxels"].shape)
-        voxels = torch.from_numpy(arrays["voxels"])
-        scale = torch.from_numpy(arrays["delta_scale"]) if "delta_scale" in arrays else None
+    voxels, scale = _colourings(path, arrays)
+    return PersonVariants(voxels, scale, outline.betas, outline.known(), outline.full_density)
+
+
+def _colourings(path: Path, arrays: Mapping[str, NDArray]) -> tuple[Tensor, Tensor]:
+    """Return voxels and delta scales of all colourings. Raises ValueError if they are of another shape."""
+    voxels = torch.from_numpy(arrays["voxels"])
     if voxels.dtype != torch.uint8 or tuple(voxels.shape[1:]) != _VOXELS:
         raise ValueError(
             f"{path} holds voxels {voxels.dtype} {tuple(voxels.shape)}; uint8 [n, {K}, {S}, {S}, {S}, 4] is needed"
         )
-    scale = torch.ones(len(voxels), K, 3) if scale is None else scale
+    scale = torch.from_numpy(arrays["delta_scale"]) if "delta_scale" in arrays else torch.ones(len(voxels), K, 3)
     fits = tuple(scale.shape) == (len(voxels), K, 3)  # before it becomes larger as float32
     scale = scale.float() if fits else scale
     if not fits or not (torch.isfinite(scale) & (scale > 0)).all():
         raise ValueError(f"{path} holds delta_scale {tuple(scale.shape)}; positive [{len(voxels)}, {K}, 3] is needed")
-    return PersonVariants(voxels, scale, outline.betas, outline.known(), outline.full_density)
+    return voxels, scale
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,9 +90,15 @@ class Outline:
     """Stored attributes."""
     full_density: float
 
+    def colourings(self) -> list[dict[str, Any]]:
+        """Stored attributes of each colouring."""
+        return list(self.stored.get("variants", [self.stored] * self.variants))
+
     def known(self) -> tuple[Attributes, ...]:
         """`PersonVariants.attributes`."""
-        return attributes_of(self.stored, self.betas, self.variants)
+        measures = measure(default_body().shape(self.betas))
+        body = {"height": measures.height, "weight": measures.weight}
+        return tuple({**words_of(colouring), **body} for colouring in self.colourings())
 
 
 def _damage_named(path: Path) -> contextlib.AbstractContextManager[None]:
@@ -161,7 +134,7 @@ def _outline_of(arrays: Mapping[str, NDArray], shape: tuple[int, ...]) -> Outlin
 
 
 class PersonFolder:
-    """A folder with one file per person."""
+    """A folder with one file per person, read on demand; their order depends on the names of the files only."""
 
     def __init__(self, folder: Path) -> None:
         """Inspect all files without reading voxels.
@@ -181,13 +154,15 @@ class PersonFolder:
         return self.outlines[index].known()
 
     def person(self, index: int) -> PersonVariants:
-        """Read a person. Raises ValueError if the file is damaged."""
+        """Read a person. Raises ValueError, naming a damaged file, and OSError."""
         return read_person(self.paths[index])
 
-    def variant(self, index: int, number: int) -> tuple[Tensor, Tensor]:
-        """Read voxels and delta scales of one colouring; reads all of the file."""
-        person = self.person(index)
-        return person.voxels[number], person.delta_scale[number]
+    def variant(self, index: int, number: int) -> tuple[UInt8[Tensor, "k 8 8 8 4"], Float[Tensor, "k 3"]]:
+        """Read voxels and delta scales of one colouring. Raises as `person`."""
+        with _damage_named(self.paths[index]):
+            arrays = read_arrays(self.paths[index], *_COLOURINGS)
+        voxels, scale = _colourings(self.paths[index], arrays)
+        return voxels[number], scale[number]
 
 
 def find_people(folder: Path) -> list[Path]:
