@@ -21,7 +21,7 @@ from ..formats.whole_files import written_whole
 from ..motion.posture import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
-from ..scene.human import link_part
+from ..scene.human import link_part, proxy_of
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
     HumanMotion,
@@ -35,34 +35,13 @@ from ..scene.human_file import (
 )
 from ..scene.merged import read_grid, write_grid
 from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
-from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
-from ..scene.representation import parts_by_representation, representation_of, set_representation
+from ..scene.proxy import build_proxy, follow_shape, read_proxy, remove_proxy, show_textures_in_solid
+from ..scene.representation import MESH_IN_VIEWPORT, set_representation
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
 from ..scene.shape import betas_of, generated_betas, has_custom_shape
 from .generate import build_person
 from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
-
-
-def show(person: bpy.types.Object, what: str) -> None:
-    """Switch to `what`: VOLUMES, VIEWPORT or MESH. Raises ValueError where there is no proxy; makes no undo step."""
-    proxy = proxy_of(person)
-    if proxy is None:
-        raise ValueError(f"{person.name!r} has no mesh proxy yet: press Add Mesh Proxy")
-    set_representation(person, representation_of(person))  # shows its part again
-    proxy.hide_viewport, proxy.hide_render = what == "VOLUMES", what != "MESH"
-    for part in parts_by_representation(person).values():
-        if part is not None:
-            part.hide_viewport = part.hide_viewport or what != "VOLUMES"
-            part.hide_render = part.hide_render or what == "MESH"
-
-
-def shown(person: bpy.types.Object) -> str:
-    """What is shown now: VOLUMES, VIEWPORT or MESH."""
-    proxy = proxy_of(person)
-    if proxy is None or proxy.hide_viewport:
-        return "VOLUMES"
-    return "VIEWPORT" if proxy.hide_render else "MESH"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +116,7 @@ class AddProxyJob(ProxyJob):
         if earlier is not None:
             remove_proxy(earlier)
         link_part(person, proxy)
-        show(person, "VIEWPORT")
+        set_representation(person, MESH_IN_VIEWPORT)
         show_textures_in_solid()
         return f"Mesh proxy of {result.triangles} triangles for {person.name} in {result.seconds:.1f} s"
 

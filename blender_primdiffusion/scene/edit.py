@@ -14,9 +14,9 @@ from ..formats.joints import JOINT_NAMES
 from .armature import floor_below, move_rest_joints
 from .cells import scale_cells
 from .convention import points_to_blender
-from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data
+from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data, proxy_of
 from .payload import pack, session_file
-from .proxy import follow_shape, proxy_of
+from .proxy import follow_shape
 from .rest_human import read_human, shape_model_of
 from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
 from .splats import replace_splats

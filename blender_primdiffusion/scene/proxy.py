@@ -27,13 +27,11 @@ from .armature import floor_below, model_origin
 from .blend_values import as_numbers, stored_record
 from .build import build_body_mesh
 from .convention import points_to_blender
-from .human import BETA_COUNT, BODY_MARK, own_data, parts_of
+from .human import BETA_COUNT, BODY_MARK, PROXY_MARK, own_data
 from .payload import state_of
 from .rest_human import shape_model_of
 from .shape import SAME_BETAS, ShapeModel
 
-PROXY_MARK = "primdiffusion_proxy"
-"""Custom property of a proxy: the human's file that it was made from and the shape that it shows, as JSON."""
 _FORMAT_VERSION = 1
 _SHAPES = {"vertices": ("V", 3), "faces": ("F", 3), "uv_corner": ("F", 3, 2), "skin_weights": ("V", 24)}
 NEIGHBOURS = 12
@@ -88,11 +86,6 @@ def build_proxy(person: bpy.types.Object, proxy: ProxyMesh, texture: Path, betas
     made.hide_viewport = made.hide_render = False
     made.data.materials.append(_material(name, texture))
     return made
-
-
-def proxy_of(person: bpy.types.Object) -> bpy.types.Object | None:
-    """The human's proxy in the scene, if any."""
-    return next((obj for obj in parts_of(person) if obj.type == "MESH" and PROXY_MARK in obj), None)
 
 
 def is_outdated(person: bpy.types.Object, proxy: bpy.types.Object, betas: NDArray | None) -> bool:

@@ -19,7 +19,6 @@ from ..jobs.export import (
     posed_frames,
     posed_now,
     scene_frames,
-    show,
     write_human,
 )
 from ..jobs.follow import Reporting, submit
@@ -27,7 +26,6 @@ from ..jobs.queue import Job
 from ..jobs.target import HumanTarget
 from ..scene.export_model import check_ready
 from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
-from ..scene.proxy import proxy_of, remove_proxy
 from .declared import SKIP, declared
 from .drawing import property_columns
 from .gallery import FOLDER
@@ -92,12 +90,6 @@ OPTIONS = {
     "VDB": ("voxel",),
 }
 """Settings of each format."""
-SHOWN = (
-    ("VOLUMES", "Volumes", "Show and render the volumes; the mesh proxy is hidden"),
-    ("VIEWPORT", "Mesh in Viewport", "Show the mesh proxy while working, and render the volumes"),
-    ("MESH", "Mesh", "Show and render the mesh proxy, in any engine; the volumes are hidden"),
-    ("REMOVED", "Remove Mesh Proxy", "Delete the mesh proxy, and show and render the volumes"),
-)
 
 
 class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
@@ -228,23 +220,6 @@ class PRIMDIFFUSION_OT_add_proxy(HumanOperator, bpy.types.Operator):
         target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
         check_ready(person)
         return submit(self, context, AddProxyJob(target, int(settings.texture_px), settings.triangles))
-
-
-class PRIMDIFFUSION_OT_show_proxy(HumanOperator, bpy.types.Operator):
-    """Choose how the selected human is shown: as volumes or as the mesh proxy; or remove the mesh proxy"""
-
-    bl_idname = "primdiffusion.show_proxy"
-    bl_label = "Show Volumes or Mesh"
-    bl_options = {"UNDO"}
-
-    shown: bpy.props.EnumProperty(name="Show", description="How the human is shown", items=SHOWN)
-
-    def run(self, _context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        removed = self.shown == "REMOVED"
-        show(person, "VOLUMES" if removed else self.shown)
-        if removed:
-            remove_proxy(proxy_of(person))
-        return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):

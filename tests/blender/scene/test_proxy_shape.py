@@ -16,8 +16,8 @@ from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import reshape
-from blender_primdiffusion.scene.human import body_of, link_part
-from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, proxy_of, read_proxy, shown_betas
+from blender_primdiffusion.scene.human import body_of, link_part, proxy_of
+from blender_primdiffusion.scene.proxy import build_proxy, is_outdated, read_proxy, shown_betas
 from blender_primdiffusion.scene.shape import betas_of, generated_betas
 
 TALLER, WIDER = np.eye(10)[0] * 2.0, np.eye(10)[1] * 2.0
