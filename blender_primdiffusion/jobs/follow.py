@@ -8,13 +8,12 @@ import traceback
 import bpy
 
 from ..backend.environment import NOT_INSTALLED
-from ..backend.requests import error_text, sentence
+from ..backend.requests import RequestError, error_text, sentence
 from ..formats.regular_files import printable
 from ..places import backend_is_named
 from .memory import release_when_idle
 from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
-from .remedies import error_before_the_scene
 from .windows import in_the_way, redraw, window_of
 
 
@@ -23,7 +22,7 @@ def enter() -> None:
     entry = queue.current
     scene = next((scene for scene in bpy.data.scenes if scene.session_uid == entry.scene_uid), None)
     if scene is None and entry.job.undo:
-        queue.fail(error_before_the_scene(GONE.format(entry.scene)))
+        queue.fail(RequestError(GONE.format(entry.scene), "", "scene"))
         return
     try:
         with window_of(scene):
@@ -31,7 +30,7 @@ def enter() -> None:
     except RuntimeError as error:  # the timer must continue, whatever state Blender is in
         traceback.print_exc()
         if queue.current is entry:
-            queue.fail(error_before_the_scene(f"the result could not enter the scene: {error}"))
+            queue.fail(RequestError(f"the result could not enter the scene: {error}", "", "scene"))
 
 
 class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):

@@ -19,7 +19,7 @@ from ..backend.environment import NOT_ABSOLUTE
 from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError, error_text
 from ..formats.regular_files import is_local_path, remove_folder
 from ..places import new_backend, preference
-from .remedies import defect_in_the_scene, error_in_the_scene
+from .remedies import defect_in_the_scene, error_in_the_scene, write_error_log
 
 PREVIEW_PX = 16
 """Of the child's previews, which most jobs do not use."""
@@ -282,6 +282,8 @@ class Queue:
             self.request = FinishedRequest(backend, method, result)
 
     def _end(self, outcome: JobOutcome) -> JobOutcome:
+        if outcome.error is not None:
+            write_error_log(outcome.entry.job.label, outcome.error, self.info, self.log)
         self.outcomes[outcome.entry.job.kind] = self.last = outcome
         self.ended.appendleft(outcome)
         self.current = self.request = None

@@ -7,13 +7,12 @@ import textwrap
 
 import bpy
 
-from ..backend.requests import RequestError
 from ..formats.regular_files import printable
 from ..jobs.follow import in_the_way
 from ..jobs.pictures import so_far
 from ..jobs.queue import JobOutcome, queue
-from ..jobs.remedies import remedy_for
-from ..places import EXTENSION, backend_is_named
+from ..jobs.remedies import error_log, remedy_for
+from ..places import backend_is_named
 from .manual import draw_manual_button
 
 MAIN, DATA = "PrimDiffusion", "PrimDiffusion Data"
@@ -152,19 +151,11 @@ def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
         return
     draw_lines(layout, outcome.sentence, "ERROR")
     column = layout.column(align=True)  # side by side the labels would be cut
-    _draw_remedy(column, outcome.error, outcome.entry.job.kind)
-    column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
-
-
-def _draw_remedy(layout: bpy.types.UILayout, error: RequestError, kind: str) -> None:
-    remedy = remedy_for(error)
-    if remedy is None:
-        return
-    props = layout.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
-    if remedy.operator == "primdiffusion.try_again":
-        props.kind = kind
-    elif remedy.operator == "preferences.addon_show":
-        props.module = EXTENSION
+    if (remedy := remedy_for(outcome.error)) is not None:
+        props = column.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
+        for name, value in remedy.properties.items():
+            setattr(props, name, value)
+    column.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(error_log())
 
 
 def _progress_text() -> str:

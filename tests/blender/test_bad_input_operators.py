@@ -29,8 +29,8 @@ from blender_primdiffusion.scene.handles import add_handles
 from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.ui.drawing import DATA
 
-ELSEWHERE = {"set_up_backend", "copy_diagnostics"}
-"""Set up, write a text: whatever is in the scene, it stays as it is."""
+ELSEWHERE = {"set_up_backend"}
+"""Whatever is in the scene, it stays as it is."""
 
 
 def operators() -> list[tuple[str, dict[str, object]]]:

@@ -58,7 +58,6 @@ def test_one_that_waits_can_be_taken_out_and_the_others_are_done(addon):
     assert ops.cancel(number=second) == {"FINISHED"}
     drive()
     assert seeds() == [11, 13]
-    assert not ops.cancel.poll()
 
 
 def test_a_job_that_is_not_queued_cannot_be_cancelled(addon):
@@ -241,13 +240,3 @@ def test_progress_is_shown_once_beside_the_button_and_the_jobs_panel_tells_what_
     ]  # fmt: skip
     texts = shown(PRIMDIFFUSION_PT_jobs, addon)
     assert texts[:3] == [f"Human, seed {seed}" for seed in (TAKES_LONG, 11, FAILS)]
-
-
-def test_try_again_asks_for_the_same(addon):
-    assert not ops.try_again.poll()
-    ask(DIES)
-    drive()
-    with refused(RuntimeError, "ended"):
-        ops.try_again(kind="generate")
-    with refused(RuntimeError, "vary"):
-        ops.try_again(kind="vary")

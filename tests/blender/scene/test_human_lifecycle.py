@@ -201,7 +201,7 @@ def test_memory_of_deleted_people_is_given_back_and_undo_shows_them_again(person
     step("delete")
     bpy.ops.ed.undo()
     assert whole(named(), where)
-    ops.release_memory()
+    ops.cancel(what="MEMORY")
     assert whole(named(), where)
 
 
