@@ -147,8 +147,9 @@ def memory(arguments: argparse.Namespace) -> dict[str, float]:
 def merged(arguments: argparse.Namespace) -> dict[str, float]:
     """The same Cycles frame with 1024 volumes and with one merged volume."""
     _enable(arguments)
+    from cycles_preview import setup_cycles_preview
+
     from blender_primdiffusion.scene.build import build_human
-    from blender_primdiffusion.scene.cycles import setup_cycles_preview
 
     folder = arguments.folder / "person"
     build_human(bpy.context, folder / "person.human.safetensors")

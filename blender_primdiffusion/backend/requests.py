@@ -7,7 +7,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from ..formats.answers import Progress
 from ..formats.regular_files import printable
@@ -32,21 +32,6 @@ def sentence(text: BaseException | str) -> str:
     words = error_text(text) or type(text).__name__
     words = words[:1].upper() + words[1:]
     return words if words.endswith((".", "!", "?")) else f"{words}."
-
-
-TICK_S = 0.02
-
-Result = TypeVar("Result")
-
-
-def run_to_end(work: Generator[object, None, Result]) -> Result:
-    """What `work` returns; sleeps at each of its yields. Raises what it raises."""
-    while True:
-        try:
-            next(work)
-        except StopIteration as done:
-            return done.value
-        time.sleep(TICK_S)
 
 
 END_S = 2.0
@@ -92,10 +77,6 @@ class Backend:
         client.start()
         self._client = client
         return client
-
-    def connect(self) -> BackendClient:
-        """As `connecting`, for callers that wait."""
-        return run_to_end(self.connecting())
 
     @property
     def log(self) -> tuple[str, ...]:

@@ -35,10 +35,10 @@ from ..scene.human_file import (
 )
 from ..scene.merged import read_grid, write_grid
 from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
-from ..scene.proxy import build_proxy, follow_shape, read_proxy, remove_proxy, show_textures_in_solid
+from ..scene.proxy import build_proxy, read_proxy, remove_proxy, show_textures_in_solid
 from ..scene.representation import MESH_IN_VIEWPORT, set_representation
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
-from ..scene.shape import betas_of, generated_betas, has_custom_shape
+from ..scene.shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
 from .generate import build_person
 from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
@@ -64,11 +64,10 @@ class ProxyJob(Job):
         }
 
     def built(self, person: bpy.types.Object, result: ProxyAnswer) -> bpy.types.Object:
-        """The proxy as an object, in no collection, with the current shape of the body."""
-        made = np.array(result.betas, np.float64)
-        proxy = build_proxy(person, read_proxy(result.proxy), result.texture, made)
-        follow_shape(person, proxy, betas_of(person))
-        return proxy
+        """The proxy as an object, in no collection. Raises ValueError where the human has another shape by now."""
+        if not np.allclose(result.betas, betas_of(person), atol=SAME_BETAS):
+            raise ValueError(f"the shape of {person.name!r} was changed while its mesh was made: try again")
+        return build_proxy(person, read_proxy(result.proxy), result.texture)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -288,22 +287,29 @@ class ImportHumanJob(Job):
 def opened(source: Path, folder: Path) -> HumanAnswer | None:
     """Write the human of a file, without a motion, into `folder`, and the file of its body where it has one.
 
-    None for files that only the backend can read: humans on a body of the user's files without BODY_FILE beside them,
-    and files of other kinds. Raises ValueError for a damaged human, OSError.
+    None for files that only the backend can read: humans on a body of the user's files without a good BODY_FILE beside
+    them, and files of other kinds. Raises ValueError for a damaged human, OSError.
     """
     began = time.monotonic()
     try:
         human = read_tensors(source)
     except ValueError:
         return None
-    body = source.with_name(BODY_FILE)
-    if "body" in human.metadata and (not exists_in_its_folder(body) or body_of_file(source).uv_corner is None):
+    if "body" in human.metadata and not _has_body(source):
         return None
     read_human(source, CHOOSE_ANOTHER)
     write_tensors(folder / PERSON_FILE, with_motion(human, None))
     if "body" in human.metadata:
-        shutil.copyfile(body, folder / BODY_FILE)
+        shutil.copyfile(source.with_name(BODY_FILE), folder / BODY_FILE)
     return HumanAnswer(person=folder / PERSON_FILE, seconds=time.monotonic() - began)
+
+
+def _has_body(person: Path) -> bool:
+    """Whether a good BODY_FILE is beside a human's file."""
+    try:
+        return exists_in_its_folder(person.with_name(BODY_FILE)) and bool(body_of_file(person))
+    except (ValueError, OSError):
+        return False
 
 
 def name_of(path: str) -> str:

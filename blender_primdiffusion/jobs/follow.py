@@ -12,7 +12,6 @@ from ..backend.requests import RequestError, error_text, sentence
 from ..formats.regular_files import printable
 from ..places import backend_is_named
 from .memory import release_when_idle
-from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
 from .windows import in_the_way, redraw, window_of
 
@@ -149,7 +148,6 @@ def follow() -> float | None:
     if queue.ready and not queue.advancing and not in_the_way():
         enter()
         changed = True
-    changed |= so_far.show(queue.request.picture if queue.request is not None else None)
     if changed:
         redraw()
     return TICK_S if queue.busy else None

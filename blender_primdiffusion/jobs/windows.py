@@ -107,17 +107,8 @@ def redraw() -> None:
 
     Not the views beside them, which take long.
     """
-    _redraw_regions("UI")
-
-
-def redraw_views() -> None:
-    """Redraw the 3D views of all windows."""
-    _redraw_regions("WINDOW")
-
-
-def _redraw_regions(kind: str) -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
             for region in area.regions if area.type == "VIEW_3D" else ():
-                if region.type == kind:
+                if region.type == "UI":
                     region.tag_redraw()

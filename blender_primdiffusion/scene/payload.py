@@ -62,8 +62,7 @@ def session_file(armature: bpy.types.Object) -> Path:
     folder = session_folder() / state_of(armature)
     if stored_image(armature, PAYLOAD, LARGEST_PERSON) is None:
         raise ValueError(
-            f"{armature.name!r} holds no data of a human, as in files of earlier versions: generate the human again, "
-            "or import its .human file"
+            f"{armature.name!r} holds no data of a human: generate the human again, or import its .human file"
         )
     for name, file in _FILES.items():
         image = stored_image(armature, name, LARGEST_PERSON)

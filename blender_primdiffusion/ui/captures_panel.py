@@ -12,7 +12,7 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..capture.cameras import aim
-from ..capture.command import ASK_FROM, estimate, parse, scans_in, settings_of
+from ..capture.command import parse, settings_of
 from ..console import FAILED
 from ..formats.camera_rig import bounding_sphere
 from ..formats.regular_files import printable
@@ -36,30 +36,12 @@ class PRIMDIFFUSION_OT_render_captures(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.render_captures"
     bl_label = "Render Captures"
 
-    people: bpy.props.StringProperty(name="People", description="Empty: the panel's")
-    out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     options: bpy.props.StringProperty(name="Options", description="More words, as on the command line")
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask before a long run; errors are reported by `execute`."""
-        try:
-            options = parse(self._args(context))
-            views, message = estimate(settings_of(options), len(scans_in(options.people, options.only)))
-        except (OSError, ValueError, RuntimeError):
-            return self.execute(context)
-        if views < ASK_FROM:
-            return self.execute(context)
-        return context.window_manager.invoke_confirm(
-            self, event, title="Render Captures?", message=message, confirm_text="Render"
-        )
-
-    def _args(self, context: bpy.types.Context) -> list[str]:
-        asked = context.scene.primdiffusion_captures
-        return command_args(asked, context, captures.new_folder(), self.people, self.out) + shlex.split(self.options)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         """Another Blender renders; a timer follows it, or in background mode this waits."""
-        args = self._args(context)
+        settings = context.scene.primdiffusion_captures
+        args = command_args(settings, context, captures.new_folder()) + shlex.split(self.options)
         settings_of(parse(args))  # report impossible settings at once
         return follow_captures(args)
 
@@ -70,13 +52,12 @@ class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.verify_captures"
     bl_label = "Verify"
 
-    out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     repair: bpy.props.BoolProperty(
         name="Repair", description="Remove damaged files, so that the next run renders only those again"
     )
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        out = bpy.path.abspath(self.out) or setting_path(context.scene.primdiffusion_captures.out, "Captures")
+        out = setting_path(context.scene.primdiffusion_captures.out, "Captures")
         if not out:
             raise ValueError("choose the folder of captures first")
         return follow_captures(["--out", out, "--verify", *(["--repair"] if self.repair else [])])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 
 import bpy
@@ -142,15 +141,12 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         )
 
 
-def command_args(
-    asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path, people: str = "", out: str = ""
-) -> list[str]:
+def command_args(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
     """The arguments of the command `capture` (`capture.command`); a file of cameras, where needed, goes to `folder`.
 
-    `people` and `out` go before the panel's. Raises ValueError where something is missing or a path is impossible.
+    Raises ValueError where something is missing or a path is impossible.
     """
-    people = os.path.abspath(bpy.path.abspath(people)) if people else setting_path(asked.people, "People")
-    out = os.path.abspath(bpy.path.abspath(out)) if out else setting_path(asked.out, "Captures")
+    people, out = setting_path(asked.people, "People"), setting_path(asked.out, "Captures")
     if not people or not out:
         raise ValueError(f"choose a folder {'of people' if not people else 'for the captures'} first")
     args = ["--people", people, "--out", out, "--shard", f"{min(asked.shard, asked.shards - 1)}/{asked.shards}"]

@@ -9,7 +9,7 @@ import bpy
 
 from ..formats.regular_files import printable
 from ..jobs.follow import in_the_way
-from ..jobs.pictures import so_far
+from ..jobs.pictures import icons
 from ..jobs.queue import JobOutcome, queue
 from ..jobs.remedies import error_log, remedy_for
 from ..places import backend_is_named
@@ -93,8 +93,8 @@ def draw_job(
 def draw_job_state(layout: bpy.types.UILayout, kind: str) -> None:
     """The progress of a job of this kind, and how the last one ended."""
     if queue.current is not None and queue.current.job.kind == kind:
-        if so_far.icon:
-            layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
+        if icon := icons.of(queue.request.picture):
+            layout.template_icon(icon_value=icon, scale=_PICTURE_SCALE)
         _draw_progress(layout)
     if waiting := sum(entry.job.kind == kind for entry in queue.waiting):
         layout.label(text=f"Queued: {waiting}", icon="SORTTIME", translate=False)

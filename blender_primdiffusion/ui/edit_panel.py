@@ -1,4 +1,4 @@
-"""The panel Edit: vary, re-dress, transfer and blend the selected human in place."""
+"""The section Edit of the panel Human: vary, re-dress, transfer and blend the selected human in place."""
 
 from __future__ import annotations
 
@@ -18,15 +18,19 @@ from ..formats.requests import (
 from ..jobs import edit
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import selected_person
-from ..places import backend_is_named
 from ..scene.edit import end_painting, painted_weights, start_painting
 from ..scene.human import BODY_MARK, body_of, humans
 from ..scene.payload import session_file
-from .attributes import PRIMDIFFUSION_PG_attributes, chosen_attributes, draw_attributes, title
 from .declared import SKIP, declared
-from .drawing import draw_job, property_columns
-from .generate_panel import seed_property
-from .on_person import HumanOperator, HumanPanel, other_human
+from .drawing import draw_job, draw_section
+from .generate_settings import (
+    PRIMDIFFUSION_PG_attributes,
+    chosen_attributes,
+    draw_attributes,
+    seed_property,
+    title,
+)
+from .on_person import HumanOperator, other_human
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
@@ -216,22 +220,13 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)
 
 
-class PRIMDIFFUSION_PT_edit(HumanPanel, bpy.types.Panel):
+def draw_edit(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Which edit, its settings and its button."""
-
-    bl_label = "Edit"
-    bl_order = 3
-    manual_page, manual_section = "editing", "edits"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return backend_is_named() and super().poll(context)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        settings = context.scene.primdiffusion_edit
-        self.layout.row(align=True).prop(settings, "kind", expand=True)  # with a label beside it words are cut short
-        layout = property_columns(self.layout)
-        _DRAW[settings.kind](layout, settings, context)
+    settings = context.scene.primdiffusion_edit
+    row = layout.row(align=True)
+    row.use_property_split = False  # with a label beside it words are cut short
+    row.prop(settings, "kind", expand=True)
+    _DRAW[settings.kind](layout, settings, context)
 
 
 def _draw_vary(layout: bpy.types.UILayout, settings, _context) -> None:
@@ -275,9 +270,7 @@ def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Contex
     layout.row().prop(settings, "region", expand=True)
     if settings.region == "PARTS":
         _draw_parts(layout, settings, WHOLE_PARTS, 3)
-        header, body = layout.panel("primdiffusion_sides", default_closed=True)
-        header.label(text="Left and Right")
-        if body is not None:
+        if (body := draw_section(layout, "sides", text="Left and Right")) is not None:
             _draw_parts(body, settings, SIDED_PARTS, 2)
         return
     try:

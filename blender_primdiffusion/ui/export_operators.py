@@ -28,7 +28,7 @@ from ..scene.export_model import check_ready
 from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
 from .declared import SKIP, declared
 from .drawing import property_columns
-from .gallery import FOLDER
+from .menus import FOLDER
 from .on_person import HumanOperator
 
 _SAMPLE = "Add a human that comes with the extension to the scene; its data are in the public domain (CC0)"
@@ -139,13 +139,6 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
     check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
-    format: bpy.props.EnumProperty(
-        name="Format",
-        items=FORMATS,
-        description="Not given: that of the file's extension, else the panel's",
-        default="HUMAN",
-        options=SKIP,
-    )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Open the file browser with the panel's format."""
@@ -154,16 +147,15 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
-        if not self.given("format"):
-            self.format = context.scene.primdiffusion_export.format
         if not self.filepath:
-            self.filepath = bpy.path.clean_name(person.name) + ENDINGS[self.format][0]
+            ending = ENDINGS[context.scene.primdiffusion_export.format][0]
+            self.filepath = bpy.path.clean_name(person.name) + ending
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def check(self, _context: bpy.types.Context) -> bool:
+    def check(self, context: bpy.types.Context) -> bool:
         """The file browser: another format changes the file's extension."""
-        endings = ENDINGS[self.format]
+        endings = ENDINGS[context.scene.primdiffusion_export.format]
         name, ending = os.path.splitext(self.filepath)
         if not name or ending.lower() in endings:
             return False
@@ -172,23 +164,18 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         return True
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = property_columns(self.layout)
-        layout.prop(self, "format")
-        for name in OPTIONS[self.format]:
-            layout.prop(context.scene.primdiffusion_export, name)
+        layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
+        for name in ("format", *OPTIONS[settings.format]):
+            layout.prop(settings, name)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        kind = self._format(context)
+        ending = Path(self.filepath).suffix.lower()
+        by_ending = next((kind for kind, endings in ENDINGS.items() if ending in endings), None)
+        kind = by_ending or context.scene.primdiffusion_export.format
         path = destination(self.filepath, ENDINGS[kind])
         if kind == "HUMAN":
             return self._write_human(context, person, path)
         return submit(self, context, self._job(context, person, kind, path))
-
-    def _format(self, context: bpy.types.Context) -> str:
-        ending = Path(self.filepath).suffix.lower()
-        by_ending = next((kind for kind, endings in ENDINGS.items() if ending in endings), None)
-        panel = context.scene.primdiffusion_export
-        return self.format if self.given("format") else by_ending or panel.format
 
     def _write_human(self, context: bpy.types.Context, person: bpy.types.Object, path: Path) -> set[str]:
         settings = context.scene.primdiffusion_export

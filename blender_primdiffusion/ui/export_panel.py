@@ -12,11 +12,10 @@ from ..jobs.target import HumanTarget, selected_person
 from ..places import INSTALLS_BACKEND, backend_is_named
 from ..scene.human import humans, proxy_of
 from ..scene.proxy import is_outdated
-from ..scene.shape import betas_of
-from . import gallery
 from .advanced_panel import draw_representations
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .export_operators import OPTIONS
+from .menus import draw_samples
 from .on_person import HumanOperator
 
 _JOBS = {"PLY": "export_gaussians", "VDB": "export_vdb_sequence"}
@@ -72,7 +71,7 @@ def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         return
     try:
         proxy = proxy_of(person)
-        outdated = proxy is not None and is_outdated(person, proxy, betas_of(person))
+        outdated = proxy is not None and is_outdated(person, proxy)
     except ValueError:
         return
     if proxy is None:
@@ -120,7 +119,7 @@ class PRIMDIFFUSION_PT_from_file(SidebarPanel, bpy.types.Panel):
     manual_page, manual_section = "export", "human-files"
 
     def draw(self, _context: bpy.types.Context) -> None:
-        gallery.draw_samples(self.layout)
+        draw_samples(self.layout)
         draw_job(self.layout, "import_human", "primdiffusion.import_human", "IMPORT")
 
 

@@ -8,7 +8,6 @@ from bpy.app.handlers import persistent
 from ..jobs import follow, memory
 from ..jobs.follow import Reporting, redraw
 from ..jobs.memory import device_line
-from ..jobs.pictures import so_far
 from ..jobs.queue import queue
 from .captures_session import captures
 from .declared import SKIP
@@ -83,7 +82,6 @@ def draw_backend(layout: bpy.types.UILayout) -> None:
 def drop_before_loading(*_: object) -> None:
     """Handler of load_pre: the results of jobs belong into the file that is being closed."""
     queue.drop()
-    so_far.show(None)
 
 
 @persistent
@@ -108,7 +106,6 @@ def register() -> None:
 def unregister() -> None:
     """End the child and the timers."""
     queue.close()
-    so_far.close()
     for timer in (follow.follow, follow.watch):
         if bpy.app.timers.is_registered(timer):
             bpy.app.timers.unregister(timer)

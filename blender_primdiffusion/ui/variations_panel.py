@@ -1,4 +1,4 @@
-"""The sidebar panel Variations: a contact sheet of humans to select and build."""
+"""The section Variations of the panel Generate: a contact sheet of humans to select and build."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from ..scene.build import build_human
 from ..scene.cycles import overlap_warning_in
 from ..scene.place import stand_at_cursor
 from .declared import SKIP, declared
-from .drawing import BackendPanel, draw_job, property_columns, row_unless
-from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, last_seed, sampling, seed_property
+from .drawing import draw_job, row_unless
+from .generate_settings import LARGEST_SEED, STEPS_AND_SAMPLER, last_seed, sampling, seed_property
 
 MOST = 16
 COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in range(4, MOST + 1, 4)]
@@ -208,28 +208,20 @@ _UNIT_PX = 20
 """Of Blender's interface at a scale of 1: what `template_icon` counts in."""
 
 
-class PRIMDIFFUSION_PT_variations(BackendPanel, bpy.types.Panel):
+def draw_variations(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Humans to choose from."""
-
-    bl_label = "Variations"
-    bl_parent_id = "PRIMDIFFUSION_PT_generate"
-    bl_order = 1
-    bl_options = {"DEFAULT_CLOSED"}
-    manual_page, manual_section = "first_human", "variations"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = property_columns(self.layout), context.scene.primdiffusion_variations
-        column = layout.column()
-        column.row().prop(settings, "count", expand=True)
-        column.prop(settings, "seeds")
-        column.prop(settings, "quality")
-        draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
-        job = queue.current.job if queue.current is not None else None
-        if job is not None and job.kind == "variations":
-            _draw_progress(layout, _columns(context), job)
-        elif sheet.variations:
-            _draw_sheet(layout, _columns(context))
-            _draw_choice(layout, settings)
+    settings = context.scene.primdiffusion_variations
+    column = layout.column()
+    column.row().prop(settings, "count", expand=True)
+    column.prop(settings, "seeds")
+    column.prop(settings, "quality")
+    draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
+    job = queue.current.job if queue.current is not None else None
+    if job is not None and job.kind == "variations":
+        _draw_progress(layout, _columns(context), job)
+    elif sheet.variations:
+        _draw_sheet(layout, _columns(context))
+        _draw_choice(layout, settings)
 
 
 def _columns(context: bpy.types.Context) -> tuple[int, float]:

@@ -25,7 +25,7 @@ READS = {
 """Operators that read a file: the property with its path, and endings."""
 WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human", ".vdb"))]
 """Operators that write the file of their `filepath`."""
-FOLDERS = {"human_from_captures", "set_up_backend"}
+FOLDERS = {"set_up_backend"}
 """Operators on the folder of their `directory`."""
 PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
 

@@ -4,6 +4,7 @@ import os
 import stat
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -23,9 +24,18 @@ from blender_primdiffusion.backend.environment import (
     search,
     tried,
 )
-from blender_primdiffusion.backend.requests import run_to_end
 
 PYTHON = Path(sys.executable)
+
+
+def run_to_end(work):
+    """What `work` returns; sleeps at each of its yields."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            return done.value
+        time.sleep(0.02)
 
 
 def script(path: Path, text: str) -> Path:

@@ -12,7 +12,7 @@ from primdiffusion.formats.tensor_layout import DTYPES, LARGEST_HEADER, MOST_DIM
 from primdiffusion.tensor_file import TensorFile
 
 from blender_primdiffusion.scene import human_file
-from blender_primdiffusion.ui.attributes import read_vocabulary
+from blender_primdiffusion.ui.generate_settings import read_vocabulary
 
 HUMAN = {"format": "primdiffusion.human", "format_version": "1", "architecture": "{}"}
 

@@ -169,7 +169,7 @@ def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the
     until_running()
     while len(queue.request.pictures) < 2:
         queue.tick()
-    texts = shown(variations_panel.PRIMDIFFUSION_PT_variations, addon)
+    texts = shown(variations_panel.draw_variations, addon)
     assert [path is not None for path in drawn] == [True, True, False]
     assert {"31", "4", "33", "primdiffusion.cancel"} <= set(texts)
     ops.cancel()
@@ -180,7 +180,7 @@ def test_pictures_appear_one_by_one_while_they_are_made_and_cancelling_keeps_the
 def test_the_panel_shows_the_sheet_and_what_can_be_done_with_those_selected(addon, shown_people):
     select(1)
     layout = Layout()
-    variations_panel.PRIMDIFFUSION_PT_variations.draw(SimpleNamespace(layout=layout), addon)
+    variations_panel.draw_variations(layout, addon)
     assert layout.of("prop").count("primdiffusion_selected") == 4
     texts = layout.of("text", "button")
     assert {"primdiffusion.build_variation", "New humans: 4"} <= set(texts)

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -28,7 +27,7 @@ from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui import captures_session
-from blender_primdiffusion.ui.captures_panel import RIG, PRIMDIFFUSION_OT_render_captures
+from blender_primdiffusion.ui.captures_panel import RIG
 from blender_primdiffusion.ui.captures_session import captures
 from blender_primdiffusion.ui.captures_settings import command_args
 
@@ -111,36 +110,42 @@ def follow(until=lambda: False, seconds: float = 300) -> None:
         time.sleep(0.02)
 
 
+def render(people, out, options: str = SMALL) -> set[str]:
+    """Press Render Captures with these folders in the panel."""
+    settings = bpy.context.scene.primdiffusion_captures
+    settings.people, settings.out = str(people), str(out)
+    return bpy.ops.primdiffusion.render_captures(options=options)
+
+
 def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(extension, only_good, tmp_path):
     before = {(block.id_type, block.name) for block in data_blocks()}
-    out = tmp_path / "captures"
-    assert bpy.ops.primdiffusion.render_captures(people=str(only_good), out=str(out), options=SMALL) == {"FINISHED"}
+    out, verify = tmp_path / "captures", bpy.ops.primdiffusion.verify_captures
+    assert render(only_good, out) == {"FINISHED"}
     assert {(block.id_type, block.name) for block in data_blocks()} == before
     assert (out / "release_human_list.txt").read_text() == "anna\n"
     assert json.loads((out / "dataset.json").read_text())["frames"] == 2
-    assert bpy.ops.primdiffusion.verify_captures(out=str(out)) == {"FINISHED"}
+    assert verify() == {"FINISHED"}
     picture_path(out / "anna", "depth", 1, 1).unlink()
     with refused(RuntimeError, "1 problems", "0001.png"):
-        bpy.ops.primdiffusion.verify_captures(out=str(out))
-    assert bpy.ops.primdiffusion.verify_captures(out=str(out), repair=True) == {"FINISHED"}
-    assert bpy.ops.primdiffusion.render_captures(people=str(only_good), out=str(out), options=SMALL) == {"FINISHED"}
-    assert bpy.ops.primdiffusion.verify_captures(out=str(out)) == {"FINISHED"}
+        verify()
+    assert verify(repair=True) == {"FINISHED"}
+    assert render(only_good, out) == {"FINISHED"}
+    assert verify() == {"FINISHED"}
 
 
 def test_the_operator_reports_an_error_in_one_sentence(extension, people, tmp_path):
-    render = bpy.ops.primdiffusion.render_captures
     with refused(RuntimeError, "folder"):
-        render()
+        bpy.ops.primdiffusion.render_captures()
     with refused(RuntimeError, "nobody"):
-        render(people=str(tmp_path / "nobody"), out=str(tmp_path / "a"))
+        render(tmp_path / "nobody", tmp_path / "a")
     with refused(RuntimeError, "--size"):
-        render(people=str(people), out=str(tmp_path / "a"), options="--size big")
+        render(people, tmp_path / "a", "--size big")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").touch()
     with refused(RuntimeError, "empty"):
-        render(people=str(people), out=str(tmp_path / "full"), options=SMALL)
+        render(people, tmp_path / "full")
     with refused(RuntimeError, "pose"):
-        render(people=str(people), out=str(tmp_path / "a"), options=f"{SMALL} --pose-files {tmp_path / 'none.npz'}")
+        render(people, tmp_path / "a", f"{SMALL} --pose-files {tmp_path / 'none.npz'}")
 
 
 def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(people, tmp_path):
@@ -332,20 +337,3 @@ def test_hostile_camera_files_are_rejected(tmp_path):
 def test_unknown_options_are_rejected():
     with refused(ValueError, "--rm"):
         parse(["--out", "a", "--rm", "-rf"])
-
-
-def test_the_button_asks_before_hundreds_of_views(extension, only_good, tmp_path, monkeypatch):
-    asked, begun = [], []
-    panel = extension.scene.primdiffusion_captures
-    panel.people, panel.out = str(only_good), str(tmp_path / "captures")
-    manager = SimpleNamespace(invoke_confirm=lambda *_, **words: asked.append(words) or {"RUNNING_MODAL"})
-    context = SimpleNamespace(scene=extension.scene, window_manager=manager)
-    button = SimpleNamespace(people="", out="", options="", execute=lambda _: begun.append(1) or {"FINISHED"})
-    button._args = lambda context: PRIMDIFFUSION_OT_render_captures._args(button, context)
-    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"RUNNING_MODAL"}
-    assert asked[0]["message"].startswith("720 views (1 person x 20 poses x 36 cameras) take about 26 min")
-    panel.pose_count = 1
-    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"FINISHED"}
-    panel.people = ""  # the error is for `execute`
-    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"FINISHED"}
-    assert (len(asked), len(begun)) == (1, 2)

@@ -62,7 +62,7 @@ def start(person, seed: int = FINE, **params) -> None:
 def drawn(kind: str) -> str:
     """The panel, with this edit chosen."""
     settings().kind = kind
-    return " | ".join(shown(edit_panel.PRIMDIFFUSION_PT_edit, bpy.context))
+    return " | ".join(shown(edit_panel.draw_edit, bpy.context))
 
 
 def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):

@@ -133,7 +133,7 @@ def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
 
 def test_handles_are_baked_before_a_human_is_fitted(chosen):
     person = a_human()
-    assert bpy.ops.primdiffusion.add_handles(person=person.name) == {"FINISHED"}
+    assert bpy.ops.primdiffusion.add_handles(human=person.name) == {"FINISHED"}
     for only_fit in (True, False):
         with refused(RuntimeError, person.name, "IK handles"):
             bpy.ops.primdiffusion.human_from_picture(only_fit=only_fit, human=person.name)
