@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -172,7 +173,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     _enable(arguments)
     from blender_primdiffusion.jobs.queue import queue
     from blender_primdiffusion.scene.human import humans, parts_of
-    from blender_primdiffusion.scene.payload import forget_session_files
+    from blender_primdiffusion.scene.payload import session_folder
 
     context, megabytes, blender = bpy.context, [], []
     context.preferences.edit.undo_steps = UNDO_STEPS
@@ -186,7 +187,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
         context.view_layer.update()
         bpy.data.batch_remove(parts_of(armature))
         bpy.ops.outliner.orphans_purge(do_recursive=True)
-        forget_session_files()
+        shutil.rmtree(session_folder(), ignore_errors=True)
         record.trim()
         blender.append(record.resident_mb())
         megabytes.append(blender[-1] + children_mb())

@@ -34,6 +34,20 @@ def sentence(text: BaseException | str) -> str:
     return words if words.endswith((".", "!", "?")) else f"{words}."
 
 
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """How far a long piece of work is."""
+
+    message: str
+    fraction: float
+    """Share of everything that is done, 0 to 1."""
+    lines: tuple[str, ...] = ()
+    """What there is to say since the step before."""
+
+
+Steps = Generator[Step, None, str]
+"""Returns a sentence on how it ended; raises RuntimeError or OSError. Closing it ends the work."""
+
 END_S = 2.0
 """How long a child may take to end."""
 

@@ -42,7 +42,7 @@ from ..formats.poses.files import ENDINGS
 from ..formats.regular_files import FileError, as_file_error, printable
 from ..formats.requests import LAYOUTS, PASSES
 from .job import CaptureProgress, run
-from .scan import ScanFile, find_scans
+from .scan_files import ScanFile, find_scans
 from .settings import CaptureSettings
 
 MARK = "PRIMDIFFUSION "

@@ -127,11 +127,6 @@ def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
     return FrameRange(scene.frame_current, scene.frame_current)
 
 
-def posed_now(context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
-    """The human at the current frame: see `posed_frames`."""
-    return posed_frames(context, person, [context.scene.frame_current])[0]
-
-
 def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: Iterable[int]) -> list[dict[str, Any]]:
     """The human at these frames: file, object matrix, joints and shape, as parameters of the child's `draw`.
 

@@ -10,7 +10,7 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
@@ -28,11 +28,11 @@ PREVIEW_PX = 16
 class Job(abc.ABC):
     """A request to the child, and what becomes of its result. Holds plain data: undo replaces Blender's objects."""
 
-    kind: ClassVar[str]
+    kind: str
     """Identifies the kind of job, for panels; unique."""
-    method: ClassVar[str]
+    method: str
     """The child's method."""
-    undo: ClassVar[str] = ""
+    undo: str = ""
     """Name of the undo step that `finish` makes; empty when it leaves the scene as it is."""
 
     @property

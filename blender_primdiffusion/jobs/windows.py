@@ -103,12 +103,14 @@ def window_of(scene: bpy.types.Scene | None) -> Iterator[None]:
 
 
 def redraw() -> None:
-    """Redraw the sidebars of all windows, which do not notice progress themselves.
+    """Redraw the sidebars of all windows, and the preferences, which do not notice progress themselves.
 
     Not the views beside them, which take long.
     """
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
+            if area.type == "PREFERENCES":
+                area.tag_redraw()
             for region in area.regions if area.type == "VIEW_3D" else ():
                 if region.type == "UI":
                     region.tag_redraw()

@@ -57,39 +57,19 @@ def new_camera(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def frame_box(
-    camera: bpy.types.Object,
-    extent: tuple[NDArray, NDArray],
-    yaw: float,
-    size: tuple[int, int] = (1, 1),
-    distance: float | None = None,
+    camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
 ) -> None:
     """Point the camera at the middle of a box, level, from `yaw` radians, as near as a picture of `size` shows all
-    corners; or from `distance` metres, which turntables keep constant.
-    """
+    corners."""
     low, high = extent
-    if distance is None:
-        distance = framing_distance(camera, extent, yaw, size)
-    direction = _camera_direction(yaw)
-    camera.location = (low + high) / 2 + direction * distance
-    camera.rotation_euler = Vector(-direction).to_track_quat("-Z", "Y").to_euler()
-    camera.data.clip_end = max(100.0, 2 * distance)
-
-
-def framing_distance(
-    camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
-) -> float:
-    """Distance in metres from the middle of a box at which a picture of `size` just shows its eight corners."""
-    low, high = extent
-    right = np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    right, direction = np.array([math.cos(yaw), math.sin(yaw), 0.0]), np.array([math.sin(yaw), -math.cos(yaw), 0.0])
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (high - low) / 2
     half = np.array(size) / max(size) * (_SENSOR_MM / 2 / camera.data.lens)  # tangents of the half angles of view
     aside = np.maximum(np.abs(corners @ right) / half[0], np.abs(corners[:, 2]) / half[1]) * _MARGIN
-    return float((aside + corners @ _camera_direction(yaw)).max())
-
-
-def _camera_direction(yaw: float) -> NDArray[np.float64]:
-    """The horizontal direction from the subject to a camera at `yaw`."""
-    return np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    distance = float((aside + corners @ direction).max())
+    camera.location = (low + high) / 2 + direction * distance
+    camera.rotation_euler = Vector(-direction).to_track_quat("-Z", "Y").to_euler()
+    camera.data.clip_end = max(100.0, 2 * distance)
 
 
 CYCLES_LIMIT = 31

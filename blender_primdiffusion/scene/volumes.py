@@ -1,8 +1,4 @@
-"""Primitives as VDB files, and Blender's cache of their grids.
-
-Blender's module openvdb may be missing, as in Debian. Humans need no volumes to be drawn by PrimDiffusion, only by
-Cycles and EEVEE, so nothing is refused then but writing: each writer raises ValueError.
-"""
+"""Primitives as VDB files, how many of them overlap, and Blender's cache of their grids."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ import dataclasses
 import os
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import bpy
 import numpy as np
@@ -20,10 +15,7 @@ from numpy.typing import NDArray
 from ..formats.whole_files import temporary_folder
 
 bpy.utils.expose_bundled_modules()
-try:
-    import openvdb as _openvdb
-except ModuleNotFoundError:
-    _openvdb = None
+import openvdb  # noqa: E402  Blender's own, importable only after the line above
 
 VOXELS = 8
 """Voxels along a side of a primitive."""
@@ -39,16 +31,6 @@ _ALMOST_EMPTY = 1e-4
 """Opacity per metre of the one voxel of an empty primitive: Cycles complains of grids without any value."""
 _ALL_ACTIVE = -1.0
 """A tolerance below every difference from the background, so that zeros become active voxels too."""
-
-
-def openvdb() -> ModuleType:
-    """The module. Raises ValueError where Blender's Python lacks it."""
-    if _openvdb is None:
-        raise ValueError(
-            "the Python of this Blender lacks openvdb, without which volumes cannot be written for Cycles and EEVEE: "
-            "install it (on Debian and Ubuntu: sudo apt install python3-openvdb), then start Blender again"
-        )
-    return _openvdb
 
 
 @dataclasses.dataclass(frozen=True)
@@ -179,16 +161,15 @@ def write_vdb(
 
     Voxels no further than `tolerance` from zero are left out. Raises OSError, and RuntimeError when the disk is full.
     """
-    vdb = openvdb()
-    transform = vdb.createLinearTransform(index_to_object.tolist())
-    fog, cd = vdb.FloatGrid(), vdb.Vec3SGrid()
-    fog.name, fog.gridClass = "density", vdb.GridClass.FOG_VOLUME
+    transform = openvdb.createLinearTransform(index_to_object.tolist())
+    fog, cd = openvdb.FloatGrid(), openvdb.Vec3SGrid()
+    fog.name, fog.gridClass = "density", openvdb.GridClass.FOG_VOLUME
     cd.name = "Cd"
     for grid, values, near_zero in ((fog, density, tolerance), (cd, colour, (tolerance,) * 3)):
         grid.copyFromArray(np.ascontiguousarray(values, np.float32), ijk=start, tolerance=near_zero)
         grid.transform = transform
         grid.saveFloatAsHalf = True
-    vdb.write(str(path), grids=[fog, cd])
+    openvdb.write(str(path), grids=[fog, cd])
 
 
 _LOWEST_LIMIT_MB = 1

@@ -14,7 +14,6 @@ from ..places import backend_is_named
 from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_of, overlap_warning_in
 from ..scene.human import humans, provenance_of, proxy_of
-from ..scene.material import density_gain
 from ..scene.merged import merged_of, merged_state, remove_merged
 from ..scene.proxy import remove_proxy
 from ..scene.representation import (
@@ -27,7 +26,7 @@ from ..scene.representation import (
     stop_showing,
 )
 from ..scene.splats import SPLATS_AVAILABLE, cloud_of
-from ..scene.volume_nodes import volumes_of
+from ..scene.volume_nodes import density_gain, volumes_of
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend

@@ -15,7 +15,7 @@ from ..formats.requests import (
     TransferRequest,
     VaryRequest,
 )
-from ..jobs import edit
+from ..jobs.edit import EditJob
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import selected_person
 from ..scene.edit import end_painting, painted_weights, start_painting
@@ -126,12 +126,12 @@ def painting(context: bpy.types.Context) -> bool:
 class _Edit(HumanOperator):
     """Base of the edits, with the panel's settings."""
 
-    job: str
-    """Class of `jobs.edit`."""
+    method: str
+    """The child's."""
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         params = {"steps": context.scene.primdiffusion.steps, **self.params(context, person)}
-        return submit(self, context, getattr(edit, self.job).of(person, params))
+        return submit(self, context, EditJob.of(self.method, person, params))
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         """The edit's parameters of the child's method: see `EditJob.asked`."""
@@ -139,13 +139,14 @@ class _Edit(HumanOperator):
 
 
 class _SeededEdit(_Edit):
-    """Base of the edits that draw at random."""
+    """Base of the edits that draw at random, from the operator's seed if it has one, else the panel's."""
 
     seed: seed_property()
 
-    def seed_of(self, settings: bpy.types.PropertyGroup) -> int:
-        """The operator's seed if it has one, else the panel's."""
-        return self.seed if self.seed >= 0 else settings.seed
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
+        if self.seed < 0:
+            self.seed = context.scene.primdiffusion_edit.seed
+        return super().run(context, person)
 
 
 def _region(settings: bpy.types.PropertyGroup, person: bpy.types.Object) -> list[str] | dict[str, list[float]]:
@@ -165,11 +166,11 @@ class PRIMDIFFUSION_OT_vary(_SeededEdit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.vary"
     bl_label = "Vary"
-    job = "VaryJob"
+    method = "vary"
 
     def params(self, context: bpy.types.Context, _person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
-        return {"amount": settings.amount, "seed": self.seed_of(settings)}
+        return {"amount": settings.amount, "seed": self.seed}
 
 
 class PRIMDIFFUSION_OT_redress(_SeededEdit, bpy.types.Operator):
@@ -177,11 +178,11 @@ class PRIMDIFFUSION_OT_redress(_SeededEdit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.redress"
     bl_label = "Regenerate Region"
-    job = "RedressJob"
+    method = "inpaint"
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
-        params: dict[str, Any] = {"region": _region(settings, person), "seed": self.seed_of(settings)}
+        params: dict[str, Any] = {"region": _region(settings, person), "seed": self.seed}
         if wanted := chosen_attributes(settings.attributes):
             params |= {"attributes": wanted, "guidance": context.scene.primdiffusion.guidance}
         return params
@@ -192,7 +193,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_SeededEdit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
-    job = "TransferJob"
+    method = "transfer"
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
@@ -201,7 +202,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_SeededEdit, bpy.types.Operator):
             "region": _region(settings, person),
             "what": settings.what,
             "harmonise": settings.harmonise,
-            "seed": self.seed_of(settings),
+            "seed": self.seed,
         }
 
 
@@ -210,7 +211,7 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.blend"
     bl_label = "Blend"
-    job = "BlendJob"
+    method = "interpolate"
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         other = other_human(context, person)

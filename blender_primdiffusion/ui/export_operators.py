@@ -17,7 +17,6 @@ from ..jobs.export import (
     ExportVdbSequenceJob,
     ImportHumanJob,
     posed_frames,
-    posed_now,
     scene_frames,
     write_human,
 )
@@ -188,7 +187,8 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         """What writes a mesh, Gaussians or volumes. Raises ValueError."""
         target, scene, settings = HumanTarget.of(person), context.scene, context.scene.primdiffusion_export
         if kind == "PLY":
-            return ExportGaussiansJob(target, path, posed_now(context, person), settings.gaussians)
+            (now,) = posed_frames(context, person, [scene.frame_current])
+            return ExportGaussiansJob(target, path, now, settings.gaussians)
         if kind == "VDB":
             people = posed_frames(context, person, range(scene.frame_start, scene.frame_end + 1))
             return ExportVdbSequenceJob(target, path.parent, path.stem, people, scene.frame_start, settings.voxel)

@@ -67,7 +67,6 @@ def _select(_manager: bpy.types.WindowManager, selected: Sequence[bool]) -> None
         variation.chosen = chosen
 
 
-_SELECTED = "Index from 0; -1: the selected ones"
 _USE_SEED = "Set the seed of the panel Generate to that of the selected human and lock it"
 
 
@@ -83,7 +82,6 @@ class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
         name="More Like This", description="Variations of a human of the sheet, with the same body", options=SKIP
     )
     use_seed: bpy.props.BoolProperty(name="Use Seed", description=_USE_SEED, options=SKIP)
-    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
     clear: bpy.props.BoolProperty(
         name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=SKIP
     )
@@ -98,7 +96,7 @@ class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
             return self._use_seed(context.scene.primdiffusion)
         settings, like = context.scene.primdiffusion_variations, {}
         if self.like:
-            around = _only(_targets(self.index), "select only the one to vary")
+            around = _only(_targets(), "select only the one to vary")
             like = {"person": str(around.person), "amount": settings.amount, "title": f"Like seed {around.seed}"}
         from_panel = settings.seeds != "RANDOM" and not self.like
         first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
@@ -108,7 +106,7 @@ class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
         return submit(self, context, VariationsJob(_seeds(first, int(settings.count)), fields, **like))
 
     def _use_seed(self, settings: bpy.types.PropertyGroup) -> set[str]:
-        wanted = _only(_targets(self.index), "select one")
+        wanted = _only(_targets(), "select one")
         if sheet.around:
             raise ValueError("variants of a human cannot be generated from a seed alone: build them instead")
         settings.seed, settings.keep_seed = wanted.seed, True
@@ -130,7 +128,6 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
     bl_label = "Build Selected"
     described_by = ("build_all",)
 
-    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
     build_all: bpy.props.BoolProperty(
         name="All", description="Add all of these humans to the scene, side by side", options=SKIP
     )
@@ -142,7 +139,7 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
         return bool(sheet.variations)
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        wanted = list(sheet.variations) if self.build_all else _targets(self.index)
+        wanted = list(sheet.variations) if self.build_all else _targets()
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         built, failure = _build(context, wanted)
@@ -157,11 +154,11 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _targets(index: int) -> list[Variation]:
-    """The variation at `index`, or the selected ones. Raises ValueError where there is none."""
+def _targets() -> list[Variation]:
+    """The selected variations. Raises ValueError where there is none."""
     if not sheet.variations:
         raise ValueError("there are no variations: press Show Variations first")
-    return sheet.chosen() if index < 0 else [sheet.at(index)]
+    return sheet.chosen()
 
 
 def _only(wanted: list[Variation], what_to_do: str) -> Variation:

@@ -4,12 +4,12 @@ import os
 import stat
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 from support.errors import refused
 from tiny_packages import until
+from waiting import run_to_end
 
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import (
@@ -26,16 +26,6 @@ from blender_primdiffusion.backend.environment import (
 )
 
 PYTHON = Path(sys.executable)
-
-
-def run_to_end(work):
-    """What `work` returns; sleeps at each of its yields."""
-    while True:
-        try:
-            next(work)
-        except StopIteration as done:
-            return done.value
-        time.sleep(0.02)
 
 
 def script(path: Path, text: str) -> Path:

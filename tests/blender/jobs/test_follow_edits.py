@@ -8,17 +8,16 @@ from pathlib import Path
 import bpy
 import pytest
 import synthetic_shape
-from human_files import folder_of, paths_of, person_file, remove_human
+from human_files import folder_of, forget_session_files, paths_of, person_file, remove_human
 from jobs_driven import drive, error_of, notice_of
 from oracle import evaluated_matrices
 
 from blender_primdiffusion.jobs import follow as follow_module
-from blender_primdiffusion.jobs.edit import VaryJob
+from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.payload import forget_session_files
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 pytestmark = pytest.mark.any_blender
@@ -55,7 +54,7 @@ def generated(addon):
 
 
 def vary(person, seed: int = FINE) -> None:
-    queue.add(bpy.context, VaryJob.of(person, {"steps": 2, "amount": 0.5, "seed": seed}))
+    queue.add(bpy.context, EditJob.of("vary", person, {"steps": 2, "amount": 0.5, "seed": seed}))
 
 
 def until_ready(seconds: float = 300.0) -> None:

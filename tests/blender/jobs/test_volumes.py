@@ -5,7 +5,7 @@ from __future__ import annotations
 import bpy
 import pytest
 import synthetic_shape
-from human_files import copy_of, folder_of
+from human_files import copy_of, folder_of, forget_session_files
 from jobs_driven import error_of, notice_of
 
 from benchmarks.cycles_preview import setup_cycles_preview
@@ -16,7 +16,6 @@ from blender_primdiffusion.jobs.volumes import VolumesJob, faults, write_before_
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.payload import forget_session_files
 from blender_primdiffusion.scene.representation import in_viewport
 from blender_primdiffusion.scene.volume_files import are_written
 from blender_primdiffusion.scene.volume_nodes import volumes_of

@@ -15,7 +15,6 @@ from human_files import sequence_files, volume_path
 from support.errors import refused
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.material import density_gain, volume_material
 from blender_primdiffusion.scene.merged import (
     MergedGrid,
     MergedState,
@@ -36,6 +35,7 @@ from blender_primdiffusion.scene.representation import (
     stop_showing,
 )
 from blender_primdiffusion.scene.volume_files import write_volumes
+from blender_primdiffusion.scene.volume_nodes import density_gain, volume_material
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402

@@ -7,13 +7,13 @@ import shutil
 
 import bpy
 import pytest
-from human_files import folder_of, lose_data, person_file
+from human_files import folder_of, forget_session_files, lose_data, person_file
 from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
 from blender_primdiffusion.jobs.volumes import faults
 from blender_primdiffusion.scene.human import BODY_MARK, body_of, humans, is_human
-from blender_primdiffusion.scene.payload import BODY, PAYLOAD, forget_session_files, session_file, session_folder
+from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_file, session_folder
 
 ops = bpy.ops.primdiffusion
 ODD = 'Ä ö\' "x" 100%s 年'

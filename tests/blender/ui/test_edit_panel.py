@@ -16,7 +16,7 @@ from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
 from support.tensor_files import read_tensors
 
-from blender_primdiffusion.jobs.edit import VaryJob
+from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import painted_weights
@@ -56,7 +56,7 @@ def sent(person) -> dict:
 
 
 def start(person, seed: int = FINE, **params) -> None:
-    queue.add(bpy.context, VaryJob.of(person, {"steps": 2, "amount": 0.5, "seed": seed, **params}))
+    queue.add(bpy.context, EditJob.of("vary", person, {"steps": 2, "amount": 0.5, "seed": seed, **params}))
 
 
 def drawn(kind: str) -> str:
