@@ -19,8 +19,8 @@ from ..formats.poses.skeleton import unchain
 from ..formats.regular_files import exists_in_its_folder, remove_file
 from ..formats.whole_files import written_whole
 from ..motion.posture import rest_joints
-from ..scene.armature import keyframe_poses, pose_from_joint_rotations
-from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
+from ..scene.armature import check_joints, keyframe_poses, pose_from_joint_rotations
+from ..scene.export_model import FrameRange, scene_with_only, write_model
 from ..scene.human import link_part, proxy_of
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
@@ -86,7 +86,7 @@ class ExportMeshJob(ProxyJob):
 
     def finish(self, context: bpy.types.Context, result: ProxyAnswer, _folder: Path) -> str:
         person = self.target.found()
-        check_ready(person)
+        check_joints(person)
         proxy = self.built(person, result)
         try:
             write_model(context, person, proxy, self.path, self.format, self.frames)
@@ -132,7 +132,7 @@ def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: I
 
     Raises ValueError for an armature in Edit Mode or without SMPL's bones, FileNotFoundError where the file is missing.
     """
-    check_ready(person)
+    check_joints(person)
     found = []
     with scene_with_only(context, person) as scene:
         for frame in frames:

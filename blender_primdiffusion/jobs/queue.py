@@ -112,7 +112,7 @@ class JobOutcome:
         return error_text(self.error) if self.error is not None else ""
 
     @property
-    def went_well(self) -> bool:
+    def succeeded(self) -> bool:
         """Neither failed nor cancelled."""
         return self.error is None and self.notice != CANCELLED
 

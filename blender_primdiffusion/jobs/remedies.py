@@ -47,14 +47,14 @@ _REMEDIES = {
     "file_system": _SAVE_AS,
 }
 """By the kind of error."""
-_OF_PREFERENCES = re.compile("checkpoint|encoder|safetensors")
+_PREFERENCE_ERRORS = re.compile("checkpoint|encoder|safetensors")
 """Other missing files, such as captures, are chosen in their panels."""
 
 
 def remedy_for(error: RequestError) -> Remedy | None:
     """The button for an error, if there is one; for others, the button that was pressed is the one to press again."""
     remedy = _REMEDIES.get(error.kind)
-    if remedy is None or (error.kind == "missing_file" and not _OF_PREFERENCES.search(error.message)):
+    if remedy is None or (error.kind == "missing_file" and not _PREFERENCE_ERRORS.search(error.message)):
         return None
     return remedy
 

@@ -24,12 +24,12 @@ _more_may_wait = False
 """Further steps may wait in Blender's queue."""
 
 
-def in_the_way() -> str:
+def blocking_activity() -> str:
     """What a timer has to wait for before it changes data, as shown in panels; empty for nothing.
 
     Undo reads only those data-blocks that differ between two of its steps, and keeps the others as they are now. What
     a timer changes between two steps then refers to data that the next step removes, and Blender (5.2.2) crashes. So a
-    timer waits until undo and redo have rested, and what it changes becomes an undo step (`take_result`).
+    timer waits until undo and redo have rested, and what it changes becomes an undo step (`apply_result`).
 
     Files are loaded and saved within one event, during which no timer runs.
     """

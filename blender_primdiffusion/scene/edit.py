@@ -10,8 +10,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES
-from .armature import floor_below, move_rest_joints
+from .armature import check_joints, floor_below, move_rest_joints
 from .cells import scale_cells
 from .convention import points_to_blender
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data
@@ -31,14 +30,9 @@ def check_shapeable(person: bpy.types.Object) -> None:
                 f"the human {person.name!r} is linked from {obj.library.filepath!r}: reshape it there, or "
                 "make it local with Object > Relations > Make Local > All"
             )
-    missing = [name for name in JOINT_NAMES if name not in person.data.bones]
-    if missing:
-        raise ValueError(
-            f"the armature {person.name!r} has no bone {missing[0]!r}: give it this name again to change the shape"
-        )
-    for obj in (person, body):
-        if obj is not None and obj.data.is_editmode:
-            raise ValueError(f"{obj.name!r} is in Edit Mode: leave it (Tab) to change the shape")
+    check_joints(person)
+    if body is not None and body.data.is_editmode:
+        raise ValueError(f"{body.name!r} is in Edit Mode: leave it (Tab) to change the shape")
 
 
 def reshape(person: bpy.types.Object, betas: NDArray) -> str:

@@ -274,7 +274,7 @@ def betas_of(person: bpy.types.Object) -> NDArray[np.float64]:
     betas = stored_numbers(person, BETAS, BETA_COUNT)
     if betas is None:
         raise ValueError(
-            f"the custom property {BETAS!r} on the armature of {person.name!r} is no list of {BETA_COUNT} numbers: "
+            f"the custom property {BETAS!r} on the armature of {person.name!r} is not a list of {BETA_COUNT} numbers: "
             "delete it"
         )
     return np.array(betas)

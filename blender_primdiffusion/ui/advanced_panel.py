@@ -7,7 +7,7 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
-from ..jobs.merge import MergeFramesJob, MergeJob, Moment
+from ..jobs.merge import MergeFramesJob, MergeJob, PoseSnapshot
 from ..jobs.target import HumanTarget, selected_person
 from ..jobs.volumes import VolumesJob
 from ..places import backend_is_named
@@ -116,12 +116,12 @@ class PRIMDIFFUSION_OT_merge(HumanOperator, bpy.types.Operator):
             return {"FINISHED"}
         target, voxel = HumanTarget.of(person), context.scene.primdiffusion_merging.voxel
         if self.what == "POSE":
-            moment = _moment(person, context.evaluated_depsgraph_get())
+            moment = PoseSnapshot.capture(person, person.evaluated_get(context.evaluated_depsgraph_get()))
             return submit(self, context, MergeJob(target, moment, voxel))
         start, end = context.scene.frame_start, context.scene.frame_end
         if not 1 < end - start + 1 <= _MOST_FRAMES:
             raise ValueError(
-                f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
+                f"frames {start} to {end} are not a sequence: give a start and a later end, of at most {_MOST_FRAMES}"
             )
         moments = _moments(context, person, range(start, end + 1))
         return submit(self, context, MergeFramesJob(target, moments, start, voxel))
@@ -135,18 +135,14 @@ def _unmerge(person: bpy.types.Object) -> None:
     remove_merged(person)
 
 
-def _moment(person: bpy.types.Object, graph: bpy.types.Depsgraph) -> Moment:
-    return Moment.now(person, person.evaluated_get(graph))
-
-
-def _moments(context: bpy.types.Context, person: bpy.types.Object, frames: range) -> list[Moment]:
+def _moments(context: bpy.types.Context, person: bpy.types.Object, frames: range) -> list[PoseSnapshot]:
     """The human in each frame; the scene is at its own frame again afterwards."""
     scene, now = context.scene, context.scene.frame_current
     moments = []
     try:
         for frame in frames:
             scene.frame_set(frame)
-            moments.append(_moment(person, context.evaluated_depsgraph_get()))
+            moments.append(PoseSnapshot.capture(person, person.evaluated_get(context.evaluated_depsgraph_get())))
     finally:
         scene.frame_set(now)
     return moments
@@ -273,7 +269,7 @@ def _draw_facts(layout: bpy.types.UILayout, _context: bpy.types.Context, person:
 def outdated(person: bpy.types.Object, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or human than the armature as it is now."""
     try:
-        return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)
+        return not merged_state(merged_of(person)).shows(PoseSnapshot.capture(person).digest, scene.frame_current)
     except (ValueError, OSError):  # other panels report broken bones and files
         return True
 

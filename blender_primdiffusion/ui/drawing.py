@@ -8,7 +8,7 @@ import textwrap
 import bpy
 
 from ..formats.regular_files import printable
-from ..jobs.follow import in_the_way
+from ..jobs.follow import blocking_activity
 from ..jobs.pictures import icons
 from ..jobs.queue import JobOutcome, queue
 from ..jobs.remedies import error_log, remedy_for
@@ -140,7 +140,7 @@ def draw_ended(layout: bpy.types.UILayout) -> None:
         return
     column = layout.column(align=True)
     for outcome in queue.ended:
-        icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.went_well else "CANCEL"
+        icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.succeeded else "CANCEL"
         column.label(text=outcome.entry.job.label, icon=icon, translate=False)
 
 
@@ -161,7 +161,7 @@ def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
 def _progress_text() -> str:
     job = queue.request
     if queue.ready:
-        blocker = in_the_way()
+        blocker = blocking_activity()
         return f"Done; waiting for {blocker}" if blocker else "Adding it to the scene"
     if not job.eta_s:
         return job.message

@@ -23,7 +23,7 @@ from ..jobs.export import (
 from ..jobs.follow import Reporting, submit
 from ..jobs.queue import Job
 from ..jobs.target import HumanTarget
-from ..scene.export_model import check_ready
+from ..scene.armature import check_joints
 from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
 from .declared import SKIP, declared
 from .drawing import property_columns
@@ -192,7 +192,7 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         if kind == "VDB":
             people = posed_frames(context, person, range(scene.frame_start, scene.frame_end + 1))
             return ExportVdbSequenceJob(target, path.parent, path.stem, people, scene.frame_start, settings.voxel)
-        check_ready(person)
+        check_joints(person)
         frames = scene_frames(scene, settings.animation)
         return ExportMeshJob(target, int(settings.texture_px), settings.triangles, path, kind, frames)
 
@@ -205,7 +205,7 @@ class PRIMDIFFUSION_OT_add_proxy(HumanOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
-        check_ready(person)
+        check_joints(person)
         return submit(self, context, AddProxyJob(target, int(settings.texture_px), settings.triangles))
 
 

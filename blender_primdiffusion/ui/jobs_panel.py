@@ -87,7 +87,7 @@ def drop_before_loading(*_: object) -> None:
 @persistent
 def watch_after_loading(*_: object) -> None:
     """Handler of load_post, and of a load that failed: the timers start again."""
-    follow.keep_watching()
+    follow.schedule_watchdog()
 
 
 HANDLERS = (
@@ -100,7 +100,7 @@ HANDLERS = (
 def register() -> None:
     """Notice a child that dies between jobs; in background mode no timer runs."""
     if not bpy.app.background:
-        follow.keep_watching()
+        follow.schedule_watchdog()
 
 
 def unregister() -> None:

@@ -26,10 +26,6 @@ from .drawing import draw_lines
 LOCKS = Path(__file__).resolve().parents[1] / "requirements"
 OWN_LOCK = "requirements.txt"
 """In a folder of wheels: a list of packages that goes before ours."""
-_LINE_BYTES_PER_S = 50e6 / 8
-"""Assumed speed of the network: 50 Mbit/s."""
-_UNPACKED_BYTES_PER_S = 30e6
-_SELF_TEST_S = 30.0
 _ONLINE = (
     "Blender may not use the network: allow it in System > Network > Allow Online Access, or install from a folder"
 )
@@ -143,11 +139,7 @@ def draw_result(layout: bpy.types.UILayout, width: int) -> None:
 
 def cost(lock: Lock) -> str:
     """The cost of a set-up, as a sentence."""
-    seconds = lock.download_bytes / _LINE_BYTES_PER_S + lock.installed_bytes / _UNPACKED_BYTES_PER_S + _SELF_TEST_S
-    return (
-        f"Downloads {gigabytes(lock.download_bytes)}, takes {gigabytes(lock.installed_bytes)} on disk, "
-        f"about {max(round(seconds / 60), 1)} min at 50 Mbit/s"
-    )
+    return f"Downloads {gigabytes(lock.download_bytes)}, takes {gigabytes(lock.installed_bytes)} on disk"
 
 
 def gigabytes(size: float) -> str:

@@ -19,7 +19,7 @@ from blender_primdiffusion.jobs.export import (
     ExportVdbSequenceJob,
     posed_frames,
 )
-from blender_primdiffusion.jobs.merge import MergeJob, Moment
+from blender_primdiffusion.jobs.merge import MergeJob, PoseSnapshot
 from blender_primdiffusion.jobs.queue import Job
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
@@ -32,7 +32,7 @@ def person(addon, tmp_path):
 
 
 def jobs_about(person: bpy.types.Object, folder: Path) -> list[Job]:
-    target, moment, context = HumanTarget.of(person), Moment.now(person), bpy.context
+    target, moment, context = HumanTarget.of(person), PoseSnapshot.capture(person), bpy.context
     return [
         EditJob.of("vary", person, {"steps": 3, "amount": 0.5, "seed": 3}),
         EditJob.of("inpaint", person, {"steps": 3, "region": {"painted": [0.0, 1.0]}, "seed": 3}),

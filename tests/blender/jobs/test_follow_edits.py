@@ -131,7 +131,7 @@ def test_a_scene_deleted_meanwhile_gets_no_human(generated):
 
 
 def test_nothing_enters_while_the_user_holds_something(generated, monkeypatch):
-    monkeypatch.setattr(follow_module, "in_the_way", lambda: "Move")
+    monkeypatch.setattr(follow_module, "blocking_activity", lambda: "Move")
     for _ in range(20):
         assert follow() is not None
     assert not humans(bpy.context.scene)
@@ -216,7 +216,7 @@ def test_a_failure_leaves_the_person_as_they_were(varied, monkeypatch):
 
 def test_a_script_that_takes_the_result_gets_the_whole_edit(varied):
     before: list[Path] = paths_of(varied)
-    bpy.ops.primdiffusion.take_result()
+    bpy.ops.primdiffusion.apply_result()
     assert follow() is None
     assert not set(paths_of(current())) & set(before)
     check_whole(current())
