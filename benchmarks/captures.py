@@ -72,7 +72,7 @@ SAME_DEPTH_M = 0.002
 
 
 @dataclasses.dataclass(frozen=True)
-class PoseSnapshot:
+class Moment:
     """Time and memory of the capture command when it has finished a view."""
 
     wall_s: float
@@ -166,7 +166,7 @@ def _cycles_figures(folder: Path, poses: int, cameras: int) -> dict[str, float |
     }
 
 
-def _run_cycles(people: Path, out: Path, poses: int, cameras: int, size: int, *more: str) -> list[PoseSnapshot]:
+def _run_cycles(people: Path, out: Path, poses: int, cameras: int, size: int, *more: str) -> list[Moment]:
     """Render captures in Cycles under uniform light; one Moment per view. Raises RuntimeError if the command fails."""
     command = [
         sys.executable, "-m", "blender_primdiffusion.capture", "--people", people, "--out", out, "--poses", poses,
@@ -180,7 +180,7 @@ def _run_cycles(people: Path, out: Path, poses: int, cameras: int, size: int, *m
             if line.startswith(MARK) and child.poll() is None:
                 used = process.cpu_times()
                 resident = process.memory_info().rss / 1e6
-                moments.append(PoseSnapshot(time.perf_counter(), used.user + used.system, resident))
+                moments.append(Moment(time.perf_counter(), used.user + used.system, resident))
         errors = child.stderr.read().decode(errors="replace")
     if child.returncode:
         raise RuntimeError(f"the capture command ended with {child.returncode}: {errors[-2000:]}")
@@ -193,7 +193,7 @@ def _no_cycles_figures() -> dict[str, float | None]:
     return dict.fromkeys(names)
 
 
-def _seconds_per_view(moments: list[PoseSnapshot], people: int) -> tuple[float, float]:
+def _seconds_per_view(moments: list[Moment], people: int) -> tuple[float, float]:
     """Wall and processor seconds per view, without each person's first view, which includes loading."""
     each = len(moments) // people
     later = [pair for i, pair in enumerate(itertools.pairwise(moments), start=1) if i % each]

@@ -141,7 +141,7 @@ def memory(arguments: argparse.Namespace) -> dict[str, float]:
     bpy.context.view_layer.update()
     record.trim()
     read = record.resident_mb() - before
-    bpy.ops.primdiffusion.release_memory()
+    bpy.ops.primdiffusion.cancel(what="MEMORY")
     return {"ram_per_human_mb": read, "ram_per_human_released_mb": record.resident_mb() - before}
 
 

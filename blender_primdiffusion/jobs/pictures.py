@@ -22,8 +22,10 @@ class Icons:
             version = 0
         if not version:
             return 0
-        name, self._previews = str(path), self._previews or bpy.utils.previews.new()
-        if self._versions.get(name) != version:
+        if self._previews is None:  # an empty collection is false
+            self._previews = bpy.utils.previews.new()
+        name = str(path)
+        if name not in self._previews or self._versions[name] != version:
             for old in [old for old in self._previews if old == name or not Path(old).exists()]:
                 del self._previews[old]
             _ = self._previews.load(name, name, "IMAGE").image_size[:]  # reads the file now: later it may be gone

@@ -20,8 +20,8 @@ _MOST_LINES = 200
 class Session:
     """Runs the steps of one piece of work at a time. All methods are for Blender's main thread."""
 
-    def __init__(self, cancelled: str) -> None:
-        """`cancelled`: what to say of work that was cancelled."""
+    def __init__(self, busy: str, cancelled: str) -> None:
+        """What to say while there is work, and of work that was cancelled."""
         self.message = ""
         self.fraction = 0.0
         self.lines: collections.deque[str] = collections.deque(maxlen=_MOST_LINES)
@@ -31,7 +31,7 @@ class Session:
         self.notice = ""
         """How the last one ended otherwise."""
         self._steps: Steps | None = None
-        self._cancelled = cancelled
+        self._busy, self._cancelled = busy, cancelled
         self._timer = self._follow  # Blender knows a timer by the object
 
     @property
@@ -42,7 +42,7 @@ class Session:
     def start(self, steps: Steps) -> None:
         """Begin at the next tick. Raises ValueError while there is other work."""
         if self.busy:
-            raise ValueError("this is being done already: wait for it, or press Cancel")
+            raise ValueError(f"{self._busy}: wait for it, or press Cancel")
         self._steps, self.error, self.notice, self.message, self.fraction = steps, "", "", "Starting", 0.0
         self.lines.clear()
 
@@ -89,7 +89,7 @@ class Session:
                 time.sleep(TICK_S / 4)
         finally:
             self.cancel()
-        for line in (*self.lines, self.notice):
+        for line in filter(None, (*self.lines, self.notice)):
             print(printable(f"PrimDiffusion: {line}"), flush=True)
         if self.error:
             operator.report({"ERROR"}, self.error)

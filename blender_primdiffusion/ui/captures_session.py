@@ -21,7 +21,7 @@ from ..formats.regular_files import remove_folder
 from ..formats.schema import read
 from ..jobs.steps import Session
 
-captures = Session("Cancelled; the same settings resume from here")
+captures = Session("captures are being rendered", "Cancelled; the same settings resume from here")
 """One for all windows."""
 
 

@@ -31,7 +31,9 @@ _ONLINE = (
 )
 
 
-session = Session("Cancelled; what has been downloaded is used by the next Set Up Backend")
+session = Session(
+    "the backend is being set up already", "Cancelled; what has been downloaded is used by the next Set Up Backend"
+)
 """One for all windows."""
 
 

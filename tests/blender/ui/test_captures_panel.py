@@ -229,7 +229,7 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
 def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypatch, tmp_path, message, fault):
     program = f"import time; print({MARK + message!r}, flush=True); time.sleep(600)"
     monkeypatch.setattr(captures_session, "child_command", lambda: [sys.executable, "-c", program])
-    session = Session("")
+    session = Session("", "")
     session.start(captures_session.capturing([], tmp_path / "folder"))
     end = time.monotonic() + 300
     while session.busy and time.monotonic() < end:
