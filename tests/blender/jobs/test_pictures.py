@@ -29,7 +29,7 @@ def write_png(path: Path, colour: tuple[int, int, int], side: int = 8) -> Path:
 def test_a_picture_that_is_written_again_is_read_again_and_one_that_is_gone_is_let_go(tmp_path):
     icons, path, other = Icons(), tmp_path / "a.png", tmp_path / "b.png"
     for green in (0, 99):
-        os.utime(write_png(path, (0, green, 0)), ns=(green + 1, green + 1))
+        os.utime(write_png(path, (0, green, 0)), ns=((green + 1) * 10**9,) * 2)
         icons.of(path)
         assert icons._previews[str(path)].image_pixels_float[1] == pytest.approx(green / 255, abs=0.01)
     path.unlink()

@@ -187,7 +187,7 @@ def test_files_are_dropped_onto_the_import(addon):
 
 def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature, tmp_path):
     def drawn(path: str, **settings) -> tuple[list[str], list[str]]:
-        values = {"filepath": path, "person": "", "into": "NEW", "bones": "AUTO", **settings}
+        values = {"filepath": path, "human": "", "into": "NEW", "bones": "AUTO", **settings}
         operator = SimpleNamespace(layout=Layout(), axis=lambda: "", tracked_person="", **values)
         operator._draw_found = lambda *a: PRIMDIFFUSION_OT_import_motion._draw_found(operator, *a)
         PRIMDIFFUSION_OT_import_motion.draw(operator, addon)
