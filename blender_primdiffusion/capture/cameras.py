@@ -152,4 +152,7 @@ def stored_turned(path: Path) -> bool:
     """Whether a picture's EXIF data says that it must be turned or mirrored. Raises OSError."""
     check_regular(path)
     file = OpenImageIO.ImageInput.open(str(path))
-    return file is not None and file.spec().get_int_attribute("Orientation", 1) != 1
+    if file is None:
+        OpenImageIO.geterror()  # else it is printed at the end; Blender itself says what is wrong
+        return False
+    return file.spec().get_int_attribute("Orientation", 1) != 1
