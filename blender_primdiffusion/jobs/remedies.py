@@ -105,4 +105,5 @@ def write_error_log(job: str, error: RequestError, backend: Mapping[str, Any], l
 
 def _version() -> str:
     manifest = Path(__file__).resolve().parents[1] / "blender_manifest.toml"
-    return tomllib.loads(manifest.read_text(encoding="utf-8"))["version"]
+    with open(manifest, "rb") as file:
+        return tomllib.load(file)["version"]
