@@ -8,7 +8,7 @@ import time
 import bpy
 
 from ..backend.requests import Steps, sentence
-from ..formats.regular_files import printable
+from ..files.regular_files import printable
 from .windows import redraw
 
 TICK_S = 0.1

@@ -16,8 +16,8 @@ from pathlib import Path
 import addon_utils
 import bpy
 
-from ..formats.regular_files import remove_folder
-from ..formats.whole_files import replacing
+from ..files.regular_files import remove_folder
+from ..files.whole_files import replacing
 from .armature import check_joints
 
 

@@ -13,9 +13,9 @@ import numpy as np
 from mathutils import Color
 from numpy.typing import NDArray
 
-from ..formats.arrays import all_finite, check_shapes, read_arrays
+from ..files.arrays import all_finite, check_shapes, read_arrays
+from ..files.regular_files import FileError, as_file_error, portable_name
 from ..formats.joints import JOINT_NAMES
-from ..formats.regular_files import FileError, as_file_error, portable_name
 from .armature import model_origin
 from .blend_values import as_numbers, stored_record
 from .build import build_body_mesh

@@ -15,9 +15,9 @@ from ..backend.requests import Step, Steps
 from ..capture import launch
 from ..capture.command import MARK
 from ..console import DONE, FAILED, duration
+from ..files.json_files import parse_message
+from ..files.regular_files import remove_folder
 from ..formats.answers import CapturesProgress
-from ..formats.json_files import parse_message
-from ..formats.regular_files import remove_folder
 from ..formats.schema import read
 from ..jobs.steps import Session
 

@@ -7,7 +7,7 @@ import textwrap
 
 import bpy
 
-from ..formats.regular_files import printable
+from ..files.regular_files import printable
 from ..jobs.follow import blocking_activity
 from ..jobs.pictures import icons
 from ..jobs.queue import JobOutcome, queue

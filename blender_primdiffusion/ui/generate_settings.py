@@ -16,10 +16,10 @@ from typing import Any
 
 import bpy
 
-from ..formats.json_files import parse_json
-from ..formats.regular_files import as_file_error, is_local_path, open_regular
+from ..files.json_files import parse_json
+from ..files.regular_files import as_file_error, is_local_path, open_regular
+from ..files.tensor_layout import read_layout
 from ..formats.requests import SAMPLERS, GenerateRequest
-from ..formats.tensor_layout import read_layout
 from ..places import backend_module_path, preference
 from .declared import SKIP, declared
 

@@ -160,7 +160,7 @@ def _import_all() -> None:
     import importlib
 
     from primdiffusion.cli import COMMANDS
-    from primdiffusion.machine import share_processors
+    from primdiffusion.runtime.machine import share_processors
 
     share_processors()
     lazily = ("commands.session", "commands.output", "commands.frame_drawer", "people.folder", "people.payloads",

@@ -11,14 +11,14 @@ import torch
 from primdiffusion.commands.options import InfoCommand
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
-from primdiffusion.device import best_device, device_info
 from primdiffusion.diffusion.checkpoint import default_checkpoint, read_card
 from primdiffusion.diffusion.conditioning import NOTHING
 from primdiffusion.encoder.model import default_encoder
 from primdiffusion.formats.answers import AttributesAnswer
 from primdiffusion.formats.requests import AttributesRequest
 from primdiffusion.human_file import NoPersonError, format_version, load_human
-from primdiffusion.machine import memory
+from primdiffusion.runtime.device import best_device, device_info
+from primdiffusion.runtime.machine import memory
 from primdiffusion.version import __version__
 
 

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from primdiffusion.formats.regular_files import real_path
+from primdiffusion.files.regular_files import real_path
 from primdiffusion.formats.requests import (
     LARGEST_SEED,
     RAY_STEP,

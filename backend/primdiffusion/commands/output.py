@@ -16,8 +16,8 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.samplers import SamplerStep
+from primdiffusion.files.regular_files import remove_file
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.regular_files import remove_file
 from primdiffusion.formats.requests import Compositing
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb

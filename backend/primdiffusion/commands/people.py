@@ -15,14 +15,14 @@ from primdiffusion.commands.options import (
     PeopleCommand,
     VerifyPayloadsCommand,
 )
-from primdiffusion.device import best_device
 from primdiffusion.encoder.model import load_encoder
-from primdiffusion.folder_lock import lock_folder
-from primdiffusion.formats.regular_files import printable
+from primdiffusion.files.folder_lock import lock_folder
+from primdiffusion.files.regular_files import printable
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people, unknown_licences
 from primdiffusion.people.payloads import make_payloads
 from primdiffusion.people.wardrobe import required_meshes
+from primdiffusion.runtime.device import best_device
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, read_cards
 from primdiffusion.training.shards import damaged_shards, pack_people
 from primdiffusion.training.stored_people import find_people

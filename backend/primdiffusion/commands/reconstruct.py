@@ -28,13 +28,16 @@ from primdiffusion.commands.options import RefineCommand
 from primdiffusion.commands.output import FILES, write_human
 from primdiffusion.commands.progress import ReportProgress, print_warnings, progress_bar
 from primdiffusion.commands.session import Session
-from primdiffusion.device import best_device
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import EncoderModel, load_encoder
+from primdiffusion.files.whole_files import staged
 from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer
 from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
-from primdiffusion.formats.whole_files import staged
-from primdiffusion.from_pictures import (
+from primdiffusion.human import Human
+from primdiffusion.human_file import load_human
+from primdiffusion.reconstruction.from_captures import reconstruct as reconstruct_human
+from primdiffusion.reconstruction.from_captures import reconstruct_by_prior
+from primdiffusion.reconstruction.from_pictures import (
     POSTURE_STEPS,
     Start,
     fit_posture_in,
@@ -43,15 +46,12 @@ from primdiffusion.from_pictures import (
     outline_overlap,
     start_of,
 )
-from primdiffusion.human import Human
-from primdiffusion.human_file import load_human
-from primdiffusion.machine import peak_memory_gb
-from primdiffusion.posture.file import write_posture
-from primdiffusion.posture.fit import Posture
-from primdiffusion.posture.start import views_of
-from primdiffusion.reconstruction import reconstruct as reconstruct_human
-from primdiffusion.reconstruction import reconstruct_by_prior
+from primdiffusion.reconstruction.posture_file import write_posture
+from primdiffusion.reconstruction.posture_fit import Posture
+from primdiffusion.reconstruction.posture_start import views_of
 from primdiffusion.render.descent import DescentSettings, DescentStep
+from primdiffusion.runtime.device import best_device
+from primdiffusion.runtime.machine import peak_memory_gb
 from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
 
 STAGES = 4
