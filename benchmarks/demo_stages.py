@@ -100,8 +100,9 @@ def cycles(arguments: argparse.Namespace) -> dict[str, float]:
     """Open the saved file, merge the human as it stands, and render the current frame in Cycles."""
     bpy.ops.wm.open_mainfile(filepath=str(arguments.blend))
     sys.path.insert(0, str(ROOT))
+    from cycles_preview import setup_cycles_preview
+
     import blender_primdiffusion
-    from blender_primdiffusion.scene.cycles import setup_cycles_preview
     from blender_primdiffusion.scene.human import humans
 
     blender_primdiffusion.register()

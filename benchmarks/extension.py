@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -140,15 +141,16 @@ def memory(arguments: argparse.Namespace) -> dict[str, float]:
     bpy.context.view_layer.update()
     record.trim()
     read = record.resident_mb() - before
-    bpy.ops.primdiffusion.release_memory()
+    bpy.ops.primdiffusion.cancel(what="MEMORY")
     return {"ram_per_human_mb": read, "ram_per_human_released_mb": record.resident_mb() - before}
 
 
 def merged(arguments: argparse.Namespace) -> dict[str, float]:
     """The same Cycles frame with 1024 volumes and with one merged volume."""
     _enable(arguments)
+    from cycles_preview import setup_cycles_preview
+
     from blender_primdiffusion.scene.build import build_human
-    from blender_primdiffusion.scene.cycles import setup_cycles_preview
 
     folder = arguments.folder / "person"
     build_human(bpy.context, folder / "person.human.safetensors")
@@ -171,7 +173,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
     _enable(arguments)
     from blender_primdiffusion.jobs.queue import queue
     from blender_primdiffusion.scene.human import humans, parts_of
-    from blender_primdiffusion.scene.payload import forget_session_files
+    from blender_primdiffusion.scene.payload import session_folder
 
     context, megabytes, blender = bpy.context, [], []
     context.preferences.edit.undo_steps = UNDO_STEPS
@@ -185,7 +187,7 @@ def soak(arguments: argparse.Namespace) -> dict[str, float]:
         context.view_layer.update()
         bpy.data.batch_remove(parts_of(armature))
         bpy.ops.outliner.orphans_purge(do_recursive=True)
-        forget_session_files()
+        shutil.rmtree(session_folder(), ignore_errors=True)
         record.trim()
         blender.append(record.resident_mb())
         megabytes.append(blender[-1] + children_mb())

@@ -32,14 +32,15 @@ from primdiffusion.render.march import march
 from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from cycles_preview import setup_cycles_preview
+
 import blender_primdiffusion
 from blender_primdiffusion.scene import merged as merging
 from blender_primdiffusion.scene.armature import keyframe_poses, model_origin, pose_from_joint_rotations
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.cycles import setup_cycles_preview
-from blender_primdiffusion.scene.material import density_gain
 from blender_primdiffusion.scene.representation import set_representation, show_in_viewport
 from blender_primdiffusion.scene.volume_files import files_of, write_volumes
+from blender_primdiffusion.scene.volume_nodes import density_gain
 
 SEED, STEPS, SIZE, GREY = 7, 30, 512, 0.48
 FRAMES = 10

@@ -22,9 +22,10 @@ import numpy as np
 from record import command_line, report
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from cycles_preview import setup_cycles_preview
+
 import blender_primdiffusion
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE
 
 SIZE, GREY = 512, 0.5

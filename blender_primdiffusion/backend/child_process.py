@@ -176,10 +176,6 @@ class Output:
         self._line.clear()
         return rest
 
-    def has_more(self) -> bool:
-        """Some output has not been read yet."""
-        return not self._source.closed and os.fstat(self._source.fileno()).st_size > self._source.tell()
-
     def log(self) -> list[str]:
         """The last lines of the whole output, read independently of `lines`."""
         if self._source.closed:

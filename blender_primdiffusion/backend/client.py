@@ -32,8 +32,6 @@ LONGEST_POLL_GAP_S = 1.0
 """Silence counts only while we poll: a suspended laptop or a blocked Blender is not the child's fault."""
 POLL_S = 0.05
 """Of parsing in one call of `poll`: a flood of messages is taken in over several."""
-LISTEN_S = 0.01
-"""Between two looks at the child's output in `wait`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,15 +232,6 @@ class BackendClient:
             self._reported_silence = True
             events.append(Silent(self._silence))
         return events
-
-    def wait(self, timeout_s: float) -> None:
-        """Sleeps until the child has written something or ended, at most `timeout_s`; then `poll`."""
-        end = time.monotonic() + timeout_s
-        while self.alive and not self._lines and not (self._output is not None and self._output.has_more()):
-            left = end - time.monotonic()
-            if left <= 0:
-                return
-            time.sleep(min(left, LISTEN_S))
 
     def end(self) -> None:
         """Asks the child to end, without waiting for it: by a request, and by the end of its input."""

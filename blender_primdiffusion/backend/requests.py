@@ -7,7 +7,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 from ..files.regular_files import printable
 from ..files.whole_files import remove_of_process
@@ -34,20 +34,19 @@ def sentence(text: BaseException | str) -> str:
     return words if words.endswith((".", "!", "?")) else f"{words}."
 
 
-TICK_S = 0.02
+@dataclasses.dataclass(frozen=True)
+class Step:
+    """How far a long piece of work is."""
 
-Result = TypeVar("Result")
+    message: str
+    fraction: float
+    """Share of everything that is done, 0 to 1."""
+    lines: tuple[str, ...] = ()
+    """What there is to say since the step before."""
 
 
-def run_to_end(work: Generator[object, None, Result]) -> Result:
-    """What `work` returns; sleeps at each of its yields. Raises what it raises."""
-    while True:
-        try:
-            next(work)
-        except StopIteration as done:
-            return done.value
-        time.sleep(TICK_S)
-
+Steps = Generator[Step, None, str]
+"""Returns a sentence on how it ended; raises RuntimeError or OSError. Closing it ends the work."""
 
 END_S = 2.0
 """How long a child may take to end."""
@@ -92,10 +91,6 @@ class Backend:
         client.start()
         self._client = client
         return client
-
-    def connect(self) -> BackendClient:
-        """As `connecting`, for callers that wait."""
-        return run_to_end(self.connecting())
 
     @property
     def log(self) -> tuple[str, ...]:

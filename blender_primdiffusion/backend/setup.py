@@ -12,7 +12,6 @@ set_up.log     what venv and pip said
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import json
 import mimetypes
 import os
@@ -27,7 +26,7 @@ from ..files.whole_files import write_atomically
 from .client import BackendClient
 from .environment import MARK, SetUpFolder, search, tried
 from .packages import Lock, clean_environment, followed, what_went_wrong
-from .requests import Backend, ChildRequest
+from .requests import Backend, ChildRequest, Step, Steps
 
 OFFLINE = (
     "Blender may not use the network; allow it in Preferences > System > Network > Allow Online Access, "
@@ -44,19 +43,6 @@ _INSTALL = (
     "--disable-pip-version-check", "--no-input", "--no-color", "--progress-bar", "off",
 )  # fmt: skip
 """Named wheels of known hashes alone, nothing built. The child keeps byte code in the extension's cache."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Step:
-    """How far it is."""
-
-    message: str
-    fraction: float
-    """Share of everything that is done, 0 to 1."""
-
-
-Steps = Generator[Step, None, str]
-"""Returns a sentence on how it ended; raises RuntimeError or OSError."""
 
 
 def set_up(

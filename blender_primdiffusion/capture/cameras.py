@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 
 import bpy
@@ -10,10 +9,13 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from ..files.regular_files import open_regular
+from ..files.regular_files import check_regular
 from ..formats.camera_rig import View
 from ..formats.poses.rotation import first_improper
 from ..scene.convention import points_to_backend, points_to_blender
+
+bpy.utils.expose_bundled_modules()
+import OpenImageIO  # noqa: E402  Blender's own, importable only after the line above
 
 _SENSOR_MM = 36.0
 _FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
@@ -23,10 +25,6 @@ LONG_SIDE_DEGREES = 45.0
 """Field of view along the picture's longer side before it is fitted, as the backend assumes too."""
 AWAY_M, HEIGHT_M = 4.0, 0.95
 """Distance of a new camera from the human, and its height."""
-_LARGEST_FILE = 512 * 2**20
-_HEAD = 256 * 2**10
-"""Bytes in which the EXIF data of a picture begins."""
-_ORIENTATION = 0x0112
 
 
 def aim(camera: bpy.types.Object, view: View) -> tuple[float, float]:
@@ -152,28 +150,9 @@ def aim_at_picture(camera: bpy.types.Object, view: View) -> None:
 
 def stored_turned(path: Path) -> bool:
     """Whether a picture's EXIF data says that it must be turned or mirrored. Raises OSError."""
-    with open_regular(path, _LARGEST_FILE) as file:
-        head = file.read(_HEAD)
-    for start in (head.find(b"Exif\0\0") + 6, head.find(b"eXIf") + 4):
-        if start > 6 or head[start - 4 : start] == b"eXIf":
-            found = _orientation(head[start:])
-            if found not in (0, 1):
-                return True
-    return False
-
-
-def _orientation(tiff: bytes) -> int:
-    """The orientation in a TIFF header; 0 if not stated."""
-    order = {b"II": "<", b"MM": ">"}.get(tiff[:2])
-    if order is None:
-        return 0
-    try:
-        (place,) = struct.unpack_from(f"{order}I", tiff, 4)
-        (count,) = struct.unpack_from(f"{order}H", tiff, place)
-        for entry in range(min(count, 512)):
-            tag, _, _, value = struct.unpack_from(f"{order}HHIH", tiff, place + 2 + 12 * entry)
-            if tag == _ORIENTATION:
-                return value
-    except struct.error:
-        return 0
-    return 0
+    check_regular(path)
+    file = OpenImageIO.ImageInput.open(str(path))
+    if file is None:
+        OpenImageIO.geterror()  # else it is printed at the end; Blender itself says what is wrong
+        return False
+    return file.spec().get_int_attribute("Orientation", 1) != 1

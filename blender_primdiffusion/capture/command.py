@@ -42,13 +42,11 @@ from ..formats.capture_repair import repair, verify
 from ..formats.poses.files import ENDINGS
 from ..formats.requests import PASSES
 from .job import CaptureProgress, run
-from .scan import ScanFile, find_scans
+from .scan_files import ScanFile, find_scans
 from .settings import CaptureSettings
 
 MARK = "PRIMDIFFUSION "
 """Begins each line of --progress json; an object follows: {"line": ...}, or the fields of `job.Progress`."""
-ASK_FROM = 100
-"""Views, before which a user at a terminal is asked."""
 _PRINT_S = 1.0
 """Between lines of progress."""
 
@@ -89,7 +87,6 @@ def parser() -> CommandParser:
     declared(CaptureSettings, "threads")
     declared(CaptureSettings, "released_reference")
     add("--list", action="store_true", help="list the subjects of the shard, render nothing")
-    add("--yes", action="store_true", help=f"do not ask before {ASK_FROM} views or more; only a terminal is asked")
     add("--verify", action="store_true", help="check the dataset, render nothing")
     add("--repair", action="store_true", help="with --verify: remove damaged files; without: then render them again")
     add("--progress", choices=("text", "json", "none"), default="text", help="on stdout")
@@ -164,8 +161,6 @@ def main(argv: Sequence[str]) -> int:
     with separate_stdout() as write:
         say = _json_lines(write) if options.progress == "json" else write
         try:
-            if not _agreed(options, say):
-                return CANCELLED
             with stopped_by_signals() as stop:
                 return _run(options, say, stop)
         except (OSError, ValueError) as error:
@@ -194,35 +189,6 @@ def scans_in(folders: Sequence, only: Sequence[str] = ()) -> list[ScanFile]:
     if not found:
         raise ValueError("there are no scans: name a folder of them with --people")
     return [found[name] for name in sorted(found) if not only or name in only]
-
-
-_SECONDS_A_VIEW = 2.2
-"""Of 512 x 512 pixels and 16 samples on two processor cores: benchmarks/captures.py."""
-
-
-def estimate(settings: CaptureSettings, people: int) -> tuple[int, str]:
-    """Views of a run on this many scans, those that exist included, and a sentence that says how long they take."""
-    index, shards = settings.shard
-    people = len(range(index, people, shards))
-    views = people * settings.pose_count * settings.camera_count
-    size = settings.cameras[0] if settings.cameras else settings.rig
-    seconds = views * _SECONDS_A_VIEW * size.width * size.height / 512**2 * settings.samples / 16
-    return views, (
-        f"{views} views ({people} {'person' if people == 1 else 'people'} x {settings.pose_count} poses x "
-        f"{settings.camera_count} cameras) take about {duration(seconds)} on two processor cores"
-    )
-
-
-def _agreed(options: argparse.Namespace, say: Say) -> bool:
-    """Print the estimate of a run; ask at a terminal where it is long."""
-    if options.verify or options.list or not options.people or options.progress != "text":
-        return True
-    views, sentence = estimate(settings_of(options), len(scans_in(options.people, options.only)))
-    say(f"{sentence}; finished ones are skipped")
-    if views < ASK_FROM or options.yes or options.while_stdin or not sys.stdin or not sys.stdin.isatty():
-        return True
-    say("Render them? [y/N]")
-    return sys.stdin.readline().strip().lower() in {"y", "yes"}
 
 
 def _run(options: argparse.Namespace, say: Say, stop: Stop) -> int:

@@ -21,7 +21,8 @@ from ..formats.capture_layout import view_seed
 from ..formats.group_places import extent, first_frames, stand_together
 from ..formats.poses.motion import Motion
 from .body import Body
-from .scan import Scan, ScanFile
+from .scan import Scan
+from .scan_files import ScanFile
 from .settings import CaptureSettings
 from .stage import Stage
 

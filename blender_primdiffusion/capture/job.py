@@ -8,9 +8,8 @@ import errno
 import os
 import shutil
 import time
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
-from typing import Protocol
 
 import bpy
 import numpy as np
@@ -39,9 +38,9 @@ from ..motion.poses import built_in_poses, pick_poses
 from .body import Body, read_body
 from .group import Placed, groups_of, load_neighbours, place_group
 from .passes import write_passes
-from .scan import Scan, ScanFile, load_scan
+from .scan import Scan, load_scan
+from .scan_files import ScanFile
 from .settings import CaptureSettings
-from .skinned_surface import cameras_inside
 from .stage import Stage, shoot_centres, shoot_colours
 from .surfaces import mark_parts, prepare_materials
 
@@ -74,12 +73,8 @@ _CENTRE_PASSES = frozenset({"depth", FLOAT_DEPTH, "normal", "part"})
 _DISK_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
-class Loader(Protocol):
-    """Loads a scan into the context's scene."""
-
-    def __call__(self, context: bpy.types.Context, scan_file: ScanFile, body: Body) -> Scan:
-        """Raises FileError."""
-        ...
+Loader = Callable[[bpy.types.Context, ScanFile, Body], Scan]
+"""Loads a scan into the context's scene. Raises FileError."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -226,11 +221,10 @@ def _capture(
                 camera for camera in range(len(views)) if not is_complete_view(folder, settings.kinds, camera, frame)
             ]
             if missing:
-                with stage.entered() as own:
+                with stage.entered():
                     scan.pose(poses.rotations[frame], poses.translations[frame])
                     for neighbour, motion in neighbours:
                         neighbour.pose(motion.rotations[frame], motion.translations[frame])
-                    _check_outside(scan, own, views, frame)
             for camera, view in enumerate(views):
                 if camera in missing:
                     with clock.rendering():
@@ -246,14 +240,6 @@ def _body_joints(body: Body, betas: NDArray, poses: Motion) -> NDArray[np.float6
 
 def _views_around(scan: Scan, settings: CaptureSettings, poses: Motion) -> list[View]:
     return settings.rig.views(*bounding_sphere(scan.bounds(poses.rotations, poses.translations)))
-
-
-def _check_outside(scan: Scan, context: bpy.types.Context, views: list[View], frame: int) -> None:
-    inside = cameras_inside(scan.objects, context.evaluated_depsgraph_get(), views)
-    if inside:
-        raise ValueError(
-            f"camera {inside[0]} is inside the human in frame {frame}: move it away, or give the rig a larger margin"
-        )
 
 
 def _shoot(stage: Stage, settings: CaptureSettings, folder: Path, view: View, where: tuple[int, int]) -> None:

@@ -31,12 +31,10 @@ from .rigged import (
     to_backend,
     uniform_scale,
 )
-from .scan_files import ScanFile, find_scans, import_file, own_betas
+from .scan_files import ScanFile, import_file, own_betas
 from .skinned_surface import SkinnedSurface, mesh_points, skinned_surface
 from .stage import AddedData
 from .surfaces import complete_colours
-
-__all__ = ["Scan", "ScanFile", "find_scans", "load_scan"]
 
 _POOR_FIT_M = 0.05
 _EXACT_M = 0.001

@@ -1,4 +1,4 @@
-"""Posed meshes: the space that a human takes up over its poses, and cameras that are inside of it."""
+"""Posed meshes: the space that a human takes up over its poses."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from collections.abc import Iterable, Sequence
 
 import bpy
 import numpy as np
-from mathutils import Vector
-from mathutils.bvhtree import BVHTree
 from numpy.typing import NDArray
 
-from ..formats.camera_rig import View, bounding_sphere
-from ..scene.convention import points_to_backend, points_to_blender
+from ..formats.camera_rig import bounding_sphere
+from ..scene.convention import points_to_backend
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -93,56 +91,3 @@ def _influences(mesh: bpy.types.Object, bones: Sequence[str]) -> tuple[NDArray[n
     for vertex, row in enumerate(rows):
         index[vertex, : len(row)], weight[vertex, : len(row)] = zip(*row, strict=True)
     return index, weight / weight.sum(1, keepdims=True)
-
-
-TOUCHING_M = 0.02
-"""Nearer than this to a surface a camera counts as inside."""
-_DIRECTIONS = [
-    Vector((x, y, z)).normalized() for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z
-]
-
-
-def cameras_inside(
-    objects: Sequence[bpy.types.Object], depsgraph: bpy.types.Depsgraph, views: Sequence[View]
-) -> list[int]:
-    """Indices of the views inside of the meshes `objects` as posed, or at their surface.
-
-    A camera is inside where most rays first meet the back of a face, so open clothes are no problem.
-    """
-    meshes = [_world_mesh(obj, depsgraph) for obj in objects]
-    points = np.concatenate([points for points, _ in meshes])
-    low, high = points.min(0) - TOUCHING_M, points.max(0) + TOUCHING_M
-    positions = [points_to_blender(view.position) for view in views]
-    near = [i for i, at in enumerate(positions) if ((low <= at) & (at <= high)).all()]
-    if not near:
-        return []
-    trees = [BVHTree.FromPolygons(points.tolist(), faces) for points, faces in meshes]
-    return [i for i in near if _is_inside(trees, Vector(positions[i]))]
-
-
-def _is_inside(trees: list[BVHTree], at: Vector) -> bool:
-    if any(
-        distance is not None and distance < TOUCHING_M for *_, distance in (tree.find_nearest(at) for tree in trees)
-    ):
-        return True
-    behind = 0
-    for direction in _DIRECTIONS:
-        hits = [tree.ray_cast(at, direction) for tree in trees]
-        hits = [(distance, normal) for _, normal, _, distance in hits if distance is not None]
-        if hits:
-            _, normal = min(hits, key=lambda hit: hit[0])
-            behind += normal.dot(direction) > 0
-    return behind > len(_DIRECTIONS) / 2
-
-
-def _world_mesh(obj: bpy.types.Object, depsgraph: bpy.types.Depsgraph) -> tuple[NDArray[np.float64], list[tuple]]:
-    evaluated = obj.evaluated_get(depsgraph)
-    mesh = evaluated.to_mesh()
-    try:
-        points = np.empty(3 * len(mesh.vertices), np.float32)
-        mesh.vertices.foreach_get("co", points)
-        world = np.array(evaluated.matrix_world, np.float64)
-        faces = [tuple(polygon.vertices) for polygon in mesh.polygons]
-        return points.reshape(-1, 3).astype(np.float64) @ world[:3, :3].T + world[:3, 3], faces
-    finally:
-        evaluated.to_mesh_clear()

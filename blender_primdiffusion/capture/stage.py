@@ -174,8 +174,6 @@ def _set_up_passes(scene: bpy.types.Scene, settings: CaptureSettings) -> None:
 def _light(scene: bpy.types.Scene, settings: CaptureSettings) -> bpy.types.ShaderNodeTexEnvironment | None:
     """Light the scene; returns the node with the HDRI, if there is one."""
     world = scene.world = bpy.data.worlds.new("Capture")
-    if world.node_tree is None:
-        world.use_nodes = True
     background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
     grey = 1.0 if settings.light == "dome" else 0.0
     background.inputs["Color"].default_value = (grey, grey, grey, 1.0)

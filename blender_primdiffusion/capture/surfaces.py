@@ -75,7 +75,7 @@ def _complete_mesh(obj: bpy.types.Object, path: Path, nearby: list[Path]) -> str
     missing, notes = [], set()
     for material in _materials(obj):
         image = _base_picture(material)
-        if image is not None and _is_there(image):
+        if image is not None and image.size[0] > 0:
             notes.add("texture found by the file")
             continue
         wanted = Path(image.filepath.replace("\\", "/")).name.lower() if image is not None else ""
@@ -94,14 +94,12 @@ def _complete_mesh(obj: bpy.types.Object, path: Path, nearby: list[Path]) -> str
 
 
 def _materials(obj: bpy.types.Object) -> list[bpy.types.Material]:
-    """The mesh's materials; one is made where it has none."""
+    """The mesh's materials; a light grey one is made where it has none."""
     if not obj.material_slots:
         obj.data.materials.append(None)
     for slot in obj.material_slots:
         if slot.material is None:
-            slot.material = bpy.data.materials.new(obj.name)
-        if slot.material.node_tree is None:
-            slot.material.use_nodes = True
+            slot.material = _grey()
     return list({slot.material.name: slot.material for slot in obj.material_slots}.values())
 
 
@@ -112,20 +110,8 @@ def _shader(material: bpy.types.Material) -> bpy.types.Node | None:
 def _base_picture(material: bpy.types.Material) -> bpy.types.Image | None:
     """The first image upstream of the base colour; of a material without Principled BSDF, any."""
     shader = _shader(material)
-    waiting = list(shader.inputs["Base Color"].links) if shader is not None else []
-    nodes = [] if shader is not None else list(material.node_tree.nodes)
-    seen = set()
-    while waiting:
-        node = waiting.pop(0).from_node
-        if node.name not in seen:
-            seen.add(node.name)
-            nodes.append(node)
-            waiting += [link for entry in node.inputs for link in entry.links]
+    nodes = material.node_tree.nodes if shader is None else _upstream(shader.inputs["Base Color"])
     return next((node.image for node in nodes if node.type == "TEX_IMAGE" and node.image is not None), None)
-
-
-def _is_there(image: bpy.types.Image) -> bool:
-    return image.size[0] > 0
 
 
 def _show_picture(material: bpy.types.Material, picture: Path) -> None:
@@ -192,15 +178,7 @@ def prepare_materials(objects: Iterable[bpy.types.Object], unlit: bool) -> None:
 
     Meshes without a material get a light grey one. The materials are changed where they are: they must be ours.
     """
-    for obj in objects:
-        if not obj.material_slots:
-            obj.data.materials.append(None)
-        for slot in obj.material_slots:
-            if slot.material is None:
-                slot.material = _grey()
-    for material in {slot.material for obj in objects for slot in obj.material_slots}:
-        if material.node_tree is None:
-            material.use_nodes = True
+    for material in {material for obj in objects for material in _materials(obj)}:
         _add_part(material.node_tree)
         if unlit:
             make_unlit(material)
@@ -211,7 +189,7 @@ def make_unlit(material: bpy.types.Material) -> None:
     material.cycles.emission_sampling = "NONE"  # else every triangle becomes a lamp in Cycles' light tree
     tree = material.node_tree
     output = _output(tree)
-    shader = next((node for node in _upstream(output.inputs["Surface"]) if _colour(node) is not None), None)
+    shader = next((node for node in _shaders(tree) if _colour(node) is not None), None)
     if shader is None or shader.type == "EMISSION":
         return  # unlit already
     emission, clear, mix = (
@@ -241,16 +219,21 @@ def _follow(tree: bpy.types.NodeTree, source: bpy.types.NodeSocket, target: bpy.
 
 
 def _upstream(socket: bpy.types.NodeSocket) -> Iterator[bpy.types.Node]:
-    """Shader nodes that lead into a socket, nearest first."""
+    """Nodes that lead into a socket, nearest first."""
     waiting, seen = [link.from_node for link in socket.links], set()
     while waiting:
         node = waiting.pop(0)
         if node.name in seen:
             continue
         seen.add(node.name)
-        if any(output.type == "SHADER" for output in node.outputs):
-            yield node
+        yield node
         waiting += [link.from_node for entry in node.inputs for link in entry.links]
+
+
+def _shaders(tree: bpy.types.NodeTree) -> Iterator[bpy.types.Node]:
+    """Shaders of the surface, nearest to the output first."""
+    nodes = _upstream(_output(tree).inputs["Surface"])
+    return (node for node in nodes if any(output.type == "SHADER" for output in node.outputs))
 
 
 def _output(tree: bpy.types.NodeTree) -> bpy.types.Node:
@@ -261,8 +244,7 @@ def _add_part(tree: bpy.types.NodeTree) -> None:
     """Cycles adds up the values of all surfaces on the way to the first solid one: holes must give nothing."""
     attribute, value = tree.nodes.new("ShaderNodeAttribute"), tree.nodes.new("ShaderNodeOutputAOV")
     attribute.attribute_name = value.aov_name = PART
-    shaders = _upstream(_output(tree).inputs["Surface"])
-    shader = next((node for node in shaders if "Alpha" in node.inputs), None)
+    shader = next((node for node in _shaders(tree) if "Alpha" in node.inputs), None)
     if shader is None or not shader.inputs["Alpha"].is_linked:
         tree.links.new(attribute.outputs["Fac"], value.inputs["Value"])
         return
@@ -277,8 +259,6 @@ def _add_part(tree: bpy.types.NodeTree) -> None:
 
 def _grey() -> bpy.types.Material:
     material = bpy.data.materials.new("Grey")
-    if material.node_tree is None:
-        material.use_nodes = True
     shader = next(node for node in material.node_tree.nodes if node.type == "BSDF_PRINCIPLED")
     shader.inputs["Base Color"].default_value = (0.6, 0.6, 0.6, 1.0)
     return material

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 import numpy as np
@@ -37,23 +37,34 @@ def show_in_place(context: bpy.types.Context, person: bpy.types.Object, result: 
     return done
 
 
-@dataclasses.dataclass(frozen=True)
+_EDITS = {
+    "vary": ("Vary Human", "Varied"),
+    "inpaint": ("Regenerate Region", "Re-dressed"),
+    "transfer": ("Transfer Texture", "Texture transferred to"),
+    "interpolate": ("Blend Humans", "Blended"),
+}
+"""By the child's method: the undo step, and what stands before the human's name in the message."""
+
+
+@dataclasses.dataclass
 class EditJob(Job):
-    """Base of the edits."""
+    """Change a human in place: vary it, generate a region again, transfer one from another human, or blend the two."""
 
-    made: ClassVar[str]
-    """Before the human's name in the message: Varied."""
-
+    method: str
     target: HumanTarget
     asked: Mapping[str, Any]
     """Fields of the request. A region {"painted": [V numbers]} holds weights, and travels as a file."""
     checkpoint: str = dataclasses.field(default_factory=lambda: chosen_checkpoint("checkpoint"))
 
     @classmethod
-    def of(cls, person: bpy.types.Object, asked: Mapping[str, Any]) -> EditJob:
+    def of(cls, method: str, person: bpy.types.Object, asked: Mapping[str, Any]) -> EditJob:
         """Raises ValueError for a human that cannot be edited."""
         session_file(person)
-        return cls(HumanTarget.of(person), asked)
+        return cls(method, HumanTarget.of(person), asked)
+
+    def __post_init__(self) -> None:
+        self.kind = self.method
+        self.undo, self.made = _EDITS[self.method]
 
     @property
     def label(self) -> str:
@@ -76,31 +87,3 @@ class EditJob(Job):
         message = f"{self.made} {person.name} in {result.seconds:.1f} s"
         warnings = (*result.warnings, done.warning, overlap_warning_in(context.scene, person))
         return " ".join([f"{message}{shape}.", *(sentence(text) for text in warnings if text)])
-
-
-class VaryJob(EditJob):
-    """Vary the whole human."""
-
-    kind = method = "vary"
-    undo, made = "Vary Human", "Varied"
-
-
-class RedressJob(EditJob):
-    """Generate a region again."""
-
-    kind = method = "inpaint"
-    undo, made = "Regenerate Region", "Re-dressed"
-
-
-class TransferJob(EditJob):
-    """Transfer a region from another human."""
-
-    kind = method = "transfer"
-    undo, made = "Transfer Texture", "Texture transferred to"
-
-
-class BlendJob(EditJob):
-    """Blend with another human."""
-
-    kind = method = "interpolate"
-    undo, made = "Blend Humans", "Blended"

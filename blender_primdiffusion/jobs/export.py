@@ -19,9 +19,9 @@ from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, P
 from ..formats.poses.rotation import nearest
 from ..formats.poses.skeleton import unchain
 from ..motion.posture import rest_joints
-from ..scene.armature import keyframe_poses, pose_from_joint_rotations
-from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model
-from ..scene.human import link_part
+from ..scene.armature import check_joints, keyframe_poses, pose_from_joint_rotations
+from ..scene.export_model import FrameRange, scene_with_only, write_model
+from ..scene.human import link_part, proxy_of
 from ..scene.human_file import (
     CHOOSE_ANOTHER,
     HumanMotion,
@@ -35,34 +35,13 @@ from ..scene.human_file import (
 )
 from ..scene.merged import read_grid, write_grid
 from ..scene.payload import BODY_FILE, PERSON_FILE, session_file
-from ..scene.proxy import build_proxy, follow_shape, proxy_of, read_proxy, remove_proxy, show_textures_in_solid
-from ..scene.representation import parts_by_representation, representation_of, set_representation
+from ..scene.proxy import build_proxy, read_proxy, remove_proxy, show_textures_in_solid
+from ..scene.representation import MESH_IN_VIEWPORT, set_representation
 from ..scene.rest_human import body_of_file, read_human, shape_model_of
-from ..scene.shape import betas_of, generated_betas, has_custom_shape
+from ..scene.shape import SAME_BETAS, betas_of, generated_betas, has_custom_shape
 from .generate import build_person
 from .queue import PREVIEW_PX, Job
 from .target import HumanTarget
-
-
-def show(person: bpy.types.Object, what: str) -> None:
-    """Switch to `what`: VOLUMES, VIEWPORT or MESH. Raises ValueError where there is no proxy; makes no undo step."""
-    proxy = proxy_of(person)
-    if proxy is None:
-        raise ValueError(f"{person.name!r} has no mesh proxy yet: press Add Mesh Proxy")
-    set_representation(person, representation_of(person))  # shows its part again
-    proxy.hide_viewport, proxy.hide_render = what == "VOLUMES", what != "MESH"
-    for part in parts_by_representation(person).values():
-        if part is not None:
-            part.hide_viewport = part.hide_viewport or what != "VOLUMES"
-            part.hide_render = part.hide_render or what == "MESH"
-
-
-def shown(person: bpy.types.Object) -> str:
-    """What is shown now: VOLUMES, VIEWPORT or MESH."""
-    proxy = proxy_of(person)
-    if proxy is None or proxy.hide_viewport:
-        return "VOLUMES"
-    return "VIEWPORT" if proxy.hide_render else "MESH"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,11 +64,10 @@ class ProxyJob(Job):
         }
 
     def built(self, person: bpy.types.Object, result: ProxyAnswer) -> bpy.types.Object:
-        """The proxy as an object, in no collection, with the current shape of the body."""
-        made = np.array(result.betas, np.float64)
-        proxy = build_proxy(person, read_proxy(result.proxy), result.texture, made)
-        follow_shape(person, proxy, betas_of(person))
-        return proxy
+        """The proxy as an object, in no collection. Raises ValueError where the human has another shape by now."""
+        if not np.allclose(result.betas, betas_of(person), atol=SAME_BETAS):
+            raise ValueError(f"the shape of {person.name!r} was changed while its mesh was made: try again")
+        return build_proxy(person, read_proxy(result.proxy), result.texture)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,7 +86,7 @@ class ExportMeshJob(ProxyJob):
 
     def finish(self, context: bpy.types.Context, result: ProxyAnswer, _folder: Path) -> str:
         person = self.target.found()
-        check_ready(person)
+        check_joints(person)
         proxy = self.built(person, result)
         try:
             write_model(context, person, proxy, self.path, self.format, self.frames)
@@ -137,7 +115,7 @@ class AddProxyJob(ProxyJob):
         if earlier is not None:
             remove_proxy(earlier)
         link_part(person, proxy)
-        show(person, "VIEWPORT")
+        set_representation(person, MESH_IN_VIEWPORT)
         show_textures_in_solid()
         return f"Mesh proxy of {result.triangles} triangles for {person.name} in {result.seconds:.1f} s"
 
@@ -149,17 +127,12 @@ def scene_frames(scene: bpy.types.Scene, animated: bool) -> FrameRange:
     return FrameRange(scene.frame_current, scene.frame_current)
 
 
-def posed_now(context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
-    """The human at the current frame: see `posed_frames`."""
-    return posed_frames(context, person, [context.scene.frame_current])[0]
-
-
 def posed_frames(context: bpy.types.Context, person: bpy.types.Object, frames: Iterable[int]) -> list[dict[str, Any]]:
     """The human at these frames: file, object matrix, joints and shape, as parameters of the child's `draw`.
 
     Raises ValueError for an armature in Edit Mode or without SMPL's bones, FileNotFoundError where the file is missing.
     """
-    check_ready(person)
+    check_joints(person)
     found = []
     with scene_with_only(context, person) as scene:
         for frame in frames:
@@ -309,22 +282,29 @@ class ImportHumanJob(Job):
 def opened(source: Path, folder: Path) -> HumanAnswer | None:
     """Write the human of a file, without a motion, into `folder`, and the file of its body where it has one.
 
-    None for files that only the backend can read: humans on a body of the user's files without BODY_FILE beside them,
-    and files of other kinds. Raises ValueError for a damaged human, OSError.
+    None for files that only the backend can read: humans on a body of the user's files without a good BODY_FILE beside
+    them, and files of other kinds. Raises ValueError for a damaged human, OSError.
     """
     began = time.monotonic()
     try:
         human = read_tensors(source)
     except ValueError:
         return None
-    body = source.with_name(BODY_FILE)
-    if "body" in human.metadata and (not exists_in_its_folder(body) or body_of_file(source).uv_corner is None):
+    if "body" in human.metadata and not _has_body(source):
         return None
     read_human(source, CHOOSE_ANOTHER)
     write_tensors(folder / PERSON_FILE, with_motion(human, None))
     if "body" in human.metadata:
-        shutil.copyfile(body, folder / BODY_FILE)
+        shutil.copyfile(source.with_name(BODY_FILE), folder / BODY_FILE)
     return HumanAnswer(person=folder / PERSON_FILE, seconds=time.monotonic() - began)
+
+
+def _has_body(person: Path) -> bool:
+    """Whether a good BODY_FILE is beside a human's file."""
+    try:
+        return exists_in_its_folder(person.with_name(BODY_FILE)) and bool(body_of_file(person))
+    except (ValueError, OSError):
+        return False
 
 
 def name_of(path: str) -> str:

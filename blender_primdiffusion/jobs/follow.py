@@ -8,37 +8,35 @@ import traceback
 import bpy
 
 from ..backend.environment import NOT_INSTALLED
-from ..backend.requests import error_text, sentence
+from ..backend.requests import RequestError, error_text, sentence
 from ..files.regular_files import printable
 from ..places import backend_is_named
 from .memory import release_when_idle
-from .pictures import so_far
 from .queue import GONE, Entry, Job, JobOutcome, queue
-from .remedies import error_before_the_scene
-from .windows import in_the_way, redraw, window_of
+from .windows import blocking_activity, redraw, window_of
 
 
-def enter() -> None:
+def apply_ready_result() -> None:
     """Run the operator that puts the result into the scene it was requested for."""
     entry = queue.current
     scene = next((scene for scene in bpy.data.scenes if scene.session_uid == entry.scene_uid), None)
     if scene is None and entry.job.undo:
-        queue.fail(error_before_the_scene(GONE.format(entry.scene)))
+        queue.fail(RequestError(GONE.format(entry.scene), "", "scene"))
         return
     try:
         with window_of(scene):
-            bpy.ops.primdiffusion.take_result()
+            bpy.ops.primdiffusion.apply_result()
     except RuntimeError as error:  # the timer must continue, whatever state Blender is in
         traceback.print_exc()
         if queue.current is entry:
-            queue.fail(error_before_the_scene(f"the result could not enter the scene: {error}"))
+            queue.fail(RequestError(f"the result could not enter the scene: {error}", "", "scene"))
 
 
-class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
+class PRIMDIFFUSION_OT_apply_result(bpy.types.Operator):
     """Put the result that is ready into the scene"""
 
-    bl_idname = "primdiffusion.take_result"
-    bl_label = "Take Result"
+    bl_idname = "primdiffusion.apply_result"
+    bl_label = "Apply Result"
     bl_options = {
         "INTERNAL"
     }  # not UNDO: the step has the job's own name, and a failure that changed nothing makes none
@@ -53,12 +51,12 @@ class PRIMDIFFUSION_OT_take_result(bpy.types.Operator):
         job, before = queue.current.job, _data_blocks()
         left_edit_mode = bool(job.undo) and _leave_edit_mode(context)
         outcome = queue.finish(context)
-        went_well = outcome.error is None
-        if went_well and job.undo:
+        succeeded = outcome.error is None
+        if succeeded and job.undo:
             bpy.ops.ed.undo_push(message=job.undo)
-        elif left_edit_mode or _data_blocks() != before:  # by a failure or an exporter; see `in_the_way`
+        elif left_edit_mode or _data_blocks() != before:  # by a failure or an exporter; see `blocking_activity`
             bpy.ops.ed.undo_push(message=job.undo or job.label)
-        if not went_well:
+        if not succeeded:
             print(f"PrimDiffusion: {outcome.sentence}")
             return {"CANCELLED"}
         return {"FINISHED"}
@@ -128,7 +126,7 @@ def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -
         return {"CANCELLED"}
     if not bpy.app.background:
         queue.add(context, job)
-        keep_following()
+        schedule_polling()
         return {"FINISHED"}
     outcome = _wait_for(queue.add(context, job))
     if outcome.error is not None:
@@ -138,7 +136,7 @@ def submit(operator: bpy.types.Operator, context: bpy.types.Context, job: Job) -
     return {"FINISHED"}
 
 
-def keep_following() -> None:
+def schedule_polling() -> None:
     """Have Blender call `follow` until the queue is empty."""
     if not bpy.app.timers.is_registered(follow):
         bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
@@ -147,10 +145,9 @@ def keep_following() -> None:
 def follow() -> float | None:
     """The timer: one tick of the queue; a result enters the scene as soon as nothing is in the way."""
     changed = queue.tick()
-    if queue.ready and not queue.advancing and not in_the_way():
-        enter()
+    if queue.ready and not queue.advancing and not blocking_activity():
+        apply_ready_result()
         changed = True
-    changed |= so_far.show(queue.request.picture if queue.request is not None else None)
     if changed:
         redraw()
     return TICK_S if queue.busy else None
@@ -159,13 +156,13 @@ def follow() -> float | None:
 def watch() -> float:
     """The timer between jobs: notice a child that died, end one that has been idle."""
     if queue.busy:
-        keep_following()
+        schedule_polling()
     elif queue.listen() or release_when_idle(time.monotonic()):
         redraw()
     return WATCH_S
 
 
-def keep_watching() -> None:
+def schedule_watchdog() -> None:
     """Have Blender call `watch` from now on."""
     if not bpy.app.background and not bpy.app.timers.is_registered(watch):
         bpy.app.timers.register(watch, first_interval=WATCH_S, persistent=True)
@@ -178,7 +175,7 @@ def _wait_for(entry: Entry) -> JobOutcome:
             printed = time.monotonic()
             print(printable(f"PrimDiffusion: {queue.request.message}"), flush=True)
         if queue.ready:
-            enter()
+            apply_ready_result()
         else:
             time.sleep(TICK_S / 4)
     return queue.last

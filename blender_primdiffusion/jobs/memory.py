@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-
 import bpy
 
 from ..engine import drawing_child
@@ -12,22 +9,8 @@ from ..places import EXTENSION
 from ..scene.volumes import free_unused_grids
 from .queue import queue
 
-
-def resident_bytes(pid: int) -> int | None:
-    """Physical memory of a process; None on Windows, or where the process is gone."""
-    if os.name == "nt":
-        return None
-    try:
-        shown = subprocess.run(["ps", "-o", "rss=", "-p", str(pid)], capture_output=True, timeout=1.0, check=True)
-        return int(shown.stdout) * 1024
-    except (OSError, subprocess.SubprocessError, ValueError):
-        return None
-
-
 IDLE_MINUTES = 10.0
 """Default, where the preferences have none."""
-_WORTH_REPORTING = 50e6
-"""Bytes."""
 
 
 def device_line() -> str:
@@ -66,28 +49,15 @@ def release_when_idle(now: float) -> bool:
     return True
 
 
-def release() -> str:
-    """End the children that generate and draw, and free grids that Blender can read again; returns what was freed.
+def release() -> None:
+    """End the children that generate and draw, and free grids that Blender can read again.
 
-    Raises RuntimeError while one of them is busy.
+    Raises ValueError while one of them is busy.
     """
     if queue.busy:
-        raise RuntimeError("the backend is busy: wait for it, or cancel the job first")
+        raise ValueError("the backend is busy: wait for it, or cancel the job first")
     if bpy.app.is_job_running("RENDER"):
-        raise RuntimeError("Blender is rendering: wait for it, or cancel it first")
-    pids = [pid for pid in (queue.child_pid, drawing_child.child_pid()) if pid is not None]
-    held = [size for size in map(resident_bytes, pids) if size is not None]
+        raise ValueError("Blender is rendering: wait for it, or cancel it first")
     queue.release()
     drawing_child.close()
-    before = resident_bytes(os.getpid()) or 0
     free_unused_grids()
-    grids = before - (resident_bytes(os.getpid()) or before)
-    freed = (
-        f"Blender gave back {grids / 1e9:.1f} GB of volumes, read again when needed" if grids > _WORTH_REPORTING else ""
-    )
-    if not pids:
-        return freed or "nothing to release: the backend is not running"
-    card = f", and what they held of {queue.info['device_name']}" if queue.info.get("device_memory_gb") else ""
-    size = f", {sum(held) / 1e9:.1f} GB of memory" if held else ""
-    ended = f"{len(pids)} {'process' if len(pids) == 1 else 'processes'} ended{size}{card}"
-    return f"{ended}; {freed}" if freed else ended

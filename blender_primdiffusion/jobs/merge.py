@@ -20,7 +20,7 @@ from .target import HumanTarget
 
 
 @dataclasses.dataclass(frozen=True)
-class Moment:
+class PoseSnapshot:
     """A human in one pose."""
 
     params: dict[str, Any]
@@ -29,7 +29,7 @@ class Moment:
     """See `pose_digest`."""
 
     @classmethod
-    def now(cls, person: bpy.types.Object, armature: bpy.types.Object | None = None) -> Moment:
+    def capture(cls, person: bpy.types.Object, armature: bpy.types.Object | None = None) -> PoseSnapshot:
         """The current pose of the human, or of the evaluated `armature` if given.
 
         Raises ValueError for a renamed bone or a pose that holds NaN, FileNotFoundError where the human's file is
@@ -51,7 +51,7 @@ class MergeJob(Job):
     undo = "Merge Human"
 
     target: HumanTarget
-    moment: Moment
+    moment: PoseSnapshot
     voxel: float
     """Metres."""
 
@@ -81,7 +81,7 @@ class MergeFramesJob(Job):
     undo = "Merge Frames"
 
     target: HumanTarget
-    moments: list[Moment]
+    moments: list[PoseSnapshot]
     start: int
     """The first frame's number."""
     voxel: float

@@ -15,7 +15,7 @@ from bpy.app.handlers import persistent
 
 from ..files.regular_files import printable
 from ..scene.parts import complete_humans, orphans, without_parts
-from .windows import in_the_way, window_of
+from .windows import blocking_activity, window_of
 
 SOON_S = 0.2
 UNDONE_S = 1.0
@@ -42,7 +42,7 @@ def complete() -> None:
 
 def tick() -> float | None:
     """The timer."""
-    if in_the_way() or bpy.context.mode.startswith("EDIT"):
+    if blocking_activity() or bpy.context.mode.startswith("EDIT"):
         return SOON_S
     if not _held:
         with window_of(None):

@@ -10,7 +10,7 @@ import tempfile
 import time
 import traceback
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import bpy
 
@@ -19,7 +19,7 @@ from ..backend.environment import NOT_ABSOLUTE
 from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError, error_text
 from ..files.regular_files import is_local_path, remove_folder
 from ..places import new_backend, preference
-from .remedies import defect_in_the_scene, error_in_the_scene
+from .remedies import defect_in_the_scene, error_in_the_scene, write_error_log
 
 PREVIEW_PX = 16
 """Of the child's previews, which most jobs do not use."""
@@ -28,11 +28,11 @@ PREVIEW_PX = 16
 class Job(abc.ABC):
     """A request to the child, and what becomes of its result. Holds plain data: undo replaces Blender's objects."""
 
-    kind: ClassVar[str]
+    kind: str
     """Identifies the kind of job, for panels; unique."""
-    method: ClassVar[str]
+    method: str
     """The child's method."""
-    undo: ClassVar[str] = ""
+    undo: str = ""
     """Name of the undo step that `finish` makes; empty when it leaves the scene as it is."""
 
     @property
@@ -112,7 +112,7 @@ class JobOutcome:
         return error_text(self.error) if self.error is not None else ""
 
     @property
-    def went_well(self) -> bool:
+    def succeeded(self) -> bool:
         """Neither failed nor cancelled."""
         return self.error is None and self.notice != CANCELLED
 
@@ -282,6 +282,8 @@ class Queue:
             self.request = FinishedRequest(backend, method, result)
 
     def _end(self, outcome: JobOutcome) -> JobOutcome:
+        if outcome.error is not None:
+            write_error_log(outcome.entry.job.label, outcome.error, self.info, self.log)
         self.outcomes[outcome.entry.job.kind] = self.last = outcome
         self.ended.appendleft(outcome)
         self.current = self.request = None

@@ -75,13 +75,6 @@ class Sheet:
             remove_folder(self._folder, self._folder.parent)
         self.variations, self.title, self.around, self._folder = [], "", False, None
 
-    def at(self, index: int) -> Variation:
-        """Raises ValueError for an index that does not exist."""
-        if not 0 <= index < len(self.variations):
-            there = f"there are {len(self.variations)}, counted from 0" if self.variations else "show variations first"
-            raise ValueError(f"there is no variation {index}: {there}")
-        return self.variations[index]
-
     def chosen(self) -> list[Variation]:
         """The selected ones. Raises ValueError for none."""
         found = [variation for variation in self.variations if variation.chosen]

@@ -18,7 +18,6 @@ from ..scene.payload import session_file
 from ..scene.representation import show_in_viewport
 from ..scene.volume_files import open_humans, write_volumes, writing
 from ..scene.volume_nodes import set_folder, volumes_of
-from .export import show, shown
 from .queue import Job
 from .target import HumanTarget
 
@@ -65,7 +64,7 @@ class VolumesJob(Job):
         if self._error is not None:
             raise self._error
         person = self.target.found()
-        show_volumes(person, True)
+        show_in_viewport(person, True)
         set_folder(person, session_file(person).parent, again=True)
         return f"3D views show the volumes of {person.name}"
 
@@ -91,14 +90,6 @@ def write_or_report(person: bpy.types.Object) -> None:
         write_volumes(person)
     except (OSError, ValueError) as error:
         faults.report(str(error))
-
-
-def show_volumes(person: bpy.types.Object, in_viewport: bool) -> None:
-    """Show a human's volumes in viewports or hide them; what is shown of its mesh proxy stays. Makes no undo step."""
-    what = shown(person)
-    show_in_viewport(person, in_viewport)
-    if what != "VOLUMES":
-        show(person, what)
 
 
 @persistent

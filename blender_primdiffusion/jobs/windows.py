@@ -24,12 +24,12 @@ _more_may_wait = False
 """Further steps may wait in Blender's queue."""
 
 
-def in_the_way() -> str:
+def blocking_activity() -> str:
     """What a timer has to wait for before it changes data, as shown in panels; empty for nothing.
 
     Undo reads only those data-blocks that differ between two of its steps, and keeps the others as they are now. What
     a timer changes between two steps then refers to data that the next step removes, and Blender (5.2.2) crashes. So a
-    timer waits until undo and redo have rested, and what it changes becomes an undo step (`take_result`).
+    timer waits until undo and redo have rested, and what it changes becomes an undo step (`apply_result`).
 
     Files are loaded and saved within one event, during which no timer runs.
     """
@@ -103,21 +103,14 @@ def window_of(scene: bpy.types.Scene | None) -> Iterator[None]:
 
 
 def redraw() -> None:
-    """Redraw the sidebars of all windows, which do not notice progress themselves.
+    """Redraw the sidebars of all windows, and the preferences, which do not notice progress themselves.
 
     Not the views beside them, which take long.
     """
-    _redraw_regions("UI")
-
-
-def redraw_views() -> None:
-    """Redraw the 3D views of all windows."""
-    _redraw_regions("WINDOW")
-
-
-def _redraw_regions(kind: str) -> None:
     for window in bpy.context.window_manager.windows:
         for area in window.screen.areas:
+            if area.type == "PREFERENCES":
+                area.tag_redraw()
             for region in area.regions if area.type == "VIEW_3D" else ():
-                if region.type == kind:
+                if region.type == "UI":
                     region.tag_redraw()

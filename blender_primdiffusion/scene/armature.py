@@ -138,6 +138,15 @@ def model_origin(data: bpy.types.Armature) -> NDArray[np.float64]:
     return np.array(stored_numbers(data, ORIGIN, 3) or (0.0, 0.0, 0.0))
 
 
+def check_joints(armature: bpy.types.Object) -> None:
+    """Raises ValueError for an armature that lacks one of SMPL's joints or is in Edit Mode."""
+    missing = [name for name in JOINT_NAMES if name not in armature.data.bones]
+    if missing:
+        raise ValueError(f"the armature {armature.name!r} has no bone {missing[0]!r}: give it this name again")
+    if armature.data.is_editmode:
+        raise ValueError(f"{armature.name!r} is in Edit Mode: leave it (Tab) first")
+
+
 def rest_rotations(armature: bpy.types.Object) -> NDArray[np.float64]:
     """Rest axes of the bones [24, 3, 3] in the armature's space, in SMPL's joint order.
 

@@ -41,8 +41,6 @@ def build_human(context: bpy.types.Context, file: str | Path, name: str = "Human
     """
     file = Path(file)
     human = read_human(file)
-    if human.model.uv_corner is None:
-        raise ValueError("the body's file is of an earlier version, without texture coordinates: import it again")
     with _no_data_left_on_failure():
         collection = bpy.data.collections.new(name[:NAME_LENGTH])
         origin = floor_below(points_to_blender(human.rest.vertices))

@@ -191,14 +191,6 @@ def set_input(modifier: bpy.types.NodesModifier, name: str, value: Any) -> None:
         getattr(modifier.properties.inputs, socket).value = value
 
 
-def get_input(modifier: bpy.types.NodesModifier, name: str) -> Any:
-    """An input of a modifier by its name in the group; None where there is no such input."""
-    socket = _sockets(modifier).get(name, "")
-    if bpy.app.version < (5, 2):
-        return modifier.get(socket)
-    return getattr(getattr(modifier.properties.inputs, socket, None), "value", None)
-
-
 def _sockets(modifier: bpy.types.NodesModifier) -> dict[str, str]:
     """Identifiers of a group's inputs by their names."""
     items = modifier.node_group.interface.items_tree if modifier.node_group is not None else ()

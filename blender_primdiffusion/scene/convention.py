@@ -17,11 +17,6 @@ def points_to_blender(points: NDArray) -> NDArray[np.float64]:
     return np.asarray(points, np.float64) @ BLENDER_FROM_BACKEND.T
 
 
-def frames_to_blender(rotation: NDArray) -> NDArray[np.float64]:
-    """Local-to-world rotations [..., 3, 3] of frames: the world turns, the local axes stay."""
-    return BLENDER_FROM_BACKEND @ np.asarray(rotation, np.float64)
-
-
 def rotations_to_blender(rotation: NDArray) -> NDArray[np.float64]:
     """World-to-world rotations [..., 3, 3], such as SMPL's joint rotations: both sides turn."""
     return BLENDER_FROM_BACKEND @ np.asarray(rotation, np.float64) @ BLENDER_FROM_BACKEND.T

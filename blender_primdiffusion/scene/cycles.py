@@ -17,37 +17,6 @@ _MARGIN = 1.05
 _FLESH_M = 0.08
 
 
-def setup_cycles_preview(
-    scene: bpy.types.Scene,
-    *,
-    size: int = 384,
-    samples: int = 1,
-    yaw: float = 0.0,
-    world: float | None = None,
-) -> bpy.types.Object:
-    """Make `scene` ready to render its humans as they are posed now, and return the camera, which frames them.
-
-    size: pixels a side. samples: per pixel; more samples only smooth edges, since no light scatters. yaw: angle of the
-    camera from the front towards the human's left, radians. world: grey level of the background, None for a transparent
-    film. The view transform is Standard, so that the picture has the colours of the volumes. A picture of 384 x 384 at
-    one sample took a minute on two idle cores (docs/results/demo.json). Raises ValueError for a scene without humans.
-    """
-    extent = humans_extent(scene)
-    scene.render.engine = "CYCLES"
-    fit_cycles_to_volumes(scene, samples)
-    scene.render.resolution_x = scene.render.resolution_y = size
-    scene.render.resolution_percentage = 100
-    scene.render.film_transparent = world is None
-    scene.render.image_settings.file_format = "PNG"
-    scene.render.image_settings.color_mode = "RGBA"
-    scene.view_settings.view_transform = "Standard"
-    scene.view_settings.look = "None"
-    scene.world = _flat_world(0.0 if world is None else world)
-    scene.camera = new_camera(scene)
-    frame_box(scene.camera, extent, yaw)
-    return scene.camera
-
-
 def fit_cycles_to_volumes(scene: bpy.types.Scene, samples: int) -> None:
     """Set Cycles up so that a human takes minutes, not hours: other objects lose indirect light."""
     cycles = scene.cycles
@@ -78,13 +47,6 @@ def posed_extent(person: bpy.types.Object) -> tuple[NDArray[np.float64], NDArray
     return points.min(0) - _FLESH_M, points.max(0) + _FLESH_M
 
 
-def _flat_world(grey: float) -> bpy.types.World:
-    world = bpy.data.worlds.new("PrimDiffusion Preview")
-    background = next(node for node in world.node_tree.nodes if node.type == "BACKGROUND")
-    background.inputs["Color"].default_value = (grey, grey, grey, 1.0)
-    return world
-
-
 def new_camera(scene: bpy.types.Scene) -> bpy.types.Object:
     """A camera in the scene, at the origin until `frame_box` places it."""
     data = bpy.data.cameras.new("Preview Camera")
@@ -95,39 +57,19 @@ def new_camera(scene: bpy.types.Scene) -> bpy.types.Object:
 
 
 def frame_box(
-    camera: bpy.types.Object,
-    extent: tuple[NDArray, NDArray],
-    yaw: float,
-    size: tuple[int, int] = (1, 1),
-    distance: float | None = None,
+    camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
 ) -> None:
     """Point the camera at the middle of a box, level, from `yaw` radians, as near as a picture of `size` shows all
-    corners; or from `distance` metres, which turntables keep constant.
-    """
+    corners."""
     low, high = extent
-    if distance is None:
-        distance = framing_distance(camera, extent, yaw, size)
-    direction = _camera_direction(yaw)
-    camera.location = (low + high) / 2 + direction * distance
-    camera.rotation_euler = Vector(-direction).to_track_quat("-Z", "Y").to_euler()
-    camera.data.clip_end = max(100.0, 2 * distance)
-
-
-def framing_distance(
-    camera: bpy.types.Object, extent: tuple[NDArray, NDArray], yaw: float, size: tuple[int, int] = (1, 1)
-) -> float:
-    """Distance in metres from the middle of a box at which a picture of `size` just shows its eight corners."""
-    low, high = extent
-    right = np.array([math.cos(yaw), math.sin(yaw), 0.0])
+    right, direction = np.array([math.cos(yaw), math.sin(yaw), 0.0]), np.array([math.sin(yaw), -math.cos(yaw), 0.0])
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]) * (high - low) / 2
     half = np.array(size) / max(size) * (_SENSOR_MM / 2 / camera.data.lens)  # tangents of the half angles of view
     aside = np.maximum(np.abs(corners @ right) / half[0], np.abs(corners[:, 2]) / half[1]) * _MARGIN
-    return float((aside + corners @ _camera_direction(yaw)).max())
-
-
-def _camera_direction(yaw: float) -> NDArray[np.float64]:
-    """The horizontal direction from the subject to a camera at `yaw`."""
-    return np.array([math.sin(yaw), -math.cos(yaw), 0.0])
+    distance = float((aside + corners @ direction).max())
+    camera.location = (low + high) / 2 + direction * distance
+    camera.rotation_euler = Vector(-direction).to_track_quat("-Z", "Y").to_euler()
+    camera.data.clip_end = max(100.0, 2 * distance)
 
 
 CYCLES_LIMIT = 31

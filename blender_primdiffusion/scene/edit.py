@@ -1,4 +1,4 @@
-"""Edits of a human: another shape, for which bones, body mesh and proxy move to their new rest places; the
+"""Edits of a human: another shape, for which bones and body mesh move to their new rest places; the
 region painted for an edit by the backend; and its result in place of the human before."""
 
 from __future__ import annotations
@@ -10,13 +10,11 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.joints import JOINT_NAMES
-from .armature import floor_below, move_rest_joints
+from .armature import check_joints, floor_below, move_rest_joints
 from .cells import scale_cells
 from .convention import points_to_blender
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, ORIGIN, body_of, check_editable, own_data
 from .payload import pack, session_file
-from .proxy import follow_shape, proxy_of
 from .rest_human import read_human, shape_model_of
 from .shape import SAME_BETAS, Rest, betas_of, generated_betas, has_custom_shape
 from .splats import replace_splats
@@ -32,20 +30,15 @@ def check_shapeable(person: bpy.types.Object) -> None:
                 f"the human {person.name!r} is linked from {obj.library.filepath!r}: reshape it there, or "
                 "make it local with Object > Relations > Make Local > All"
             )
-    missing = [name for name in JOINT_NAMES if name not in person.data.bones]
-    if missing:
-        raise ValueError(
-            f"the armature {person.name!r} has no bone {missing[0]!r}: give it this name again to change the shape"
-        )
-    for obj in (person, body):
-        if obj is not None and obj.data.is_editmode:
-            raise ValueError(f"{obj.name!r} is in Edit Mode: leave it (Tab) to change the shape")
+    check_joints(person)
+    if body is not None and body.data.is_editmode:
+        raise ValueError(f"{body.name!r} is in Edit Mode: leave it (Tab) to change the shape")
 
 
 def reshape(person: bpy.types.Object, betas: NDArray) -> str:
     """Give a human another shape [10]; returns what could not follow in a sentence, empty when everything did.
 
-    Bones, body mesh and mesh proxy move to their new rest places, with the soles where they were; pose and animation
+    Bones and body mesh move to their new rest places, with the soles where they were; pose and animation
     stay. Raises ValueError or FileNotFoundError before anything is touched. Makes no undo step.
     """
     betas = np.asarray(betas, np.float64)
@@ -57,7 +50,6 @@ def reshape(person: bpy.types.Object, betas: NDArray) -> str:
     growth = model.growth(generated, betas)
     notice = apply_rest(person, model.rest(betas), betas)
     scale_cells(person, model, betas, growth)
-    follow_shape(person, proxy_of(person), betas)
     return notice
 
 
@@ -111,8 +103,6 @@ def replace_person(person: bpy.types.Object, file: Path) -> Replaced:
     growth = human.model.growth(betas, betas_of(person)) if custom else np.ones((len(human.payload.density), 3))
     pack(person, file, own_body=human.payload.rest_half_extent is not None)
     warning = apply_rest(person, human.rest, betas) if reshaped else ""
-    if reshaped:
-        follow_shape(person, proxy_of(person), betas)
     replace_splats(person, human)
     scale_cells(person, human.model, betas_of(person), growth)
     set_folder(person, session_file(person).parent)

@@ -18,7 +18,7 @@ import bpy
 
 from ..files.regular_files import remove_folder
 from ..files.whole_files import replacing
-from ..formats.joints import JOINT_NAMES
+from .armature import check_joints
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,17 +34,6 @@ class FrameRange:
         return self.last > self.first
 
 
-def check_ready(armature: bpy.types.Object) -> None:
-    """Raises ValueError for an armature that cannot be exported now."""
-    if armature.data.is_editmode:
-        raise ValueError(f"{armature.name!r} is in Edit Mode: leave it (Tab) to export")
-    missing = [name for name in JOINT_NAMES if name not in armature.data.bones]
-    if missing:
-        raise ValueError(
-            f"the armature {armature.name!r} has no bone {missing[0]!r}: give it this name again to export"
-        )
-
-
 def write_model(
     context: bpy.types.Context,
     armature: bpy.types.Object,
@@ -58,7 +47,7 @@ def write_model(
     USD's textures go into a folder beside the file, except in .usdz. Raises ValueError or RuntimeError where an
     exporter is missing or fails, and OSError.
     """
-    check_ready(armature)
+    check_joints(armature)
     folder = Path(tempfile.mkdtemp(prefix="export_", dir=bpy.app.tempdir or None))
     try:
         with _selected_in_scene(context, armature, mesh, frames) as overrides, context.temp_override(**overrides):

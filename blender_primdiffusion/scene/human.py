@@ -22,6 +22,8 @@ MARK = "primdiffusion_human"
 """Custom property of a human, which is an armature: provenance as JSON."""
 BODY_MARK = "primdiffusion_body"
 """Custom property of a body mesh: the engine leaves it out, shown or hidden."""
+PROXY_MARK = "primdiffusion_proxy"
+"""Custom property of a mesh proxy: the human's file that it was made from and the shape that it shows, as JSON."""
 BETAS = "primdiffusion_betas"
 """Custom property of a human: the body's shape, which the engine draws and which may be animated."""
 ORIGIN = "primdiffusion_origin"
@@ -54,6 +56,11 @@ def parts_of(person: bpy.types.Object) -> list[bpy.types.Object]:
 def body_of(person: bpy.types.Object) -> bpy.types.Object | None:
     """The human's body mesh; None when it was deleted."""
     return next((obj for obj in parts_of(person) if obj.type == "MESH" and BODY_MARK in obj), None)
+
+
+def proxy_of(person: bpy.types.Object) -> bpy.types.Object | None:
+    """The human's mesh proxy, if any."""
+    return next((obj for obj in parts_of(person) if obj.type == "MESH" and PROXY_MARK in obj), None)
 
 
 def humans(scene: bpy.types.Scene) -> list[bpy.types.Object]:

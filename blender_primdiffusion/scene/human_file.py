@@ -10,7 +10,6 @@ import dataclasses
 import functools
 import io
 import json
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -248,17 +247,6 @@ def write_tensors(path: Path, human: HumanTensors) -> None:
         file.write(len(text).to_bytes(LENGTH_BYTES, "little") + text)
         for name in ordered:
             file.write(human.arrays[name][2])
-
-
-def write_body(path: Path, arrays: Mapping[str, NDArray]) -> None:
-    """Write a body's file, as `body_arrays` reads it. Raises OSError."""
-    stored = {
-        name: ("I32", array.shape, np.ascontiguousarray(array, "<i4").tobytes())
-        if array.dtype.kind in "iu"
-        else _stored(array)
-        for name, array in arrays.items()
-    }
-    write_tensors(path, HumanTensors({"format": "primdiffusion.body", "format_version": "1"}, stored))
 
 
 def _stored(array: NDArray) -> tuple[str, tuple[int, ...], bytes | memoryview]:

@@ -18,8 +18,8 @@ from ..files.regular_files import FileError, as_file_error, check_inside, real_p
 from ..files.whole_files import written_whole
 from .blend_values import stored_record
 from .human import link_part, parts_of, write_error
-from .material import volume_material
 from .payload import session_folder, state_of
+from .volume_nodes import volume_material
 from .volumes import write_vdb
 
 MARK = "primdiffusion_merged"

@@ -6,9 +6,8 @@ from __future__ import annotations
 import bpy
 
 from .build import build_missing_parts
-from .human import BODY_MARK, all_humans
+from .human import BODY_MARK, PROXY_MARK, all_humans
 from .merged import MARK as MERGED_MARK
-from .proxy import PROXY_MARK
 from .splats import CELLS_MARK, SPLATS_AVAILABLE, SPLATS_MARK, cloud_of
 from .stand_in import STAND_IN
 from .volume_nodes import VOLUMES_MARK, volumes_of

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import bpy
 
-from ..files.regular_files import read_regular, remove_folder
+from ..files.regular_files import read_regular
 from ..files.whole_files import written_whole
 from .blend_values import stored_image
 
@@ -62,8 +62,7 @@ def session_file(armature: bpy.types.Object) -> Path:
     folder = session_folder() / state_of(armature)
     if stored_image(armature, PAYLOAD, LARGEST_PERSON) is None:
         raise ValueError(
-            f"{armature.name!r} holds no data of a human, as in files of earlier versions: generate the human again, "
-            "or import its .human file"
+            f"{armature.name!r} holds no data of a human: generate the human again, or import its .human file"
         )
     for name, file in _FILES.items():
         image = stored_image(armature, name, LARGEST_PERSON)
@@ -78,11 +77,6 @@ def state_of(armature: bpy.types.Object) -> str:
     """Identifies what an armature holds, by its content: an edit changes it, undo switches it back."""
     images = (stored_image(armature, name, LARGEST_PERSON) for name in _FILES)
     return "_".join(_digest(image) for image in images if image is not None)
-
-
-def forget_session_files() -> None:
-    """Remove the files of this session; those that are needed again are written again."""
-    remove_folder(session_folder(), session_folder().parent)
 
 
 def _packed(name: str, data: bytes) -> bpy.types.Image:

@@ -9,8 +9,7 @@ import numpy as np
 from mathutils import Vector
 from numpy.typing import NDArray
 
-from .human import BODY_MARK, humans
-from .proxy import PROXY_MARK
+from .human import BODY_MARK, PROXY_MARK, humans
 from .stand_in import STAND_IN
 
 GAP_M = 0.2

@@ -28,10 +28,9 @@ from .human_file import (
     read_sizes,
     read_tensors,
 )
-from .overlap import max_overlap
 from .payload import BODY_FILE, session_file
 from .shape import FIELDS, OPTIONAL_FIELDS, Rest, ShapeModel, faulty_field
-from .volumes import Grids, bake
+from .volumes import Grids, bake, max_overlap
 
 
 def shape_model_of(person: bpy.types.Object) -> ShapeModel:

@@ -75,8 +75,8 @@ class ShapeModel:
     """Skinning of the vertices [V, 24]; rows sum to one."""
     rest_half_extent: NDArray[np.float32]
     """Half sides of the boxes along T, B, N before their delta scale [K, 3], metres."""
-    uv_corner: NDArray[np.float32] | None = None
-    """Texture coordinates of each triangle corner [F, 3, 2], v up; None in files of an earlier version."""
+    uv_corner: NDArray[np.float32]
+    """Texture coordinates of each triangle corner [F, 3, 2], v up."""
     pose_basis: NDArray[np.float32] | None = None
     """Pose-dependent correctives (SMPL eq. 9) of the vertices `used` [U, 3, 207]; None for a body without."""
 
@@ -85,10 +85,6 @@ class ShapeModel:
         """The model of a file's arrays, in the dtypes above."""
         names = [*FIELDS, *(name for name in OPTIONAL_FIELDS if name in arrays)]
         return cls(**{name: arrays[name].astype(np.int32 if name in INTEGERS else np.float32) for name in names})
-
-    def primitive_weights(self) -> NDArray[np.float64]:
-        """Skinning of each primitive [K, 24]; rows sum to one."""
-        return np.einsum("kc,kcj->kj", self.barycentric, self.skin_weights[self.faces[self.face]], dtype=np.float64)
 
     def used(self) -> NDArray[np.int32]:
         """The vertices that determine the primitives' frames [U], ascending."""
@@ -168,12 +164,10 @@ FIELDS: dict[str, tuple[int | str, ...]] = {
     "joint_template": (24, 3), "joint_basis": (24, 3, BETA_COUNT),
     "faces": ("F", 3), "face": ("K",), "barycentric": ("K", 3),
     "stencil_vertex": ("K", "m"), "stencil_du": ("K", "m"), "stencil_dv": ("K", "m"),
-    "skin_weights": ("V", 24), "rest_half_extent": ("K", 3),
+    "skin_weights": ("V", 24), "rest_half_extent": ("K", 3), "uv_corner": ("F", 3, 2),
 }  # fmt: skip
 """Shapes of a ShapeModel's arrays, which files store under the same names."""
-OPTIONAL_FIELDS: dict[str, tuple[int | str, ...]] = {
-    "uv_corner": ("F", 3, 2), "pose_basis": ("U", 3, 207),
-}  # fmt: skip
+OPTIONAL_FIELDS: dict[str, tuple[int | str, ...]] = {"pose_basis": ("U", 3, 207)}
 INTEGERS = ("faces", "face", "stencil_vertex")
 
 
@@ -280,7 +274,7 @@ def betas_of(person: bpy.types.Object) -> NDArray[np.float64]:
     betas = stored_numbers(person, BETAS, BETA_COUNT)
     if betas is None:
         raise ValueError(
-            f"the custom property {BETAS!r} on the armature of {person.name!r} is no list of {BETA_COUNT} numbers: "
+            f"the custom property {BETAS!r} on the armature of {person.name!r} is not a list of {BETA_COUNT} numbers: "
             "delete it"
         )
     return np.array(betas)

@@ -1,8 +1,4 @@
-"""Primitives as VDB files, and Blender's cache of their grids.
-
-Blender's module openvdb may be missing, as in Debian. Humans need no volumes to be drawn by PrimDiffusion, only by
-Cycles and EEVEE, so nothing is refused then but writing: each writer raises ValueError.
-"""
+"""Primitives as VDB files, how many of them overlap, and Blender's cache of their grids."""
 
 from __future__ import annotations
 
@@ -11,7 +7,6 @@ import dataclasses
 import os
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import bpy
 import numpy as np
@@ -20,10 +15,7 @@ from numpy.typing import NDArray
 from ..files.whole_files import temporary_folder
 
 bpy.utils.expose_bundled_modules()
-try:
-    import openvdb as _openvdb
-except ModuleNotFoundError:
-    _openvdb = None
+import openvdb  # noqa: E402  Blender's own, importable only after the line above
 
 VOXELS = 8
 """Voxels along a side of a primitive."""
@@ -39,16 +31,6 @@ _ALMOST_EMPTY = 1e-4
 """Opacity per metre of the one voxel of an empty primitive: Cycles complains of grids without any value."""
 _ALL_ACTIVE = -1.0
 """A tolerance below every difference from the background, so that zeros become active voxels too."""
-
-
-def openvdb() -> ModuleType:
-    """The module. Raises ValueError where Blender's Python lacks it."""
-    if _openvdb is None:
-        raise ValueError(
-            "the Python of this Blender lacks openvdb, without which volumes cannot be written for Cycles and EEVEE: "
-            "install it (on Debian and Ubuntu: sudo apt install python3-openvdb), then start Blender again"
-        )
-    return _openvdb
 
 
 @dataclasses.dataclass(frozen=True)
@@ -72,6 +54,40 @@ class Grids:
         low = -self.half_extent + (self.first - PAD - 0.5) * step
         high = -self.half_extent + (self.last - PAD + 0.5) * step
         return (low + high) / 2, (high - low) / 2
+
+
+_OFFSET = 0.8
+"""Offset from the middle, in half sides, of the points of a box that are tried on each axis."""
+
+
+def max_overlap(centre: NDArray, rotation: NDArray, half: NDArray) -> int:
+    """The largest number of boxes (centre [K, 3], axes in columns [K, 3, 3], half sides [K, 3]) over one point.
+
+    A lower bound: 27 points of each box are tried.
+    """
+    centre, rotation, half = (np.asarray(values, np.float32) for values in (centre, rotation, half))
+    lattice = (
+        np.stack(np.meshgrid(*[[-_OFFSET, 0.0, _OFFSET]] * 3, indexing="ij"), -1).reshape(-1, 3).astype(np.float32)
+    )
+    tried, box = _near(centre, np.linalg.norm(half, axis=-1))
+    into = rotation[box].transpose(0, 2, 1)
+    at = np.matmul(into, (centre[tried] - centre[box])[..., None])[..., 0] / half[box]
+    axes = np.matmul(into, rotation[tried]) * half[tried][:, None] / half[box][..., None]
+    meets = (np.abs(at) < 1 + _OFFSET * np.abs(axes).sum(-1)).all(-1)
+    tried, at, axes = tried[meets], at[meets], axes[meets]
+    inside = np.ones((len(at), len(lattice)), bool)
+    for axis in range(3):
+        inside &= np.abs(axes[:, axis] @ lattice.T + at[:, axis, None]) < 1
+    firsts = np.searchsorted(tried, np.arange(len(centre)))  # each box meets itself
+    return int(np.add.reduceat(inside, firsts, axis=0, dtype=np.int32).max())
+
+
+def _near(centre: NDArray, radius: NDArray) -> tuple[NDArray, NDArray]:
+    """Pairs of a box and one, or itself, that may contain one of its points; sorted."""
+    squared = np.zeros((len(centre), len(centre)), centre.dtype)
+    for axis in range(3):
+        squared += (centre[:, None, axis] - centre[None, :, axis]) ** 2
+    return np.nonzero(squared < (_OFFSET * radius[:, None] + radius[None]) ** 2)
 
 
 def window() -> NDArray[np.float64]:
@@ -145,16 +161,15 @@ def write_vdb(
 
     Voxels no further than `tolerance` from zero are left out. Raises OSError, and RuntimeError when the disk is full.
     """
-    vdb = openvdb()
-    transform = vdb.createLinearTransform(index_to_object.tolist())
-    fog, cd = vdb.FloatGrid(), vdb.Vec3SGrid()
-    fog.name, fog.gridClass = "density", vdb.GridClass.FOG_VOLUME
+    transform = openvdb.createLinearTransform(index_to_object.tolist())
+    fog, cd = openvdb.FloatGrid(), openvdb.Vec3SGrid()
+    fog.name, fog.gridClass = "density", openvdb.GridClass.FOG_VOLUME
     cd.name = "Cd"
     for grid, values, near_zero in ((fog, density, tolerance), (cd, colour, (tolerance,) * 3)):
         grid.copyFromArray(np.ascontiguousarray(values, np.float32), ijk=start, tolerance=near_zero)
         grid.transform = transform
         grid.saveFloatAsHalf = True
-    vdb.write(str(path), grids=[fog, cd])
+    openvdb.write(str(path), grids=[fog, cd])
 
 
 _LOWEST_LIMIT_MB = 1

@@ -16,15 +16,13 @@ from ..jobs import follow, parts, volumes, windows
 from ..scene import stand_in
 from . import (
     advanced_panel,
-    attributes,
-    captures_command,
     captures_panel,
     captures_settings,
     edit_panel,
     export_operators,
     export_panel,
-    gallery,
     generate_panel,
+    generate_settings,
     human_panel,
     import_motion,
     jobs_panel,
@@ -42,11 +40,11 @@ from . import (
 )
 
 MODULES = (
-    *filter(None, (preferences.setup, preferences)), windows, follow, jobs_panel, attributes,
-    generate_panel, variations_panel, human_panel, shape_panel, edit_panel, parts,
+    *filter(None, (preferences.setup, preferences)), windows, follow, jobs_panel,
+    generate_settings, variations_panel, generate_panel, human_panel, shape_panel, edit_panel, parts,
     volumes, import_motion, motion_panel, pose_panel, picture_panel,
-    render_panel, export_operators, gallery, export_panel, advanced_panel, captures_settings,
-    captures_panel, reconstruct_panel, viewport_humans, captures_command, manual, menus, stand_in,
+    render_panel, export_operators, export_panel, advanced_panel, captures_settings,
+    captures_panel, reconstruct_panel, viewport_humans, manual, menus, stand_in,
 )  # fmt: skip
 """In the order of registration: later ones refer to settings and parent panels of earlier ones."""
 

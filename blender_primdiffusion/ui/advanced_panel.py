@@ -7,23 +7,26 @@ import bpy
 from ..backend.requests import sentence
 from ..formats.requests import VOXEL
 from ..jobs.follow import submit
-from ..jobs.merge import MergeFramesJob, MergeJob, Moment
+from ..jobs.merge import MergeFramesJob, MergeJob, PoseSnapshot
 from ..jobs.target import HumanTarget, selected_person
-from ..jobs.volumes import VolumesJob, show_volumes
+from ..jobs.volumes import VolumesJob
 from ..places import backend_is_named
 from ..scene.blend_values import as_shown
 from ..scene.cycles import overlap_of, overlap_warning_in
-from ..scene.human import humans, provenance_of
-from ..scene.material import density_gain
+from ..scene.human import humans, provenance_of, proxy_of
 from ..scene.merged import merged_of, merged_state, remove_merged
+from ..scene.proxy import remove_proxy
 from ..scene.representation import (
+    MESH_IN_VIEWPORT,
     in_viewport,
+    mesh_in_viewport,
     representation_of,
     set_representation,
-    without_merged,
+    show_in_viewport,
+    stop_showing,
 )
 from ..scene.splats import SPLATS_AVAILABLE, cloud_of
-from ..scene.volume_nodes import volumes_of
+from ..scene.volume_nodes import density_gain, volumes_of
 from .declared import SKIP
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .jobs_panel import draw_backend
@@ -38,12 +41,15 @@ REPRESENTATIONS = (
     ),
     ("VOLUMES", "Volumes", "A volume for each box, which follow every pose; Cycles needs minutes"),
     ("MERGED", "Merged", "The merged volume, in the pose it was merged in; far faster in Cycles"),
+    ("MESH", "Mesh", "The mesh proxy, in renders and viewports"),
+    (MESH_IN_VIEWPORT, "Mesh in Viewport", "The mesh proxy while working; renders show what they showed before"),
 )
+_NO_MESH = ("NO_MESH", "Remove Mesh Proxy", "Delete the mesh proxy, and show what there was before")
 _MOST_FRAMES = 3_000
 
 
 class PRIMDIFFUSION_OT_set_representation(HumanOperator, bpy.types.Operator):
-    """Choose what renders show of the selected human"""
+    """Choose what renders and viewports show of the selected human"""
 
     bl_idname = "primdiffusion.set_representation"
     bl_label = "Show As"
@@ -51,11 +57,17 @@ class PRIMDIFFUSION_OT_set_representation(HumanOperator, bpy.types.Operator):
     described_by = ("representation",)
 
     representation: bpy.props.EnumProperty(
-        name="Show As", description="What renders show of the human", items=REPRESENTATIONS, default="VOLUMES"
+        name="Show As", description="What shows the human", items=(*REPRESENTATIONS, _NO_MESH), default="VOLUMES"
     )
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        set_representation(person, self.representation)
+        if self.representation != "NO_MESH":
+            set_representation(person, self.representation)
+        elif (proxy := proxy_of(person)) is None:
+            raise ValueError(f"{person.name!r} has no mesh proxy")
+        else:
+            stop_showing(person, "MESH")
+            remove_proxy(proxy)
         return {"FINISHED"}
 
 
@@ -68,7 +80,7 @@ class PRIMDIFFUSION_OT_volumes_in_viewport(HumanOperator, bpy.types.Operator):
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         if not in_viewport(person) and representation_of(person) == "VOLUMES":
             return submit(self, context, VolumesJob(HumanTarget.of(person)))
-        show_volumes(person, not in_viewport(person))
+        show_in_viewport(person, not in_viewport(person))
         bpy.ops.ed.undo_push(message=self.bl_label)
         return {"FINISHED"}
 
@@ -104,12 +116,12 @@ class PRIMDIFFUSION_OT_merge(HumanOperator, bpy.types.Operator):
             return {"FINISHED"}
         target, voxel = HumanTarget.of(person), context.scene.primdiffusion_merging.voxel
         if self.what == "POSE":
-            moment = _moment(person, context.evaluated_depsgraph_get())
+            moment = PoseSnapshot.capture(person, person.evaluated_get(context.evaluated_depsgraph_get()))
             return submit(self, context, MergeJob(target, moment, voxel))
         start, end = context.scene.frame_start, context.scene.frame_end
         if not 1 < end - start + 1 <= _MOST_FRAMES:
             raise ValueError(
-                f"frames {start} to {end} are no sequence: give a start and a later end, of at most {_MOST_FRAMES}"
+                f"frames {start} to {end} are not a sequence: give a start and a later end, of at most {_MOST_FRAMES}"
             )
         moments = _moments(context, person, range(start, end + 1))
         return submit(self, context, MergeFramesJob(target, moments, start, voxel))
@@ -119,23 +131,18 @@ def _unmerge(person: bpy.types.Object) -> None:
     """Raises ValueError where there is no merged volume."""
     if merged_of(person) is None:
         raise ValueError(f"{person.name!r} has no merged volume")
-    if representation_of(person) == "MERGED":
-        set_representation(person, without_merged(person))
+    stop_showing(person, "MERGED")
     remove_merged(person)
 
 
-def _moment(person: bpy.types.Object, graph: bpy.types.Depsgraph) -> Moment:
-    return Moment.now(person, person.evaluated_get(graph))
-
-
-def _moments(context: bpy.types.Context, person: bpy.types.Object, frames: range) -> list[Moment]:
+def _moments(context: bpy.types.Context, person: bpy.types.Object, frames: range) -> list[PoseSnapshot]:
     """The human in each frame; the scene is at its own frame again afterwards."""
     scene, now = context.scene, context.scene.frame_current
     moments = []
     try:
         for frame in frames:
             scene.frame_set(frame)
-            moments.append(_moment(person, context.evaluated_depsgraph_get()))
+            moments.append(PoseSnapshot.capture(person, person.evaluated_get(context.evaluated_depsgraph_get())))
     finally:
         scene.frame_set(now)
     return moments
@@ -200,17 +207,29 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
 
 def _draw_representation(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:
     """What renders show of the human."""
-    now = representation_of(person)
-    absent = {"MERGED": merged_of(person) is None, "SPLATS": not SPLATS_AVAILABLE}
-    row = layout.row(align=True)
-    for name, label, _ in REPRESENTATIONS:
-        if not absent.get(name):
-            row.operator("primdiffusion.set_representation", text=label, depress=name == now).representation = name
-    if now != "SPLATS":
+    draw_representations(layout, person)
+    if representation_of(person) in ("VOLUMES", "MERGED"):
         is_shown = in_viewport(person)
         icon = "RESTRICT_VIEW_OFF" if is_shown else "RESTRICT_VIEW_ON"
         text = "Hide Volumes in Viewport" if is_shown else "Show Volumes in Viewport"
         draw_job(layout, "volumes", "primdiffusion.volumes_in_viewport", icon, text=text)
+
+
+def draw_representations(layout: bpy.types.UILayout, person: bpy.types.Object) -> None:
+    """Buttons for what there is to choose from; the one shown is pressed."""
+    now = MESH_IN_VIEWPORT if mesh_in_viewport(person) else representation_of(person)
+    now = "MESH" if representation_of(person) == "MESH" else now
+    without_mesh = proxy_of(person) is None
+    absent = {
+        "MERGED": merged_of(person) is None,
+        "SPLATS": not SPLATS_AVAILABLE,
+        "MESH": without_mesh,
+        MESH_IN_VIEWPORT: without_mesh,
+    }
+    grid = layout.grid_flow(columns=2, even_columns=True, align=True)
+    for name, label, _ in REPRESENTATIONS:
+        if not absent.get(name):
+            grid.operator("primdiffusion.set_representation", text=label, depress=name == now).representation = name
 
 
 def _draw_merge(layout: bpy.types.UILayout, context: bpy.types.Context, person: bpy.types.Object) -> None:
@@ -250,7 +269,7 @@ def _draw_facts(layout: bpy.types.UILayout, _context: bpy.types.Context, person:
 def outdated(person: bpy.types.Object, scene: bpy.types.Scene) -> bool:
     """Whether the merged volume shows another pose, shape or human than the armature as it is now."""
     try:
-        return not merged_state(merged_of(person)).shows(Moment.now(person).digest, scene.frame_current)
+        return not merged_state(merged_of(person)).shows(PoseSnapshot.capture(person).digest, scene.frame_current)
     except (ValueError, OSError):  # other panels report broken bones and files
         return True
 

@@ -1,10 +1,13 @@
-"""The sidebar panel Captures: render, verify, and a preview of the cameras."""
+"""The sidebar panel Captures: render, verify, and a preview of the cameras; and the extension's command line,
+`blender -c primdiffusion capture ...`."""
 
 from __future__ import annotations
 
 import shlex
-import time
+import sys
+import tempfile
 from collections.abc import Sequence
+from pathlib import Path
 
 import bpy
 import numpy as np
@@ -12,20 +15,18 @@ from mathutils import Vector
 from numpy.typing import NDArray
 
 from ..capture.cameras import aim
-from ..capture.command import ASK_FROM, estimate, parse, scans_in, settings_of
-from ..console import FAILED
-from ..files.regular_files import printable
+from ..capture.command import main, parse, settings_of
+from ..console import DONE, UNUSABLE
 from ..formats.camera_rig import bounding_sphere
-from ..jobs.follow import Reporting, redraw
+from ..jobs.follow import Reporting
 from ..places import shows_captures
 from ..scene.blend_values import setting_path
 from ..scene.convention import points_to_backend
-from .captures_session import captures
+from .captures_session import captures, capturing
 from .captures_settings import command_args
 from .drawing import DATA, SidebarPanel, draw_lines, draw_section, property_columns
 
 RIG = "Capture Rig"
-_TICK_S = 0.1
 _PERSON_M = 1.1
 """Radius of the sphere around a human in T pose at the world's origin, where nothing is selected."""
 
@@ -36,32 +37,16 @@ class PRIMDIFFUSION_OT_render_captures(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.render_captures"
     bl_label = "Render Captures"
 
-    people: bpy.props.StringProperty(name="People", description="Empty: the panel's")
-    out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     options: bpy.props.StringProperty(name="Options", description="More words, as on the command line")
-
-    def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
-        """Ask before a long run; errors are reported by `execute`."""
-        try:
-            options = parse(self._args(context))
-            views, message = estimate(settings_of(options), len(scans_in(options.people, options.only)))
-        except (OSError, ValueError, RuntimeError):
-            return self.execute(context)
-        if views < ASK_FROM:
-            return self.execute(context)
-        return context.window_manager.invoke_confirm(
-            self, event, title="Render Captures?", message=message, confirm_text="Render"
-        )
-
-    def _args(self, context: bpy.types.Context) -> list[str]:
-        asked = context.scene.primdiffusion_captures
-        return command_args(asked, context, captures.new_folder(), self.people, self.out) + shlex.split(self.options)
 
     def act(self, context: bpy.types.Context) -> set[str]:
         """Another Blender renders; a timer follows it, or in background mode this waits."""
-        args = self._args(context)
+        settings = context.scene.primdiffusion_captures
+        folder = _temporary_folder()
+        args = command_args(settings, context, folder) + shlex.split(self.options)
         settings_of(parse(args))  # report impossible settings at once
-        return follow_captures(args)
+        captures.start(capturing(args, folder))
+        return captures.follow(self)
 
 
 class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
@@ -70,16 +55,17 @@ class PRIMDIFFUSION_OT_verify_captures(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.verify_captures"
     bl_label = "Verify"
 
-    out: bpy.props.StringProperty(name="Captures", description="Empty: the panel's")
     repair: bpy.props.BoolProperty(
         name="Repair", description="Remove damaged files, so that the next run renders only those again"
     )
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        out = bpy.path.abspath(self.out) or setting_path(context.scene.primdiffusion_captures.out, "Captures")
+        out = setting_path(context.scene.primdiffusion_captures.out, "Captures")
         if not out:
             raise ValueError("choose the folder of captures first")
-        return follow_captures(["--out", out, "--verify", *(["--repair"] if self.repair else [])])
+        args = ["--out", out, "--verify", *(["--repair"] if self.repair else [])]
+        captures.start(capturing(args, _temporary_folder()))
+        return captures.follow(self)
 
 
 class PRIMDIFFUSION_OT_preview_rig(Reporting, bpy.types.Operator):
@@ -113,38 +99,8 @@ def remove_rig(collection: bpy.types.Object) -> None:
     bpy.data.batch_remove([*ours, *cameras, collection])
 
 
-def follow_captures(args: Sequence[str]) -> set[str]:
-    """Start a run and follow it: by a timer with a window, by waiting in background mode.
-
-    Raises ValueError while one runs, and in background mode for one that fails; OSError.
-    """
-    captures.start(args)
-    if not bpy.app.background:
-        bpy.app.timers.register(follow, first_interval=_TICK_S, persistent=True)
-        return {"FINISHED"}
-    shown = ""
-    try:
-        while captures.busy:
-            time.sleep(_TICK_S)
-            captures.tick()
-            if captures.message != shown:
-                shown = captures.message
-                print(printable(f"PrimDiffusion: {shown}"), flush=True)
-    finally:
-        captures.close()
-    for line in captures.lines:
-        print(printable(f"PrimDiffusion: {line}"), flush=True)
-    failed = captures.exit_code == FAILED
-    if captures.error and not (failed and "--repair" in args):  # what was damaged is mended then
-        raise ValueError("; ".join(list(captures.lines)[-2:]) if failed else captures.error)
-    return {"FINISHED"}
-
-
-def follow() -> float | None:
-    """The timer: process the child's output, redraw."""
-    if captures.tick():
-        redraw()
-    return _TICK_S if captures.busy else None
+def _temporary_folder() -> Path:
+    return Path(tempfile.mkdtemp(prefix="primdiffusion_captures_", dir=bpy.app.tempdir or None))
 
 
 def _sphere_around(context: bpy.types.Context) -> tuple[NDArray[np.float64], float]:
@@ -192,8 +148,7 @@ class PRIMDIFFUSION_PT_captures(DataPanel, bpy.types.Panel):
         column.prop(asked, "people")
         column.prop(asked, "out")
         if captures.busy:
-            left = f" ({_minutes(captures.eta_s)} left)" if captures.eta_s else ""
-            layout.progress(factor=captures.fraction, text=f"{captures.message}{left}", translate=False)
+            layout.progress(factor=captures.fraction, text=captures.message, translate=False)
             layout.operator("primdiffusion.cancel", icon="CANCEL").what = "CAPTURES"
         else:
             layout.operator("primdiffusion.render_captures", icon="RENDER_ANIMATION")
@@ -255,13 +210,30 @@ def _draw_verify(layout: bpy.types.UILayout, _asked, _context) -> None:
     row.operator("primdiffusion.verify_captures", text="Repair", icon="TOOL_SETTINGS").repair = True
 
 
-def _minutes(seconds: float) -> str:
-    minutes = round(seconds / 60)
-    return f"{seconds:.0f} s" if seconds < 90 else f"{minutes} min" if minutes < 120 else f"{minutes / 60:.1f} h"
+COMMAND = "primdiffusion"
+_HELP = """\
+blender -c primdiffusion capture --people SCANS --out CAPTURES         captures from all sides, to train on
+It has more options: see capture --help. Humans: primdiffusion generate, or examples/blender_batch.py."""
+_handles: list[object] = []
+"""Handles of the registered command."""
+
+
+def execute(argv: Sequence[str]) -> int:
+    """Run a command; returns its exit code."""
+    if argv and argv[0] == "capture":
+        return main(list(argv[1:]))
+    asked = list(argv) in (["--help"], ["-h"])
+    print(_HELP, file=sys.stdout if asked else sys.stderr, flush=True)
+    return DONE if asked else UNUSABLE
+
+
+def register() -> None:
+    """Register the command with Blender."""
+    _handles.append(bpy.utils.register_cli_command(COMMAND, execute))
 
 
 def unregister() -> None:
-    """End the child and the timer."""
+    """End the running capture, and the command."""
     captures.close()
-    if bpy.app.timers.is_registered(follow):
-        bpy.app.timers.unregister(follow)
+    while _handles:
+        bpy.utils.unregister_cli_command(_handles.pop())

@@ -2,168 +2,80 @@
 
 from __future__ import annotations
 
-import collections
 import contextlib
 import subprocess
 import sys
-import tempfile
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
 import bpy
 
 from ..backend.child_process import BLENDER, COMPUTING, Output, passed_on
+from ..backend.requests import Step, Steps
 from ..capture import launch
 from ..capture.command import MARK
-from ..console import CANCELLED, DONE
+from ..console import DONE, FAILED, duration
 from ..files.json_files import parse_message
 from ..files.regular_files import remove_folder
 from ..formats.answers import CapturesProgress
 from ..formats.schema import read
+from ..jobs.steps import Session
 
-PATIENCE_S = 0.7
-"""After this a child that was asked to stop is killed: its views are written whole or not at all."""
-_MOST_LINES = 200
+captures = Session("captures are being rendered", "Cancelled; the same settings resume from here")
+"""One for all windows."""
 
 
-class CaptureSession:
-    """Starts the child, follows it, ends it. All methods are for Blender's main thread."""
+def capturing(words: Sequence[str], folder: Path) -> Steps:
+    """Steps of the command `capture`, whose temporary files go to `folder`, which is removed.
 
-    def __init__(self) -> None:
-        self.error = ""
-        """Why the last run failed; empty when it went well."""
-        self.notice = ""
-        """How the last run ended otherwise."""
-        self.message = ""
-        self.fraction = 0.0
-        self.eta_s: float | None = None
-        self._fault = ""
-        self.lines: collections.deque[str] = collections.deque(maxlen=_MOST_LINES)
-        """Lines of the child, newest last."""
-        self.exit_code: int | None = None
-        """The last run's exit code."""
-        self._process: subprocess.Popen[bytes] | None = None
-        self._output: Output | None = None
-        self._errors: Output | None = None
-        self._folder: Path | None = None
-        self._asked_to_stop_at: float | None = None
+    Closing it kills the Blender that renders: its views are written whole or not at all.
+    """
+    output, errors, process = Output(), Output(), None
+    step, said = Step("Starting Blender", 0.0), []
+    try:
+        process = subprocess.Popen(
+            [*child_command(), *words, "--progress", "json", "--while-stdin"],
+            stdin=subprocess.PIPE,
+            stdout=output.target,
+            stderr=errors.target,
+            env={**passed_on(COMPUTING, BLENDER), "TMPDIR": str(folder), "TEMP": str(folder), "TMP": str(folder)},
+            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+        )
+        exit_code = None
+        while exit_code is None or not output.at_end:
+            exit_code = process.poll()  # before reading: then all that it wrote is there
+            for line in output.lines():
+                if line.startswith(MARK.encode()):  # others are Blender's
+                    step = _step(line.decode("utf-8", "replace")[len(MARK) :], step)
+                    said = [*said, *step.lines][-2:]
+                    yield step
+            yield Step(step.message, step.fraction)
+        if exit_code == DONE or (exit_code == FAILED and "--repair" in words):  # what was damaged is mended then
+            return said[-1]
+        complaints = [line.removeprefix("capture: ") for line in errors.log() if line.startswith("capture: ")]
+        raise RuntimeError("; ".join(complaints[-1:] or said) or f"Blender ended with code {exit_code}")
+    finally:
+        if process is not None:
+            process.kill()
+            process.wait()
+            with contextlib.suppress(OSError):
+                process.stdin.close()
+        output.close()
+        errors.close()
+        remove_folder(folder, folder.parent)
 
-    @property
-    def busy(self) -> bool:
-        """A child is running."""
-        return self._process is not None
 
-    def new_folder(self) -> Path:
-        """A folder for files of the next run, removed when it ends."""
-        if self._folder is None:
-            self._folder = Path(tempfile.mkdtemp(prefix="primdiffusion_captures_"))
-        return self._folder
-
-    def start(self, words: Sequence[str]) -> None:
-        """Begin a run of the command `capture`. Raises ValueError while one runs, OSError where no Blender starts."""
-        if self.busy:
-            raise ValueError("captures are being rendered; wait for them or press Cancel")
-        folder = str(self.new_folder())
-        self.error = self.notice = self._fault = ""
-        self.message, self.fraction, self.eta_s, self.exit_code = "Starting Blender", 0.0, None, None
-        self.lines.clear()
-        self._asked_to_stop_at = None
-        self._output, self._errors = Output(), Output()
-        try:
-            self._process = subprocess.Popen(
-                [*child_command(), *words, "--progress", "json", "--while-stdin"],
-                stdin=subprocess.PIPE,
-                stdout=self._output.target,
-                stderr=self._errors.target,
-                env={**passed_on(COMPUTING, BLENDER), "TMPDIR": folder, "TEMP": folder, "TMP": folder},
-                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-            )
-        except OSError:
-            self._close_streams()
-            raise
-
-    def tick(self) -> bool:
-        """Process the child's output; True when something visible changed. Never waits."""
-        if self._process is None:
-            return False
-        before = (self.message, self.fraction, len(self.lines), self.busy)
-        exit_code = self._process.poll()  # before reading: then all that it wrote is there
-        self._listen()
-        asked = self._asked_to_stop_at
-        if asked is not None and time.monotonic() - asked > PATIENCE_S:
-            self._process.kill()
-        if exit_code is not None and self._output.at_end:
-            self._finish(exit_code)
-        return before != (self.message, self.fraction, len(self.lines), self.busy)
-
-    def cancel(self) -> None:
-        """Ask the child to stop; it ends within a second. Rendered views stay, and the next run resumes there."""
-        if self._process is None or self._asked_to_stop_at is not None:
-            return
-        self._asked_to_stop_at = time.monotonic()
-        self.message, self.eta_s = "Cancelling", None
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()
-
-    def close(self) -> None:
-        """Kill the child: the extension is being disabled, or another file is loaded."""
-        if self._process is not None:
-            self._process.kill()
-            self._process.wait()
-            self._process = None
-            self._close_streams()
-        self._clear_folder()
-
-    def _listen(self) -> None:
-        for line in self._output.lines():
-            self._take(line.decode("utf-8", "replace"))
-
-    def _take(self, line: str) -> None:
-        if not line.startswith(MARK):
-            return  # printed by Blender
-        try:
-            progress = read(CapturesProgress, parse_message(line[len(MARK) :]))
-        except ValueError as fault:
-            self._fault = f"Blender was ended because it sent a malformed message ({fault}): render again"
-            self._process.kill()
-            return
-        if progress.line is not None:
-            self.lines.append(progress.line)
-            return
-        self.lines.extend(progress.news)
-        if self._asked_to_stop_at is None:
-            self.fraction, self.eta_s = progress.done / max(progress.total, 1), progress.eta_s
-            self.message = f"{progress.subject}: view {progress.done} of {progress.total}"
-
-    def _finish(self, code: int) -> None:
-        self.exit_code, stopped = code, self._asked_to_stop_at is not None
-        complaints = self._errors.log()
-        with contextlib.suppress(OSError):
-            self._process.stdin.close()
-        self._process = None
-        self._close_streams()
-        self._clear_folder()
-        last = self.lines[-1] if self.lines else ""
-        if self._fault and not stopped:
-            self.error = self._fault
-        elif stopped or code == CANCELLED:
-            self.notice = "Cancelled; the same settings resume from here."
-        elif code == DONE:
-            self.notice, self.fraction = last, 1.0
-        else:
-            said = [line for line in complaints if line.startswith("capture: ")]
-            self.error = said[-1].removeprefix("capture: ") if said else last or f"Blender ended with code {code}"
-
-    def _close_streams(self) -> None:
-        self._output.close()
-        self._errors.close()
-        self._output = self._errors = None
-
-    def _clear_folder(self) -> None:
-        if self._folder is not None:
-            remove_folder(self._folder, self._folder.parent)
-            self._folder = None
+def _step(message: str, before: Step) -> Step:
+    """What a message of the child says. Raises RuntimeError for a malformed one."""
+    try:
+        progress = read(CapturesProgress, parse_message(message))
+    except ValueError as fault:
+        raise RuntimeError(f"Blender was ended because it sent a malformed message ({fault}): render again") from fault
+    if progress.line is not None:
+        return Step(before.message, before.fraction, (progress.line,))
+    left = f" ({duration(progress.eta_s)} left)" if progress.eta_s else ""
+    text = f"{progress.subject}: view {progress.done} of {progress.total}{left}"
+    return Step(text, progress.done / max(progress.total, 1), tuple(progress.news))
 
 
 def child_command() -> list[str]:
@@ -172,7 +84,3 @@ def child_command() -> list[str]:
     if bpy.app.binary_path:
         return [bpy.app.binary_path, "-b", "--factory-startup", "--python", script, "--"]
     return [sys.executable, script, "--"]
-
-
-captures = CaptureSession()
-"""One for all windows."""

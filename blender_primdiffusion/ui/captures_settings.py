@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 
 import bpy
@@ -27,7 +26,27 @@ _FLAGS = ("denoise", "float_depth", "released_reference")
 _PASS_ITEMS = [(kind, *_PASS_NAMES[kind], 1 << i) for i, kind in enumerate(PASSES)]
 
 
-class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
+def _angle(name: str, description: str, default: float, limits: tuple[float, float]) -> object:
+    """A property of degrees."""
+    least, most = map(math.radians, limits)
+    return bpy.props.FloatProperty(
+        name=name, description=description, default=math.radians(default), min=least, max=most, subtype="ANGLE"
+    )
+
+
+_DECLARED = (
+    "seed", "body", "together", "samples", "light", "denoise", "device", "background", "float_depth",
+    "released_reference",
+)  # fmt: skip
+
+
+class _Declared:
+    """What the record of a capture declares as the panel has it."""
+
+    __annotations__ = {name: declared(CaptureSettings, name) for name in _DECLARED}
+
+
+class PRIMDIFFUSION_PG_captures(_Declared, bpy.types.PropertyGroup):
     """`scene.primdiffusion_captures`."""
 
     people: bpy.props.StringProperty(
@@ -36,14 +55,10 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     out: bpy.props.StringProperty(
         name="Captures", description="Folder of the dataset; an unfinished one is resumed", subtype="DIR_PATH"
     )
-    seed: declared(CaptureSettings, "seed")
-    body: declared(CaptureSettings, "body")
     shard: bpy.props.IntProperty(name="Shard", description="Part of the people that this machine renders", min=0)
     shards: bpy.props.IntProperty(
         name="Shards", description="Number of parts the people are divided into", min=1, default=1
     )
-
-    together: declared(CaptureSettings, "together")
 
     poses: bpy.props.StringProperty(
         name="Poses",
@@ -66,41 +81,19 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
     rings: bpy.props.IntProperty(
         name="Rings", description="Number of rings the cameras are distributed over", default=3, min=1, max=50
     )
-    lowest: bpy.props.FloatProperty(
-        name="Lowest",
-        description="Angle above the horizon",
-        default=math.radians(-10),
-        min=math.radians(-89),
-        max=math.radians(89),
-        subtype="ANGLE",
-    )
-    highest: bpy.props.FloatProperty(
-        name="Highest",
-        description="Angle above the horizon",
-        default=math.radians(40),
-        min=math.radians(-89),
-        max=math.radians(89),
-        subtype="ANGLE",
-    )
-    fov: bpy.props.FloatProperty(
-        name="Field of View", description="Vertical", default=math.radians(30),
-        min=math.radians(1), max=math.radians(150), subtype="ANGLE",
-    )  # fmt: skip
+    lowest: _angle("Lowest", "Angle above the horizon", -10, (-89, 89))
+    highest: _angle("Highest", "Angle above the horizon", 40, (-89, 89))
+    fov: _angle("Field of View", "Vertical", 30, (1, 150))
     margin: declared(Rig, "margin")
     cameras: bpy.props.PointerProperty(
         name="Collection", description="Collection with the cameras", type=bpy.types.Collection
     )
 
-    samples: declared(CaptureSettings, "samples")
-    light: declared(CaptureSettings, "light")
     hdri: declared(CaptureSettings, "hdri", name="HDRI")
-    denoise: declared(CaptureSettings, "denoise")
     shadows: declared(CaptureSettings, "shadows", name="Shadows Between People")
-    device: declared(CaptureSettings, "device")
 
     width: declared(Rig, "width", subtype="PIXEL")
     height: declared(Rig, "height", subtype="PIXEL")
-    background: declared(CaptureSettings, "background")
     passes: bpy.props.EnumProperty(
         name="Passes",
         description="Kinds of pictures to write",
@@ -108,8 +101,6 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         items=_PASS_ITEMS,
         default=set(PASSES),
     )
-    float_depth: declared(CaptureSettings, "float_depth")
-    released_reference: declared(CaptureSettings, "released_reference")
 
     def elevations(self) -> list[float]:
         """Elevations of the rings, degrees."""
@@ -133,15 +124,12 @@ class PRIMDIFFUSION_PG_captures(bpy.types.PropertyGroup):
         )
 
 
-def command_args(
-    asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path, people: str = "", out: str = ""
-) -> list[str]:
+def command_args(asked: PRIMDIFFUSION_PG_captures, context: bpy.types.Context, folder: Path) -> list[str]:
     """The arguments of the command `capture` (`capture.command`); a file of cameras, where needed, goes to `folder`.
 
-    `people` and `out` go before the panel's. Raises ValueError where something is missing or a path is impossible.
+    Raises ValueError where something is missing or a path is impossible.
     """
-    people = os.path.abspath(bpy.path.abspath(people)) if people else setting_path(asked.people, "People")
-    out = os.path.abspath(bpy.path.abspath(out)) if out else setting_path(asked.out, "Captures")
+    people, out = setting_path(asked.people, "People"), setting_path(asked.out, "Captures")
     if not people or not out:
         raise ValueError(f"choose a folder {'of people' if not people else 'for the captures'} first")
     args = ["--people", people, "--out", out, "--shard", f"{min(asked.shard, asked.shards - 1)}/{asked.shards}"]

@@ -7,13 +7,12 @@ import textwrap
 
 import bpy
 
-from ..backend.requests import RequestError
 from ..files.regular_files import printable
-from ..jobs.follow import in_the_way
-from ..jobs.pictures import so_far
+from ..jobs.follow import blocking_activity
+from ..jobs.pictures import icons
 from ..jobs.queue import JobOutcome, queue
-from ..jobs.remedies import remedy_for
-from ..places import EXTENSION, backend_is_named
+from ..jobs.remedies import error_log, remedy_for
+from ..places import backend_is_named
 from .manual import draw_manual_button
 
 MAIN, DATA = "PrimDiffusion", "PrimDiffusion Data"
@@ -94,8 +93,8 @@ def draw_job(
 def draw_job_state(layout: bpy.types.UILayout, kind: str) -> None:
     """The progress of a job of this kind, and how the last one ended."""
     if queue.current is not None and queue.current.job.kind == kind:
-        if so_far.icon:
-            layout.template_icon(icon_value=so_far.icon, scale=_PICTURE_SCALE)
+        if icon := icons.of(queue.request.picture):
+            layout.template_icon(icon_value=icon, scale=_PICTURE_SCALE)
         _draw_progress(layout)
     if waiting := sum(entry.job.kind == kind for entry in queue.waiting):
         layout.label(text=f"Queued: {waiting}", icon="SORTTIME", translate=False)
@@ -141,7 +140,7 @@ def draw_ended(layout: bpy.types.UILayout) -> None:
         return
     column = layout.column(align=True)
     for outcome in queue.ended:
-        icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.went_well else "CANCEL"
+        icon = "ERROR" if outcome.error is not None else "CHECKMARK" if outcome.succeeded else "CANCEL"
         column.label(text=outcome.entry.job.label, icon=icon, translate=False)
 
 
@@ -152,25 +151,17 @@ def _draw_outcome(layout: bpy.types.UILayout, outcome: JobOutcome) -> None:
         return
     draw_lines(layout, outcome.sentence, "ERROR")
     column = layout.column(align=True)  # side by side the labels would be cut
-    _draw_remedy(column, outcome.error, outcome.entry.job.kind)
-    column.operator("primdiffusion.copy_diagnostics", icon="COPYDOWN")
-
-
-def _draw_remedy(layout: bpy.types.UILayout, error: RequestError, kind: str) -> None:
-    remedy = remedy_for(error)
-    if remedy is None:
-        return
-    props = layout.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
-    if remedy.operator == "primdiffusion.try_again":
-        props.kind = kind
-    elif remedy.operator == "preferences.addon_show":
-        props.module = EXTENSION
+    if (remedy := remedy_for(outcome.error)) is not None:
+        props = column.operator(remedy.operator, text=remedy.label, icon=remedy.icon)
+        for name, value in remedy.properties.items():
+            setattr(props, name, value)
+    column.operator("wm.path_open", text="Open Log", icon="TEXT").filepath = str(error_log())
 
 
 def _progress_text() -> str:
     job = queue.request
     if queue.ready:
-        blocker = in_the_way()
+        blocker = blocking_activity()
         return f"Done; waiting for {blocker}" if blocker else "Adding it to the scene"
     if not job.eta_s:
         return job.message

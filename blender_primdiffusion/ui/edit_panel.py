@@ -1,4 +1,4 @@
-"""The panel Edit: vary, re-dress, transfer and blend the selected human in place."""
+"""The section Edit of the panel Human: vary, re-dress, transfer and blend the selected human in place."""
 
 from __future__ import annotations
 
@@ -15,18 +15,22 @@ from ..formats.requests import (
     TransferRequest,
     VaryRequest,
 )
-from ..jobs import edit
+from ..jobs.edit import EditJob
 from ..jobs.follow import Reporting, submit
 from ..jobs.target import selected_person
-from ..places import backend_is_named
 from ..scene.edit import end_painting, painted_weights, start_painting
 from ..scene.human import BODY_MARK, body_of, humans
 from ..scene.payload import session_file
-from .attributes import PRIMDIFFUSION_PG_attributes, chosen_attributes, draw_attributes, title
 from .declared import SKIP, declared
-from .drawing import draw_job, property_columns
-from .generate_panel import seed_property
-from .on_person import HumanOperator, HumanPanel, other_human
+from .drawing import draw_job, draw_section
+from .generate_settings import (
+    PRIMDIFFUSION_PG_attributes,
+    chosen_attributes,
+    draw_attributes,
+    seed_property,
+    title,
+)
+from .on_person import HumanOperator, other_human
 
 PAINTED_GROUP = "PrimDiffusion Region"
 """Vertex group of the body mesh that Paint Region makes."""
@@ -122,12 +126,12 @@ def painting(context: bpy.types.Context) -> bool:
 class _Edit(HumanOperator):
     """Base of the edits, with the panel's settings."""
 
-    job: str
-    """Class of `jobs.edit`."""
+    method: str
+    """The child's."""
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         params = {"steps": context.scene.primdiffusion.steps, **self.params(context, person)}
-        return submit(self, context, getattr(edit, self.job).of(person, params))
+        return submit(self, context, EditJob.of(self.method, person, params))
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         """The edit's parameters of the child's method: see `EditJob.asked`."""
@@ -135,13 +139,14 @@ class _Edit(HumanOperator):
 
 
 class _SeededEdit(_Edit):
-    """Base of the edits that draw at random."""
+    """Base of the edits that draw at random, from the operator's seed if it has one, else the panel's."""
 
     seed: seed_property()
 
-    def seed_of(self, settings: bpy.types.PropertyGroup) -> int:
-        """The operator's seed if it has one, else the panel's."""
-        return self.seed if self.seed >= 0 else settings.seed
+    def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
+        if self.seed < 0:
+            self.seed = context.scene.primdiffusion_edit.seed
+        return super().run(context, person)
 
 
 def _region(settings: bpy.types.PropertyGroup, person: bpy.types.Object) -> list[str] | dict[str, list[float]]:
@@ -161,11 +166,11 @@ class PRIMDIFFUSION_OT_vary(_SeededEdit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.vary"
     bl_label = "Vary"
-    job = "VaryJob"
+    method = "vary"
 
     def params(self, context: bpy.types.Context, _person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
-        return {"amount": settings.amount, "seed": self.seed_of(settings)}
+        return {"amount": settings.amount, "seed": self.seed}
 
 
 class PRIMDIFFUSION_OT_redress(_SeededEdit, bpy.types.Operator):
@@ -173,11 +178,11 @@ class PRIMDIFFUSION_OT_redress(_SeededEdit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.redress"
     bl_label = "Regenerate Region"
-    job = "RedressJob"
+    method = "inpaint"
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
-        params: dict[str, Any] = {"region": _region(settings, person), "seed": self.seed_of(settings)}
+        params: dict[str, Any] = {"region": _region(settings, person), "seed": self.seed}
         if wanted := chosen_attributes(settings.attributes):
             params |= {"attributes": wanted, "guidance": context.scene.primdiffusion.guidance}
         return params
@@ -188,7 +193,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_SeededEdit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.transfer_texture"
     bl_label = "Transfer Texture"
-    job = "TransferJob"
+    method = "transfer"
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         settings = context.scene.primdiffusion_edit
@@ -197,7 +202,7 @@ class PRIMDIFFUSION_OT_transfer_texture(_SeededEdit, bpy.types.Operator):
             "region": _region(settings, person),
             "what": settings.what,
             "harmonise": settings.harmonise,
-            "seed": self.seed_of(settings),
+            "seed": self.seed,
         }
 
 
@@ -206,7 +211,7 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 
     bl_idname = "primdiffusion.blend"
     bl_label = "Blend"
-    job = "BlendJob"
+    method = "interpolate"
 
     def params(self, context: bpy.types.Context, person: bpy.types.Object) -> dict[str, Any]:
         other = other_human(context, person)
@@ -216,22 +221,13 @@ class PRIMDIFFUSION_OT_blend(_Edit, bpy.types.Operator):
 PROPERTIES = ((bpy.types.Scene, "primdiffusion_edit", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_edit)),)
 
 
-class PRIMDIFFUSION_PT_edit(HumanPanel, bpy.types.Panel):
+def draw_edit(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Which edit, its settings and its button."""
-
-    bl_label = "Edit"
-    bl_order = 3
-    manual_page, manual_section = "editing", "edits"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return backend_is_named() and super().poll(context)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        settings = context.scene.primdiffusion_edit
-        self.layout.row(align=True).prop(settings, "kind", expand=True)  # with a label beside it words are cut short
-        layout = property_columns(self.layout)
-        _DRAW[settings.kind](layout, settings, context)
+    settings = context.scene.primdiffusion_edit
+    row = layout.row(align=True)
+    row.use_property_split = False  # with a label beside it words are cut short
+    row.prop(settings, "kind", expand=True)
+    _DRAW[settings.kind](layout, settings, context)
 
 
 def _draw_vary(layout: bpy.types.UILayout, settings, _context) -> None:
@@ -275,9 +271,7 @@ def _draw_region(layout: bpy.types.UILayout, settings, context: bpy.types.Contex
     layout.row().prop(settings, "region", expand=True)
     if settings.region == "PARTS":
         _draw_parts(layout, settings, WHOLE_PARTS, 3)
-        header, body = layout.panel("primdiffusion_sides", default_closed=True)
-        header.label(text="Left and Right")
-        if body is not None:
+        if (body := draw_section(layout, "sides", text="Left and Right")) is not None:
             _draw_parts(body, settings, SIDED_PARTS, 2)
         return
     try:

@@ -17,20 +17,17 @@ from ..jobs.export import (
     ExportVdbSequenceJob,
     ImportHumanJob,
     posed_frames,
-    posed_now,
     scene_frames,
-    show,
     write_human,
 )
 from ..jobs.follow import Reporting, submit
 from ..jobs.queue import Job
 from ..jobs.target import HumanTarget
-from ..scene.export_model import check_ready
+from ..scene.armature import check_joints
 from ..scene.human_file import CHOOSE_ANOTHER, motion_in, read_tensors
-from ..scene.proxy import proxy_of, remove_proxy
 from .declared import SKIP, declared
 from .drawing import property_columns
-from .gallery import FOLDER
+from .menus import FOLDER
 from .on_person import HumanOperator
 
 _SAMPLE = "Add a human that comes with the extension to the scene; its data are in the public domain (CC0)"
@@ -92,12 +89,6 @@ OPTIONS = {
     "VDB": ("voxel",),
 }
 """Settings of each format."""
-SHOWN = (
-    ("VOLUMES", "Volumes", "Show and render the volumes; the mesh proxy is hidden"),
-    ("VIEWPORT", "Mesh in Viewport", "Show the mesh proxy while working, and render the volumes"),
-    ("MESH", "Mesh", "Show and render the mesh proxy, in any engine; the volumes are hidden"),
-    ("REMOVED", "Remove Mesh Proxy", "Delete the mesh proxy, and show and render the volumes"),
-)
 
 
 class PRIMDIFFUSION_PG_export(bpy.types.PropertyGroup):
@@ -147,13 +138,6 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
 
     filepath: bpy.props.StringProperty(name="File", subtype="FILE_PATH", options=SKIP)
     check_existing: bpy.props.BoolProperty(default=True, options={"HIDDEN"})
-    format: bpy.props.EnumProperty(
-        name="Format",
-        items=FORMATS,
-        description="Not given: that of the file's extension, else the panel's",
-        default="HUMAN",
-        options=SKIP,
-    )
 
     def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
         """Open the file browser with the panel's format."""
@@ -162,16 +146,15 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         except ValueError as error:
             self.report({"ERROR"}, error_text(error))
             return {"CANCELLED"}
-        if not self.given("format"):
-            self.format = context.scene.primdiffusion_export.format
         if not self.filepath:
-            self.filepath = bpy.path.clean_name(person.name) + ENDINGS[self.format][0]
+            ending = ENDINGS[context.scene.primdiffusion_export.format][0]
+            self.filepath = bpy.path.clean_name(person.name) + ending
         context.window_manager.fileselect_add(self)
         return {"RUNNING_MODAL"}
 
-    def check(self, _context: bpy.types.Context) -> bool:
+    def check(self, context: bpy.types.Context) -> bool:
         """The file browser: another format changes the file's extension."""
-        endings = ENDINGS[self.format]
+        endings = ENDINGS[context.scene.primdiffusion_export.format]
         name, ending = os.path.splitext(self.filepath)
         if not name or ending.lower() in endings:
             return False
@@ -180,23 +163,18 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         return True
 
     def draw(self, context: bpy.types.Context) -> None:
-        layout = property_columns(self.layout)
-        layout.prop(self, "format")
-        for name in OPTIONS[self.format]:
-            layout.prop(context.scene.primdiffusion_export, name)
+        layout, settings = property_columns(self.layout), context.scene.primdiffusion_export
+        for name in ("format", *OPTIONS[settings.format]):
+            layout.prop(settings, name)
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        kind = self._format(context)
+        ending = Path(self.filepath).suffix.lower()
+        by_ending = next((kind for kind, endings in ENDINGS.items() if ending in endings), None)
+        kind = by_ending or context.scene.primdiffusion_export.format
         path = destination(self.filepath, ENDINGS[kind])
         if kind == "HUMAN":
             return self._write_human(context, person, path)
         return submit(self, context, self._job(context, person, kind, path))
-
-    def _format(self, context: bpy.types.Context) -> str:
-        ending = Path(self.filepath).suffix.lower()
-        by_ending = next((kind for kind, endings in ENDINGS.items() if ending in endings), None)
-        panel = context.scene.primdiffusion_export
-        return self.format if self.given("format") else by_ending or panel.format
 
     def _write_human(self, context: bpy.types.Context, person: bpy.types.Object, path: Path) -> set[str]:
         settings = context.scene.primdiffusion_export
@@ -209,11 +187,12 @@ class PRIMDIFFUSION_OT_export(HumanOperator, bpy.types.Operator):
         """What writes a mesh, Gaussians or volumes. Raises ValueError."""
         target, scene, settings = HumanTarget.of(person), context.scene, context.scene.primdiffusion_export
         if kind == "PLY":
-            return ExportGaussiansJob(target, path, posed_now(context, person), settings.gaussians)
+            (now,) = posed_frames(context, person, [scene.frame_current])
+            return ExportGaussiansJob(target, path, now, settings.gaussians)
         if kind == "VDB":
             people = posed_frames(context, person, range(scene.frame_start, scene.frame_end + 1))
             return ExportVdbSequenceJob(target, path.parent, path.stem, people, scene.frame_start, settings.voxel)
-        check_ready(person)
+        check_joints(person)
         frames = scene_frames(scene, settings.animation)
         return ExportMeshJob(target, int(settings.texture_px), settings.triangles, path, kind, frames)
 
@@ -226,25 +205,8 @@ class PRIMDIFFUSION_OT_add_proxy(HumanOperator, bpy.types.Operator):
 
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         target, settings = HumanTarget.of(person), context.scene.primdiffusion_export
-        check_ready(person)
+        check_joints(person)
         return submit(self, context, AddProxyJob(target, int(settings.texture_px), settings.triangles))
-
-
-class PRIMDIFFUSION_OT_show_proxy(HumanOperator, bpy.types.Operator):
-    """Choose how the selected human is shown: as volumes or as the mesh proxy; or remove the mesh proxy"""
-
-    bl_idname = "primdiffusion.show_proxy"
-    bl_label = "Show Volumes or Mesh"
-    bl_options = {"UNDO"}
-
-    shown: bpy.props.EnumProperty(name="Show", description="How the human is shown", items=SHOWN)
-
-    def run(self, _context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
-        removed = self.shown == "REMOVED"
-        show(person, "VOLUMES" if removed else self.shown)
-        if removed:
-            remove_proxy(proxy_of(person))
-        return {"FINISHED"}
 
 
 class PRIMDIFFUSION_OT_import_human(Reporting, bpy.types.Operator):

@@ -7,21 +7,19 @@ import bpy
 
 from ..backend.requests import sentence
 from ..jobs.assets import HumanAssetJob
-from ..jobs.export import shown
 from ..jobs.follow import submit
 from ..jobs.target import HumanTarget, selected_person
 from ..places import INSTALLS_BACKEND, backend_is_named
-from ..scene.human import humans
-from ..scene.proxy import is_outdated, proxy_of
-from ..scene.shape import betas_of
-from . import gallery
+from ..scene.human import humans, proxy_of
+from ..scene.proxy import is_outdated
+from .advanced_panel import draw_representations
 from .drawing import SidebarPanel, draw_job, draw_lines, draw_section, property_columns
 from .export_operators import OPTIONS
+from .menus import draw_samples
 from .on_person import HumanOperator
 
 _JOBS = {"PLY": "export_gaussians", "VDB": "export_vdb_sequence"}
 """Kinds of jobs by format; a .human file needs none, the others are meshes."""
-_LABELS = {"VOLUMES": "Show Volumes", "VIEWPORT": "Show Mesh in Viewport", "MESH": "Show Mesh"}
 
 
 class PRIMDIFFUSION_OT_mark_as_asset(HumanOperator, bpy.types.Operator):
@@ -73,12 +71,13 @@ def _draw_proxy(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
         return
     try:
         proxy = proxy_of(person)
-        outdated = proxy is not None and is_outdated(person, proxy, betas_of(person))
+        outdated = proxy is not None and is_outdated(person, proxy)
     except ValueError:
         return
     if proxy is None:
         return
-    layout.operator_menu_enum("primdiffusion.show_proxy", "shown", text=_LABELS[shown(person)], icon="HIDE_OFF")
+    draw_representations(layout, person)
+    layout.operator("primdiffusion.set_representation", text="Remove Mesh Proxy", icon="X").representation = "NO_MESH"
     if outdated:
         draw_lines(layout, "Shape or clothes have changed: add it again", "INFO")
 
@@ -92,7 +91,7 @@ def draw_as_mesh(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     if proxy_of(person) is None:
         draw_job(layout, "add_proxy", "primdiffusion.add_proxy", "OUTLINER_OB_MESH", text="As Mesh")
     else:
-        layout.operator_menu_enum("primdiffusion.show_proxy", "shown", text=_LABELS[shown(person)], icon="HIDE_OFF")
+        draw_representations(layout, person)
 
 
 def _draw_assets(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
@@ -120,7 +119,7 @@ class PRIMDIFFUSION_PT_from_file(SidebarPanel, bpy.types.Panel):
     manual_page, manual_section = "export", "human-files"
 
     def draw(self, _context: bpy.types.Context) -> None:
-        gallery.draw_samples(self.layout)
+        draw_samples(self.layout)
         draw_job(self.layout, "import_human", "primdiffusion.import_human", "IMPORT")
 
 

@@ -2,123 +2,24 @@
 
 from __future__ import annotations
 
-import random
-from typing import Any
-
 import bpy
 from bl_operators.presets import AddPresetBase
 from bl_ui.utils import PresetPanel
 
 from ..backend.requests import sentence
-from ..formats.requests import SAMPLERS, GenerateRequest
 from ..jobs.follow import Reporting, submit
 from ..jobs.generate import GenerateJob
 from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
-from .attributes import CATEGORIES, SCALARS, PRIMDIFFUSION_PG_attributes, chosen_attributes, draw_attributes
-from .declared import SKIP, declared
-from .drawing import BackendPanel, SidebarPanel, draw_job, draw_lines, property_columns
+from .drawing import BackendPanel, draw_job, draw_lines, draw_section, property_columns
 from .export_panel import draw_as_mesh
-from .gallery import draw_samples
+from .generate_settings import CATEGORIES, SCALARS, draw_attributes, last_seed, random_seed, sampling, seed_property
 from .manual import draw_manual_button
+from .menus import draw_samples
 from .preferences import draw_set_up
 from .render_panel import draw_next_step
-
-LARGEST_SEED = 2**31 - 1
-"""The backend itself takes seeds up to 2^63 - 1."""
-
-
-def random_seed() -> int:
-    """A random seed."""
-    return random.randrange(LARGEST_SEED + 1)
-
-
-def last_seed(seed: int, count: int) -> int:
-    """The last of `count` consecutive seeds. Raises ValueError beyond LARGEST_SEED."""
-    last = seed + count - 1
-    if last > LARGEST_SEED:
-        raise ValueError(f"{count} seeds from {seed} on go beyond {LARGEST_SEED}: choose a smaller seed")
-    return last
-
-
-STEPS_AND_SAMPLER = {"DRAFT": (8, "dpmpp_2m"), "STANDARD": (30, "ddim"), "HIGH": (60, "ddim")}
-CUSTOM = "CUSTOM"
-ITEMS = [
-    ("DRAFT", "Draft", "8 steps of DPM-Solver++: quick and softer; the same seed sometimes gives another human"),
-    ("STANDARD", "Standard", "30 steps of DDIM"),
-    ("HIGH", "High", "60 steps of DDIM: twice the time of Standard for a little more detail"),
-    (CUSTOM, "Custom", "Steps and sampler as chosen below"),
-]
-
-
-def apply_quality(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
-    """Steps and sampler of the chosen quality. The update function of `quality`."""
-    if settings.quality != CUSTOM and quality_of(settings) != settings.quality:
-        settings.steps, settings.sampler = STEPS_AND_SAMPLER[settings.quality]
-
-
-def name_quality(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
-    """The quality with these steps and this sampler. The update function of both."""
-    if settings.quality != quality_of(settings):
-        settings.quality = quality_of(settings)
-
-
-def quality_of(settings: bpy.types.PropertyGroup) -> str:
-    """The quality with these steps and this sampler, else CUSTOM."""
-    chosen = (settings.steps, settings.sampler)
-    return next((name for name, both in STEPS_AND_SAMPLER.items() if both == chosen), CUSTOM)
-
-
-_SAMPLERS = {
-    "ddim": ("DDIM", "No noise besides the seed's: the paper's sampler"),
-    "dpmpp_2m": ("DPM-Solver++(2M)", "Second-order multistep: good with few steps"),
-    "ddpm": ("DDPM", "New noise at each step; needs many steps"),
-}
-SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in SAMPLERS]
-
-
-class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
-    """`scene.primdiffusion`."""
-
-    seed: declared(GenerateRequest, "seed", default=10)
-    keep_seed: bpy.props.BoolProperty(
-        name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each human"
-    )
-    count: bpy.props.IntProperty(
-        name="Count",
-        description="How many humans: from this seed and the following ones, placed side by side",
-        default=1,
-        min=1,
-        max=1000,
-        soft_max=20,
-    )
-    quality: bpy.props.EnumProperty(
-        name="Quality",
-        description="Steps and sampler",
-        items=ITEMS,
-        default="STANDARD",
-        update=apply_quality,
-    )
-    steps: declared(GenerateRequest, "steps", update=name_quality)
-    sampler: bpy.props.EnumProperty(
-        name="Sampler", description="How the noise is removed", items=SAMPLER_ITEMS, update=name_quality
-    )
-    guidance: declared(GenerateRequest, "guidance")
-    attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
-
-
-def seed_property():
-    """The seed of an operator, for scripts."""
-    return declared(GenerateRequest, "seed", default=-1, min=-1, description="-1: the panel's seed", options=SKIP)
-
-
-def sampling(settings: bpy.types.PropertyGroup) -> dict[str, Any]:
-    """Fields of `GenerateRequest` besides the seed."""
-    wanted = chosen_attributes(settings.attributes)
-    fields = {name: getattr(settings, name) for name in ("steps", "sampler", "guidance")}
-    return fields | ({"attributes": wanted} if wanted else {})
-
+from .variations_panel import draw_variations
 
 SUBDIR = "primdiffusion/generate"
 _ASKED = (*CATEGORIES, *(part for name in SCALARS for part in (f"use_{name}", name)))
@@ -212,19 +113,9 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
             draw_next_step(layout, context.scene)
         if ready:
             draw_as_mesh(layout, context)
-
-
-class PRIMDIFFUSION_PT_attributes(SidebarPanel, bpy.types.Panel):
-    """Attributes to generate with; none unless chosen."""
-
-    bl_label = "Attributes"
-    bl_parent_id = "PRIMDIFFUSION_PT_generate"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = property_columns(self.layout), context.scene.primdiffusion
-        draw_attributes(layout, settings.attributes)
-        layout.prop(settings, "guidance")
-
-
-PROPERTIES = ((bpy.types.Scene, "primdiffusion", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_settings)),)
+        if (body := draw_section(layout, "attributes", text="Attributes")) is not None:
+            draw_attributes(body, settings.attributes)
+            body.prop(settings, "guidance")
+        page, section = "first_human", "variations"
+        if (body := draw_section(layout, "variations", text="Variations", page=page, section=section)) is not None:
+            draw_variations(body, context)

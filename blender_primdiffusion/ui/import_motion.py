@@ -20,7 +20,7 @@ from ..formats.poses.files import ENDINGS, read_motion
 from ..scene.human import humans
 from .drawing import draw_lines, property_columns
 from .motion_placing import Placement, extend_range, facts, place_motion
-from .on_person import OnArmature, WhereTo, target_armature
+from .on_person import ArmatureOperator, WhereTo, target_armature, warn_of_rest
 
 _MARGIN = 0.12
 """Margin around the joints' rectangle that still counts as the human, as a share of its height."""
@@ -126,7 +126,7 @@ class _BoneMap:
     }
 
 
-class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper, bpy.types.Operator):
+class PRIMDIFFUSION_OT_import_motion(ArmatureOperator, WhereTo, _BoneMap, ImportHelper, bpy.types.Operator):
     """Apply the motion of an AMASS .npz, a pose file, a tracker's .pkl or a .bvh to the human"""
 
     bl_idname = "primdiffusion.import_motion"
@@ -192,12 +192,12 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     def invoke(self, context: bpy.types.Context, event: bpy.types.Event) -> set[str]:
         """Show the options of a dropped file at the cursor, for the human there; else open the file browser."""
         if self.filepath:
-            self.person = person_under(context, event) or self.person
+            self.human = person_under(context, event) or self.human
             title = f"Import {Path(self.filepath).name}"
             return context.window_manager.invoke_props_dialog(self, width=420, title=title, confirm_text="Import")
         return ImportHelper.invoke(self, context, event)
 
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+    def run(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         if not self.filepath:
             raise ValueError("no file was chosen: choose an .npz, .npy, .json, .pkl or .bvh file")
         chosen = None
@@ -211,10 +211,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
         first, last = place_motion(context, armature, motion, how)
         if self.extend:
             extend_range(context.scene, last)
-        if armature.data.pose_position == "REST":
-            self.report(
-                {"WARNING"}, f"{armature.name!r} shows its rest position: switch to Pose Position to see it move"
-            )
+        warn_of_rest(self, armature)
         if motion.detected.doubt:
             self.report({"WARNING"}, motion.detected.doubt)
         self.report({"INFO"}, f"{motion.name}: {len(motion)} frames of the file on frames {first:g} to {last:g}")
@@ -256,7 +253,7 @@ class PRIMDIFFUSION_OT_import_motion(OnArmature, WhereTo, _BoneMap, ImportHelper
     def _draw_found(self, context: bpy.types.Context, look: FileFacts) -> None:
         box = self.layout.box().column(align=True)
         try:
-            box.label(text=target_armature(context, self.person).name, icon="OUTLINER_OB_ARMATURE")
+            box.label(text=target_armature(context, self.human).name, icon="OUTLINER_OB_ARMATURE")
         except ValueError as error:
             draw_lines(box, sentence(error), "ERROR")
         for label, text in look.facts.items():

@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import bpy
 
 from ..places import backend_is_named
-from .gallery import draw_samples
 
 _IMPORT, _EXPORT = "PrimDiffusion Human (.human)", "PrimDiffusion Human (.human, .glb, .ply, .vdb)"
+
+
+FOLDER = Path(__file__).resolve().parents[1] / "gallery"
+
+
+def draw_samples(layout: bpy.types.UILayout) -> None:
+    """A button for each human that comes with the extension, which needs no backend."""
+    for path in sorted(FOLDER.glob("*.human")):
+        text = "Add Sample Human" if path.stem == "Sample" else f"Add {path.stem}"
+        layout.operator("primdiffusion.import_human", text=text, icon="COMMUNITY").filepath = str(path)
 
 
 class PRIMDIFFUSION_MT_add(bpy.types.Menu):

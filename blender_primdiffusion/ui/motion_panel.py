@@ -1,4 +1,4 @@
-"""The sidebar panel Motion."""
+"""The section Motion of the panel Human."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ..formats.poses.motion import Motion
 from ..motion.adjust import rounds_of
 from ..scene.actions import action_curves
 from ..scene.blend_values import as_shown, stored_record
-from .drawing import SidebarPanel, draw_lines, property_columns
+from .drawing import draw_lines
 from .export_operators import destination
 from .motion_placing import Placement, extend_range, place_motion, sample_motion
-from .on_person import FACTS, OnArmature, WhereTo, may_have_joints, scene_fps, target_armature
+from .on_person import FACTS, ArmatureOperator, WhereTo, scene_fps, target_armature
 
 _MOST_FACTS = 20
 _BUILT_IN = [
@@ -37,7 +37,7 @@ def built_in_motion(name: str) -> Motion:
     return dataclasses.replace(motion, name=label, detected=dataclasses.replace(motion.detected, average_legs=True))
 
 
-class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
+class PRIMDIFFUSION_OT_add_motion(ArmatureOperator, WhereTo, bpy.types.Operator):
     """Apply a built-in motion to the human"""
 
     bl_idname = "primdiffusion.add_motion"
@@ -48,7 +48,7 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
     rounds: bpy.props.IntProperty(name="Rounds", description="Number of repetitions", default=2, min=1, max=500)
     speed: bpy.props.FloatProperty(name="Speed", description="2 is twice as fast", default=1.0, min=0.1, max=10.0)
 
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+    def run(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         motion = rounds_of(built_in_motion(self.motion), self.rounds)
         seconds = (len(motion) - 1) / motion.fps / self.speed
         frames = max(1, round(seconds * scene_fps(context.scene)))  # whole, for a loop's end to be its beginning
@@ -60,7 +60,7 @@ class PRIMDIFFUSION_OT_add_motion(OnArmature, WhereTo, bpy.types.Operator):
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operator):
+class PRIMDIFFUSION_OT_export_motion(ArmatureOperator, ExportHelper, bpy.types.Operator):
     """Write the human's motion as an AMASS .npz file: axis angles, translations and shape, z up"""
 
     bl_idname = "primdiffusion.export_motion"
@@ -73,7 +73,7 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
     )
     last: bpy.props.IntProperty(name="To", description="Last frame", default=0)
 
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+    def run(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         scene = context.scene
         first, last = (self.first, self.last) if self.first or self.last else (scene.frame_start, scene.frame_end)
         if last < first:
@@ -85,49 +85,34 @@ class PRIMDIFFUSION_OT_export_motion(OnArmature, ExportHelper, bpy.types.Operato
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_PT_motion(SidebarPanel, bpy.types.Panel):
+def draw_motion(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Import and built-in motions, the current motion, and export."""
+    layout.operator("primdiffusion.import_motion", icon="IMPORT")
+    layout.operator_menu_enum("primdiffusion.add_motion", "motion", text="Add Built-in Motion", icon="ADD")
+    try:
+        armature = target_armature(context)
+    except ValueError as error:
+        draw_lines(layout, sentence(error), "INFO")
+        return
+    _draw_action(layout, armature)
+    layout.operator("primdiffusion.export_motion", icon="EXPORT")
 
-    bl_label = "Motion"
-    bl_parent_id = "PRIMDIFFUSION_PT_human"
-    bl_order = 2
-    bl_options = {"DEFAULT_CLOSED"}
-    manual_page = "motion"
 
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return may_have_joints(context)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout = property_columns(self.layout)
-        layout.operator("primdiffusion.import_motion", icon="IMPORT")
-        layout.operator_menu_enum("primdiffusion.add_motion", "motion", text="Add Built-in Motion", icon="ADD")
-        try:
-            armature = target_armature(context)
-        except ValueError as error:
-            draw_lines(layout, sentence(error), "INFO")
-            return
-        self._draw_action(layout, armature)
-        layout.operator("primdiffusion.export_motion", icon="EXPORT")
-
-    def _draw_action(self, layout: bpy.types.UILayout, armature: bpy.types.Object) -> None:
-        row = layout.row()
-        row.context_pointer_set("animated_id", armature)
-        row.template_action(armature, unlink="action.unlink")
-        action = armature.animation_data.action if armature.animation_data else None
-        if action is None:
-            return
-        box = layout.box().column(align=True)
-        for label, text in facts_of(action).items():
-            row = box.split(factor=0.4)
-            row.label(text=label)
-            row.label(text=text, translate=False)
-        start, end = action.frame_range
+def _draw_action(layout: bpy.types.UILayout, armature: bpy.types.Object) -> None:
+    row = layout.row()
+    row.context_pointer_set("animated_id", armature)
+    row.template_action(armature, unlink="action.unlink")
+    action = armature.animation_data.action if armature.animation_data else None
+    if action is None:
+        return
+    start, end = action.frame_range
+    box = layout.box().column(align=True)
+    for label, text in {**facts_of(action), "In the Scene": f"{start:g} \N{EN DASH} {end:g}"}.items():
         row = box.split(factor=0.4)
-        row.label(text="In the Scene")
-        row.label(text=f"{start:g} \N{EN DASH} {end:g}", translate=False)
-        if action_curves(armature) is not None:
-            layout.prop(armature.primdiffusion_human, "loop", toggle=True, icon="FILE_REFRESH")
+        row.label(text=label)
+        row.label(text=text, translate=False)
+    if action_curves(armature) is not None:
+        layout.prop(armature.primdiffusion_human, "loop", toggle=True, icon="FILE_REFRESH")
 
 
 def facts_of(action: bpy.types.Action) -> dict[str, str]:

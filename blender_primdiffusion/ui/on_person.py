@@ -1,4 +1,4 @@
-"""Bases of operators and panels on one human, or on one armature with SMPL's joints."""
+"""Bases of operators on one human, or on one armature with SMPL's joints."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from ..jobs.parts import complete
 from ..jobs.target import named_person, selected_person
 from ..scene.human import human_of, humans
 from .declared import SKIP
-from .drawing import SidebarPanel
 
 
 class HumanOperator(Reporting):
@@ -38,21 +37,6 @@ class HumanOperator(Reporting):
     def run(self, context: bpy.types.Context, person: bpy.types.Object) -> set[str]:
         """The operator itself."""
         raise NotImplementedError
-
-
-class HumanPanel(SidebarPanel):
-    """A panel in the panel Human, shown for the selected human and closed at first."""
-
-    bl_parent_id = "PRIMDIFFUSION_PT_human"
-    bl_options = {"DEFAULT_CLOSED"}
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        try:
-            selected_person(context)
-        except ValueError:
-            return False
-        return True
 
 
 def other_human(context: bpy.types.Context, person: bpy.types.Object) -> bpy.types.Object:
@@ -104,14 +88,8 @@ def scene_fps(scene: bpy.types.Scene) -> float:
     return scene.render.fps / scene.render.fps_base
 
 
-class OnArmature(Reporting):
-    """Base of operators on one armature, which it finds; subclasses define `on`."""
-
-    person: bpy.props.StringProperty(
-        name="Human",
-        description="Name of the human; empty: the active armature or the selected human",
-        options={"SKIP_SAVE"},
-    )
+class ArmatureOperator(HumanOperator):
+    """Base of operators on one armature with SMPL's joints, a human's or another."""
 
     @classmethod
     def poll(cls, context: bpy.types.Context) -> bool:
@@ -120,13 +98,8 @@ class OnArmature(Reporting):
             cls.poll_message_set("There is no human in the scene: add one, or select an armature with SMPL's joints")
         return found
 
-    def act(self, context: bpy.types.Context) -> set[str]:
-        complete()
-        return self.on(context, target_armature(context, self.person))
-
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
-        """The operator itself."""
-        raise NotImplementedError
+    def person(self, context: bpy.types.Context) -> bpy.types.Object:
+        return target_armature(context, self.human)
 
 
 class WhereTo:

@@ -36,7 +36,10 @@ class PRIMDIFFUSION_PG_picture(bpy.types.PropertyGroup):
         max=65535,
     )
     seed: bpy.props.IntProperty(
-        name="Seed", description="Draws what the picture does not show; -1: the most probable", default=-1, min=-1
+        name="Seed",
+        description="Random seed for parts not visible in the picture; -1 uses the most likely appearance",
+        default=-1,
+        min=-1,
     )
 
 

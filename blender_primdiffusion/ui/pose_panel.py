@@ -1,4 +1,4 @@
-"""The panel Pose: where the built-in poses are in Blender's own pose library, and IK handles."""
+"""The section Pose of the panel Human: where the built-in poses are in Blender's own pose library, and IK handles."""
 
 from __future__ import annotations
 
@@ -8,77 +8,57 @@ import bpy
 
 from ..motion.posture import check_posable
 from ..scene.handles import add_handles, bake_handles, has_handles
-from .drawing import SidebarPanel, draw_lines, property_columns
-from .on_person import OnArmature, may_have_joints, target_armature, warn_of_rest
+from .drawing import draw_lines
+from .on_person import ArmatureOperator, target_armature, warn_of_rest
 
 LIBRARY = "PrimDiffusion"
 """Name of the asset library in the preferences."""
 _FOLDER = Path(__file__).parents[1] / "motion" / "data"
 
 
-class PRIMDIFFUSION_OT_add_handles(OnArmature, bpy.types.Operator):
+class PRIMDIFFUSION_OT_add_handles(ArmatureOperator, bpy.types.Operator):
     """Add handles that hold hands and feet where they are (IK), and poles that elbows and knees point to"""
 
     bl_idname = "primdiffusion.add_handles"
     bl_label = "Add IK Handles"
     bl_options = {"REGISTER", "UNDO"}
 
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+    def run(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         check_posable(armature)
         add_handles(context, armature)
         warn_of_rest(self, armature)
         return {"FINISHED"}
 
 
-class PRIMDIFFUSION_OT_bake_handles(OnArmature, bpy.types.Operator):
+class PRIMDIFFUSION_OT_bake_handles(ArmatureOperator, bpy.types.Operator):
     """Turn the joints as the IK handles show, on every frame where the pose is animated, and remove the handles"""
 
     bl_idname = "primdiffusion.bake_handles"
     bl_label = "Bake and Remove Handles"
     bl_options = {"REGISTER", "UNDO"}
 
-    def on(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
+    def run(self, context: bpy.types.Context, armature: bpy.types.Object) -> set[str]:
         check_posable(armature)
         bake_handles(context, armature)
         return {"FINISHED"}
 
 
-def draw_handles(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
-    """The button that adds handles, or the one that bakes them."""
+def draw_pose(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """The way to Blender's pose library, which is in Pose Mode, and IK handles."""
+    if context.mode == "POSE":
+        row = layout.row()
+        row.use_property_split = False  # a button over the whole width
+        row.prop(context.space_data, "show_region_asset_shelf", text="Show Poses", toggle=True, icon="ASSET_MANAGER")
+        draw_lines(layout, "Click a pose to apply it, drag to blend, right-click to flip it", "INFO")
+    else:
+        layout.operator("object.posemode_toggle", text="Pose Mode", icon="POSE_HLT")
+        draw_lines(layout, "Poses are in the asset shelf of Pose Mode", "INFO")
     try:
         armature = target_armature(context)
     except ValueError:
         return
     name = "bake_handles" if has_handles(armature) else "add_handles"
     layout.operator(f"primdiffusion.{name}", icon="CON_KINEMATIC")
-
-
-class PRIMDIFFUSION_PT_poses(SidebarPanel, bpy.types.Panel):
-    """The way to Blender's pose library, which is in Pose Mode, and IK handles."""
-
-    bl_label = "Pose"
-    bl_parent_id = "PRIMDIFFUSION_PT_human"
-    bl_order = 1
-    bl_options = {"DEFAULT_CLOSED"}
-    manual_page = "posing"
-
-    @classmethod
-    def poll(cls, context: bpy.types.Context) -> bool:
-        return may_have_joints(context)
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout = property_columns(self.layout)
-        if context.mode == "POSE":
-            row = layout.row()
-            row.use_property_split = False  # a button over the whole width
-            row.prop(
-                context.space_data, "show_region_asset_shelf", text="Show Poses", toggle=True, icon="ASSET_MANAGER"
-            )
-            draw_lines(layout, "Click a pose to apply it, drag to blend, right-click to flip it", "INFO")
-        else:
-            layout.operator("object.posemode_toggle", text="Pose Mode", icon="POSE_HLT")
-            draw_lines(layout, "Poses are in the asset shelf of Pose Mode", "INFO")
-        draw_handles(layout, context)
 
 
 def _libraries() -> list[bpy.types.UserAssetLibrary]:

@@ -111,7 +111,7 @@ def cancel_set_up() -> None:
     if not being_set_up():
         raise ValueError("nothing is being set up")
     setup.session.cancel()
-    setup.redraw()
+    redraw()
 
 
 def _python_changed(_preferences: bpy.types.AddonPreferences, _context: bpy.types.Context) -> None:

@@ -69,27 +69,14 @@ class PRIMDIFFUSION_OT_human_from_captures(Reporting, bpy.types.Operator):
     bl_idname = "primdiffusion.human_from_captures"
     bl_label = "Human from Captures"
 
-    directory: bpy.props.StringProperty(
-        name="Captures", description="Empty: the panel's", subtype="DIR_PATH", options={"SKIP_SAVE"}
-    )
-    filter_folder: bpy.props.BoolProperty(default=True, options={"HIDDEN", "SKIP_SAVE"})
-
-    def invoke(self, context: bpy.types.Context, _event: bpy.types.Event) -> set[str]:
-        """Open the file browser where the panel names no folder."""
-        if self.directory or context.scene.primdiffusion_reconstruct.capture:
-            return self.execute(context)
-        context.window_manager.fileselect_add(self)
-        return {"RUNNING_MODAL"}
-
     def act(self, context: bpy.types.Context) -> set[str]:
         asked = context.scene.primdiffusion_reconstruct
-        folder = bpy.path.abspath(self.directory) or setting_path(asked.capture, "Captures")
-        subject = "" if self.directory else asked.subject  # which belongs to the panel's own folder
+        folder = setting_path(asked.capture, "Captures")
         if not folder:
             raise ValueError("choose the folder of captures first")
         if not os.path.isdir(folder):
             raise FileNotFoundError(f"there is no folder {folder!r:.200}: choose one of captures")
-        return submit(self, context, ReconstructJob(folder, subject, asked.frame, asked.views, asked.by))
+        return submit(self, context, ReconstructJob(folder, asked.subject, asked.frame, asked.views, asked.by))
 
 
 class PRIMDIFFUSION_PT_human_from_captures(DataPanel, bpy.types.Panel):

@@ -12,7 +12,7 @@ from ..backend.environment import NOT_INSTALLED
 from ..engine.engine import ENGINE
 from ..engine.who_draws import Drawer, who_draws
 from ..jobs.follow import Reporting, submit
-from ..jobs.merge import MergeJob, Moment
+from ..jobs.merge import MergeJob, PoseSnapshot
 from ..jobs.target import HumanTarget
 from ..places import backend_is_named
 from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_camera, posed_extent
@@ -139,7 +139,7 @@ def _merge_all(operator: bpy.types.Operator, context: bpy.types.Context) -> set[
     """Merge the humans that volumes show: Cycles then renders them in seconds. Those that move keep their volumes."""
     graph, voxel = context.evaluated_depsgraph_get(), context.scene.primdiffusion_merging.voxel
     jobs = [
-        MergeJob(HumanTarget.of(person), Moment.now(person, person.evaluated_get(graph)), voxel)
+        MergeJob(HumanTarget.of(person), PoseSnapshot.capture(person, person.evaluated_get(graph)), voxel)
         for person in humans(context.scene)
         if representation_of(person) == "VOLUMES" and not (person.animation_data and person.animation_data.action)
     ]

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import os
-import time
 from pathlib import Path
 
 import bpy
@@ -15,11 +14,11 @@ import bpy
 from ..backend import setup
 from ..backend.environment import state_of
 from ..backend.packages import Lock, Machine, chosen_compute, locks_for, read_lock, this_machine
-from ..backend.requests import sentence
-from ..backend.setup import Steps
+from ..backend.requests import Steps, sentence
 from ..engine import drawing_child
 from ..jobs.follow import Reporting
 from ..jobs.queue import queue
+from ..jobs.steps import Session
 from ..places import EXTENSION, backend_module_path, cache_folder, set_up_folder
 from .declared import SKIP
 from .drawing import draw_lines
@@ -27,100 +26,15 @@ from .drawing import draw_lines
 LOCKS = Path(__file__).resolve().parents[1] / "requirements"
 OWN_LOCK = "requirements.txt"
 """In a folder of wheels: a list of packages that goes before ours."""
-TICK_S = 0.2
-_PRINT_S = 2.0
-"""Between lines of progress on the console in background mode."""
-_LINE_BYTES_PER_S = 50e6 / 8
-"""Assumed speed of the network: 50 Mbit/s."""
-_UNPACKED_BYTES_PER_S = 30e6
-_SELF_TEST_S = 30.0
 _ONLINE = (
     "Blender may not use the network: allow it in System > Network > Allow Online Access, or install from a folder"
 )
 
 
-class SetUpSession:
-    """Runs the steps of a set-up. All methods are for Blender's main thread."""
-
-    def __init__(self) -> None:
-        self.message = ""
-        self.fraction = 0.0
-        self.error = ""
-        """Why the last one failed, in a sentence."""
-        self.notice = ""
-        """How the last one ended otherwise."""
-        self._steps: Steps | None = None
-
-    @property
-    def busy(self) -> bool:
-        """Whether the backend is being set up."""
-        return self._steps is not None
-
-    def start(self, steps: Steps) -> None:
-        """Begin at the next tick."""
-        self._steps, self.error, self.notice, self.message, self.fraction = steps, "", "", "Starting", 0.0
-
-    def tick(self) -> bool:
-        """Continue; True when something visible changed. At the end `notice` or `error` is set."""
-        if self._steps is None:
-            return False
-        before = (self.message, self.fraction)
-        try:
-            step = next(self._steps)
-        except StopIteration as done:
-            self._steps, self.notice = None, done.value
-        except (RuntimeError, OSError) as error:
-            self._steps, self.error = None, sentence(error)
-        else:
-            self.message, self.fraction = step.message, step.fraction
-        return not self.busy or before != (self.message, self.fraction)
-
-    def cancel(self) -> None:
-        """End the set-up and its processes at once."""
-        if self._steps is not None:
-            self._steps.close()
-            self._steps, self.notice = None, "Cancelled; what has been downloaded is used by the next Set Up Backend"
-
-
-session = SetUpSession()
+session = Session(
+    "the backend is being set up already", "Cancelled; what has been downloaded is used by the next Set Up Backend"
+)
 """One for all windows."""
-
-
-def follow_session(operator: bpy.types.Operator) -> set[str]:
-    """Follow the session: by a timer with a window, by waiting in background mode, which reports an error."""
-    if not bpy.app.background:
-        if not bpy.app.timers.is_registered(follow):
-            bpy.app.timers.register(follow, first_interval=TICK_S, persistent=True)
-        return {"FINISHED"}
-    printed = 0.0
-    try:
-        while session.busy:
-            if session.tick() and session.busy and time.monotonic() - printed > _PRINT_S:
-                printed = time.monotonic()
-                print(f"PrimDiffusion: {session.message}", flush=True)
-            time.sleep(TICK_S / 4)
-    finally:
-        session.cancel()
-    if session.error:
-        operator.report({"ERROR"}, session.error)
-        return {"CANCELLED"}
-    print(f"PrimDiffusion: {session.notice}", flush=True)
-    return {"FINISHED"}
-
-
-def follow() -> float | None:
-    """The timer."""
-    if session.tick():
-        redraw()
-    return TICK_S if session.busy else None
-
-
-def redraw() -> None:
-    """Redraw sidebars and preferences."""
-    for window in bpy.context.window_manager.windows:
-        for area in window.screen.areas:
-            if area.type in {"VIEW_3D", "PREFERENCES"}:
-                area.tag_redraw()
 
 
 @functools.cache
@@ -227,11 +141,7 @@ def draw_result(layout: bpy.types.UILayout, width: int) -> None:
 
 def cost(lock: Lock) -> str:
     """The cost of a set-up, as a sentence."""
-    seconds = lock.download_bytes / _LINE_BYTES_PER_S + lock.installed_bytes / _UNPACKED_BYTES_PER_S + _SELF_TEST_S
-    return (
-        f"Downloads {gigabytes(lock.download_bytes)}, takes {gigabytes(lock.installed_bytes)} on disk, "
-        f"about {max(round(seconds / 60), 1)} min at 50 Mbit/s"
-    )
+    return f"Downloads {gigabytes(lock.download_bytes)}, takes {gigabytes(lock.installed_bytes)} on disk"
 
 
 def gigabytes(size: float) -> str:
@@ -282,11 +192,9 @@ class PRIMDIFFUSION_OT_set_up_backend(Reporting, bpy.types.Operator):
         queue.close()  # children that run on the environment: their files could not be replaced
         drawing_child.close()
         session.start(steps)
-        return follow_session(self)
+        return session.follow(self)
 
 
 def unregister() -> None:
     """End a running set-up."""
-    session.cancel()
-    if bpy.app.timers.is_registered(follow):
-        bpy.app.timers.unregister(follow)
+    session.close()

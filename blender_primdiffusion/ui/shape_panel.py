@@ -1,4 +1,4 @@
-"""The panel Shape of the selected human; its shape and loop are properties of the armature, applied at once."""
+"""The section Shape of the panel Human; the human's shape and loop are properties of the armature, applied at once."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from ..scene.human import BETA_COUNT, BETAS, LARGEST_BETA, humans, is_human
 from ..scene.rest_human import shape_model_of
 from ..scene.shape import BodyMeasures, betas_of, betas_of_measures, generated_betas, measure, slider_names
 from .declared import SKIP
-from .drawing import draw_lines, property_columns
-from .on_person import HumanOperator, HumanPanel, other_human
+from .drawing import draw_lines, draw_section, property_columns
+from .on_person import HumanOperator, other_human
 
 _NOT_ANIMATED: set[str] = set()
 """Options: an animation would move the rest bones in each frame; the custom property can be animated instead."""
@@ -232,43 +232,34 @@ class PRIMDIFFUSION_OT_reshape(HumanOperator, bpy.types.Operator):
 _ANIMATED = "The shape is animated: the exact engine draws it in each frame; bones and volumes keep one shape"
 
 
-class PRIMDIFFUSION_PT_shape(HumanPanel, bpy.types.Panel):
-    """Height, weight and the sliders of the body's shape."""
-
-    bl_label = "Shape"
-    bl_order = 0
-    manual_page, manual_section = "editing", "shape"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout = property_columns(self.layout)
-        person = selected_person(context)
-        try:
-            names = slider_names(shape_model_of(person))
-            check_shapeable(person)
-        except (OSError, ValueError) as error:
-            draw_lines(layout, sentence(error), "INFO")
-            return
-        settings = person.primdiffusion_human
-        layout.prop(settings, "height")
-        layout.prop(settings, "weight")
-        shown = in_the_scene(context.scene, person, settings.height)
-        if shown:
-            layout.label(text=f"In the scene: {shown}", icon="BLANK1", translate=False)
-        _draw_sliders(layout, settings, {index: name for index, name in enumerate(names) if not name.isdecimal()})
+def draw_shape(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
+    """Height, weight and the sliders of the selected human's shape."""
+    person = selected_person(context)
+    try:
+        names = slider_names(shape_model_of(person))
+        check_shapeable(person)
+    except (OSError, ValueError) as error:
+        draw_lines(layout, sentence(error), "INFO")
+        return
+    settings = person.primdiffusion_human
+    layout.prop(settings, "height")
+    layout.prop(settings, "weight")
+    shown = in_the_scene(context.scene, person, settings.height)
+    if shown:
+        layout.label(text=f"In the scene: {shown}", icon="BLANK1", translate=False)
+    _draw_sliders(layout, settings, {index: name for index, name in enumerate(names) if not name.isdecimal()})
+    row = layout.row(align=True)
+    row.operator("primdiffusion.reshape", text="Random", icon="FILE_REFRESH").to = "RANDOM"
+    row.operator("primdiffusion.reshape", text="Reset", icon="LOOP_BACK").to = "GENERATED"
+    if len(humans(context.scene)) > 1:
         row = layout.row(align=True)
-        row.operator("primdiffusion.reshape", text="Random", icon="FILE_REFRESH").to = "RANDOM"
-        row.operator("primdiffusion.reshape", text="Reset", icon="LOOP_BACK").to = "GENERATED"
-        if len(humans(context.scene)) > 1:
-            row = layout.row(align=True)
-            row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
-            if context.scene.primdiffusion_edit.other is not None:
-                row.operator("primdiffusion.reshape", text="", icon="PASTEDOWN").to = "OTHER"
-        if _animated(person):
-            draw_lines(layout, _ANIMATED, "INFO")
-        header, body = layout.panel("primdiffusion_more_sliders", default_closed=True)
-        header.label(text="More Sliders")
-        if body is not None:
-            _draw_sliders(body, settings, {index: name for index, name in enumerate(names) if name.isdecimal()})
+        row.prop(context.scene.primdiffusion_edit, "other", text="Copy From")
+        if context.scene.primdiffusion_edit.other is not None:
+            row.operator("primdiffusion.reshape", text="", icon="PASTEDOWN").to = "OTHER"
+    if _animated(person):
+        draw_lines(layout, _ANIMATED, "INFO")
+    if (body := draw_section(layout, "more_sliders", text="More Sliders")) is not None:
+        _draw_sliders(body, settings, {index: name for index, name in enumerate(names) if name.isdecimal()})
 
 
 def _draw_sliders(layout: bpy.types.UILayout, settings: bpy.types.PropertyGroup, names: dict[int, str]) -> None:
@@ -291,15 +282,9 @@ def in_the_scene(scene: bpy.types.Scene, armature: bpy.types.Object, height: flo
 
 def _animated(armature: bpy.types.Object) -> bool:
     """Whether keys or drivers move the betas."""
-    animation = armature.animation_data
-    if animation is None:
+    if armature.animation_data is None:
         return False
-    curves = list(animation.drivers)
-    if animation.action is not None and animation.action_slot is not None:
-        for layer in animation.action.layers:
-            for strip in layer.strips:
-                bag = strip.channelbag(animation.action_slot)
-                curves += bag.fcurves if bag is not None else ()
+    curves = (*armature.animation_data.drivers, *(action_curves(armature) or ()))
     return any(curve.data_path == f'["{BETAS}"]' for curve in curves)
 
 

@@ -1,4 +1,4 @@
-"""The sidebar panel Variations: a contact sheet of humans to select and build."""
+"""The section Variations of the panel Generate: a contact sheet of humans to select and build."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from ..scene.build import build_human
 from ..scene.cycles import overlap_warning_in
 from ..scene.place import stand_at_cursor
 from .declared import SKIP, declared
-from .drawing import BackendPanel, draw_job, property_columns, row_unless
-from .generate_panel import LARGEST_SEED, STEPS_AND_SAMPLER, last_seed, sampling, seed_property
+from .drawing import draw_job, row_unless
+from .generate_settings import LARGEST_SEED, STEPS_AND_SAMPLER, last_seed, sampling, seed_property
 
 MOST = 16
 COUNT_ITEMS = [(str(count), str(count), f"{count} humans") for count in range(4, MOST + 1, 4)]
@@ -67,7 +67,6 @@ def _select(_manager: bpy.types.WindowManager, selected: Sequence[bool]) -> None
         variation.chosen = chosen
 
 
-_SELECTED = "Index from 0; -1: the selected ones"
 _USE_SEED = "Set the seed of the panel Generate to that of the selected human and lock it"
 
 
@@ -83,7 +82,6 @@ class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
         name="More Like This", description="Variations of a human of the sheet, with the same body", options=SKIP
     )
     use_seed: bpy.props.BoolProperty(name="Use Seed", description=_USE_SEED, options=SKIP)
-    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
     clear: bpy.props.BoolProperty(
         name="Clear", description="Clear the sheet and delete its files; humans in the scene stay", options=SKIP
     )
@@ -98,7 +96,7 @@ class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
             return self._use_seed(context.scene.primdiffusion)
         settings, like = context.scene.primdiffusion_variations, {}
         if self.like:
-            around = _only(_targets(self.index), "select only the one to vary")
+            around = _only(_targets(), "select only the one to vary")
             like = {"person": str(around.person), "amount": settings.amount, "title": f"Like seed {around.seed}"}
         from_panel = settings.seeds != "RANDOM" and not self.like
         first = self.seed if self.seed >= 0 or not from_panel else context.scene.primdiffusion.seed
@@ -108,7 +106,7 @@ class PRIMDIFFUSION_OT_variations(Reporting, bpy.types.Operator):
         return submit(self, context, VariationsJob(_seeds(first, int(settings.count)), fields, **like))
 
     def _use_seed(self, settings: bpy.types.PropertyGroup) -> set[str]:
-        wanted = _only(_targets(self.index), "select one")
+        wanted = _only(_targets(), "select one")
         if sheet.around:
             raise ValueError("variants of a human cannot be generated from a seed alone: build them instead")
         settings.seed, settings.keep_seed = wanted.seed, True
@@ -130,7 +128,6 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
     bl_label = "Build Selected"
     described_by = ("build_all",)
 
-    index: bpy.props.IntProperty(name="Index", default=-1, min=-1, description=_SELECTED, options=SKIP)
     build_all: bpy.props.BoolProperty(
         name="All", description="Add all of these humans to the scene, side by side", options=SKIP
     )
@@ -142,7 +139,7 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
         return bool(sheet.variations)
 
     def act(self, context: bpy.types.Context) -> set[str]:
-        wanted = list(sheet.variations) if self.build_all else _targets(self.index)
+        wanted = list(sheet.variations) if self.build_all else _targets()
         if context.mode != "OBJECT":
             bpy.ops.object.mode_set(mode="OBJECT")
         built, failure = _build(context, wanted)
@@ -157,11 +154,11 @@ class PRIMDIFFUSION_OT_build_variation(Reporting, bpy.types.Operator):
         return {"FINISHED"}
 
 
-def _targets(index: int) -> list[Variation]:
-    """The variation at `index`, or the selected ones. Raises ValueError where there is none."""
+def _targets() -> list[Variation]:
+    """The selected variations. Raises ValueError where there is none."""
     if not sheet.variations:
         raise ValueError("there are no variations: press Show Variations first")
-    return sheet.chosen() if index < 0 else [sheet.at(index)]
+    return sheet.chosen()
 
 
 def _only(wanted: list[Variation], what_to_do: str) -> Variation:
@@ -208,28 +205,20 @@ _UNIT_PX = 20
 """Of Blender's interface at a scale of 1: what `template_icon` counts in."""
 
 
-class PRIMDIFFUSION_PT_variations(BackendPanel, bpy.types.Panel):
+def draw_variations(layout: bpy.types.UILayout, context: bpy.types.Context) -> None:
     """Humans to choose from."""
-
-    bl_label = "Variations"
-    bl_parent_id = "PRIMDIFFUSION_PT_generate"
-    bl_order = 1
-    bl_options = {"DEFAULT_CLOSED"}
-    manual_page, manual_section = "first_human", "variations"
-
-    def draw(self, context: bpy.types.Context) -> None:
-        layout, settings = property_columns(self.layout), context.scene.primdiffusion_variations
-        column = layout.column()
-        column.row().prop(settings, "count", expand=True)
-        column.prop(settings, "seeds")
-        column.prop(settings, "quality")
-        draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
-        job = queue.current.job if queue.current is not None else None
-        if job is not None and job.kind == "variations":
-            _draw_progress(layout, _columns(context), job)
-        elif sheet.variations:
-            _draw_sheet(layout, _columns(context))
-            _draw_choice(layout, settings)
+    settings = context.scene.primdiffusion_variations
+    column = layout.column()
+    column.row().prop(settings, "count", expand=True)
+    column.prop(settings, "seeds")
+    column.prop(settings, "quality")
+    draw_job(layout, "variations", "primdiffusion.variations", "LIGHTPROBE_VOLUME")
+    job = queue.current.job if queue.current is not None else None
+    if job is not None and job.kind == "variations":
+        _draw_progress(layout, _columns(context), job)
+    elif sheet.variations:
+        _draw_sheet(layout, _columns(context))
+        _draw_choice(layout, settings)
 
 
 def _columns(context: bpy.types.Context) -> tuple[int, float]:

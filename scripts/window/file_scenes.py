@@ -139,7 +139,7 @@ def read_back(module: str, python: str) -> Steps:
 def handles(module: str, python: str) -> Steps:
     """IK handles: added, the pelvis lowered with the feet where they were, baked back."""
     yield from with_people(module, python, FIRST_SEED)
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
+    yield from show("PRIMDIFFUSION_PT_human/pose")
     armature = armatures()[0]
     press("view3d.view_selected", "EXEC_DEFAULT")
     press("primdiffusion.add_handles")

@@ -37,8 +37,8 @@ def from_a_standing_start(module: str, python: str) -> Steps:
 def from_a_posed_start(module: str, python: str) -> Steps:
     picture = yield from drawn(module, python, SECOND_SEED, "Waving")
     yield from chosen(module, python, picture)
-    gallery = import_module(f"{module}.ui.gallery")
-    press("primdiffusion.import_human", filepath=str(gallery.samples()[0]))
+    folder = import_module(f"{module}.ui.menus").FOLDER
+    press("primdiffusion.import_human", filepath=str(min(folder.glob("*.human"))))
     yield from wait(lambda: not queue_of(module).busy and bool(armatures()), _MOST_S)
     (armature,) = armatures()
     armature.location = armature.rotation_euler = (0.0, 0.0, 0.0)

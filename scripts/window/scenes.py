@@ -8,7 +8,6 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 
 import bpy
@@ -61,10 +60,9 @@ def first_human(module: str, python: str) -> Steps:
     yield from wait(lambda: queue.busy, 5)
     if not queue.busy:
         raise RuntimeError("the click did not hit Generate Human")
-    so_far = import_module(f"{module}.jobs.pictures").so_far
     yield 1.0
     yield "first_starting"
-    yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
+    yield from wait(lambda: not queue.busy or has_picture(queue), 120)
     yield "first_denoising"
     yield from wait(lambda: not queue.busy, 240)
     yield from at_rest(module)
@@ -81,8 +79,8 @@ def generate(module: str, python: str) -> Steps:
     settings = bpy.context.scene.primdiffusion
     settings.count = 3
     press("primdiffusion.generate")
-    so_far = import_module(f"{module}.jobs.pictures").so_far
-    yield from wait(lambda: bool(so_far.icon), 120)
+    queue = queue_of(module)
+    yield from wait(lambda: has_picture(queue), 120)
     yield "generate_in_line"
     yield from cancel_all(module)
     settings.count = 1
@@ -97,7 +95,7 @@ def generate(module: str, python: str) -> Steps:
     attributes = settings.attributes
     attributes.sex, attributes.outfit, attributes.hair = "female", "blouse and skirt", "braid"
     attributes.use_height = True
-    yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_attributes")
+    yield from show("PRIMDIFFUSION_PT_generate/attributes")
     yield "generate_attributes"
     for name in ("sex", "outfit", "hair"):
         setattr(attributes, name, "ANY")
@@ -107,7 +105,7 @@ def generate(module: str, python: str) -> Steps:
 def variations(module: str, python: str) -> Steps:
     """Eight in progress, the sheet, two selected."""
     yield from begin(module, python)
-    yield from show("PRIMDIFFUSION_PT_generate", "PRIMDIFFUSION_PT_variations")
+    yield from show("PRIMDIFFUSION_PT_generate/variations")
     bpy.context.scene.primdiffusion_variations.seeds = "CONSECUTIVE"
     bpy.context.scene.primdiffusion.seed = 40
     yield "variations_empty"
@@ -128,7 +126,7 @@ def human(module: str, python: str) -> Steps:
     """Shape before and after, facts, poses, assets."""
     yield from with_people(module, python, FIRST_SEED)
     armature = armatures()[0]
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_shape")
+    yield from show("PRIMDIFFUSION_PT_human/shape")
     yield from rendered_view(module)
     yield "human_shape_before"
     settings = armature.primdiffusion_human
@@ -139,7 +137,7 @@ def human(module: str, python: str) -> Steps:
     yield 4.0
     yield from show("PRIMDIFFUSION_PT_advanced/facts")
     yield "human_details"
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_poses")
+    yield from show("PRIMDIFFUSION_PT_human/pose")
     space = view()[1].spaces.active
     space.shading.type, space.overlay.show_bones = "SOLID", True
     press("view3d.view_selected", "EXEC_DEFAULT")
@@ -162,7 +160,7 @@ def edits(module: str, python: str) -> Steps:
     clear_of_the_sidebar()
     settings = bpy.context.scene.primdiffusion_edit
     settings.other = second
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_edit")
+    yield from show("PRIMDIFFUSION_PT_human/edit")
     settings.kind = "TRANSFER"
     yield 0.5
     yield "edit_two_people"
@@ -171,8 +169,7 @@ def edits(module: str, python: str) -> Steps:
     yield "edit_parts"
     press("primdiffusion.redress")
     queue = queue_of(module)
-    so_far = import_module(f"{module}.jobs.pictures").so_far
-    yield from wait(lambda: bool(so_far.icon) or not queue.busy, 120)
+    yield from wait(lambda: not queue.busy or has_picture(queue), 120)
     yield "edit_working"
     yield from wait(lambda: not queue.busy, 180)
     yield from rendered_view(module)
@@ -192,7 +189,7 @@ def edits(module: str, python: str) -> Steps:
 def motion(module: str, python: str) -> Steps:
     """The empty panel, the dialog with what was detected in a file, after the import."""
     yield from with_people(module, python, FIRST_SEED)
-    yield from show("PRIMDIFFUSION_PT_human", "PRIMDIFFUSION_PT_motion")
+    yield from show("PRIMDIFFUSION_PT_human/motion")
     yield from at_rest(module)
     yield "motion_empty"
     path = Path(bpy.app.tempdir) / "walk_01.npz"
@@ -347,3 +344,8 @@ SCENES: dict[str, Callable[[str, str], Steps]] = {
     "turning": turning,
     "playing": playing,
 }
+
+
+def has_picture(queue) -> bool:
+    """Whether the running job shows a picture of its human so far."""
+    return queue.request is not None and queue.request.picture is not None

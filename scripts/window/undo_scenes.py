@@ -128,7 +128,7 @@ def _play(this: Round) -> Steps:
     yield from wait(this.look, 300)
     if not this.look():
         yield "undo_and_timers_waiting"
-        blocker = import_module(f"{this.module}.jobs.windows").in_the_way() or "nothing"
+        blocker = import_module(f"{this.module}.jobs.windows").blocking_activity() or "nothing"
         raise RuntimeError(f"{this}: not there within five minutes; in the way: {blocker}")
     yield from _rest(this)
     handled = this.steps

@@ -18,8 +18,8 @@ def viewer(module: str, _python: str) -> Steps:
     yield from begin(module, "")
     yield from sidebar()
     yield "viewer_sidebar"
-    gallery = import_module(f"{module}.ui.gallery")
-    press("primdiffusion.import_human", filepath=str(gallery.samples()[0]))
+    folder = import_module(f"{module}.ui.menus").FOLDER
+    press("primdiffusion.import_human", filepath=str(min(folder.glob("*.human"))))
     yield from wait(lambda: not queue_of(module).busy and bool(armatures()), _MOST_S)
     select(armatures()[0])
     yield from at_rest(module)

@@ -45,7 +45,7 @@ GRIDS_KEPT_MB = 64
 @pytest.fixture
 def empty_scene():
     """A context with an empty, unsaved file."""
-    from blender_primdiffusion.scene.payload import forget_session_files
+    from human_files import forget_session_files
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     forget_session_files()

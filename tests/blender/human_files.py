@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import bpy
 
 from blender_primdiffusion.scene.human import parts_of
 from blender_primdiffusion.scene.parts import complete_humans
-from blender_primdiffusion.scene.payload import PAYLOAD, session_file
+from blender_primdiffusion.scene.payload import PAYLOAD, session_file, session_folder
 from blender_primdiffusion.scene.volume_files import files_of
 
 
@@ -41,6 +42,11 @@ def sequence_files(volume: bpy.types.Volume) -> list[Path]:
 def lose_data(person: bpy.types.Object) -> None:
     """Leave the human without its packed file."""
     del person[PAYLOAD]
+
+
+def forget_session_files() -> None:
+    """Remove the files of this session; those that are needed again are written again."""
+    shutil.rmtree(session_folder(), ignore_errors=True)
 
 
 def remove_human(person: bpy.types.Object) -> None:

@@ -72,7 +72,10 @@ class Layout:
 
 
 def shown(panel, context, *, opened: bool = False) -> list[str]:
-    """Operators and texts that a panel draws; `opened` with its closed sections."""
+    """Operators and texts that a panel, or a function for a section of one, draws; `opened` with closed sections."""
     layout = Layout(opened)
-    panel.draw(SimpleNamespace(layout=layout), context)
+    if isinstance(panel, type):
+        panel.draw(SimpleNamespace(layout=layout), context)
+    else:
+        panel(layout, context)
     return layout.of("text", "button")

@@ -12,7 +12,8 @@ import scan_fixtures
 from blender_primdiffusion.formats.poses.rotation import from_axis_angle
 
 from blender_primdiffusion.capture.body import read_body
-from blender_primdiffusion.capture.scan import Scan, find_scans, load_scan
+from blender_primdiffusion.capture.scan import Scan, load_scan
+from blender_primdiffusion.capture.scan_files import find_scans
 
 BODY = read_body()
 RNG = np.random.default_rng(0)

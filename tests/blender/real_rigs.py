@@ -22,7 +22,8 @@ from bvh_files import FRAMES, along_x, motion_of, write_bvh
 from mathutils import Vector
 
 from blender_primdiffusion.capture.body import Body, read_body
-from blender_primdiffusion.capture.scan import find_scans, load_scan
+from blender_primdiffusion.capture.scan import load_scan
+from blender_primdiffusion.capture.scan_files import find_scans
 from blender_primdiffusion.scene.convention import points_to_blender
 
 RIGS = ("MIXAMO", "RPM", "ROKOKO", "VROID", "SOMA")

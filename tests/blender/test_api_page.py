@@ -28,7 +28,7 @@ def test_every_operator_and_setting_has_its_place(addon):
         assert f"\n### {operator.bl_idname.partition('.')[2]}\n" in text
     assert "`bpy.context.scene.primdiffusion`" in text
     assert "| `seed` | int, -1 or more | `-1` |" in text
-    assert "### take_result" not in text
+    assert "### apply_result" not in text
 
 
 def test_the_page_states_when_an_operator_is_disabled(addon):

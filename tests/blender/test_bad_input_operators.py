@@ -20,7 +20,7 @@ from jobs_driven import drive
 from scene_state import state
 from shown_words import ways
 
-from blender_primdiffusion.jobs.edit import VaryJob
+from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.parts import complete
 from blender_primdiffusion.jobs.queue import Job, queue
@@ -29,8 +29,8 @@ from blender_primdiffusion.scene.handles import add_handles
 from blender_primdiffusion.scene.human import body_of, humans
 from blender_primdiffusion.ui.drawing import DATA
 
-ELSEWHERE = {"set_up_backend", "copy_diagnostics"}
-"""Set up, write a text: whatever is in the scene, it stays as it is."""
+ELSEWHERE = {"set_up_backend"}
+"""Whatever is in the scene, it stays as it is."""
 
 
 def operators() -> list[tuple[str, dict[str, object]]]:
@@ -209,12 +209,12 @@ def anna(addon, tmp_path, monkeypatch):
 @pytest.fixture
 def outside(anna, monkeypatch):
     """Nothing is downloaded or installed."""
-    from blender_primdiffusion.ui.setup import SetUpSession
+    from blender_primdiffusion.jobs.steps import Session
 
-    def start(session: SetUpSession, _steps: object) -> None:
+    def start(session: Session, _steps: object) -> None:
         session.notice = "as if it were done"
 
-    monkeypatch.setattr(SetUpSession, "start", start)
+    monkeypatch.setattr(Session, "start", start)
     monkeypatch.setattr("blender_primdiffusion.backend.environment.short_root", lambda *_: anna / "set up")
     bpy.context.preferences.system.use_online_access = True
     yield
@@ -263,7 +263,7 @@ def _generated(_person) -> Job:
 
 
 def _varied(person) -> Job:
-    return VaryJob.of(person, {"steps": 1, "amount": 0.5, "seed": 3})
+    return EditJob.of("vary", person, {"steps": 1, "amount": 0.5, "seed": 3})
 
 
 @pytest.mark.any_blender

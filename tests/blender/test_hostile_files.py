@@ -14,6 +14,7 @@ import synthetic_shape
 from exporting import write_person
 from scene_state import state
 
+from blender_primdiffusion.jobs.steps import Session
 from blender_primdiffusion.scene.build import build_human
 
 LONGEST_SENTENCE = 300
@@ -25,7 +26,7 @@ READS = {
 """Operators that read a file: the property with its path, and endings."""
 WRITES = [("export_motion", ".npz"), *(("export", ending) for ending in (".glb", ".ply", ".human", ".vdb"))]
 """Operators that write the file of their `filepath`."""
-FOLDERS = {"human_from_captures", "set_up_backend"}
+FOLDERS = {"set_up_backend"}
 """Operators on the folder of their `directory`."""
 PATHS = {"FILE_PATH", "DIR_PATH", "FILE_NAME"}
 
@@ -157,7 +158,7 @@ def test_a_place_that_cannot_be_written_is_named_in_one_sentence(anna, name, end
 
 @pytest.mark.parametrize("name", sorted(FOLDERS))
 def test_a_folder_that_is_none_is_named_in_one_sentence(anna, name, monkeypatch):
-    monkeypatch.setattr("blender_primdiffusion.ui.setup.follow_session", lambda _: {"FINISHED"})
+    monkeypatch.setattr(Session, "follow", lambda *_: {"FINISHED"})
     (anna / "file").write_bytes(b"a user's file")
     faults = [fault(name, anna, directory=str(anna / place)) for place in ("file", "n" * 300, "nowhere")]
     assert not list(filter(None, faults)), "\n".join(filter(None, faults))

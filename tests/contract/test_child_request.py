@@ -81,9 +81,10 @@ def test_a_child_that_was_being_started_when_all_was_shut_down_is_ended_too(chec
 
 
 def test_a_second_request_uses_the_same_child(start, backend):
-    first = backend.connect()
     follow(start(1))
-    assert backend.connect() is first
+    first = backend.client
+    follow(start(2))
+    assert backend.client is first is not None
 
 
 def test_a_cancelled_request_leaves_nothing(start, slow_checkpoint, tmp_path):
@@ -182,8 +183,8 @@ def test_a_cancel_while_torch_is_loaded_keeps_the_child(checkpoint, tmp_path):
     assert not request.info.get("ready")
     request.cancel()
     assert follow(request)[-1] == "cancelled"
-    first = backend.connect()
+    first = backend.client
     again = generate_request(backend, seed=1, steps=1, out_dir=tmp_path / "again", checkpoint=checkpoint)
     assert follow(again)[-1] == "done"
-    assert backend.connect() is first
+    assert backend.client is first is not None
     backend.shutdown()

@@ -10,7 +10,7 @@ from primdiffusion.editing.regions import parts_of, region_of
 from primdiffusion.formats.requests import PARTS, SAMPLERS
 from support.errors import refused
 
-from blender_primdiffusion.ui.attributes import read_vocabulary
+from blender_primdiffusion.ui.generate_settings import read_vocabulary
 
 
 def test_every_part_of_the_body_is_a_region():

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 from support.errors import refused
 from tiny_packages import until
+from waiting import run_to_end
 
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import (
@@ -23,7 +24,6 @@ from blender_primdiffusion.backend.environment import (
     search,
     tried,
 )
-from blender_primdiffusion.backend.requests import run_to_end
 
 PYTHON = Path(sys.executable)
 

@@ -9,7 +9,7 @@ from export_people import person
 from primdiffusion.body.model import default_body as backend_body
 from primdiffusion.human import Human, place
 from primdiffusion.human_file import load_human, save_body, save_human
-from primdiffusion.primitives.anchors import anchor_skin_weights, default_anchors
+from primdiffusion.primitives.anchors import default_anchors
 
 from blender_primdiffusion.jobs.export import opened
 from blender_primdiffusion.scene.human_file import (
@@ -51,8 +51,6 @@ def test_a_human_at_rest_is_the_backends_in_the_t_pose(human, tmp_path):
     assert np.allclose(found.rest.position, wanted.position, atol=1e-5)
     assert np.allclose(found.rest.rotation, wanted.rotation, atol=1e-4)
     assert np.allclose(found.grids().half_extent, wanted.half_extent, atol=1e-6)
-    weights = anchor_skin_weights(default_anchors(), backend_body())
-    assert np.allclose(found.model.primitive_weights(), weights, atol=1e-6)
 
 
 def test_what_is_opened_is_a_whole_human(human, tmp_path):

@@ -14,14 +14,13 @@ from blender_primdiffusion.files.whole_files import write_atomically
 from support.errors import refused
 from support.fake_child import FAKE_CHILD
 from tiny_packages import own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel
-from waiting import BACKEND, PYTHON
+from waiting import BACKEND, PYTHON, run_to_end
 
 from blender_primdiffusion.backend import setup
 from blender_primdiffusion.backend.client import BackendClient
 from blender_primdiffusion.backend.environment import MARK, VARIABLE, SetUpFolder, candidates, state_of
 from blender_primdiffusion.backend.packages import read_lock
-from blender_primdiffusion.backend.requests import Backend, ChildRequest, run_to_end
-from blender_primdiffusion.backend.setup import Steps
+from blender_primdiffusion.backend.requests import Backend, ChildRequest, Steps
 
 
 class Place(NamedTuple):

@@ -12,7 +12,7 @@ from primdiffusion.files.tensor_file import TensorFile
 from primdiffusion.files.tensor_layout import DTYPES, LARGEST_HEADER, MOST_DIMENSIONS
 
 from blender_primdiffusion.scene import human_file
-from blender_primdiffusion.ui.attributes import read_vocabulary
+from blender_primdiffusion.ui.generate_settings import read_vocabulary
 
 HUMAN = {"format": "primdiffusion.human", "format_version": "1", "architecture": "{}"}
 

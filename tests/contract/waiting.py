@@ -22,3 +22,13 @@ def wait_for(client: BackendClient, wanted, timeout_s: float = 300, into: list |
                 return event
         time.sleep(0.005)
     raise AssertionError(f"not within {timeout_s} s; seen {seen}; stderr {client.stderr}")
+
+
+def run_to_end(work):
+    """What a generator returns; sleeps at each of its yields."""
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            return done.value
+        time.sleep(0.02)

@@ -11,9 +11,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ...scene.human import BODY_MARK, human_of
+from ...scene.human import BODY_MARK, PROXY_MARK, human_of
 from ...scene.human_file import FileVersion, file_version, read_payload
-from ...scene.proxy import PROXY_MARK
 from ...scene.splats import SPLATS_MARK
 from ...scene.volume_nodes import VOLUMES_MARK
 from ..boxes import Boxes, boxes_of

@@ -25,7 +25,8 @@ from primdiffusion.capture.sheet import joints_of
 from primdiffusion.formats import camera_rig as backend_rig
 
 from blender_primdiffusion.capture.job import run
-from blender_primdiffusion.capture.scan import find_scans, load_scan
+from blender_primdiffusion.capture.scan import load_scan
+from blender_primdiffusion.capture.scan_files import find_scans
 from blender_primdiffusion.console import Report
 from blender_primdiffusion.motion.poses import built_in_poses
 

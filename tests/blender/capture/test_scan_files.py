@@ -13,8 +13,7 @@ from loaded_scans import BETAS, BODY, load
 from support.errors import refused
 
 from blender_primdiffusion.capture.registration import unit_of
-from blender_primdiffusion.capture.scan import find_scans
-from blender_primdiffusion.capture.scan_files import own_betas
+from blender_primdiffusion.capture.scan_files import find_scans, own_betas
 from blender_primdiffusion.capture.surfaces import choose_picture
 
 pytestmark = pytest.mark.any_blender

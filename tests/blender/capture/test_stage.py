@@ -25,7 +25,6 @@ from blender_primdiffusion.capture.cameras import aim, view_of
 from blender_primdiffusion.capture.job import run
 from blender_primdiffusion.capture.passes import srgb_bytes, write_passes
 from blender_primdiffusion.capture.settings import CaptureSettings
-from blender_primdiffusion.capture.skinned_surface import cameras_inside
 from blender_primdiffusion.capture.stage import Stage, shoot_centres, shoot_colours
 from blender_primdiffusion.capture.surfaces import mark_parts, prepare_materials
 from blender_primdiffusion.scene.convention import points_to_blender
@@ -253,14 +252,6 @@ def test_cameras_whose_picture_is_no_view_of_a_camera_are_refused(empty_scene, o
     bpy.context.view_layer.update()
     with refused(ValueError, "'mine'", "scale"):
         view_of(camera, empty_scene.evaluated_depsgraph_get(), (80, 50))
-
-
-def test_cameras_inside_are_found_and_those_between_the_legs_are_not(stage):
-    person = put(stage, frame=0)
-    places = [(0.0, 0.0, 0.0), (0.0, -0.9, 0.0), (0.0, 0.0, 3.0), (0.35, 0.26, 0.02), (0.4, -0.2, 0.0)]
-    views = [look_at(np.array(at), np.array([0.0, 0.05, 9.0]), 0.5, 8, 8) for at in places]
-    with stage.entered() as own:
-        assert cameras_inside(person.objects, own.evaluated_depsgraph_get(), views) == [0, 3]
 
 
 def test_files_hold_what_was_rendered(empty_scene, tmp_path):

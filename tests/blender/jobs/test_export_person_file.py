@@ -8,24 +8,22 @@ from pathlib import Path
 import bpy
 import pytest
 import synthetic_shape
-from human_files import person_file
+from human_files import forget_session_files, person_file
 
 from blender_primdiffusion.jobs.assets import HumanAssetJob
-from blender_primdiffusion.jobs.edit import BlendJob, RedressJob, TransferJob, VaryJob
+from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.export import (
     AddProxyJob,
     ExportGaussiansJob,
     ExportMeshJob,
     ExportVdbSequenceJob,
     posed_frames,
-    posed_now,
 )
-from blender_primdiffusion.jobs.merge import MergeJob, Moment
+from blender_primdiffusion.jobs.merge import MergeJob, PoseSnapshot
 from blender_primdiffusion.jobs.queue import Job
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.export_model import FrameRange
-from blender_primdiffusion.scene.payload import forget_session_files
 
 
 @pytest.fixture
@@ -34,16 +32,16 @@ def person(addon, tmp_path):
 
 
 def jobs_about(person: bpy.types.Object, folder: Path) -> list[Job]:
-    target, moment, context = HumanTarget.of(person), Moment.now(person), bpy.context
+    target, moment, context = HumanTarget.of(person), PoseSnapshot.capture(person), bpy.context
     return [
-        VaryJob.of(person, {"steps": 3, "amount": 0.5, "seed": 3}),
-        RedressJob.of(person, {"steps": 3, "region": {"painted": [0.0, 1.0]}, "seed": 3}),
-        TransferJob.of(person, {"steps": 3, "other": "/a/b"}),
-        BlendJob.of(person, {"steps": 3, "other": "/a/b", "fraction": 0.5}),
+        EditJob.of("vary", person, {"steps": 3, "amount": 0.5, "seed": 3}),
+        EditJob.of("inpaint", person, {"steps": 3, "region": {"painted": [0.0, 1.0]}, "seed": 3}),
+        EditJob.of("transfer", person, {"steps": 3, "other": "/a/b"}),
+        EditJob.of("interpolate", person, {"steps": 3, "other": "/a/b", "fraction": 0.5}),
         MergeJob(target, moment, 0.006),
         ExportMeshJob(target, 512, 9000, folder / "ä.glb", "GLB", FrameRange(1, 3)),
         AddProxyJob(target, 512, 9000),
-        ExportGaussiansJob(target, folder / "ä.ply", posed_now(context, person), 500),
+        ExportGaussiansJob(target, folder / "ä.ply", posed_frames(context, person, [1])[0], 500),
         ExportVdbSequenceJob(target, folder, "ä", posed_frames(context, person, range(1, 4)), 1, 0.01),
         HumanAssetJob(target),
     ]

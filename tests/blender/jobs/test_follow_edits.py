@@ -8,17 +8,16 @@ from pathlib import Path
 import bpy
 import pytest
 import synthetic_shape
-from human_files import folder_of, paths_of, person_file, remove_human
+from human_files import folder_of, forget_session_files, paths_of, person_file, remove_human
 from jobs_driven import drive, error_of, notice_of
 from oracle import evaluated_matrices
 
 from blender_primdiffusion.jobs import follow as follow_module
-from blender_primdiffusion.jobs.edit import VaryJob
+from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.follow import follow
 from blender_primdiffusion.jobs.generate import GenerateJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.payload import forget_session_files
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 
 pytestmark = pytest.mark.any_blender
@@ -55,7 +54,7 @@ def generated(addon):
 
 
 def vary(person, seed: int = FINE) -> None:
-    queue.add(bpy.context, VaryJob.of(person, {"steps": 2, "amount": 0.5, "seed": seed}))
+    queue.add(bpy.context, EditJob.of("vary", person, {"steps": 2, "amount": 0.5, "seed": seed}))
 
 
 def until_ready(seconds: float = 300.0) -> None:
@@ -132,7 +131,7 @@ def test_a_scene_deleted_meanwhile_gets_no_human(generated):
 
 
 def test_nothing_enters_while_the_user_holds_something(generated, monkeypatch):
-    monkeypatch.setattr(follow_module, "in_the_way", lambda: "Move")
+    monkeypatch.setattr(follow_module, "blocking_activity", lambda: "Move")
     for _ in range(20):
         assert follow() is not None
     assert not humans(bpy.context.scene)
@@ -217,7 +216,7 @@ def test_a_failure_leaves_the_person_as_they_were(varied, monkeypatch):
 
 def test_a_script_that_takes_the_result_gets_the_whole_edit(varied):
     before: list[Path] = paths_of(varied)
-    bpy.ops.primdiffusion.take_result()
+    bpy.ops.primdiffusion.apply_result()
     assert follow() is None
     assert not set(paths_of(current())) & set(before)
     check_whole(current())

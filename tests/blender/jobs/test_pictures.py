@@ -1,4 +1,4 @@
-"""The picture of what is being generated."""
+"""Pictures in panels."""
 
 from __future__ import annotations
 
@@ -7,18 +7,11 @@ import struct
 import zlib
 from pathlib import Path
 
-import bpy
 import pytest
-from jobs_driven import drive, until_running
-from support.fake_child import TAKES_LONG
 
-from blender_primdiffusion.jobs.follow import follow
-from blender_primdiffusion.jobs.generate import GenerateJob
-from blender_primdiffusion.jobs.pictures import SoFar, so_far
-from blender_primdiffusion.jobs.queue import queue
+from blender_primdiffusion.jobs.pictures import Icons
 
 pytestmark = pytest.mark.any_blender
-ops = bpy.ops.primdiffusion
 
 
 def write_png(path: Path, colour: tuple[int, int, int], side: int = 8) -> Path:
@@ -33,36 +26,15 @@ def write_png(path: Path, colour: tuple[int, int, int], side: int = 8) -> Path:
     return path
 
 
-def test_pictures_follow_one_another_and_one_at_a_time_is_held(tmp_path):
-    picture = SoFar()
-    for red in range(0, 200, 40):
-        assert picture.show(write_png(tmp_path / f"{red}.png", (red, 0, 0)))
-        assert picture._collection["so far"].image_pixels_float[0] == pytest.approx(red / 255, abs=0.01)
-        assert len(picture._collection) == 1
-    assert not picture.show(picture.shown)
-    same = picture.shown
-    os.utime(write_png(same, (0, 99, 0)), ns=(1, 1))
-    assert picture.show(same), "the same name, written again"
-    assert picture._collection["so far"].image_pixels_float[1] == pytest.approx(99 / 255, abs=0.01)
-    picture.close()
-    picture.close()
-
-
-def test_a_picture_that_is_gone_or_none_is_no_error(tmp_path):
-    picture = SoFar()
-    assert not picture.show(None)
-    assert not picture.show(tmp_path / "gone.png")
-    (tmp_path / "bad.png").write_bytes(b"half a pic")
-    picture.show(tmp_path / "bad.png")
-    assert (picture.shown, picture.icon) == (None, 0)
-    picture.close()
-
-
-def test_the_childs_picture_is_shown_while_it_works_and_then_no_more(addon):
-    queue.add(bpy.context, GenerateJob(TAKES_LONG, {"steps": 5}))
-    until_running()
-    follow()
-    assert so_far.shown.name == "picture.png"
-    ops.cancel()
-    drive()
-    assert so_far.shown is None
+def test_a_picture_that_is_written_again_is_read_again_and_one_that_is_gone_is_let_go(tmp_path):
+    icons, path, other = Icons(), tmp_path / "a.png", tmp_path / "b.png"
+    for green in (0, 99):
+        os.utime(write_png(path, (0, green, 0)), ns=((green + 1) * 10**9,) * 2)
+        icons.of(path)
+        assert icons._previews[str(path)].image_pixels_float[1] == pytest.approx(green / 255, abs=0.01)
+    path.unlink()
+    assert icons.of(path) == icons.of(None) == 0
+    icons.of(write_png(other, (9, 9, 9)))
+    assert list(icons._previews) == [str(other)]
+    icons.free()
+    icons.free()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import errno
+from pathlib import Path
 
 import bpy
 import pytest
 from jobs_driven import shown
-from support.fake_child import DIES, NO_MEMORY
+from support.fake_child import FAILS, NO_MEMORY
 
 from blender_primdiffusion.backend.requests import RequestError
 from blender_primdiffusion.jobs import remedies
@@ -19,24 +20,30 @@ ops = bpy.ops.primdiffusion
 
 def test_each_error_has_a_button_where_there_is_something_to_do(addon):
     for kind in ("died", "hung", "busy", "timeout"):
-        assert remedies.remedy_for(RequestError("", "", kind)).operator == "primdiffusion.try_again"
-    assert remedies.remedy_for(RequestError("", "", "out_of_memory")).operator == "primdiffusion.release_memory"
+        assert remedies.remedy_for(RequestError("", "", kind)) is None
+    assert remedies.remedy_for(RequestError("", "", "out_of_memory")).properties == {"what": "MEMORY"}
     assert remedies.remedy_for(RequestError("", "", "unwritable")).operator == "wm.save_as_mainfile"
     no_checkpoint = RequestError("there is no checkpoint at 'x.safetensors'", "", "missing_file")
     assert remedies.remedy_for(no_checkpoint).operator == "preferences.addon_show"
     assert remedies.remedy_for(RequestError("there is no folder of captures 'x'", "", "missing_file")) is None
     assert remedies.remedy_for(RequestError("", "", "bad_input")) is None
-    environment = remedies.remedy_for(RequestError("", "", "environment"))
-    assert environment is None or environment.operator == "primdiffusion.set_up_backend"
+    assert remedies.remedy_for(RequestError("", "", "environment")).operator == "primdiffusion.set_up_backend"
 
 
-def test_the_panel_shows_the_error_its_button_and_the_diagnostics(addon):
-    for seed, button in ((DIES, "try_again"), (NO_MEMORY, "release_memory")):
-        with pytest.raises(RuntimeError):
-            ops.generate(seed=seed)
-        texts = shown(PRIMDIFFUSION_PT_generate, addon)
-        assert f"primdiffusion.{button}" in texts
-        assert "primdiffusion.copy_diagnostics" in texts
+def test_the_panel_shows_the_error_its_button_and_the_log(addon):
+    with pytest.raises(RuntimeError):
+        ops.generate(seed=NO_MEMORY)
+    texts = shown(PRIMDIFFUSION_PT_generate, addon)
+    assert {"primdiffusion.cancel", "wm.path_open"} <= set(texts)
+
+
+def test_the_log_holds_versions_and_the_error(addon):
+    with pytest.raises(RuntimeError):
+        ops.generate(seed=FAILS)
+    text = remedies.error_log().read_text(encoding="utf-8")
+    for part in (bpy.app.version_string, "0-fake", "fake device", "seed 2", "CheckpointError", "checkpoint is damaged"):
+        assert part in text
+    assert str(Path.home()) not in text
 
 
 def test_a_full_disk_is_a_kind_of_its_own(addon):

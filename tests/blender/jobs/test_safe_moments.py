@@ -50,7 +50,7 @@ def test_a_result_waits_until_undo_and_redo_have_rested(addon, monkeypatch):
         step()
         for _ in range(5):
             assert follow() is not None
-        assert windows.in_the_way() == "undo"
+        assert windows.blocking_activity() == "undo"
         assert not humans(bpy.context.scene)
     monkeypatch.setattr(windows, "UNDO_REST_S", 0.0)
     drive()
@@ -89,7 +89,7 @@ def test_nothing_is_changed_while_blender_reads_the_scene_in_a_thread(addon, mon
     until_ready()
     app = SimpleNamespace(is_job_running=lambda kind: kind == job)
     monkeypatch.setattr(windows, "bpy", SimpleNamespace(app=app, context=bpy.context))
-    assert windows.in_the_way() == shown
+    assert windows.blocking_activity() == shown
     for _ in range(5):
         assert follow() is not None
     assert not humans(bpy.context.scene)
@@ -110,9 +110,9 @@ def test_nothing_is_changed_within_a_modal_operator(addon, monkeypatch):
     app = SimpleNamespace(is_job_running=lambda _kind: False)
     with monkeypatch.context() as held:
         held.setattr(windows, "bpy", SimpleNamespace(app=app, context=context))
-        assert windows.in_the_way() == "Move"
+        assert windows.blocking_activity() == "Move"
         modals.pop()
-        assert windows.in_the_way() == ""
+        assert windows.blocking_activity() == ""
     drive()
     assert len(humans(bpy.context.scene)) == 1
 
@@ -124,21 +124,21 @@ def test_steps_that_wait_behind_slow_redraws_are_waited_for(addon, resting_at_on
     for _ in range(3):
         windows.note_undo()
         assert windows._look_for_more() is not None, "the timer between this step and the next"
-        assert windows.in_the_way() == "undo"
+        assert windows.blocking_activity() == "undo"
     assert windows._look_for_more() is None
-    assert windows.in_the_way() == ""
+    assert windows.blocking_activity() == ""
     windows.note_undo()
     windows.forget_undo()
-    assert windows.in_the_way() == "", "another file"
+    assert windows.blocking_activity() == "", "another file"
 
 
 def test_another_file_does_not_wait_for_the_undo_of_the_last_one(addon, monkeypatch):
     monkeypatch.setattr(windows, "UNDO_REST_S", 60.0)
     steps("one", "two")
     bpy.ops.ed.undo()
-    assert windows.in_the_way() == "undo"
+    assert windows.blocking_activity() == "undo"
     bpy.ops.wm.read_homefile(use_empty=True)
-    assert windows.in_the_way() == ""
+    assert windows.blocking_activity() == ""
 
 
 def test_what_a_failure_leaves_is_an_undo_step(addon, resting_at_once, monkeypatch):

@@ -6,7 +6,7 @@ import bpy
 import pytest
 from mathutils import Matrix, Vector
 
-from blender_primdiffusion.jobs.views import share_of_height
+from blender_primdiffusion.jobs.generate import share_of_height
 
 FOCAL = 2.0
 """In half heights of the view, which spans as many metres as it is away."""

@@ -5,18 +5,17 @@ from __future__ import annotations
 import bpy
 import pytest
 import synthetic_shape
-from human_files import copy_of, folder_of
+from human_files import copy_of, folder_of, forget_session_files
 from jobs_driven import error_of, notice_of
 
+from benchmarks.cycles_preview import setup_cycles_preview
 from blender_primdiffusion.engine.engine import ENGINE
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.jobs.target import HumanTarget
 from blender_primdiffusion.jobs.volumes import VolumesJob, faults, write_before_rendering
 from blender_primdiffusion.scene import volumes
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.cycles import setup_cycles_preview
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.scene.payload import forget_session_files
 from blender_primdiffusion.scene.representation import in_viewport
 from blender_primdiffusion.scene.volume_files import are_written
 from blender_primdiffusion.scene.volume_nodes import volumes_of

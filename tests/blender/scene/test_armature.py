@@ -14,7 +14,6 @@ from blender_primdiffusion.scene.armature import build_armature, keyframe_poses,
 from blender_primdiffusion.scene.build import build_body_mesh
 from blender_primdiffusion.scene.convention import (
     continuous_quaternions,
-    frames_to_blender,
     points_to_blender,
     rotations_to_blender,
 )
@@ -50,7 +49,6 @@ def test_turning_points_and_turning_rotations_agree():
     point = np.array([0.3, -0.2, 0.9])
     moved = points_to_blender(rotation @ point)
     np.testing.assert_allclose(moved, rotations_to_blender(rotation) @ points_to_blender(point), atol=1e-15)
-    np.testing.assert_allclose(moved, frames_to_blender(rotation) @ point, atol=1e-15)
 
 
 def test_bones_have_smpl_names_parents_and_heads_at_the_joints(armature):

@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
-from human_files import folder_of
+from human_files import folder_of, forget_session_files
 from human_stage import strong_pose
 from mathutils import Matrix, Vector
 from oracle import TOLERANCE_M, evaluated_matrices, raised, surface_frames, world_from_model
@@ -21,7 +21,6 @@ from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.cycles import overlap_warning
 from blender_primdiffusion.scene.human import MARK, body_of, humans, parts_of
-from blender_primdiffusion.scene.payload import forget_session_files
 from blender_primdiffusion.scene.volume_files import open_humans
 
 KINDS = ("objects", "collections", "volumes", "meshes", "armatures", "materials", "actions", "images", "node_groups")

@@ -77,7 +77,7 @@ def textures(mesh):
 @pytest.mark.parametrize(("kind", "ending"), [("GLB", ".glb"), ("FBX", ".fbx"), ("USD", ".usdc"), ("USD", ".usdz")])
 def test_joints_and_surface_are_where_they_were(moving, store, tmp_path, kind, ending, frames):
     armature = moving
-    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png")
     bpy.context.scene.collection.objects.link(proxy)
     bpy.context.scene.frame_set(3)
     out = tmp_path / f"eine Frau ä{ending}"
@@ -96,7 +96,7 @@ def test_joints_and_surface_are_where_they_were(moving, store, tmp_path, kind, e
 
 
 def test_textures_are_not_written_through_a_link(moving, store, tmp_path):
-    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png")
     bpy.context.scene.collection.objects.link(proxy)
     (tmp_path / "outside").mkdir()
     (tmp_path / "out").mkdir()
@@ -116,7 +116,7 @@ def test_ik_handles_are_not_exported_and_their_effect_is(store, tmp_path, kind, 
     for frame, height in ((1, 0.0), (4, 0.3)):
         armature.pose.bones["left_foot_ik"].location.z = height
         armature.pose.bones["left_foot_ik"].keyframe_insert("location", frame=frame)
-    proxy = build_proxy(person, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    proxy = build_proxy(person, read_proxy(store / "proxy.npz"), store / "proxy.png")
     bpy.context.scene.collection.objects.link(proxy)
     frames = FrameRange(1, 4)
     write_model(bpy.context, armature, proxy, tmp_path / f"a{ending}", kind, frames)
@@ -129,7 +129,7 @@ def test_ik_handles_are_not_exported_and_their_effect_is(store, tmp_path, kind, 
 
 
 def test_exporting_leaves_the_scene_as_it_was(moving, store, tmp_path):
-    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png")
     armature = moving
     armature.hide_viewport, armature.data.pose_position = True, "REST"
     bpy.context.scene.frame_set(2)
@@ -145,7 +145,7 @@ def test_exporting_leaves_the_scene_as_it_was(moving, store, tmp_path):
 def test_an_exporter_that_is_disabled_is_enabled_for_the_moment(moving, store, tmp_path):
     import addon_utils
 
-    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png")
     addon_utils.disable("io_scene_fbx")
     try:
         write_model(bpy.context, moving, proxy, tmp_path / "a.fbx", "FBX", FrameRange(1, 2))
@@ -156,7 +156,7 @@ def test_an_exporter_that_is_disabled_is_enabled_for_the_moment(moving, store, t
 
 
 def test_an_armature_in_edit_mode_or_without_a_bone_is_rejected(moving, store, tmp_path):
-    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png", None)
+    proxy = build_proxy(moving, read_proxy(store / "proxy.npz"), store / "proxy.png")
     armature = moving
     armature.data.bones["head"].name = "skull"
     with refused(ValueError, "'head'"):

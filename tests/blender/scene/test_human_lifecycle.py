@@ -9,14 +9,13 @@ import numpy as np
 import psutil
 import pytest
 import synthetic_shape
-from human_files import copy_of, person_file, press_x
+from human_files import copy_of, forget_session_files, person_file, press_x
 from human_stage import named, places, whole
 from support.errors import refused
 from support.fake_child import request_of
 
 from blender_primdiffusion.scene.build import build_human
 from blender_primdiffusion.scene.human import humans, is_human, parts_of
-from blender_primdiffusion.scene.payload import forget_session_files
 
 ops = bpy.ops.primdiffusion
 
@@ -201,7 +200,7 @@ def test_memory_of_deleted_people_is_given_back_and_undo_shows_them_again(person
     step("delete")
     bpy.ops.ed.undo()
     assert whole(named(), where)
-    ops.release_memory()
+    ops.cancel(what="MEMORY")
     assert whole(named(), where)
 
 

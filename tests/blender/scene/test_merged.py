@@ -15,7 +15,6 @@ from human_files import sequence_files, volume_path
 from support.errors import refused
 
 from blender_primdiffusion.scene.build import build_human
-from blender_primdiffusion.scene.material import density_gain, volume_material
 from blender_primdiffusion.scene.merged import (
     MergedGrid,
     MergedState,
@@ -33,9 +32,10 @@ from blender_primdiffusion.scene.representation import (
     representation_of,
     set_representation,
     show_in_viewport,
-    without_merged,
+    stop_showing,
 )
 from blender_primdiffusion.scene.volume_files import write_volumes
+from blender_primdiffusion.scene.volume_nodes import density_gain, volume_material
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402
@@ -95,8 +95,7 @@ def test_a_merged_person_is_one_volume_and_goes_back(person, tmp_path):
     assert merged.data.filepath.startswith("//shot_volumes/merged_")
     assert merged.data.grids.load(), merged.data.grids.error_message
     assert {one.name for one in merged.data.grids} == {"density", "Cd"}
-    assert without_merged(person) == "VOLUMES"
-    set_representation(person, "VOLUMES")
+    stop_showing(person, "MERGED")
     remove_merged(person)
     assert (representation_of(person), merged_of(person)) == ("VOLUMES", None)
     assert visible_volumes() == {"Human_volumes"}

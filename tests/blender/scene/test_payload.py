@@ -7,13 +7,13 @@ import shutil
 
 import bpy
 import pytest
-from human_files import folder_of, lose_data, person_file
+from human_files import folder_of, forget_session_files, lose_data, person_file
 from human_stage import build_posed, named, places, whole
 from support.errors import refused
 
 from blender_primdiffusion.jobs.volumes import faults
 from blender_primdiffusion.scene.human import BODY_MARK, body_of, humans, is_human
-from blender_primdiffusion.scene.payload import BODY, PAYLOAD, forget_session_files, session_file, session_folder
+from blender_primdiffusion.scene.payload import BODY, PAYLOAD, session_file, session_folder
 
 ops = bpy.ops.primdiffusion
 ODD = 'Ä ö\' "x" 100%s 年'
@@ -157,13 +157,13 @@ def test_files_of_the_session_are_written_again_where_they_are_removed(person, c
     assert os.path.dirname(bpy.data.filepath) not in str(session_folder())
 
 
-def test_a_human_of_an_earlier_version_is_named_in_one_sentence(person, capsys):
+def test_a_human_without_data_is_named_in_one_sentence(person, capsys):
     lose_data(person)
     bpy.ops.wm.save_mainfile()
     anna = reopened()
-    assert "'Anna' holds no data of a human, as in files of earlier versions" in faults.text
-    assert capsys.readouterr().out.count("earlier versions") == 1
+    assert "'Anna' holds no data of a human" in faults.text
+    assert capsys.readouterr().out.count("no data of a human") == 1
     assert not body_of(anna).hide_viewport
     assert BODY_MARK in body_of(anna)
-    with refused(RuntimeError, "earlier versions"):
+    with refused(RuntimeError, "no data"):
         ops.vary(human="Anna")

@@ -140,12 +140,3 @@ def test_unknown_representations_and_what_is_not_merged_are_rejected(person):
     with refused(ValueError, "Merge"):
         set_representation(person[0], "MERGED")
     assert representation_of(person[0]) == "VOLUMES"
-
-
-def test_without_openvdb_humans_stand_and_only_their_volumes_are_refused(person, monkeypatch):
-    from blender_primdiffusion.scene import volumes
-
-    monkeypatch.setattr(volumes, "_openvdb", None)
-    with refused(ValueError, "python3-openvdb"):
-        write_volumes(person[0])
-    assert not list(folder_of(person[0]).glob("*.vdb"))

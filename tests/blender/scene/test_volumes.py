@@ -10,9 +10,8 @@ import pytest
 import synthetic
 
 from blender_primdiffusion.scene import volumes
-from blender_primdiffusion.scene.overlap import max_overlap
 from blender_primdiffusion.scene.volume_nodes import FILES
-from blender_primdiffusion.scene.volumes import FAINTEST, bake, window, write_volume
+from blender_primdiffusion.scene.volumes import FAINTEST, bake, max_overlap, window, write_volume
 
 bpy.utils.expose_bundled_modules()
 import openvdb  # noqa: E402

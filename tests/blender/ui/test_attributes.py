@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import MagicMock
 
 import bpy
@@ -16,8 +15,8 @@ from support.errors import refused
 from support.fake_child import request_of
 
 from blender_primdiffusion.scene.human import humans
-from blender_primdiffusion.ui import attributes, edit_panel
-from blender_primdiffusion.ui.generate_panel import PRIMDIFFUSION_PT_attributes
+from blender_primdiffusion.ui import edit_panel
+from blender_primdiffusion.ui import generate_settings as attributes
 
 VOCABULARY = {
     "categories": {"sex": ["female", "male"], "outfit": ["suit", "fitted tee and jeans"], "age": ["old"]},
@@ -100,7 +99,7 @@ def test_a_checkpoint_that_cannot_be_read_or_knows_nothing_leaves_the_menus_empt
         path.write_bytes(contents)
     monkeypatch.setattr(attributes, "preference", lambda _: str(path))
     layout = MagicMock()
-    PRIMDIFFUSION_PT_attributes.draw(SimpleNamespace(layout=layout), addon)
+    attributes.draw_attributes(layout, addon.scene.primdiffusion.attributes)
     assert layout.label.call_args.kwargs["text"] == "This checkpoint has no attributes"
     assert attributes.chosen_attributes(addon.scene.primdiffusion.attributes) == {}
 
@@ -118,8 +117,8 @@ def test_a_checkpoint_that_is_damaged_or_claims_much_is_read_once(known, tmp_pat
 
 def test_the_panel_draws_menus_and_numbers_that_the_checkpoint_knows(addon, known):
     layout = MagicMock()
-    PRIMDIFFUSION_PT_attributes.draw(SimpleNamespace(layout=layout), addon)
-    assert [call.args[1] for call in layout.prop.call_args_list] == ["sex", "outfit", "guidance"]
+    attributes.draw_attributes(layout, addon.scene.primdiffusion.attributes)
+    assert [call.args[1] for call in layout.prop.call_args_list] == ["sex", "outfit"]
     assert layout.row().prop.call_args.args[1] == "use_height"
 
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from types import SimpleNamespace
 
 import bpy
 import numpy as np
@@ -25,10 +24,11 @@ from blender_primdiffusion.capture.body import read_body
 from blender_primdiffusion.capture.command import MARK, parse, settings_of
 from blender_primdiffusion.capture.stage import data_blocks
 from blender_primdiffusion.console import CANCELLED, DONE, FAILED, UNUSABLE
+from blender_primdiffusion.jobs.steps import Session
 from blender_primdiffusion.scene.armature import build_armature
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.ui import captures_session
-from blender_primdiffusion.ui.captures_panel import RIG, PRIMDIFFUSION_OT_render_captures
+from blender_primdiffusion.ui.captures_panel import RIG
 from blender_primdiffusion.ui.captures_session import captures
 from blender_primdiffusion.ui.captures_settings import command_args
 
@@ -111,36 +111,49 @@ def follow(until=lambda: False, seconds: float = 300) -> None:
         time.sleep(0.02)
 
 
+def render(people, out, options: str = SMALL) -> set[str]:
+    """Press Render Captures with these folders in the panel."""
+    settings = bpy.context.scene.primdiffusion_captures
+    settings.people, settings.out = str(people), str(out)
+    return bpy.ops.primdiffusion.render_captures(options=options)
+
+
+def start(settings, tmp_path) -> None:
+    """As the operator with a window."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    captures.start(captures_session.capturing(command_args(settings, bpy.context, folder), folder))
+
+
 def test_the_operator_renders_in_background_mode_and_leaves_the_scene_alone(extension, only_good, tmp_path):
     before = {(block.id_type, block.name) for block in data_blocks()}
-    out = tmp_path / "captures"
-    assert bpy.ops.primdiffusion.render_captures(people=str(only_good), out=str(out), options=SMALL) == {"FINISHED"}
+    out, verify = tmp_path / "captures", bpy.ops.primdiffusion.verify_captures
+    assert render(only_good, out) == {"FINISHED"}
     assert {(block.id_type, block.name) for block in data_blocks()} == before
     assert (out / "release_human_list.txt").read_text() == "anna\n"
     assert json.loads((out / "dataset.json").read_text())["frames"] == 2
-    assert bpy.ops.primdiffusion.verify_captures(out=str(out)) == {"FINISHED"}
+    assert verify() == {"FINISHED"}
     picture_path(out / "anna", "depth", 1, 1).unlink()
     with refused(RuntimeError, "1 problems", "0001.png"):
-        bpy.ops.primdiffusion.verify_captures(out=str(out))
-    assert bpy.ops.primdiffusion.verify_captures(out=str(out), repair=True) == {"FINISHED"}
-    assert bpy.ops.primdiffusion.render_captures(people=str(only_good), out=str(out), options=SMALL) == {"FINISHED"}
-    assert bpy.ops.primdiffusion.verify_captures(out=str(out)) == {"FINISHED"}
+        verify()
+    assert verify(repair=True) == {"FINISHED"}
+    assert render(only_good, out) == {"FINISHED"}
+    assert verify() == {"FINISHED"}
 
 
 def test_the_operator_reports_an_error_in_one_sentence(extension, people, tmp_path):
-    render = bpy.ops.primdiffusion.render_captures
     with refused(RuntimeError, "folder"):
-        render()
+        bpy.ops.primdiffusion.render_captures()
     with refused(RuntimeError, "nobody"):
-        render(people=str(tmp_path / "nobody"), out=str(tmp_path / "a"))
+        render(tmp_path / "nobody", tmp_path / "a")
     with refused(RuntimeError, "--size"):
-        render(people=str(people), out=str(tmp_path / "a"), options="--size big")
+        render(people, tmp_path / "a", "--size big")
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.tex").touch()
     with refused(RuntimeError, "empty"):
-        render(people=str(people), out=str(tmp_path / "full"), options=SMALL)
+        render(people, tmp_path / "full")
     with refused(RuntimeError, "pose"):
-        render(people=str(people), out=str(tmp_path / "a"), options=f"{SMALL} --pose-files {tmp_path / 'none.npz'}")
+        render(people, tmp_path / "a", f"{SMALL} --pose-files {tmp_path / 'none.npz'}")
 
 
 def test_a_batch_continues_past_a_broken_scan_reports_it_and_exits_with_1(people, tmp_path):
@@ -192,18 +205,17 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
     asked = extension.scene.primdiffusion_captures
     asked.people, asked.out = str(only_good), str(out)
     asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 2, 48, 48, 2
-    captures.start(command_args(asked, extension, captures.new_folder()))
+    start(asked, tmp_path)
     messages = set()
     while captures.busy:
         captures.tick()
         messages.add(captures.message)
         time.sleep(0.02)
     assert captures.error == ""
-    assert captures.exit_code == DONE
     assert "anna: view 4 of 4" in messages
     assert (out / "anna" / "complete.json").is_file()
     asked.seed = 3
-    captures.start(command_args(asked, extension, captures.new_folder()))
+    start(asked, tmp_path)
     follow()
     assert "seed is 0, not 3" in captures.error
 
@@ -214,11 +226,11 @@ def test_with_a_window_a_child_renders_and_is_followed(extension, only_good, tmp
      ('{"subject": "a", "done": -1}', "done is -1"),
      ('{"subject": "a", "done": 1, "total": 2, "eta_s": null, "news": [3]}', "news[0] is 3")],
 )  # fmt: skip
-def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypatch, message, fault):
+def test_a_malformed_message_ends_the_child_with_a_sentence(extension, monkeypatch, tmp_path, message, fault):
     program = f"import time; print({MARK + message!r}, flush=True); time.sleep(600)"
     monkeypatch.setattr(captures_session, "child_command", lambda: [sys.executable, "-c", program])
-    session = captures_session.CaptureSession()
-    session.start([])
+    session = Session("", "")
+    session.start(captures_session.capturing([], tmp_path / "folder"))
     end = time.monotonic() + 300
     while session.busy and time.monotonic() < end:
         session.tick()
@@ -231,16 +243,16 @@ def test_cancelling_ends_the_child_and_the_next_run_resumes(extension, only_good
     asked = extension.scene.primdiffusion_captures
     asked.people, asked.out = str(only_good), str(tmp_path / "captures")
     asked.pose_count, asked.camera_count, asked.width, asked.height, asked.samples = 2, 3, 200, 200, 8
-    captures.start(command_args(asked, extension, captures.new_folder()))
+    start(asked, tmp_path)
     follow(until=lambda: captures.fraction > 0)
     assert bpy.ops.primdiffusion.cancel(what="CAPTURES") == {"FINISHED"}
     follow()
     assert captures.notice.startswith("Cancelled")
     assert captures.error == ""
     done = files_of(tmp_path / "captures")
-    captures.start(command_args(asked, extension, captures.new_folder()))
+    start(asked, tmp_path)
     follow()
-    assert captures.exit_code == DONE, captures.error
+    assert not captures.error
     after = files_of(tmp_path / "captures")
     assert all(after[name] == done[name] for name in done if name.endswith((".jpg", ".png")))
 
@@ -274,30 +286,26 @@ def test_a_polite_kill_in_the_midst_of_a_view_ends_the_command_after_it(only_goo
 
 def test_the_panels_defaults_are_the_commands(extension, tmp_path):
     asked = extension.scene.primdiffusion_captures
-    from_panel = settings_of(parse(command_args(asked, extension, tmp_path, "people", "out")))
+    asked.people, asked.out = str(Path("people").absolute()), str(Path("out").absolute())
+    from_panel = settings_of(parse(command_args(asked, extension, tmp_path)))
     from_line = settings_of(parse(["--people", "people", "--out", str(Path("out").absolute())]))
     assert from_panel == from_line
     assert (from_line.camera_count, from_line.pose_count, from_line.size, from_line.samples) == (36, 20, (512, 512), 16)
 
 
-def test_paths_that_begin_with_a_hyphen_are_no_options(extension, tmp_path):
-    words = command_args(extension.scene.primdiffusion_captures, extension, tmp_path, "-people", "--out")
-    assert parse(words).people == [Path("-people").absolute()]
-    assert parse(words).out == Path("--out").absolute()
-
-
 def test_cameras_of_the_scene_are_taken_by_name(extension, tmp_path):
     scene, asked = extension.scene, extension.scene.primdiffusion_captures
+    asked.people = asked.out = str(tmp_path)
     asked.arrangement, asked.width, asked.height = "custom", 80, 60
     with refused(ValueError, "camera"):
-        command_args(asked, extension, tmp_path, "people", "out")
+        command_args(asked, extension, tmp_path)
     asked.cameras = bpy.data.collections.new("rig")
     scene.collection.children.link(asked.cameras)
     for name, x in (("b", 1.0), ("a", 2.0)):
         camera = bpy.data.objects.new(name, bpy.data.cameras.new(name))
         camera.location, camera.rotation_euler = (x, -4.0, 0.5), (np.pi / 2, 0, 0)
         asked.cameras.objects.link(camera)
-    settings = settings_of(parse(command_args(asked, extension, tmp_path, "people", "out")))
+    settings = settings_of(parse(command_args(asked, extension, tmp_path)))
     assert [view.position.round(4).tolist() for view in settings.cameras] == [[2, 0.5, 4], [1, 0.5, 4]]
     assert settings.camera_count == 2
     assert (settings.cameras[0].width, settings.cameras[0].height) == (80, 60)
@@ -332,20 +340,3 @@ def test_hostile_camera_files_are_rejected(tmp_path):
 def test_unknown_options_are_rejected():
     with refused(ValueError, "--rm"):
         parse(["--out", "a", "--rm", "-rf"])
-
-
-def test_the_button_asks_before_hundreds_of_views(extension, only_good, tmp_path, monkeypatch):
-    asked, begun = [], []
-    panel = extension.scene.primdiffusion_captures
-    panel.people, panel.out = str(only_good), str(tmp_path / "captures")
-    manager = SimpleNamespace(invoke_confirm=lambda *_, **words: asked.append(words) or {"RUNNING_MODAL"})
-    context = SimpleNamespace(scene=extension.scene, window_manager=manager)
-    button = SimpleNamespace(people="", out="", options="", execute=lambda _: begun.append(1) or {"FINISHED"})
-    button._args = lambda context: PRIMDIFFUSION_OT_render_captures._args(button, context)
-    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"RUNNING_MODAL"}
-    assert asked[0]["message"].startswith("720 views (1 person x 20 poses x 36 cameras) take about 26 min")
-    panel.pose_count = 1
-    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"FINISHED"}
-    panel.people = ""  # the error is for `execute`
-    assert PRIMDIFFUSION_OT_render_captures.invoke(button, context, None) == {"FINISHED"}
-    assert (len(asked), len(begun)) == (1, 2)

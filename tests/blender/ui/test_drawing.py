@@ -106,7 +106,7 @@ def drawn() -> Iterator[tuple[type, sidebar.Layout]]:
     """Every panel of the sidebar with its sections opened, and each edit."""
     settings = bpy.context.scene.primdiffusion_edit
     for cls in sidebar.panels():
-        edit = cls.__name__ == "PRIMDIFFUSION_PT_edit"
+        edit = cls.__name__ == "PRIMDIFFUSION_PT_human"
         for kind in settings.bl_rna.properties["kind"].enum_items.keys() if edit else [settings.kind]:
             settings.kind = kind
             yield cls, sidebar.draw(cls, bpy.context, opened=True)

@@ -16,7 +16,7 @@ from support.errors import refused
 from support.fake_child import DIES, FAILS, GIVES_GARBAGE, TAKES_LONG, request_of
 from support.tensor_files import read_tensors
 
-from blender_primdiffusion.jobs.edit import VaryJob
+from blender_primdiffusion.jobs.edit import EditJob
 from blender_primdiffusion.jobs.queue import queue
 from blender_primdiffusion.scene.convention import points_to_blender
 from blender_primdiffusion.scene.edit import painted_weights
@@ -56,13 +56,13 @@ def sent(person) -> dict:
 
 
 def start(person, seed: int = FINE, **params) -> None:
-    queue.add(bpy.context, VaryJob.of(person, {"steps": 2, "amount": 0.5, "seed": seed, **params}))
+    queue.add(bpy.context, EditJob.of("vary", person, {"steps": 2, "amount": 0.5, "seed": seed, **params}))
 
 
 def drawn(kind: str) -> str:
     """The panel, with this edit chosen."""
     settings().kind = kind
-    return " | ".join(shown(edit_panel.PRIMDIFFUSION_PT_edit, bpy.context))
+    return " | ".join(shown(edit_panel.draw_edit, bpy.context))
 
 
 def test_vary_changes_the_selected_person_in_place_as_one_undo_step(person):

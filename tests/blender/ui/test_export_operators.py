@@ -19,9 +19,8 @@ from support.fake_child import FAKE_CHILD
 
 import blender_primdiffusion
 from blender_primdiffusion.scene.armature import keyframe_poses
-from blender_primdiffusion.scene.human import BETAS, humans
+from blender_primdiffusion.scene.human import BETAS, humans, proxy_of
 from blender_primdiffusion.scene.human_file import read_tensors
-from blender_primdiffusion.scene.proxy import proxy_of
 from blender_primdiffusion.scene.representation import show_in_viewport
 from blender_primdiffusion.scene.volume_nodes import volumes_of
 from blender_primdiffusion.ui.export_operators import PRIMDIFFUSION_OT_export
@@ -76,13 +75,13 @@ def assert_rejected(sentence, operator, **properties):
         operator(**properties)
 
 
-@pytest.mark.parametrize(("name", "given"), [("a.glb", {}), ("b.fbx", {}), ("c.usdz", {}), ("d", {"format": "GLB"})])
-def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name, given):
+@pytest.mark.parametrize("name", ["a.glb", "b.fbx", "c.usdz"])
+def test_a_mesh_is_exported_and_nothing_stays_in_the_scene(anna, out, name):
     moving(anna)
     before = everything()
-    assert OPERATORS.export(filepath=str(out / name), **given) == {"FINISHED"}
+    assert OPERATORS.export(filepath=str(out / name)) == {"FINISHED"}
     assert everything() == before
-    assert [path.name for path in out.iterdir()] == [name if "." in name else f"{name}.glb"]
+    assert [path.name for path in out.iterdir()] == [name]
 
 
 def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
@@ -99,9 +98,8 @@ def test_a_failed_export_leaves_neither_file_nor_data(anna, out, monkeypatch):
     [
         ("export", {"filepath": "OUT/a.stl"}, "another ending"),
         ("export", {"filepath": "OUT/a.glb", "human": "Bert"}, "'Bert' is not in the scene"),
-        ("export", {"filepath": "OUT/a.glb", "format": "PLY"}, "another ending than .ply"),
-        ("show_proxy", {"shown": "MESH"}, "no mesh proxy"),
-        ("show_proxy", {"shown": "REMOVED"}, "no mesh proxy"),
+        ("set_representation", {"representation": "MESH"}, "no mesh proxy"),
+        ("set_representation", {"representation": "NO_MESH"}, "no mesh proxy"),
         ("add_proxy", {"human": "Bert"}, "'Bert' is not in the scene"),
     ],
 )
@@ -123,9 +121,11 @@ def test_a_proxy_follows_the_armature_and_is_shown_in_its_place(anna):
     assert proxy.parent == anna
     assert (proxy.hide_viewport, proxy.hide_render) == (False, True)
     assert (volumes_of(anna).hide_viewport, volumes_of(anna).hide_render) == (True, False)
-    OPERATORS.show_proxy(shown="MESH")
+    OPERATORS.set_representation(representation="MESH")
     assert (proxy.hide_render, volumes_of(anna).hide_render) == (False, True)
-    OPERATORS.show_proxy(shown="VOLUMES")
+    OPERATORS.set_representation(representation="MESH_IN_VIEWPORT")
+    assert (proxy.hide_render, volumes_of(anna).hide_render) == (True, False)
+    OPERATORS.set_representation(representation="VOLUMES")
     assert (proxy.hide_viewport, proxy.hide_render) == (True, True)
     assert not volumes_of(anna).hide_viewport
     assert not volumes_of(anna).hide_render
@@ -135,14 +135,14 @@ def test_as_mesh_on_the_create_tab_becomes_the_choice_of_what_is_shown(anna):
     def drawn() -> dict[str, str]:
         layout = MagicMock()
         draw_as_mesh(layout, bpy.context)
-        made = (*layout.row().operator.call_args_list, *layout.operator_menu_enum.call_args_list)
-        return {call.args[0]: call.kwargs["text"] for call in made}
+        made = (*layout.row().operator.call_args_list, *layout.grid_flow().operator.call_args_list)
+        return {call.kwargs["text"]: call.kwargs.get("depress") for call in made}
 
-    assert drawn() == {"primdiffusion.add_proxy": "As Mesh"}
+    assert drawn() == {"As Mesh": None}
     OPERATORS.add_proxy()
-    assert drawn() == {"primdiffusion.show_proxy": "Show Mesh in Viewport"}
-    OPERATORS.show_proxy(shown="REMOVED")
-    assert drawn() == {"primdiffusion.add_proxy": "As Mesh"}
+    assert {"Mesh": False, "Mesh in Viewport": True, "Volumes": False}.items() <= drawn().items()
+    OPERATORS.set_representation(representation="NO_MESH")
+    assert drawn() == {"As Mesh": None}
     bpy.context.scene.collection.children.unlink(bpy.data.collections[anna.name])
     assert drawn() == {}
 
@@ -153,7 +153,7 @@ def test_adding_a_proxy_again_replaces_it_and_removing_takes_all_of_it(anna):
     once = everything()
     OPERATORS.add_proxy()
     assert {kind: len(names) for kind, names in everything().items()} == {k: len(n) for k, n in once.items()}
-    OPERATORS.show_proxy(shown="REMOVED")
+    OPERATORS.set_representation(representation="NO_MESH")
     assert everything() == before
     assert not volumes_of(anna).hide_viewport
 
@@ -254,7 +254,8 @@ class Dialog:
     ],
 )
 def test_another_format_in_the_file_browser_changes_the_extension(anna, format, before, after):
-    dialog = Dialog(format=format)
+    bpy.context.scene.primdiffusion_export.format = format
+    dialog = Dialog()
     dialog.filepath = before
     assert dialog.check(bpy.context) == (before != after)
     assert dialog.filepath == after
@@ -269,7 +270,6 @@ def test_the_file_browser_opens_with_the_panels_format_and_shows_its_settings(an
     dialog.layout = Layout()
     dialog.draw(context)
     assert dialog.layout.of("prop") == ["format", "texture_px", "triangles", "animation"]
-    assert dialog.format == "FBX"
     assert dialog.filepath == "Anna.fbx"
     window_manager.fileselect_add.assert_called_once()
 

@@ -24,7 +24,7 @@ from blender_primdiffusion.ui.advanced_panel import PRIMDIFFUSION_PT_advanced
 from blender_primdiffusion.ui.human_panel import PRIMDIFFUSION_PT_human
 from blender_primdiffusion.ui.shape_panel import (
     PRIMDIFFUSION_OT_reshape,
-    PRIMDIFFUSION_PT_shape,
+    draw_shape,
 )
 
 ops = bpy.ops.primdiffusion
@@ -111,7 +111,7 @@ def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_wh
     before = list(person[BETAS])
     settings(person).betas = TALL
     assert list(person[BETAS]) == before
-    assert "Edit Mode: leave it" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
+    assert "Edit Mode: leave it" in " ".join(shown(draw_shape, addon))
     with refused(RuntimeError, "Edit Mode"):
         ops.reshape(to="GENERATED")
     bpy.ops.object.mode_set(mode="OBJECT")
@@ -119,7 +119,7 @@ def test_sliders_of_a_human_without_a_shape_do_nothing_and_the_panel_explains_wh
 
 def test_an_animated_shape_is_reported(person, addon):
     person.keyframe_insert(f'["{BETAS}"]', frame=1)
-    assert "animated" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
+    assert "animated" in " ".join(shown(draw_shape, addon))
 
 
 def test_reset_brings_back_the_shape_the_person_was_generated_with(person):
@@ -190,7 +190,7 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
         }
     )
     addon.scene.unit_settings.system = "IMPERIAL"
-    panel = " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
+    panel = " ".join(shown(draw_shape, addon))
     assert "In the scene: " in panel
     assert "'" in panel
     details = " ".join(shown(PRIMDIFFUSION_PT_advanced, addon, opened=True))
@@ -200,11 +200,11 @@ def test_the_panels_show_height_provenance_and_counts(person, addon):
 
 
 def test_a_scaled_human_shows_its_height_in_the_scene(person, addon):
-    assert "In the scene" not in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
+    assert "In the scene" not in " ".join(shown(draw_shape, addon))
     person.scale = (2, 2, 2)
     addon.view_layer.update()
     tall = 2 * measure(shape_model_of(person), betas_of(person)).height
-    assert f"In the scene: {f'{tall:.2f}'.rstrip('0')} m" in " ".join(shown(PRIMDIFFUSION_PT_shape, addon))
+    assert f"In the scene: {f'{tall:.2f}'.rstrip('0')} m" in " ".join(shown(draw_shape, addon))
 
 
 def test_other_bodies_have_sliders_with_numbers(person):
@@ -225,7 +225,7 @@ def test_the_six_sliders_with_names_are_shown_and_the_others_folded(person, addo
         )
         return made
 
-    PRIMDIFFUSION_PT_shape.draw(SimpleNamespace(layout=layout("")), addon)
+    draw_shape(layout(""), addon)
     named = ["height", "weight", "Stature", "Shoulders", "Waist", "Girth"]
     assert drawn == [("", name) for name in named] + [("folded", number) for number in ("3", "5", "7", "8", "9", "10")]
 
@@ -235,4 +235,4 @@ def test_the_panel_names_who_is_selected_or_asks(person, other, addon):
     addon.view_layer.objects.active = body_of(other)
     layout = Layout()
     PRIMDIFFUSION_PT_human.draw(SimpleNamespace(layout=layout), addon)
-    assert layout.calls == [("prop", "name")]
+    assert layout.of("prop") == ["name"]

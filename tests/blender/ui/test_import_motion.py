@@ -113,11 +113,11 @@ def test_any_armature_with_smpls_joints_can_be_moved(addon, tmp_path):
 
 def test_of_two_people_the_named_one_moves(addon, armature, tmp_path):
     other = build_human(addon, synthetic.write(tmp_path / "q", 8), "Bob")
-    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Bob")
+    ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), human="Bob")
     assert armature.animation_data is None or armature.animation_data.action is None
     assert other.animation_data.action is not None
     with refused(RuntimeError, "Eve"):
-        ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), person="Eve")
+        ops.import_motion(filepath=write_amass(tmp_path / "m.npz"), human="Eve")
 
 
 def test_bones_can_be_chosen_for_an_unknown_rig(addon, armature, tmp_path):
@@ -187,7 +187,7 @@ def test_files_are_dropped_onto_the_import(addon):
 
 def test_the_import_shows_what_it_finds_before_anything_is_done(addon, armature, tmp_path):
     def drawn(path: str, **settings) -> tuple[list[str], list[str]]:
-        values = {"filepath": path, "person": "", "into": "NEW", "bones": "AUTO", **settings}
+        values = {"filepath": path, "human": "", "into": "NEW", "bones": "AUTO", **settings}
         operator = SimpleNamespace(layout=Layout(), axis=lambda: "", tracked_person="", **values)
         operator._draw_found = lambda *a: PRIMDIFFUSION_OT_import_motion._draw_found(operator, *a)
         PRIMDIFFUSION_OT_import_motion.draw(operator, addon)

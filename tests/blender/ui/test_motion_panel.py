@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import bpy
 import numpy as np
 import pytest
@@ -14,7 +12,7 @@ from jobs_driven import Layout
 
 from blender_primdiffusion.motion.posture import current_pose
 from blender_primdiffusion.scene.actions import action_curves, last_key, loops
-from blender_primdiffusion.ui.motion_panel import PRIMDIFFUSION_PT_motion
+from blender_primdiffusion.ui.motion_panel import draw_motion
 
 ops = bpy.ops.primdiffusion
 
@@ -134,16 +132,16 @@ def test_export_counts_constraints_and_rejects_an_empty_range(addon, armature, t
         ops.export_motion(filepath=str(tmp_path / "m.npz"), first=5, last=2)
 
 
-def texts(cls, context) -> list[str]:
-    panel = SimpleNamespace(layout=Layout(), _draw_action=lambda *a: cls._draw_action(None, *a))
-    cls.draw(panel, context)
-    return panel.layout.of("text", "prop", "button")
+def texts(context) -> list[str]:
+    layout = Layout()
+    draw_motion(layout, context)
+    return layout.of("text", "prop", "button")
 
 
 def test_the_panel_shows_what_was_found(addon, armature, tmp_path):
     ops.import_motion(filepath=write_amass(tmp_path / "m.npz"))
-    shown = texts(PRIMDIFFUSION_PT_motion, addon)
+    shown = texts(addon)
     assert {"SMPL-H", "z", "31 (0.3 s)", "120", "metres"} <= set(shown)
     assert "loop" in shown
     armature.animation_data.action["primdiffusion_motion"] = "rubbish"
-    assert "SMPL-H" not in texts(PRIMDIFFUSION_PT_motion, addon)
+    assert "SMPL-H" not in texts(addon)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -15,7 +14,7 @@ from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused
 from support.fake_child import request_of
 
-from blender_primdiffusion.capture.cameras import picture_of, picture_view, stored_turned
+from blender_primdiffusion.capture.cameras import OpenImageIO, picture_of, picture_view, stored_turned
 from blender_primdiffusion.jobs import from_picture
 from blender_primdiffusion.jobs.from_picture import PictureJob, PictureTask
 from blender_primdiffusion.jobs.queue import queue
@@ -77,9 +76,12 @@ def test_a_picture_becomes_the_background_of_a_camera_of_its_size(chosen, pictur
 
 
 def test_what_is_stored_turned_leaves_nothing(addon, tmp_path, picture):
-    tiff = b"MM\0*\0\0\0\x08" + struct.pack(">HHHIHH", 1, 0x0112, 3, 1, 6, 0) + bytes(4)
-    turned = tmp_path / "turned.jpg"
-    turned.write_bytes(b"\xff\xd8\xff\xe1" + struct.pack(">H", len(tiff) + 8) + b"Exif\0\0" + tiff)
+    turned, spec = tmp_path / "turned.jpg", OpenImageIO.ImageSpec(4, 4, 3, "uint8")
+    spec.attribute("Orientation", 6)
+    output = OpenImageIO.ImageOutput.create(str(turned))
+    assert output.open(str(turned), spec)
+    output.write_image(np.zeros((4, 4, 3), np.uint8))
+    output.close()
     assert stored_turned(turned)
     assert not stored_turned(picture)
     with refused(RuntimeError, "turned.jpg"):
@@ -133,7 +135,7 @@ def test_fit_moves_the_human_and_the_camera_in_one_step_of_undo(chosen):
 
 def test_handles_are_baked_before_a_human_is_fitted(chosen):
     person = a_human()
-    assert bpy.ops.primdiffusion.add_handles(person=person.name) == {"FINISHED"}
+    assert bpy.ops.primdiffusion.add_handles(human=person.name) == {"FINISHED"}
     for only_fit in (True, False):
         with refused(RuntimeError, person.name, "IK handles"):
             bpy.ops.primdiffusion.human_from_picture(only_fit=only_fit, human=person.name)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-
 import bpy
 import numpy as np
 import pytest
@@ -34,18 +32,18 @@ def test_the_panel_leads_to_the_asset_shelf_of_pose_mode(addon, armature):
         ("show_region_asset_shelf", "object.posemode_toggle"),
     ):
         layout = Layout()
-        pose_panel.PRIMDIFFUSION_PT_poses.draw(SimpleNamespace(layout=layout), addon)
+        pose_panel.draw_pose(layout, addon)
         assert button in layout.of("button", "prop")
         assert other not in layout.of("button", "prop")
         bpy.ops.object.posemode_toggle()
 
 
 def test_the_panel_offers_to_add_handles_or_else_to_bake_them(addon, armature):
-    drawn = set(shown(pose_panel.PRIMDIFFUSION_PT_poses, addon))
+    drawn = set(shown(pose_panel.draw_pose, addon))
     assert "primdiffusion.add_handles" in drawn
     assert "primdiffusion.bake_handles" not in drawn
     assert ops.add_handles() == {"FINISHED"}
-    drawn = set(shown(pose_panel.PRIMDIFFUSION_PT_poses, addon))
+    drawn = set(shown(pose_panel.draw_pose, addon))
     assert "primdiffusion.bake_handles" in drawn
     assert "primdiffusion.add_handles" not in drawn
     assert ops.bake_handles() == {"FINISHED"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import MagicMock
 
 import bpy
 import pytest
@@ -57,28 +56,21 @@ def test_a_folder_beside_the_blend_is_found(addon, captures):
     assert (sent["subject"], sent["frame"], sent["views"], sent["by"]) == ("berta", 3, 4, "prior")
 
 
-def test_the_panels_subject_is_not_looked_for_in_another_folder(addon, captures):
-    panel = addon.scene.primdiffusion_reconstruct
-    panel.capture, panel.subject = "//elsewhere", "berta"
-    bpy.ops.primdiffusion.human_from_captures(directory=str(captures))
-    assert "subject" not in asked_of_the_child(humans(addon.scene)[0])
+def reconstruct(folder: Path) -> set[str]:
+    bpy.context.scene.primdiffusion_reconstruct.capture = str(folder)
+    return bpy.ops.primdiffusion.human_from_captures()
 
 
-def test_without_a_folder_a_script_gets_an_error_and_a_user_the_file_browser(addon):
+def test_without_a_folder_the_operator_says_so(addon):
     with refused(RuntimeError, "captures"):
         bpy.ops.primdiffusion.human_from_captures()
-    operator, context = SimpleNamespace(directory=""), MagicMock()
-    context.scene.primdiffusion_reconstruct.capture = ""
-    invoke = reconstruct_panel.PRIMDIFFUSION_OT_human_from_captures.invoke
-    assert invoke(operator, context, None) == {"RUNNING_MODAL"}
-    context.window_manager.fileselect_add.assert_called_once_with(operator)
 
 
 @pytest.mark.parametrize(("order", "sentence"), [("dies", "ended by itself"), ("fails", "checkpoint is damaged")])
 def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, captures, tmp_path, monkeypatch, order, sentence):
     monkeypatch.setenv("FAKE_ORDER", order)
     with pytest.raises(RuntimeError, match=sentence) as caught:
-        bpy.ops.primdiffusion.human_from_captures(directory=str(captures))
+        reconstruct(captures)
     assert str(caught.value).count("Error:") == 1
     assert not bpy.data.objects
     assert not session_folder().exists()
@@ -89,7 +81,7 @@ def test_a_failure_raises_one_sentence_and_leaves_nothing(addon, captures, tmp_p
 
 def test_a_warning_of_the_backend_is_shown(addon, captures):
     addon.scene.primdiffusion_reconstruct.views = 1
-    bpy.ops.primdiffusion.human_from_captures(directory=str(captures))
+    reconstruct(captures)
     assert len(humans(addon.scene)) == 1
     assert "Only one view." in " ".join(shown(PRIMDIFFUSION_PT_human_from_captures, addon))
 
@@ -136,7 +128,7 @@ def test_the_real_child_makes_a_person_of_real_captures(real_child, tmp_path, mo
         "blender_primdiffusion.jobs.queue.preference", lambda name: str(encoder) if name == "encoder" else ""
     )
     with refused(RuntimeError, "person_000000"):
-        bpy.ops.primdiffusion.human_from_captures(directory=str(folder))
+        reconstruct(folder)
     panel = real_child.scene.primdiffusion_reconstruct
     panel.capture, panel.subject, panel.views = str(folder), "person_000001", 3
     assert bpy.ops.primdiffusion.human_from_captures() == {"FINISHED"}

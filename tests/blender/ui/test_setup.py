@@ -142,7 +142,7 @@ def test_an_environment_with_outdated_packages_is_reported(wheels, monkeypatch):
 
 
 def test_nothing_to_cancel_is_rejected(wheels):
-    with refused(RuntimeError, "Nothing"):
+    with refused(RuntimeError, "nothing"):
         press.cancel(what="SET_UP")
 
 

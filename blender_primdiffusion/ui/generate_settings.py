@@ -1,23 +1,27 @@
-"""Attributes to generate humans with: menus of those that the checkpoint knows, Any by default.
+"""Settings to generate humans with: seed, quality, and the attributes that the checkpoint knows, Any by default.
 
-The backend writes them into the checkpoint's metadata, which are read without torch.
+The backend writes the attributes into the checkpoint's metadata, which are read without torch.
 """
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import random
 import re
 import zlib
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from typing import Any
 
 import bpy
 
 from ..files.json_files import parse_json
 from ..files.regular_files import as_file_error, is_local_path, open_regular
 from ..files.tensor_layout import read_layout
+from ..formats.requests import SAMPLERS, GenerateRequest
 from ..places import backend_module_path, preference
+from .declared import SKIP, declared
 
 _LARGEST_FILE = 16 << 30
 """Bytes, as in the backend's `tensor_file`."""
@@ -161,3 +165,101 @@ def draw_attributes(layout: bpy.types.UILayout, group: PRIMDIFFUSION_PG_attribut
             number.prop(group, name, text="")
     if not (vocabulary.categories or vocabulary.scalars):
         layout.label(text="This checkpoint has no attributes", icon="INFO")
+
+
+LARGEST_SEED = 2**31 - 1
+"""The backend itself takes seeds up to 2^63 - 1."""
+
+
+def random_seed() -> int:
+    """A random seed."""
+    return random.randrange(LARGEST_SEED + 1)
+
+
+def last_seed(seed: int, count: int) -> int:
+    """The last of `count` consecutive seeds. Raises ValueError beyond LARGEST_SEED."""
+    last = seed + count - 1
+    if last > LARGEST_SEED:
+        raise ValueError(f"{count} seeds from {seed} on go beyond {LARGEST_SEED}: choose a smaller seed")
+    return last
+
+
+STEPS_AND_SAMPLER = {"DRAFT": (8, "dpmpp_2m"), "STANDARD": (30, "ddim"), "HIGH": (60, "ddim")}
+CUSTOM = "CUSTOM"
+ITEMS = [
+    ("DRAFT", "Draft", "8 steps of DPM-Solver++: quick and softer; the same seed sometimes gives another human"),
+    ("STANDARD", "Standard", "30 steps of DDIM"),
+    ("HIGH", "High", "60 steps of DDIM: twice the time of Standard for a little more detail"),
+    (CUSTOM, "Custom", "Steps and sampler as chosen below"),
+]
+
+
+def apply_quality(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
+    """Steps and sampler of the chosen quality. The update function of `quality`."""
+    if settings.quality != CUSTOM and quality_of(settings) != settings.quality:
+        settings.steps, settings.sampler = STEPS_AND_SAMPLER[settings.quality]
+
+
+def name_quality(settings: bpy.types.PropertyGroup, _context: bpy.types.Context) -> None:
+    """The quality with these steps and this sampler. The update function of both."""
+    if settings.quality != quality_of(settings):
+        settings.quality = quality_of(settings)
+
+
+def quality_of(settings: bpy.types.PropertyGroup) -> str:
+    """The quality with these steps and this sampler, else CUSTOM."""
+    chosen = (settings.steps, settings.sampler)
+    return next((name for name, both in STEPS_AND_SAMPLER.items() if both == chosen), CUSTOM)
+
+
+_SAMPLERS = {
+    "ddim": ("DDIM", "No noise besides the seed's: the paper's sampler"),
+    "dpmpp_2m": ("DPM-Solver++(2M)", "Second-order multistep: good with few steps"),
+    "ddpm": ("DDPM", "New noise at each step; needs many steps"),
+}
+SAMPLER_ITEMS = [(name, *_SAMPLERS[name]) for name in SAMPLERS]
+
+
+class PRIMDIFFUSION_PG_settings(bpy.types.PropertyGroup):
+    """`scene.primdiffusion`."""
+
+    seed: declared(GenerateRequest, "seed", default=10)
+    keep_seed: bpy.props.BoolProperty(
+        name="Lock Seed", description="Keep the seed; otherwise it is set to a new random one after each human"
+    )
+    count: bpy.props.IntProperty(
+        name="Count",
+        description="How many humans: from this seed and the following ones, placed side by side",
+        default=1,
+        min=1,
+        max=1000,
+        soft_max=20,
+    )
+    quality: bpy.props.EnumProperty(
+        name="Quality",
+        description="Steps and sampler",
+        items=ITEMS,
+        default="STANDARD",
+        update=apply_quality,
+    )
+    steps: declared(GenerateRequest, "steps", update=name_quality)
+    sampler: bpy.props.EnumProperty(
+        name="Sampler", description="How the noise is removed", items=SAMPLER_ITEMS, update=name_quality
+    )
+    guidance: declared(GenerateRequest, "guidance")
+    attributes: bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_attributes)
+
+
+def seed_property():
+    """The seed of an operator, for scripts."""
+    return declared(GenerateRequest, "seed", default=-1, min=-1, description="-1: the panel's seed", options=SKIP)
+
+
+def sampling(settings: bpy.types.PropertyGroup) -> dict[str, Any]:
+    """Fields of `GenerateRequest` besides the seed."""
+    wanted = chosen_attributes(settings.attributes)
+    fields = {name: getattr(settings, name) for name in ("steps", "sampler", "guidance")}
+    return fields | ({"attributes": wanted} if wanted else {})
+
+
+PROPERTIES = ((bpy.types.Scene, "primdiffusion", bpy.props.PointerProperty(type=PRIMDIFFUSION_PG_settings)),)
