@@ -8,11 +8,25 @@ from typing import Annotated, Any, TypeVar, get_origin
 
 import tyro
 
+from primdiffusion.commands import function_of
+from primdiffusion.commands.options import OPTIONS
+from primdiffusion.commands.progress import progress_bar, show
 from primdiffusion.formats.schema import Option, Range, descriptions, field_types, read, split
 
 Record = TypeVar("Record")
 _HUGE = 1e18
 """Limits beyond this are those of the computer, not of the option."""
+
+
+def run_record(name: str, arguments: Sequence[str]) -> None:
+    """Run a subcommand of `OPTIONS` as the child runs a request, and print its answer; raises its errors."""
+    request = parse(OPTIONS[name], arguments, name)
+    from primdiffusion.commands.session import Session  # after --help, which does not need torch
+
+    function = function_of(name)
+    with progress_bar() as report:
+        answer = function(request, Session(), report)
+    show(answer)
 
 
 def parse(record: type[Record], arguments: Sequence[str], command: str) -> Record:

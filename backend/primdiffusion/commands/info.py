@@ -1,4 +1,4 @@
-"""Describe an installation, a checkpoint or a human: `primdiffusion info`, and `attributes` of JSON-RPC."""
+"""Describe an installation, a checkpoint or a human: `info` and `attributes`."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import torch
 from primdiffusion.commands.options import InfoCommand
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
-from primdiffusion.device import best_device, device_info
 from primdiffusion.diffusion.checkpoint import default_checkpoint, read_card
 from primdiffusion.diffusion.conditioning import NOTHING
 from primdiffusion.encoder.model import default_encoder
@@ -22,10 +21,10 @@ from primdiffusion.machine import memory
 from primdiffusion.version import __version__
 
 
-def run(command: InfoCommand) -> None:
-    """Print one JSON object."""
+def info(command: InfoCommand, session: Session, report: ReportProgress) -> str:
+    """Return one JSON object."""
     if command.file is None:
-        about = _installation()
+        about = _installation(session)
     else:
         try:
             human = load_human(command.file)
@@ -35,15 +34,15 @@ def run(command: InfoCommand) -> None:
             betas = [round(beta, 4) for beta in human.betas.tolist()]
             body = "default" if human.body_setup is None else dataclasses.asdict(human.body_setup.files)
             about = {"format_version": format_version(human), **human.provenance, "betas": betas, "body": body}
-    print(json.dumps(about, indent=2))
+    return json.dumps(about, indent=2)
 
 
-def _installation() -> dict[str, Any]:
+def _installation(session: Session) -> dict[str, Any]:
     cards = {
         name: read_card(path) if path.exists() else None
         for name, path in (("checkpoint", default_checkpoint()), ("encoder", default_encoder()))
     }
-    return {"version": __version__, "torch": torch.__version__, **device_info(best_device()), **memory(), **cards}
+    return {"version": __version__, "torch": torch.__version__, **session.device_info(), **memory(), **cards}
 
 
 def attributes(request: AttributesRequest, session: Session, report: ReportProgress) -> AttributesAnswer:

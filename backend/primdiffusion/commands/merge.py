@@ -1,7 +1,4 @@
-"""Merge humans into voxel grids for other renderers.
-
-`primdiffusion merge`, and `merge` and `merge_frames` of JSON-RPC.
-"""
+"""Merge humans into voxel grids for other renderers: `merge` and `merge_frames`."""
 
 from __future__ import annotations
 
@@ -26,8 +23,10 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.reshaping import reshaped
 
 
-def merge(request: MergeRequest, session: Session, report: ReportProgress) -> MergeAnswer:
+def merge(request: MergeRequest | MergeCommand, session: Session, report: ReportProgress) -> MergeAnswer | Path:
     """Write a grid of all humans. Raises as load_human, place_skinned and merge."""
+    if isinstance(request, MergeCommand):
+        return _merge_side_by_side(request)
     began = time.perf_counter()
     report("merge", 0, 1, None)
     primitives = Primitives.together([_placed(load_human(person.human), person) for person in request.people])
@@ -69,8 +68,7 @@ def _write(path: Path, primitives: Primitives, voxel: float) -> list[int]:
     return list(grid.density.shape)
 
 
-def run(command: MergeCommand) -> None:
-    """Merge, and print the path."""
+def _merge_side_by_side(command: MergeCommand) -> Path:
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {command.out.parent}: create it, or choose another")
     as_vdb = command.out.suffix.lower() == ".vdb"
@@ -85,4 +83,4 @@ def run(command: MergeCommand) -> None:
     grid = upright_grid(Primitives.together(people), command.voxel)
     with written_whole(command.out) as path:
         (write_grid_vdb if as_vdb else write_grid_npz)(path, grid)
-    print(command.out)
+    return command.out

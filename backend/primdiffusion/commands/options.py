@@ -1,4 +1,4 @@
-"""Command lines with more, fewer or other options than a request of JSON-RPC. Needs no torch, for --help."""
+"""Subcommands: requests of JSON-RPC, and those that the command line alone has. Needs no torch, for --help."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 
 from primdiffusion.formats.regular_files import real_path
 from primdiffusion.formats.requests import (
-    LARGEST_SEED,
     RAY_STEP,
     VOXEL,
     Compositing,
@@ -19,7 +18,6 @@ from primdiffusion.formats.requests import (
     InpaintRequest,
     InterpolateRequest,
     Making,
-    OutDir,
     Person,
     Pixels,
     ProxySettings,
@@ -33,27 +31,6 @@ from primdiffusion.formats.requests import (
     Voxel,
 )
 from primdiffusion.formats.schema import Ending, FieldError, Length, Option, Range
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class GenerateCommand(GenerateRequest):
-    """Generate humans: person.human.safetensors and previews."""
-
-    out_dir: OutDir
-    """Output folder; with --count above 1, of a folder for each human."""
-    seed: Seed = 0
-    count: Count = 1
-    """Number of humans, with consecutive seeds."""
-    batch: Count = 1
-    """Humans sampled at once: faster, above all on a GPU, and needs more memory. Results differ from those of single
-    humans in the last digits."""
-    compact: bool = False
-    """Store colours and densities of person.human.safetensors in 8 bits: 2 MB instead of 8, without visible loss."""
-
-    def check(self) -> None:
-        """Raise FieldError for seeds beyond the largest."""
-        if self.seed + self.count - 1 > LARGEST_SEED:
-            raise FieldError(("count",), f"is {self.count}: the last seed would be above 2^63 - 1")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -185,14 +162,6 @@ class RefineCommand:
     """Seed of the order of views; the same seed gives the same human unless time runs out."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ServeCommand:
-    """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
-
-    about: bool = False
-    """Print the versions of this program, torch and Python as one line of JSON, and end."""
-
-
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class MadePeople:
     """Fields of commands that make humans from assets."""
@@ -285,7 +254,7 @@ class VerifyPayloadsCommand:
 
 
 OPTIONS: dict[str, type] = {
-    "generate": GenerateCommand,
+    "generate": GenerateRequest,
     "vary": VaryRequest,
     "interpolate": InterpolateRequest,
     "inpaint": InpaintRequest,
@@ -295,7 +264,6 @@ OPTIONS: dict[str, type] = {
     "render": RenderCommand,
     "export": ExportCommand,
     "merge": MergeCommand,
-    "serve": ServeCommand,
     "info": InfoCommand,
     "people": PeopleCommand,
     "payloads": PayloadsCommand,
@@ -303,4 +271,4 @@ OPTIONS: dict[str, type] = {
     "payloads pack": PackPayloadsCommand,
     "payloads verify": VerifyPayloadsCommand,
 }
-"""Command lines that are read before the command's module, which loads torch, is imported."""
+"""Records of subcommands, which are read before the command's module, which loads torch, is imported."""

@@ -1,7 +1,4 @@
-"""Reconstruct a human from pictures or captures, and refine it on captures.
-
-`primdiffusion reconstruct` and `refine`; `reconstruct` and `fit_posture` of JSON-RPC.
-"""
+"""A human from pictures or captures: `reconstruct`, `fit_posture` and `refine`."""
 
 from __future__ import annotations
 
@@ -13,7 +10,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from torch import Tensor
-from tqdm import tqdm
 
 from primdiffusion.capture.conditioning import (
     CapturedPerson,
@@ -26,11 +22,10 @@ from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.capture.reader import Captures
 from primdiffusion.commands.options import RefineCommand
 from primdiffusion.commands.output import FILES, write_human
-from primdiffusion.commands.progress import ReportProgress, print_warnings, progress_bar
+from primdiffusion.commands.progress import ReportProgress, print_warnings
 from primdiffusion.commands.session import Session
-from primdiffusion.device import best_device
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.encoder.model import EncoderModel, load_encoder
+from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer
 from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
 from primdiffusion.formats.whole_files import staged
@@ -51,7 +46,7 @@ from primdiffusion.posture.fit import Posture
 from primdiffusion.posture.start import views_of
 from primdiffusion.reconstruction import reconstruct as reconstruct_human
 from primdiffusion.reconstruction import reconstruct_by_prior
-from primdiffusion.render.descent import DescentSettings, DescentStep
+from primdiffusion.render.descent import DescentSettings
 from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
 
 STAGES = 4
@@ -101,19 +96,7 @@ def reconstruct(request: ReconstructRequest, session: Session, report: ReportPro
     )
 
 
-def run(request: ReconstructRequest) -> None:
-    """Reconstruct, and print the output folder; raises as `reconstruct`."""
-    with progress_bar() as report:
-        answer = reconstruct(request, Session(), report)
-    print_warnings(answer.warnings)
-    if request.pictures:
-        print(f"{request.out_dir}  {len(request.pictures)} pictures, {answer.seconds:.1f} s")
-        return
-    seconds = f"{answer.seconds:.1f} s, of which the {request.by} {answer.seconds_encoding:.1f} s"
-    print(f"{request.out_dir}  {answer.subject}, frame {answer.frame}, {len(answer.views or ())} views, {seconds}")
-
-
-def run_refine(command: RefineCommand) -> None:
+def refine_human(command: RefineCommand, session: Session, report: ReportProgress) -> None:
     """Refine; print the folder and the PSNR before and after.
 
     Raises:
@@ -128,13 +111,9 @@ def run_refine(command: RefineCommand) -> None:
         frames = range(person.frames)
         views = [conditioning_views(captures, name, frame, given, command.size) for frame in frames]
         held_out = [conditioning_views(captures, name, frame, held, command.size) for frame in frames if held]
-        human = _start(command, captures, name, betas, given).to(best_device())
-        with tqdm(total=command.steps, desc=name, unit="step", disable=None) as bar:
-
-            def on_step(step: DescentStep) -> None:
-                bar.update()
-
-            refined = refine(human, views, settings, on_step)
+        human = _start(command, session, captures, name, betas, given).to(session.device)
+        done = itertools.count(1)
+        refined = refine(human, views, settings, lambda _: report("refine", next(done), command.steps, None))
         write_human(folder, refined.human, command.size)
     seconds = f"{refined.steps} steps, {refined.seconds:.1f} s"
     print(f"{command.out}  {name}, {person.frames} frames, {len(given)} cameras, {seconds}")
@@ -148,15 +127,18 @@ def run_refine(command: RefineCommand) -> None:
         print_warnings([f"the time limit of {command.minutes:g} minutes was reached after {seconds}"])
 
 
-def _start(command: RefineCommand, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:
+def _start(
+    command: RefineCommand, session: Session, captures: Captures, name: str, betas: Tensor, given: Sequence[int]
+) -> Human:
     """Return the initial human with the subject's betas."""
     if command.start == "body":
         human = bare_body(betas)
     elif command.start == "encoder":
         cameras = tuple(given[:: math.ceil(len(given) / ENCODER_VIEWS)])
         views = conditioning_views(captures, name, 0, cameras)
-        model = load_encoder(command.checkpoint, best_device())
-        human = reconstruct_human(model, CapturedPerson(name, 0, cameras, views, betas, ()))
+        human = reconstruct_human(
+            session.encoder(command.checkpoint), CapturedPerson(name, 0, cameras, views, betas, ())
+        )
     elif command.start.endswith(".glb"):
         human = meshed_person(command.start)
     else:

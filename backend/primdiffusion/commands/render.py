@@ -1,4 +1,4 @@
-"""Render humans: `primdiffusion render`, and `render` and `draw` of JSON-RPC."""
+"""Render humans: `render` and `draw`."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ from primdiffusion.render.march import RELEASED, MarchSettings, march
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0), "transparent": None}
 
 
-def render(request: RenderRequest, session: Session, report: ReportProgress) -> RenderAnswer:
+def render(request: RenderRequest | RenderCommand, session: Session, report: ReportProgress) -> RenderAnswer | Path:
     """Render, and return the paths. Raises as load_human and read_pose, and OSError."""
+    if isinstance(request, RenderCommand):
+        return _render_view(request)
     began = time.perf_counter()
     report("load", 0, 1, None)
     human = load_human(request.human)
@@ -52,8 +54,7 @@ def draw(request: DrawRequest, session: Session, report: ReportProgress) -> Draw
     return session.cached(FrameDrawer).draw(request, report)
 
 
-def run(command: RenderCommand) -> None:
-    """Render, and print the path."""
+def _render_view(command: RenderCommand) -> Path:
     look = ViewSettings(command.view, settings=MarchSettings(step=command.step))
     human = load_human(command.human)
     primitives = place(
@@ -73,4 +74,4 @@ def run(command: RenderCommand) -> None:
         if command.depth is not None:
             rendering = march(primitives, camera, look.settings)
             depth_to_png(files.enter_context(written_whole(command.depth)), rendering.depth, rendering.alpha)
-    print(command.out)
+    return command.out
