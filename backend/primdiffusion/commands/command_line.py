@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar, get_origin
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import tyro
 
@@ -36,19 +38,16 @@ def parse(record: type[Record], arguments: Sequence[str], command: str) -> Recor
 
 
 def _with_options(record: type) -> type:
-    """A subclass whose annotations tyro understands."""
-    about, kinds = descriptions(record), field_types(record)
-    fields = {field.name: field for field in dataclasses.fields(record)}
-    namespace: dict[str, Any] = {
-        "__annotations__": {name: _with_option(kind, about.get(name, "")) for name, kind in kinds.items()},
-        "__doc__": record.__doc__,
-        **{
-            name: dataclasses.field(default_factory=field.default_factory)
-            for name, field in fields.items()
-            if field.default_factory is not dataclasses.MISSING
-        },
-    }
-    return dataclasses.dataclass(frozen=True, kw_only=True)(type(record.__name__, (record,), namespace))
+    """A record of the fields that the command line has, with annotations that tyro understands."""
+    about, fields = descriptions(record), []
+    for field in dataclasses.fields(record):
+        kind = field_types(record)[field.name]
+        if Option(hidden=True) not in split(kind)[1]:
+            default = dataclasses.field(default=field.default, default_factory=field.default_factory)
+            fields.append((field.name, _with_option(kind, about.get(field.name, "")), default))
+    options = dataclasses.make_dataclass(record.__name__, fields, kw_only=True)
+    options.__doc__ = record.__doc__
+    return options
 
 
 def _with_option(kind: Any, about: str) -> Any:
@@ -58,8 +57,8 @@ def _with_option(kind: Any, about: str) -> Any:
         plain = Annotated[plain, _NAMES_AND_VALUES]
     if option.positional:
         plain = tyro.conf.Positional[plain]
-    if option.hidden:
-        plain = tyro.conf.Suppress[plain]
+    if list in get_args(plain):  # numbers come in files
+        plain = functools.reduce(operator.or_, (part for part in get_args(plain) if part is not list))
     words = " ".join([about, *(_limits(mark) for mark in marks if isinstance(mark, Range))]).strip()
     return Annotated[plain, tyro.conf.arg(name=option.name or None, help=words)]
 

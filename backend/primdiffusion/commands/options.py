@@ -5,89 +5,27 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from primdiffusion.formats.regular_files import real_path
 from primdiffusion.formats.requests import (
-    RAY_STEP,
-    VOXEL,
-    Compositing,
     Count,
     GaussiansRequest,
     GenerateRequest,
     InpaintRequest,
     InterpolateRequest,
     Making,
+    MergeRequest,
     Person,
     Pixels,
+    PoseOptions,
     ProxySettings,
-    RayStep,
     ReconstructRequest,
     RenderRequest,
     Seed,
     TransferRequest,
     VaryRequest,
-    View,
-    Voxel,
 )
-from primdiffusion.formats.schema import Ending, FieldError, Length, Option, Range
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PoseOptions:
-    """A pose on the command line."""
-
-    pose: Path | None = None
-    """Pose file (.npz, .npy, .json, .pkl, .bvh), such as 72 axis-angle numbers (24 x 3, radians); default: T pose."""
-    frame: int = 0
-    """Frame of a pose file with several."""
-    tracked_person: str = ""
-    """Name or number of a person in a tracker's pose file of several people; default: who is in the most frames."""
-
-    def check(self) -> None:
-        """Raise FieldError for a frame or person without a pose file."""
-        for name, value in (("frame", self.frame), ("tracked_person", self.tracked_person)):
-            if value and self.pose is None:
-                raise FieldError((name,), f"is {value} without a pose file: give one with --pose")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RenderCommand(PoseOptions):
-    """Render a human in a pose."""
-
-    human: Person
-    """A .human.safetensors file."""
-    out: Annotated[Path, Ending((".png",))]
-    """Output PNG."""
-    yaw: float = 0.0
-    """Camera position around the human, degrees: 0 in front, 90 at the human's left."""
-    size: Pixels = RenderRequest.width
-    """Width and height, pixels."""
-    width: Pixels | None = None
-    """Pixels; the default is --size."""
-    height: Pixels | None = None
-    """Pixels; the default is --size."""
-    view: View = "colour"
-    """colour; depth in false colours, bright where near; alpha in grey; boxes: the primitives."""
-    step: RayStep = RAY_STEP
-    """Metres between samples of a ray; finer is slower and more accurate."""
-    compositing: Compositing = "linear"
-    """linear, as in Blender; released, as the authors' code: sRGB-encoded colours, boxes in index order, a sample each
-    millimetre, rays through pixel corners."""
-    background: Literal["black", "white", "transparent"] = "black"
-    """Background behind the human."""
-    depth: Annotated[Path, Ending((".png",))] | None = None
-    """A second PNG: depth in false colours, bright where near."""
-
-    def check(self) -> None:
-        """Raise FieldError for one file with two contents, for what `released` does not have, as `PoseOptions`."""
-        super().check()
-        if self.depth is not None and real_path(self.depth) == real_path(self.out):
-            raise FieldError(("depth",), f"is {self.depth}, as out: give two different files")
-        if self.compositing == "released" and (self.view, self.step) != ("colour", RAY_STEP):
-            raise FieldError(
-                ("compositing",), "is released, which has its own step and the view colour: omit the others"
-            )
+from primdiffusion.formats.schema import Ending, FieldError, Option, Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -106,20 +44,6 @@ class ExportCommand(ProxySettings, PoseOptions):
         super().check()
         if self.pose is not None and self.out.suffix.lower() != ".ply":
             raise FieldError(("pose",), f"cannot be stored in {self.out.name}: omit it, or export Gaussians to a .ply")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MergeCommand(PoseOptions):
-    """Merge humans into one voxel grid; the extension of --out selects the format: .vdb or .npz."""
-
-    humans: Annotated[tuple[Path, ...], Length(1), Option(positional=True)]
-    """.human files (or .human.safetensors)."""
-    out: Annotated[Path, Ending((".vdb", ".npz"))]
-    """.vdb: grids density and Cd (needs Python's module openvdb); .npz: density, colour, origin, voxel. z up."""
-    voxel: Voxel = VOXEL
-    """Voxel size, metres; half the size shows more detail at eight times the memory."""
-    apart: float = 1.0
-    """Distance between neighbours, side by side, metres."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -261,9 +185,9 @@ OPTIONS: dict[str, type] = {
     "transfer": TransferRequest,
     "reconstruct": ReconstructRequest,
     "refine": RefineCommand,
-    "render": RenderCommand,
+    "render": RenderRequest,
     "export": ExportCommand,
-    "merge": MergeCommand,
+    "merge": MergeRequest,
     "info": InfoCommand,
     "people": PeopleCommand,
     "payloads": PayloadsCommand,
