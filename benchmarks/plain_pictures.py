@@ -44,14 +44,14 @@ from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, human_in, start_of
+from primdiffusion.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, person_in, start_of
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place, pose_body
 from primdiffusion.posture.fit import Posture
 from primdiffusion.posture.start import framed, views_of
-from primdiffusion.reconstruction import reconstruct_by_prior
+from primdiffusion.reconstruction import reconstruct
 from primdiffusion.render.march import march
 from record import command_line, report
 from scipy import ndimage
@@ -110,14 +110,14 @@ def main() -> None:
             start = given(case, photograph, model, Fault(), number)
             began = time.perf_counter()
             posture = fit_posture_in(model, [photograph], start, lambda: None)
-            human = human_in(model, [photograph], posture)
+            human = reconstruct(model, person_in([photograph], posture))
             seconds = time.perf_counter() - began
             views = aligned(case, human)
             row = {
                 "camera_error_px": camera_error(case, photograph, posture),
                 "camera_error_px_start": camera_error(case, photograph, start.posture),
                 "picture_psnr": psnr(human, case, views),
-                "picture_known_psnr": psnr(reconstruct_by_prior(model, case.given), case),
+                "picture_known_psnr": psnr(reconstruct(model, case.given), case),
                 "picture_seconds_cpu": seconds,
             }
             if not number % POSES:
@@ -172,7 +172,7 @@ def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, se
     photograph = photographed(case, folder, fault)
     start = given(case, photograph, model, fault, seed)
     posture = fit_posture_in(model, [photograph], start, lambda: None)
-    human = human_in(model, [photograph], posture)
+    human = reconstruct(model, person_in([photograph], posture))
     return camera_error(case, photograph, posture), psnr(human, case, aligned(case, human))
 
 

@@ -15,6 +15,7 @@ from primdiffusion.commands.output import (
     PreviewBudget,
     PreviewFiles,
     draw_front_and_back,
+    previews_wait,
     step_previews,
     write_files,
     write_human,
@@ -44,7 +45,7 @@ def generate(request: GenerateRequest, session: Session, report: ReportProgress)
     """
     seeds, answer = range(request.seed, request.seed + request.count), None
     for first in seeds[:: request.batch]:
-        batch = range(first, min(first + request.batch, seeds.stop))
+        batch = list(range(first, min(first + request.batch, seeds.stop)))
         for answer in _generate_batch(request, batch, session, report):
             if answer.seed != seeds[-1]:
                 report("write", request.steps, request.steps, None, human=answer)
@@ -83,13 +84,15 @@ def _generate_batch(
             )
         sampled = time.perf_counter()
         report("write", steps, steps, None)
+        drawn = not previews_wait(request.picture_px)
+        looks = {"compact": request.compact, "compositing": request.compositing, "previews": drawn}
         for folder, human in zip(unfinished, humans, strict=True):
-            write_human(folder, human, request.size, compact=request.compact, compositing=request.compositing)
+            write_human(folder, human, request.size, **looks)
         report("write", steps, steps, 0.0)  # the last chance to cancel
     seconds = (time.perf_counter() - began) / len(seeds)
     return [
         HumanAnswer(
-            **FILES.in_folder(folder),
+            **FILES.in_folder(folder, previews=drawn),
             warnings=[f"seed {seed}: {text}" if request.count > 1 else text for text in warnings_of(human.provenance)],
             seed=seed,
             steps=steps,
