@@ -86,7 +86,8 @@ def person_in_pictures(
     Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PersonComponents.of`.
     """
     photographs = read_photographs(list(map(Path, pictures)), list(map(Path, masks)), mask_label=mask_label)
-    start, warnings = start_of(photographs, model, pose, cameras), []
+    known = (None if path is None else Path(path) for path in (pose, cameras))
+    start, warnings = start_of(photographs, model, *known), []
     posture = start.posture
     if refine:
         posture = fit_posture_in(model, photographs, start, on_step)
@@ -113,8 +114,8 @@ def person_in(photographs: Sequence[Photograph], posture: Posture, warnings: Seq
 def start_of(
     photographs: Sequence[Photograph],
     model: DiffusionModel,
-    pose_path: str | Path | None = None,
-    cameras_path: str | Path | None = None,
+    pose_path: Path | None = None,
+    cameras_path: Path | None = None,
 ) -> Start:
     """The posture to start from: of the files given, else of a standing body, seen as large as in the pictures.
 
