@@ -50,8 +50,8 @@ from primdiffusion.capture.render import (
     write_parameters,
 )
 from primdiffusion.capture.sheet import body_joints, joints_of
+from primdiffusion.files.picture_files import DEPTH_UNIT
 from primdiffusion.formats.camera_rig import Rig
-from primdiffusion.formats.picture_files import DEPTH_UNIT
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import record
 from PIL import Image
-from primdiffusion.machine import share_processors
+from primdiffusion.runtime.machine import share_processors
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent

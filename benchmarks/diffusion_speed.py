@@ -12,7 +12,7 @@ THREADS = 2
 os.environ["OMP_NUM_THREADS"] = os.environ["NUMBA_NUM_THREADS"] = str(THREADS)
 BEGAN = time.perf_counter()
 
-from primdiffusion.machine import peak_memory_gb, share_processors  # noqa: E402 - the clock runs while it is imported
+from primdiffusion.runtime.machine import peak_memory_gb, share_processors  # noqa: E402 - the clock runs while it is imported
 
 share_processors()
 

@@ -19,7 +19,6 @@ import numpy as np
 import torch
 from PIL import Image, ImageDraw, ImageFont
 from primdiffusion.body.model import BodyPose
-from primdiffusion.device import best_device
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.editing.inpaint import harmonise, inpaint
@@ -32,6 +31,7 @@ from primdiffusion.formats.requests import PARTS, Sampling
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.render.march import march
+from primdiffusion.runtime.device import best_device
 from record import command_line, report
 
 COLUMNS = 6

@@ -66,7 +66,7 @@ from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.reconstruction import encode_and_fit, reconstruct
+from primdiffusion.reconstruction.from_captures import encode_and_fit, reconstruct
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.training.fit_config import FitConfig
 from primdiffusion.training.fit_data import FitSample, fit_dataset

@@ -27,8 +27,8 @@ import torch
 from chain import compare, over_grey
 from chain_sets import HEAD_YAW, draw, held_out, rest_scene
 from PIL import Image
-from primdiffusion import tensor_file
 from primdiffusion.body.model import default_body
+from primdiffusion.files import tensor_file
 from primdiffusion.formats.human_layout import (
     to_eight_bits,
 )

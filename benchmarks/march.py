@@ -30,7 +30,7 @@ from marching import OPERATIONS_PER_SAMPLE, leaves, portrait
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.human import framing, place
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.cpu import count_samples
+from primdiffusion.render.cpu.march import count_samples
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, strides_of
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference

@@ -33,14 +33,14 @@ from typing import Any
 
 import torch
 from marching import OPERATIONS_PER_SAMPLE, leaves, portrait
-from primdiffusion import cuda_graph
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.compositing import Rendering
-from primdiffusion.render.cpu import count_samples
-from primdiffusion.render.cuda import Shapes, available, march_cuda
+from primdiffusion.render.cpu.march import count_samples
+from primdiffusion.render.cuda import graph as cuda_graph
+from primdiffusion.render.cuda.march import Shapes, available, march_cuda
+from primdiffusion.render.cuda.marcher import Marcher
 from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings
-from primdiffusion.render.marcher import Marcher
 from primdiffusion.render.reference import march_reference
 from record import command_line, report
 from torch import Tensor

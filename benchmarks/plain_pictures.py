@@ -44,14 +44,14 @@ from primdiffusion.capture.dataset import Views
 from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, person_in, start_of
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place, pose_body
-from primdiffusion.posture.fit import Posture
-from primdiffusion.posture.start import framed, views_of
-from primdiffusion.reconstruction import reconstruct
+from primdiffusion.reconstruction.from_captures import reconstruct
+from primdiffusion.reconstruction.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, person_in, start_of
+from primdiffusion.reconstruction.posture_fit import Posture
+from primdiffusion.reconstruction.posture_start import framed, views_of
 from primdiffusion.render.march import march
 from record import command_line, report
 from scipy import ndimage

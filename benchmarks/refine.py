@@ -28,7 +28,6 @@ from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
 from primdiffusion.commands.reconstruct import ENCODER_VIEWS, split_cameras
-from primdiffusion.device import best_device
 from primdiffusion.encoder.model import load_encoder
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.geometry.srgb import encode_srgb
@@ -37,10 +36,11 @@ from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
-from primdiffusion.reconstruction import reconstruct, targets_of
+from primdiffusion.reconstruction.from_captures import reconstruct, targets_of
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
+from primdiffusion.runtime.device import best_device
 from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
 from record import command_line, report
 

@@ -9,7 +9,7 @@ alone, triggered by linking an empty object.
 on another body: reshaped people against people made for that body. The default body with a checkered
 texture, bare or with a suit 2 cm off the skin, is filled into boxes at the mean body and reshaped to a heavy, a thin, a
 tall and a short one; the reference is the same texture filled into boxes at that body. For each share of the stretch
-(`primdiffusion.reshaping.SHARE` is the default), in percent N: psnr_N of the pictures in dB, and holes_N, the share of
+(`primdiffusion.editing.reshaping.SHARE` is the default), in percent N: psnr_N of the pictures in dB, and holes_N, the share of
 pixels opaque in the reference that are transparent (opacity below 0.7); means over bodies and suits.
 Names with a body, such as psnr_heavy_50, are of that body.
 """
@@ -28,9 +28,9 @@ import bpy
 import numpy as np
 import torch
 from march_people import checkered_human
-from primdiffusion import reshaping
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import default_body
+from primdiffusion.editing import reshaping
 from primdiffusion.evaluation.image_metrics import psnr
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, place

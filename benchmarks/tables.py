@@ -33,7 +33,7 @@ from primdiffusion.evaluation.tables import (
     reference_cells,
     table,
 )
-from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.human import Human, pose_body
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.render.march import MarchSettings

@@ -33,7 +33,7 @@ from primdiffusion.diffusion.checkpoint import save_checkpoint
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
-from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.training.cells import CellTask, prepare

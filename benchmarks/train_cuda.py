@@ -24,12 +24,12 @@ for missing in ("tyro", "trimesh", "trimesh.geometry", "trimesh.triangles", "tri
     except ImportError:  # of command lines and meshes; nothing here calls them
         sys.modules[missing] = MagicMock()
 
-from primdiffusion import cuda_graph
 from primdiffusion.diffusion.codec import VALUES, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.schedule import SCHEDULES
+from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.training.config import TrainingConfig
 from primdiffusion.training.latents import LatentSet
 from primdiffusion.training.losses import RestObjective, weighted_error

@@ -27,7 +27,7 @@ from primdiffusion.diffusion.model import ShapePrior
 from primdiffusion.diffusion.samplers import SAMPLERS
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import TimeEmbedding, zeroed
-from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Frames, Payload, Primitives

@@ -14,9 +14,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, Literal, NoReturn
 
-from .formats.regular_files import printable
+from .files.regular_files import printable
+from .files.whole_files import write_atomically
 from .formats.schema import descriptions, field_types, split
-from .formats.whole_files import write_atomically
 
 DONE, FAILED, UNUSABLE, CANCELLED = 0, 1, 2, 130
 """Exit codes: all done; some failed, and the report lists them; usage error; stopped."""

@@ -19,7 +19,6 @@ from typing import Any
 import torch
 import tyro
 from jaxtyping import Float, UInt8
-from primdiffusion import tensor_file
 from primdiffusion.commands.evaluate import real_sources
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.evaluation.attribute_network import (
@@ -31,7 +30,8 @@ from primdiffusion.evaluation.attribute_network import (
 )
 from primdiffusion.evaluation.gallery import COLOURINGS, PORTRAITS, Report, Source, mesh_sources, open_gallery, silent
 from primdiffusion.evaluation.generation import NETWORK_FILE, PORTRAITS_FOLDER
-from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.files import tensor_file
+from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.people.assets import open_assets
 from torch import Tensor, nn
 from torch.nn import functional

@@ -18,7 +18,6 @@ import numpy as np
 import torch
 import tyro
 from jaxtyping import Float, UInt8
-from primdiffusion import tensor_file
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.evaluation.images import JOINTS, mesh_images
@@ -32,7 +31,8 @@ from primdiffusion.evaluation.pose_depth_network import (
     load_pose_depth_network,
     shrunk,
 )
-from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.files import tensor_file
+from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.geometry.rotation import axis_angle_to_matrix, matrix_to_axis_angle
 from primdiffusion.people.assets import Assets, open_assets
 from primdiffusion.people.base_mesh import load_base_mesh

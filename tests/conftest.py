@@ -5,7 +5,7 @@ import os
 import pytest
 from hypothesis import HealthCheck, settings
 from jaxtyping import install_import_hook
-from primdiffusion.machine import share_processors
+from primdiffusion.runtime.machine import share_processors
 from support import kernels
 
 share_processors()

@@ -17,19 +17,19 @@ from primdiffusion.version import __version__
 
 if TYPE_CHECKING:
     from primdiffusion.body.model import BodyPose
+    from primdiffusion.body.pose_file import read_pose
     from primdiffusion.diffusion.checkpoint import load_checkpoint
     from primdiffusion.editing.inpaint import inpaint
     from primdiffusion.editing.interpolate import interpolate
     from primdiffusion.editing.regions import region_of
     from primdiffusion.editing.transfer import transfer_garment, transfer_texture
     from primdiffusion.editing.vary import vary
-    from primdiffusion.from_pictures import person_in_pictures
     from primdiffusion.geometry.camera import Camera
     from primdiffusion.human import Human, framing, generate, place
     from primdiffusion.human_file import load_human, save_human
-    from primdiffusion.pose_file import read_pose
     from primdiffusion.primitives.primitives import Primitives
-    from primdiffusion.reconstruction import reconstruct
+    from primdiffusion.reconstruction.from_captures import reconstruct
+    from primdiffusion.reconstruction.from_pictures import person_in_pictures
     from primdiffusion.render.march import march
 
 __all__ = [

@@ -16,8 +16,8 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from primdiffusion.commands.options import OPTIONS
-from primdiffusion.failures import describe, traceback_of
-from primdiffusion.machine import DEVICES, choose_device, share_processors
+from primdiffusion.runtime.failures import describe, traceback_of
+from primdiffusion.runtime.machine import DEVICES, choose_device, share_processors
 from primdiffusion.version import __version__
 
 TRACEBACK = "--traceback"

@@ -22,7 +22,6 @@ from torch import Tensor
 
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import BodyModel, BodyPose, PosedBody, default_body
-from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.reading import unfollowed
@@ -37,6 +36,7 @@ from primdiffusion.primitives.anchors import Anchors, attach, default_anchors, s
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.runtime.device import on_fixed_threads
 from primdiffusion.version import __version__
 
 DEFAULT_SETTINGS = MarchSettings()

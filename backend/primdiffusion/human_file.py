@@ -21,10 +21,11 @@ from pathlib import Path
 
 import torch
 
-from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.body.model import BodyModel
-from primdiffusion.device import GRID_THREADS, fixed_threads
+from primdiffusion.files import tensor_file
+from primdiffusion.files.regular_files import FileError, as_file_error
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.human_layout import (
     COMPACT_SCALES,
     COMPACT_VERSION,
@@ -35,12 +36,11 @@ from primdiffusion.formats.human_layout import (
     to_eight_bits,
     version_fault,
 )
-from primdiffusion.formats.regular_files import FileError, as_file_error
-from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, find_body_setup
 from primdiffusion.primitives.primitives import K, Payload, S
+from primdiffusion.runtime.device import GRID_THREADS, fixed_threads
 
 FORMAT = "primdiffusion.human"
 FORMAT_VERSION = 1

@@ -17,8 +17,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from ..files.json_files import parse_message
 from ..formats.answers import ANSWERS, NOTIFICATIONS, ErrorData, Message
-from ..formats.json_files import parse_message
 from ..formats.schema import FieldError, read
 from .child_process import COMPUTING, LOG_LINES, LONGEST_LINE, Input, Output, passed_on
 

@@ -12,8 +12,8 @@ from collections.abc import Generator, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-from ..formats.json_files import parse_json, read_json
-from ..formats.regular_files import is_local_path
+from ..files.json_files import parse_json, read_json
+from ..files.regular_files import is_local_path
 from .child_process import Output
 from .client import PROGRAM, child_environment, is_program
 

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 
-from ..formats.regular_files import read_regular
+from ..files.regular_files import read_regular
 from .child_process import NETWORK, passed_on
 
 CUDA_DRIVER = 580

@@ -9,9 +9,9 @@ from collections.abc import Callable, Generator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
+from ..files.regular_files import printable
+from ..files.whole_files import remove_of_process
 from ..formats.answers import Progress
-from ..formats.regular_files import printable
-from ..formats.whole_files import remove_of_process
 from .client import BackendClient, Died, ErrorResponse, Event, Notification, Response, Silent
 
 _LONGEST_NAME = 120
@@ -368,7 +368,7 @@ class ChildRequest:
             self._backend.when_ended(client, self._clear_leftovers)
 
     def _clear_leftovers(self) -> None:
-        """Remove the folder of half-written files of a killed child (see formats/whole_files.py)."""
+        """Remove the folder of half-written files of a killed child (see files/whole_files.py)."""
         if self._client is not None and self._out_dir is not None:
             remove_of_process(self._out_dir, self._client.pid)
             if self._out_dir_is_new:

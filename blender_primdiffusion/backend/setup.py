@@ -22,8 +22,8 @@ from collections.abc import Generator
 from pathlib import Path
 from typing import Any
 
-from ..formats.regular_files import check_regular, remove_file, remove_folder
-from ..formats.whole_files import write_atomically
+from ..files.regular_files import check_regular, remove_file, remove_folder
+from ..files.whole_files import write_atomically
 from .client import BackendClient
 from .environment import MARK, SetUpFolder, search, tried
 from .packages import Lock, clean_environment, followed, what_went_wrong

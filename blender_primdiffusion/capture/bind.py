@@ -11,8 +11,8 @@ from mathutils.bvhtree import BVHTree
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
+from ..files.regular_files import FileError
 from ..formats.joints import JOINT_NAMES
-from ..formats.regular_files import FileError
 from ..scene.armature import build_armature
 from ..scene.convention import points_to_backend, points_to_blender
 from .body import Body, blend, fit_surface, vertex_normals

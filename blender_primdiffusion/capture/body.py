@@ -12,11 +12,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import MOST_BODY_VALUES, all_finite, read_arrays
+from ..files.arrays import MOST_BODY_VALUES, all_finite, read_arrays
+from ..files.regular_files import FileError
 from ..formats.body_layout import body_data
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.poses.skeleton import chain, joint_positions
-from ..formats.regular_files import FileError
 
 BETAS = 10
 """Shape components in use."""

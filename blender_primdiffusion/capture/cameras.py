@@ -10,9 +10,9 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..files.regular_files import open_regular
 from ..formats.camera_rig import View
 from ..formats.poses.rotation import first_improper
-from ..formats.regular_files import open_regular
 from ..scene.convention import points_to_backend, points_to_blender
 
 _SENSOR_MM = 36.0

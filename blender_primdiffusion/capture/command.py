@@ -34,12 +34,12 @@ from ..console import (
     separate_stdout,
     stopped_by_signals,
 )
-from ..formats.arrays import all_finite
+from ..files.arrays import all_finite
+from ..files.json_files import read_json
+from ..files.regular_files import FileError, as_file_error, printable
 from ..formats.camera_rig import Rig, View
 from ..formats.capture_repair import repair, verify
-from ..formats.json_files import read_json
 from ..formats.poses.files import ENDINGS
-from ..formats.regular_files import FileError, as_file_error, printable
 from ..formats.requests import LAYOUTS, PASSES
 from .job import CaptureProgress, run
 from .scan import ScanFile, find_scans

@@ -17,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..console import Report
+from ..files.regular_files import FileError, check_unlinked
+from ..files.whole_files import remove_abandoned, temporary_folder
 from ..formats.camera_rig import View, bounding_sphere
 from ..formats.capture_layout import (
     RELEASED_REFERENCE,
@@ -32,9 +34,7 @@ from ..formats.capture_repair import is_complete_view, list_subjects, remove_dam
 from ..formats.poses.files import read_motion
 from ..formats.poses.motion import Motion
 from ..formats.poses.skeleton import joint_positions
-from ..formats.regular_files import FileError, check_unlinked
 from ..formats.requests import FLOAT_DEPTH
-from ..formats.whole_files import remove_abandoned, temporary_folder
 from ..motion.poses import built_in_poses, pick_poses
 from .body import Body, read_body
 from .group import Placed, groups_of, load_neighbours, place_group

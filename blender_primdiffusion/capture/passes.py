@@ -10,10 +10,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
+from ..files.picture_files import depth_steps, is_whole_picture, normal_bytes, write_exr, write_png
+from ..files.regular_files import FileError, as_file_error, check_regular
+from ..files.whole_files import replacing
 from ..formats.capture_layout import picture_path
-from ..formats.picture_files import depth_steps, is_whole_picture, normal_bytes, write_exr, write_png
-from ..formats.regular_files import FileError, as_file_error, check_regular
-from ..formats.whole_files import replacing
 from ..scene.convention import points_to_backend
 from .surfaces import PART
 

@@ -9,7 +9,7 @@ import numpy as np
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
-from ..formats.regular_files import FileError
+from ..files.regular_files import FileError
 from ..scene.convention import BLENDER_FROM_BACKEND
 
 SHORTEST, TALLEST = 0.5, 2.6

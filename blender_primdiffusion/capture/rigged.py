@@ -10,9 +10,9 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..files.regular_files import FileError
 from ..formats.joints import JOINT_NAMES, PARENTS
 from ..formats.poses.skeleton import chain
-from ..formats.regular_files import FileError
 from ..scene.convention import BLENDER_FROM_BACKEND, points_to_backend
 from .scan_files import ScanFile
 

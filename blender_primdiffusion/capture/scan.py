@@ -9,10 +9,10 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
+from ..files.regular_files import FileError, as_file_error
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.rigs import NAME_BONES, UNMATCHED, BoneMap, facing, map_bones, rig_from_smpl
 from ..formats.poses.rotation import matrix_to_quaternion, to_axis_angle
-from ..formats.regular_files import FileError, as_file_error
 from ..scene.convention import points_to_blender
 from .bind import bind_static
 from .body import Body, ShapeFit, fit_joints

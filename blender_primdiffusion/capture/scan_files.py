@@ -13,10 +13,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import all_finite, read_arrays
-from ..formats.json_files import parse_json
+from ..files.arrays import all_finite, read_arrays
+from ..files.json_files import parse_json
+from ..files.regular_files import FileError, open_regular, portable_name, real_path
 from ..formats.poses.files import POSE_KEYS, motion_from_arrays
-from ..formats.regular_files import FileError, open_regular, portable_name, real_path
 
 ENDINGS = (".glb", ".gltf", ".fbx", ".obj")
 """Files of scans; of several with the same name in a folder, the first of these is used."""

@@ -8,11 +8,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+from ..files.picture_files import DEPTH_UNIT
 from ..formats.camera_rig import Rig, View
 from ..formats.capture_layout import ENDINGS
 from ..formats.group_places import MOST
 from ..formats.joints import JOINT_NAMES
-from ..formats.picture_files import DEPTH_UNIT
 from ..formats.requests import FLOAT_DEPTH, LAYOUTS, PASSES, Count, Seed
 from ..formats.schema import Range, Slider, check
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import bpy
 
+from ..files.regular_files import FileError, check_regular, remove_file, remove_folder
 from ..formats.camera_rig import View
-from ..formats.regular_files import FileError, check_regular, remove_file, remove_folder
 from .cameras import aim
 from .passes import Centres, Colours, read_centres, read_colours
 from .settings import CaptureSettings, Device

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.regular_files import remove_file, remove_folder
+from ..files.regular_files import remove_file, remove_folder
 
 CHANNELS = 5
 """Combined (4) and depth."""

@@ -12,8 +12,8 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.regular_files import remove_file
-from ..formats.whole_files import replacing
+from ..files.regular_files import remove_file
+from ..files.whole_files import replacing
 from ..scene.convention import points_to_backend
 from ..scene.place import is_solid
 

@@ -13,11 +13,11 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
+from ..files.regular_files import exists_in_its_folder, remove_file
+from ..files.whole_files import written_whole
 from ..formats.answers import GaussiansAnswer, HumanAnswer, MergeFramesAnswer, ProxyAnswer
 from ..formats.poses.rotation import nearest
 from ..formats.poses.skeleton import unchain
-from ..formats.regular_files import exists_in_its_folder, remove_file
-from ..formats.whole_files import written_whole
 from ..motion.posture import rest_joints
 from ..scene.armature import keyframe_poses, pose_from_joint_rotations
 from ..scene.export_model import FrameRange, check_ready, scene_with_only, write_model

@@ -9,7 +9,7 @@ import bpy
 
 from ..backend.environment import NOT_INSTALLED
 from ..backend.requests import error_text, sentence
-from ..formats.regular_files import printable
+from ..files.regular_files import printable
 from ..places import backend_is_named
 from .memory import release_when_idle
 from .pictures import so_far

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 
 from ..backend.requests import sentence
 from ..capture.cameras import aim_at_picture, picture_of, picture_view
+from ..files.json_files import read_json
+from ..files.regular_files import as_file_error
 from ..formats.answers import FitPostureAnswer, ReconstructAnswer
 from ..formats.camera_rig import View
-from ..formats.json_files import read_json
-from ..formats.regular_files import as_file_error
 from ..motion.posture import check_posable, take_world_posture, world_posture
 from ..scene.blend_values import file_path
 from ..scene.edit import check_shapeable, reshape
@@ -32,7 +32,7 @@ from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .target import HumanTarget
 
 POSTURE_FORMAT = "primdiffusion-posture"
-"""As `posture/file.py` of the backend writes it."""
+"""As `reconstruction/posture_file.py` of the backend writes it."""
 
 
 def on_own_body(person: bpy.types.Object) -> bool:

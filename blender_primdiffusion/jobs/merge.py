@@ -10,9 +10,9 @@ import bpy
 import numpy as np
 
 from ..engine.picture import pose_of
+from ..files.regular_files import remove_file
 from ..formats.answers import MergeAnswer, MergeFramesAnswer
 from ..formats.joints import JOINT_NAMES
-from ..formats.regular_files import remove_file
 from ..scene.merged import MergedState, merged_folder, pose_digest, publish, read_grid, show_merged, write_grid
 from ..scene.representation import set_representation
 from .queue import Job

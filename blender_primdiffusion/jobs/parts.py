@@ -13,7 +13,7 @@ import time
 import bpy
 from bpy.app.handlers import persistent
 
-from ..formats.regular_files import printable
+from ..files.regular_files import printable
 from ..scene.parts import complete_humans, orphans, without_parts
 from .windows import in_the_way, window_of
 

@@ -17,7 +17,7 @@ import bpy
 from ..backend.client import Died, Silent
 from ..backend.environment import NOT_ABSOLUTE
 from ..backend.requests import Backend, ChildRequest, FinishedRequest, RequestError, error_text
-from ..formats.regular_files import is_local_path, remove_folder
+from ..files.regular_files import is_local_path, remove_folder
 from ..places import new_backend, preference
 from .remedies import defect_in_the_scene, error_in_the_scene
 

@@ -12,8 +12,8 @@ from typing import Any
 import bpy
 
 from ..backend.requests import sentence
+from ..files.regular_files import remove_folder
 from ..formats.answers import VariationFiles, VariationsAnswer
-from ..formats.regular_files import remove_folder
 from ..scene.payload import BODY_FILE, PERSON_FILE
 from .pictures import icons
 from .queue import Job, chosen_checkpoint

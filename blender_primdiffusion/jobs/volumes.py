@@ -12,7 +12,7 @@ import bpy
 from bpy.app.handlers import persistent
 
 from ..engine.engine import ENGINE
-from ..formats.regular_files import printable
+from ..files.regular_files import printable
 from ..scene.human import all_humans
 from ..scene.payload import session_file
 from ..scene.representation import show_in_viewport

@@ -15,8 +15,8 @@ from typing import Any, cast
 
 import bpy
 
-from ..formats.json_files import parse_json
-from ..formats.regular_files import is_local_path, printable, real_path
+from ..files.json_files import parse_json
+from ..files.regular_files import is_local_path, printable, real_path
 
 LONGEST_TEXT = 1 << 16
 """Characters of a text; the longest is the state of a merged sequence, 20 characters a frame. Panels read texts at each

@@ -16,9 +16,9 @@ from pathlib import Path
 import addon_utils
 import bpy
 
+from ..files.regular_files import remove_folder
+from ..files.whole_files import replacing
 from ..formats.joints import JOINT_NAMES
-from ..formats.regular_files import remove_folder
-from ..formats.whole_files import replacing
 
 
 @dataclasses.dataclass(frozen=True)

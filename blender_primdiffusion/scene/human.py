@@ -7,7 +7,7 @@ from typing import Any
 
 import bpy
 
-from ..formats.regular_files import FileError
+from ..files.regular_files import FileError
 from .blend_values import stored_record
 
 

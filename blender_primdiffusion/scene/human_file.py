@@ -1,7 +1,7 @@
 """.human files: a human as the backend saves it (safetensors), with its current shape and its motion.
 
 The backend reads them as it reads its own files; the motion is stored under additional names (`motion.*`). Both find
-tensors in a file by `formats.tensor_layout`; numpy is enough to read and write them.
+tensors in a file by `files.tensor_layout`; numpy is enough to read and write them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import all_finite, check_shapes
+from ..files.arrays import all_finite, check_shapes
+from ..files.json_files import parse_json
+from ..files.regular_files import FileError, as_file_error, read_regular
+from ..files.tensor_layout import DTYPES, LENGTH_BYTES, read_layout
+from ..files.whole_files import written_whole
 from ..formats.human_layout import (
     COMPACT_SCALES,
     COMPACT_VERSION,
@@ -25,11 +29,7 @@ from ..formats.human_layout import (
     to_eight_bits,
     version_fault,
 )
-from ..formats.json_files import parse_json
 from ..formats.poses.rotation import first_improper, improper_text
-from ..formats.regular_files import FileError, as_file_error, read_regular
-from ..formats.tensor_layout import DTYPES, LENGTH_BYTES, read_layout
-from ..formats.whole_files import written_whole
 from .human import BETA_COUNT
 from .payload import LARGEST_PERSON
 

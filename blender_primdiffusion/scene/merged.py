@@ -13,9 +13,9 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import all_finite, check_shapes, read_arrays
-from ..formats.regular_files import FileError, as_file_error, check_inside, real_path, remove_file
-from ..formats.whole_files import written_whole
+from ..files.arrays import all_finite, check_shapes, read_arrays
+from ..files.regular_files import FileError, as_file_error, check_inside, real_path, remove_file
+from ..files.whole_files import written_whole
 from .blend_values import stored_record
 from .human import link_part, parts_of, write_error
 from .material import volume_material

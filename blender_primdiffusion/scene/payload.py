@@ -12,8 +12,8 @@ from pathlib import Path
 
 import bpy
 
-from ..formats.regular_files import read_regular, remove_folder
-from ..formats.whole_files import written_whole
+from ..files.regular_files import read_regular, remove_folder
+from ..files.whole_files import written_whole
 from .blend_values import stored_image
 
 PAYLOAD = "primdiffusion"

@@ -20,9 +20,9 @@ from mathutils import Color
 from mathutils.kdtree import KDTree
 from numpy.typing import NDArray
 
-from ..formats.arrays import all_finite, check_shapes, read_arrays
+from ..files.arrays import all_finite, check_shapes, read_arrays
+from ..files.regular_files import FileError, as_file_error, portable_name
 from ..formats.joints import JOINT_NAMES
-from ..formats.regular_files import FileError, as_file_error, portable_name
 from .armature import floor_below, model_origin
 from .blend_values import as_numbers, stored_record
 from .build import build_body_mesh

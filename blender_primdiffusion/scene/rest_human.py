@@ -13,10 +13,10 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import MOST_BODY_VALUES, check_shapes, read_arrays
+from ..files.arrays import MOST_BODY_VALUES, check_shapes, read_arrays
+from ..files.regular_files import FileError, as_file_error, exists_in_its_folder
 from ..formats.body_layout import body_data, half_extents, read_layout, stencils
 from ..formats.human_layout import provenance_of
-from ..formats.regular_files import FileError, as_file_error, exists_in_its_folder
 from .human import LARGEST_BETA
 from .human_file import (
     GENERATE_AGAIN,

@@ -11,7 +11,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.arrays import all_finite
+from ..files.arrays import all_finite
 from ..formats.body_layout import LARGEST_STRETCH
 from .blend_values import as_numbers, stored_numbers
 from .human import BETA_COUNT, BETAS, LARGEST_BETA, MARK, provenance_of

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import bpy
 
-from ..formats.whole_files import remove_abandoned
+from ..files.whole_files import remove_abandoned
 from .human import all_humans, body_of, write_error
 from .payload import session_file
 from .rest_human import read_human, shape_model_of

@@ -17,7 +17,7 @@ import bpy
 import numpy as np
 from numpy.typing import NDArray
 
-from ..formats.whole_files import temporary_folder
+from ..files.whole_files import temporary_folder
 
 bpy.utils.expose_bundled_modules()
 try:

@@ -14,9 +14,9 @@ from pathlib import Path
 
 import bpy
 
-from ..formats.json_files import parse_json
-from ..formats.regular_files import as_file_error, is_local_path, open_regular
-from ..formats.tensor_layout import read_layout
+from ..files.json_files import parse_json
+from ..files.regular_files import as_file_error, is_local_path, open_regular
+from ..files.tensor_layout import read_layout
 from ..places import backend_module_path, preference
 
 _LARGEST_FILE = 16 << 30

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from ..capture.cameras import aim
 from ..capture.command import ASK_FROM, estimate, parse, scans_in, settings_of
 from ..console import FAILED
+from ..files.regular_files import printable
 from ..formats.camera_rig import bounding_sphere
-from ..formats.regular_files import printable
 from ..jobs.follow import Reporting, redraw
 from ..places import shows_captures
 from ..scene.blend_values import setting_path

@@ -17,9 +17,9 @@ from ..backend.child_process import BLENDER, COMPUTING, Output, passed_on
 from ..capture import launch
 from ..capture.command import MARK
 from ..console import CANCELLED, DONE
+from ..files.json_files import parse_message
+from ..files.regular_files import remove_folder
 from ..formats.answers import CapturesProgress
-from ..formats.json_files import parse_message
-from ..formats.regular_files import remove_folder
 from ..formats.schema import read
 
 PATIENCE_S = 0.7

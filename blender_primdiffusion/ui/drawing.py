@@ -8,7 +8,7 @@ import textwrap
 import bpy
 
 from ..backend.requests import RequestError
-from ..formats.regular_files import printable
+from ..files.regular_files import printable
 from ..jobs.follow import in_the_way
 from ..jobs.pictures import so_far
 from ..jobs.queue import JobOutcome, queue

@@ -13,10 +13,10 @@ from bpy_extras.view3d_utils import location_3d_to_region_2d
 from numpy.typing import NDArray
 
 from ..backend.requests import sentence
+from ..files.regular_files import FileError
 from ..formats.joints import JOINT_NAMES
 from ..formats.poses.bvh import bone_names, parse_bvh
 from ..formats.poses.files import ENDINGS, read_motion
-from ..formats.regular_files import FileError
 from ..scene.human import humans
 from .drawing import draw_lines, property_columns
 from .motion_placing import Placement, extend_range, facts, place_motion

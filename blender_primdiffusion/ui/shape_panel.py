@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..backend.requests import sentence
-from ..formats.regular_files import printable
+from ..files.regular_files import printable
 from ..jobs.target import selected_person
 from ..scene.actions import action_curves, end_repeat, loops, repeat
 from ..scene.edit import check_shapeable, reshape

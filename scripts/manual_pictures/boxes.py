@@ -12,10 +12,10 @@ from PIL import Image
 from primdiffusion.body.measures import betas_of_measures
 from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
+from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.geometry.camera import look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, generate, render
-from primdiffusion.reshaping import reshaped
 
 from .shrink import save_jpeg
 

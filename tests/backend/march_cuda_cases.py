@@ -1,4 +1,4 @@
-"""What march_cuda must do; render/test_cuda.py runs it in Triton's interpreter, and on a CUDA device."""
+"""What march_cuda must do; render/cuda/test_march.py runs it in Triton's interpreter, and on a CUDA device."""
 
 import dataclasses
 import os
@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 import torch
 from march_scenes import camera_at, one_box, random_boxes
-from primdiffusion import cuda_graph
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render import cuda_scene
 from primdiffusion.render.compositing import Rendering
-from primdiffusion.render.cuda import Shapes, march_cuda
+from primdiffusion.render.cuda import graph as cuda_graph
+from primdiffusion.render.cuda import scene as cuda_scene
+from primdiffusion.render.cuda.march import Shapes, march_cuda
+from primdiffusion.render.cuda.marcher import Marcher
 from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings, Span
-from primdiffusion.render.marcher import Marcher
 from primdiffusion.render.reference import march_reference
 from support.errors import refused
 from torch import Tensor

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from primdiffusion import tensor_file
 from primdiffusion.body.model import default_body
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files import tensor_file
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, generate, place
 from primdiffusion.human_file import load_human, save_body, save_human

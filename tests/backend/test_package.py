@@ -9,7 +9,7 @@ import numpy as np
 import primdiffusion as pd
 import pytest
 from PIL import Image
-from primdiffusion import from_pictures
+from primdiffusion.reconstruction import from_pictures
 from tiny_model import save_tiny_checkpoint
 
 

@@ -17,7 +17,7 @@ FILES = 8
 WRITER = f"""
 import sys
 from pathlib import Path
-from primdiffusion.formats.whole_files import staged
+from primdiffusion.files.whole_files import staged
 print("ready", flush=True)
 for line in sys.stdin:
     with staged(Path(line.strip())) as folder:

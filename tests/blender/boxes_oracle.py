@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.human import Human, place_skinned, pose_body
 from primdiffusion.human_file import save_body, save_human
 from primdiffusion.primitives.anchors import default_anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, FileFingerprint
 from primdiffusion.primitives.primitives import Payload
-from primdiffusion.reshaping import reshaped
 
 folder, count, own = Path(sys.argv[1]), int(sys.argv[2]), sys.argv[3] == "own"
 g = torch.Generator().manual_seed(7)

@@ -17,6 +17,7 @@ import torch
 from primdiffusion.body.model import BodyPose, default_body
 from primdiffusion.drawing.draw import draw as compose_scene
 from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.human import Human, place
@@ -27,7 +28,6 @@ from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.lattice import MarchSettings
 from primdiffusion.render.march import Span, march
 from primdiffusion.render.solids import Solids
-from primdiffusion.reshaping import reshaped
 
 
 def make(folder: Path, seed: int, betas: list[float]) -> None:

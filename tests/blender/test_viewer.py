@@ -48,7 +48,7 @@ def test_the_zip_is_small_whole_and_accepted(archive):
         manifest, names = tomllib.loads(made.read("blender_manifest.toml").decode()), set(made.namelist())
     assert list(manifest["permissions"]) == ["files"]
     assert len(manifest["permissions"]["files"]) <= 64
-    assert {"LICENSE", "gallery/Ada.human", "gallery/Sample.human", "bundled/primdiffusion/formats/arrays.py"} <= names
+    assert {"LICENSE", "gallery/Ada.human", "gallery/Sample.human", "bundled/primdiffusion/files/arrays.py"} <= names
     assert {
         "motion/data/poses.blend",
         "motion/data/walk.npz",

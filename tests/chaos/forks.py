@@ -161,7 +161,7 @@ def _import_all() -> None:
 
     from primdiffusion.cli import PROGRAMS
     from primdiffusion.commands import FUNCTIONS
-    from primdiffusion.machine import share_processors
+    from primdiffusion.runtime.machine import share_processors
 
     share_processors()
     lazily = ("commands.session", "commands.output", "commands.frame_drawer", "people.folder", "people.payloads",

@@ -31,21 +31,21 @@ import torch
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
-from primdiffusion import tensor_file
+from primdiffusion.body.pose_file import read_pose
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.capture.people_files import read_person as read_glb
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.evaluation.pretrained_networks import read_weights
-from primdiffusion.failures import describe
-from primdiffusion.formats.arrays import read_npy
+from primdiffusion.files import tensor_file
+from primdiffusion.files.arrays import read_npy
+from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.files import read_motion
 from primdiffusion.formats.poses.skeleton import REST_JOINTS
-from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.geometry.pictures import decoded, opened_picture
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
-from primdiffusion.pose_file import read_pose
+from primdiffusion.runtime.failures import describe
 from primdiffusion.training.shards import PackedPeople, pack_people
 from primdiffusion.training.stored_people import read_person
 from tiny_model import save_tiny_checkpoint, tiny_model

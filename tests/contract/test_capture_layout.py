@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion.formats import camera_rig, capture_layout, picture_files
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files import picture_files
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.formats import camera_rig, capture_layout
 from primdiffusion.geometry.camera import look_at
 from scipy.spatial.transform import Rotation
 from support.errors import refused

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
-from primdiffusion.formats.regular_files import portable_name
+from primdiffusion.files.regular_files import portable_name
 
 from scripts.setup import TARGETS
 

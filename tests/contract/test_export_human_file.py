@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 import torch
 from export_people import person
+from primdiffusion.editing.reshaping import reshaped as reshape_in_backend
 from primdiffusion.human_file import load_human, save_human
-from primdiffusion.reshaping import reshaped as reshape_in_backend
 from support.errors import refused
 
 from blender_primdiffusion.scene.human_file import (

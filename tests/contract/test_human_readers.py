@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from primdiffusion import tensor_file
+from primdiffusion.files import tensor_file
 from primdiffusion.human import generate
 from primdiffusion.human_file import load_human, save_human
 from support.errors import refused

@@ -12,12 +12,12 @@ import pytest
 ROOT = Path(__file__).parents[2]
 BACKEND, EXTENSION = ROOT / "backend" / "primdiffusion", ROOT / "blender_primdiffusion"
 ALLOWED = {
-    "zipfile": {"formats/arrays.py", "torch_file.py"},
-    "numpy.load": {"formats/arrays.py"},
+    "zipfile": {"files/arrays.py", "torch_file.py"},
+    "numpy.load": {"files/arrays.py"},
     "numpy.lib.format.read_array": set(),
     "json.load": set(),
-    "json.loads": {"formats/json_files.py"},
-    "pickle": {"torch_file.py", "formats/smpl_pickle.py"},  # after a scan of its operations
+    "json.loads": {"files/json_files.py"},
+    "pickle": {"torch_file.py", "files/smpl_pickle.py"},  # after a scan of its operations
     "torch.load": {"torch_file.py"},
     "safetensors.safe_open": {"tensor_file.py"},
     "safetensors.torch.load_file": set(),
@@ -32,20 +32,20 @@ ALLOWED = {
         "training/state.py",
     },
     "PIL.Image.open": {"geometry/pictures.py"},
-    "shutil.rmtree": {"formats/regular_files.py", "capture/launch.py"},  # launch: Blender's own folder
-    "unlink": {"formats/regular_files.py"},
+    "shutil.rmtree": {"files/regular_files.py", "capture/launch.py"},  # launch: Blender's own folder
+    "unlink": {"files/regular_files.py"},
     "os.unlink": {"backend/child_process.py"},  # a temporary file while it is open
     "os.remove": set(),
-    "read_text": {"formats/whole_files.py", "backend/packages.py", "machine.py"},  # facts about the machine
+    "read_text": {"files/whole_files.py", "backend/packages.py", "machine.py"},  # facts about the machine
     "read_bytes": set(),
     "resolve": set(),  # raises RuntimeError for links in a circle: `real_path` does not
     "open": {
-        "formats/regular_files.py",
+        "files/regular_files.py",
         "backend/child_process.py",
         "capture/coco.py",
         "capture/dataset.py",
         "evaluation/gallery.py",
-        "formats/picture_files.py",
+        "files/picture_files.py",
         "formats/poses/files.py",
         "scene/human_file.py",
         "backend/packages.py",

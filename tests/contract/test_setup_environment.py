@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import psutil
 import pytest
-from blender_primdiffusion.formats.whole_files import write_atomically
+from blender_primdiffusion.files.whole_files import write_atomically
 from support.errors import refused
 from support.fake_child import FAKE_CHILD
 from tiny_packages import own_index, served, until, with_this_pip, write_lock, write_packages, write_wheel

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from primdiffusion.formats.tensor_layout import DTYPES, LARGEST_HEADER, MOST_DIMENSIONS
-from primdiffusion.tensor_file import TensorFile
+from primdiffusion.files.tensor_file import TensorFile
+from primdiffusion.files.tensor_layout import DTYPES, LARGEST_HEADER, MOST_DIMENSIONS
 
 from blender_primdiffusion.scene import human_file
 from blender_primdiffusion.ui.attributes import read_vocabulary

@@ -7,7 +7,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from primdiffusion.render import cuda, cuda_scene
+from primdiffusion.render.cuda import march as cuda
+from primdiffusion.render.cuda import scene as cuda_scene
 
 HOPPER = 90
 POINTER = {"f": "*fp32", "i": "*i32", "l": "*i64", "d": "*fp64"}
@@ -26,7 +27,7 @@ class Launch(NamedTuple):
 
 def forward(sets: int, gap: int, *, index_order: bool = False) -> Launch:
     """The marcher's forward kernel, for this many sets of boxes and this gap."""
-    from primdiffusion.render import triton_march
+    from primdiffusion.render.cuda import triton_march
 
     shapes = cuda_scene.Shapes()
     more = {"TILES_OF_LIST": 1, "HAS_SPAN": False, "KEEP": True, "WHOLE": True, "INDEX_ORDER": index_order}
@@ -37,7 +38,7 @@ def forward(sets: int, gap: int, *, index_order: bool = False) -> Launch:
 
 def backward(*, index_order: bool = False) -> Launch:
     """The marcher's backward kernel."""
-    from primdiffusion.render import triton_adjoint
+    from primdiffusion.render.cuda import triton_adjoint
 
     shapes = cuda_scene.Shapes()
     constants = {"HAS_SPAN": False, "INDEX_ORDER": index_order}
@@ -48,7 +49,7 @@ def backward(*, index_order: bool = False) -> Launch:
 
 def small() -> Iterator[Launch]:
     """The others, also where an argument is 1 or absent: Triton compiles such kernels anew."""
-    from primdiffusion.render import triton_adjoint, triton_boxes, triton_lists, triton_march
+    from primdiffusion.render.cuda import triton_adjoint, triton_boxes, triton_lists, triton_march
 
     place = {"STRIDES": (4, 2, 1), "TILE_WIDTH": 8, "TILE_HEIGHT": 4, "BIN": 8}
     place |= {"BLOCK_WIDTH": 8, "BLOCK_HEIGHT": 4, "LANES": cuda_scene.LANES}

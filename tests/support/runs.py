@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from primdiffusion.failures import describe
+from primdiffusion.runtime.failures import describe
 from safetensors.torch import load_file
 
 _TESTS = Path(__file__).parents[1]

@@ -33,8 +33,8 @@ import pytest
 PROGRAMS = ("primdiffusion", "blender_primdiffusion")
 UNIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
 BY_PLATFORM = {
-    ("primdiffusion.machine", "resource"),
-    *((f"{program}.formats.whole_files", "fcntl") for program in PROGRAMS),
+    ("primdiffusion.runtime.machine", "resource"),
+    *((f"{program}.files.whole_files", "fcntl") for program in PROGRAMS),
 }
 """Imports that stand below `if sys.platform != "win32"`, which pyright checks (`make types`)."""
 UNIX_OS = {

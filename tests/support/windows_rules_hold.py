@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from primdiffusion.formats import whole_files
+from primdiffusion.files import whole_files
 
 import blender_primdiffusion.backend.client as client_module
 
@@ -82,7 +82,7 @@ def test_our_modules_see_the_modules_of_windows():
 
 def test_text_without_an_encoding_is_an_error_in_our_modules(tmp_path):
     (tmp_path / "a").write_bytes(b"x")
-    read = {"__builtins__": vars(whole_files)["__builtins__"], "__name__": "primdiffusion.formats.whole_files"}
+    read = {"__builtins__": vars(whole_files)["__builtins__"], "__name__": "primdiffusion.files.whole_files"}
     for line in ("open(path)", "Path(path).read_text()"):
         with pytest.raises(EncodingWarning):
             exec(f"from pathlib import Path\n{line}", {**read, "path": str(tmp_path / "a")})

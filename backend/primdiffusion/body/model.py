@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from primdiffusion.formats.arrays import read_arrays
+from primdiffusion.files.arrays import read_arrays
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.rotation import axis_angle_to_matrix, polar

@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from primdiffusion.body.model import BodyModel, J
-from primdiffusion.failures import optional_package
-from primdiffusion.formats.arrays import all_finite, array_names, read_arrays, read_npy
-from primdiffusion.formats.regular_files import FileContent, FileError, read_regular
-from primdiffusion.formats.smpl_pickle import as_array, read_pickle
+from primdiffusion.files.arrays import all_finite, array_names, read_arrays, read_npy
+from primdiffusion.files.regular_files import FileContent, FileError, read_regular
+from primdiffusion.files.smpl_pickle import as_array, read_pickle
+from primdiffusion.runtime.failures import optional_package
 
 LARGEST_BODY_FILE = 512 * 2**20
 """SMPL with 300 shape components takes 250 MB."""

@@ -36,13 +36,13 @@ from primdiffusion.capture.composed import (
 )
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import joints_from_body, joints_of
+from primdiffusion.files.picture_files import DEPTH_UNIT
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.whole_files import staged
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.formats.group_places import MOST
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.whole_files import staged
 
 ANNOTATIONS_FILE, TABLE_FILE = "annotations.json", "images.csv"
 PASSES = ("img", "mask", "depth")

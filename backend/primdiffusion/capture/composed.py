@@ -14,10 +14,10 @@ from PIL import Image
 
 from primdiffusion.capture.reader import Subject
 from primdiffusion.capture.render import JPEG_QUALITY
+from primdiffusion.files.picture_files import DEPTH_UNIT
+from primdiffusion.files.regular_files import as_file_error
+from primdiffusion.files.whole_files import replacing
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.formats.regular_files import as_file_error
-from primdiffusion.formats.whole_files import replacing
 from primdiffusion.geometry.pictures import opened_picture
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, BYTE_STEPS, LINEAR_OF_BYTE
 

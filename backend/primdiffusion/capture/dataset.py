@@ -28,12 +28,12 @@ from torch.utils.data import DataLoader, Dataset, Sampler, get_worker_info
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.reader import Captures, Subject, Window, as_camera, full_window, resample, windowed_view
+from primdiffusion.files.arrays import map_npy
+from primdiffusion.files.json_files import LARGEST_BYTES, read_json
+from primdiffusion.files.regular_files import FileError, read_regular
+from primdiffusion.files.whole_files import replacing, write_atomically
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.arrays import map_npy
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.formats.json_files import LARGEST_BYTES, read_json
-from primdiffusion.formats.regular_files import FileError, read_regular
-from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 

@@ -16,8 +16,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from primdiffusion.failures import optional_package
-from primdiffusion.formats.json_files import parse_json
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.runtime.failures import optional_package
 
 LIST, ONLY = ("--list", "--progress", "json"), ("--progress", "none", "--only")
 """Options that a renderer must support: list its subjects as {"line": NAME} on marked lines, and render one."""

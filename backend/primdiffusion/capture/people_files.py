@@ -18,10 +18,10 @@ from jaxtyping import Float, Int, UInt8
 from numpy.typing import NDArray
 
 from primdiffusion.body.model import BodyModel, J, default_body
-from primdiffusion.formats.arrays import LARGEST_NUMBER
+from primdiffusion.files.arrays import LARGEST_NUMBER
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import FileError, as_file_error, read_regular
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import FileError, as_file_error, read_regular
 from primdiffusion.geometry.pictures import MOST_PIXELS, decoded, decoded_bytes, opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart

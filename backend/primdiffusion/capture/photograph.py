@@ -21,8 +21,8 @@ from scipy import ndimage
 from torch import Tensor
 
 from primdiffusion.capture.reader import Window, resample
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.pictures import decoded, is_indexed, label_values, opened_picture
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, LINEAR_OF_BYTE
 

@@ -10,10 +10,10 @@ import torch
 from jaxtyping import Float
 
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.body.pose_file import read_motion
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.poses.built_in import built_in_vectors
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
-from primdiffusion.pose_file import read_motion
 
 MOST_CANDIDATES = 2000
 """Frames to choose from; longer motions are subsampled evenly."""

@@ -19,12 +19,12 @@ from torch import Tensor
 from primdiffusion.body.model import BodyPose
 from primdiffusion.capture.people_files import SUBJECT_NAME
 from primdiffusion.capture.smpl_parameters import SmplParameters, read_smpl
+from primdiffusion.files.arrays import all_finite
+from primdiffusion.files.json_files import read_json
+from primdiffusion.files.picture_files import DEPTH_UNIT
+from primdiffusion.files.regular_files import FileError, open_regular
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.arrays import all_finite
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.picture_files import DEPTH_UNIT
-from primdiffusion.formats.regular_files import FileError, open_regular
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.pictures import (
     LARGEST_FILE,

@@ -23,19 +23,20 @@ from PIL import Image
 from primdiffusion.body.model import BodyModel, BodyPose
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.poses import turned
-from primdiffusion.failures import describe
-from primdiffusion.formats import capture_layout, picture_files
+from primdiffusion.files import picture_files
+from primdiffusion.files.regular_files import check_unlinked
+from primdiffusion.files.whole_files import replacing, write_atomically
+from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig, View, bounding_sphere
 from primdiffusion.formats.capture_repair import is_complete_view, list_subjects
 from primdiffusion.formats.group_places import extent, first_frames, stand_together
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.regular_files import check_unlinked
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
-from primdiffusion.formats.whole_files import replacing, write_atomically
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
 from primdiffusion.raster.multisample import RenderedView
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
-from primdiffusion.worker_process import begin_worker
+from primdiffusion.runtime.failures import describe
+from primdiffusion.runtime.worker_process import begin_worker
 
 JPEG_QUALITY = 95
 

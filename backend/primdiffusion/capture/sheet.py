@@ -11,10 +11,10 @@ from PIL import Image, ImageDraw
 
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
 from primdiffusion.capture.reader import Captures, Subject
-from primdiffusion.formats.arrays import read_numbers
+from primdiffusion.files.arrays import read_numbers
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.whole_files import replacing
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.whole_files import replacing
 
 BONE, JOINT = (255, 255, 255), (255, 64, 64)
 

@@ -10,11 +10,11 @@ import torch
 from jaxtyping import Float32
 
 from primdiffusion.body.model import BodyPose, J
-from primdiffusion.formats.arrays import all_finite, read_numbers, read_pickled_bytes
+from primdiffusion.files.arrays import all_finite, read_numbers, read_pickled_bytes
+from primdiffusion.files.regular_files import FileError, as_file_error
+from primdiffusion.files.smpl_pickle import array_of_objects, as_array, load_restricted
 from primdiffusion.formats.capture_layout import SMPL_FILE, SMPL_FOLDER, SMPL_PLAIN_FILE
 from primdiffusion.formats.poses.motion import check_motion_size
-from primdiffusion.formats.regular_files import FileError, as_file_error
-from primdiffusion.formats.smpl_pickle import array_of_objects, as_array, load_restricted
 
 KEYS = ("global_orient", "body_pose", "betas", "transl")
 

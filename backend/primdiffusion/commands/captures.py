@@ -13,6 +13,7 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.body.pose_file import read_motion
 from primdiffusion.capture.coco import ANNOTATIONS_FILE, TABLE_FILE, write_coco
 from primdiffusion.capture.composed import Backgrounds
 from primdiffusion.capture.dataset import open_pack, pack
@@ -24,14 +25,13 @@ from primdiffusion.capture.sheet import draw_sheet
 from primdiffusion.captured_humans import PASSES as PASSES_OF_VOLUMES
 from primdiffusion.captured_humans import find_subjects, is_generated, read_subject, renderer_of
 from primdiffusion.evaluation.images import folder_pictures
+from primdiffusion.files.regular_files import printable
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Arrangement, Rig
 from primdiffusion.formats.capture_repair import repair, subject_folders, verify
 from primdiffusion.formats.group_places import MOST
-from primdiffusion.formats.regular_files import printable
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.formats.schema import Range, check
-from primdiffusion.pose_file import read_motion
 from primdiffusion.training.captured_people import read_cards
 
 DESCRIPTION = "Multi-view captures, to train on."

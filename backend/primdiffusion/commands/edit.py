@@ -22,6 +22,7 @@ from primdiffusion.editing.interpolate import interpolate
 from primdiffusion.editing.regions import read_weights, region_from_weights, region_of
 from primdiffusion.editing.transfer import transfer_garment, transfer_texture
 from primdiffusion.editing.vary import vary
+from primdiffusion.files.whole_files import staged
 from primdiffusion.formats.answers import HumanAnswer
 from primdiffusion.formats.requests import (
     EditRequest,
@@ -31,10 +32,9 @@ from primdiffusion.formats.requests import (
     TransferRequest,
     VaryRequest,
 )
-from primdiffusion.formats.whole_files import staged
 from primdiffusion.human import Human
 from primdiffusion.human_file import load_human
-from primdiffusion.machine import peak_memory_gb
+from primdiffusion.runtime.machine import peak_memory_gb
 
 Sampling = Callable[[Decode], AbstractContextManager[OnStep]]
 """Reports the steps of a sampler, with previews of the humans that the function makes of its x0 guesses."""

@@ -12,9 +12,9 @@ import tyro
 from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.body.pose_file import read_motion
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
-from primdiffusion.device import best_device
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import load_encoder
@@ -64,13 +64,13 @@ from primdiffusion.evaluation.tables import (
     resolution_of,
     table,
 )
+from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.formats.requests import Count, Sampling
 from primdiffusion.formats.schema import Range, check
-from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.human import generate, place
 from primdiffusion.people.assets import open_assets
-from primdiffusion.pose_file import read_motion
 from primdiffusion.render.march import MarchSettings
+from primdiffusion.runtime.device import best_device
 from primdiffusion.training.latents import split_people
 from primdiffusion.training.stored_people import find_people, read_person
 from primdiffusion.version import __version__

@@ -7,19 +7,19 @@ from pathlib import Path
 
 import torch
 
+from primdiffusion.body.pose_file import read_pose
 from primdiffusion.commands.options import ExportCommand
 from primdiffusion.commands.output import FILES, write_human
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
+from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.export.gaussians import gaussians_of, write_gaussians
 from primdiffusion.export.proxy import ARRAYS, TEXTURE, mesh_proxy, write_proxy_arrays, write_proxy_glb, write_proxy_obj
+from primdiffusion.files.whole_files import staged
 from primdiffusion.formats.answers import GaussiansAnswer, HumanAnswer, ProxyAnswer
 from primdiffusion.formats.requests import GaussiansRequest, OpenHumanRequest, ProxyRequest
-from primdiffusion.formats.whole_files import staged
 from primdiffusion.human import Human, place_on_floor, place_skinned
 from primdiffusion.human_file import load_human
-from primdiffusion.pose_file import read_pose
-from primdiffusion.reshaping import reshaped
 
 
 def proxy(request: ProxyRequest, session: Session, report: ReportProgress) -> ProxyAnswer:

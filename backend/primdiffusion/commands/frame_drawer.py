@@ -16,20 +16,20 @@ from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
 from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
-from primdiffusion.failures import PictureOutOfMemory, out_of_memory
+from primdiffusion.editing.reshaping import reshaped
+from primdiffusion.files.arrays import read_numbers
+from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.answers import DrawAnswer
-from primdiffusion.formats.arrays import read_numbers
-from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.formats.requests import DrawRequest
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.human import Human, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import Anchors, default_anchors
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render import cuda
+from primdiffusion.render.cuda import march as cuda
 from primdiffusion.render.march import MarchSettings
 from primdiffusion.render.solids import Solids
-from primdiffusion.reshaping import reshaped
+from primdiffusion.runtime.failures import PictureOutOfMemory, out_of_memory
 
 CHANNELS = 5
 """Channels of a frame: RGBA and depth."""

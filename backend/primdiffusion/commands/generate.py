@@ -28,13 +28,13 @@ from primdiffusion.diffusion.samplers import RELEASED_END, SamplerStep
 from primdiffusion.diffusion.schedule import CLEAN
 from primdiffusion.editing.edit import with_payload
 from primdiffusion.editing.vary import vary_batch
+from primdiffusion.files.regular_files import check_unlinked
+from primdiffusion.files.whole_files import staged, staged_together
 from primdiffusion.formats.answers import HumanAnswer, VariationFiles, VariationsAnswer
-from primdiffusion.formats.regular_files import check_unlinked
 from primdiffusion.formats.requests import GenerateRequest, VariationsRequest
-from primdiffusion.formats.whole_files import staged, staged_together
 from primdiffusion.human import Human, generate_batch, people_of
 from primdiffusion.human_file import load_human
-from primdiffusion.machine import peak_memory_gb
+from primdiffusion.runtime.machine import peak_memory_gb
 
 
 def generate(request: GenerateRequest, session: Session, report: ReportProgress) -> HumanAnswer:

@@ -17,8 +17,8 @@ from primdiffusion.body.model import BodyModel
 from primdiffusion.capture.smpl_parameters import read_smpl
 from primdiffusion.diffusion.checkpoint import file_hash, under
 from primdiffusion.diffusion.model import BETAS
-from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.whole_files import replacing, write_atomically
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.whole_files import replacing, write_atomically
 from primdiffusion.primitives.anchors import grid_points_outside
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files
 from primdiffusion.primitives.primitives import K

@@ -17,7 +17,7 @@ from primdiffusion.encoder.model import default_encoder
 from primdiffusion.formats.answers import AttributesAnswer
 from primdiffusion.formats.requests import AttributesRequest
 from primdiffusion.human_file import NoPersonError, format_version, load_human
-from primdiffusion.machine import memory
+from primdiffusion.runtime.machine import memory
 from primdiffusion.version import __version__
 
 

@@ -8,17 +8,17 @@ import time
 
 import torch
 
+from primdiffusion.body.pose_file import read_pose
 from primdiffusion.commands.progress import Pace, ReportProgress
 from primdiffusion.commands.session import Session
+from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.export.merged_file import load_openvdb, upright_grid, write_grid_npz, write_grid_vdb
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.answers import MergeAnswer, MergeFramesAnswer
 from primdiffusion.formats.requests import MergeFramesRequest, MergeRequest, PosedPerson
-from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import Human, place_on_floor, place_skinned
 from primdiffusion.human_file import load_human
-from primdiffusion.pose_file import read_pose
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.reshaping import reshaped
 
 
 def merge(request: MergeRequest, session: Session, report: ReportProgress) -> MergeAnswer:

@@ -24,19 +24,19 @@ from torch import Tensor
 from primdiffusion.body.model import BodyPose
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.diffusion.samplers import SamplerStep
+from primdiffusion.files.regular_files import remove_file
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.regular_files import remove_file
 from primdiffusion.formats.requests import Compositing
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import save_body, save_human
 from primdiffusion.primitives.primitives import K, Payload, Primitives, S
-from primdiffusion.render.cpu_compiled import is_compiled
-from primdiffusion.render.cpu_forward import march_tiles
+from primdiffusion.render.cpu.compiled import is_compiled
+from primdiffusion.render.cpu.forward import march_tiles
 from primdiffusion.render.image import Background, depth_to_png, rgba_to_png
 from primdiffusion.render.march import RELEASED, Rendering, march
-from primdiffusion.worker_process import end_with_parent
+from primdiffusion.runtime.worker_process import end_with_parent
 
 INTERVAL_S = 0.4
 """Seconds between two previews."""

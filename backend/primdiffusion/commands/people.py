@@ -15,8 +15,8 @@ from primdiffusion.commands.options import (
 )
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
-from primdiffusion.folder_lock import lock_folder
-from primdiffusion.formats.regular_files import printable
+from primdiffusion.files.folder_lock import lock_folder
+from primdiffusion.files.regular_files import printable
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people, unknown_licences
 from primdiffusion.people.payloads import make_payloads

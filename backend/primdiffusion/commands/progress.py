@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from tqdm import tqdm
 
-from primdiffusion.formats.regular_files import printable
+from primdiffusion.files.regular_files import printable
 
 if TYPE_CHECKING:
     from primdiffusion.diffusion.samplers import SamplerStep

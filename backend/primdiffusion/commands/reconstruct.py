@@ -24,17 +24,17 @@ from primdiffusion.commands.output import FILES, write_human
 from primdiffusion.commands.progress import ReportProgress, print_warnings
 from primdiffusion.commands.session import Session
 from primdiffusion.encoder.model import EncoderModel
+from primdiffusion.files.whole_files import staged
 from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer
 from primdiffusion.formats.requests import FitPostureRequest, Pictures, ReconstructRequest
-from primdiffusion.formats.whole_files import staged
-from primdiffusion.from_pictures import POSTURE_STEPS, person_in_pictures
 from primdiffusion.human import Human
 from primdiffusion.human_file import load_human
-from primdiffusion.machine import peak_memory_gb
-from primdiffusion.posture.file import write_posture
-from primdiffusion.reconstruction import reconstruct as reconstruct_human
-from primdiffusion.reconstruction import steps_of
+from primdiffusion.reconstruction.from_captures import reconstruct as reconstruct_human
+from primdiffusion.reconstruction.from_captures import steps_of
+from primdiffusion.reconstruction.from_pictures import POSTURE_STEPS, person_in_pictures
+from primdiffusion.reconstruction.posture_file import write_posture
 from primdiffusion.render.descent import DescentSettings
+from primdiffusion.runtime.machine import peak_memory_gb
 from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
 
 STAGES = 4

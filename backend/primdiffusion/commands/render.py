@@ -8,18 +8,18 @@ from pathlib import Path
 
 import torch
 
+from primdiffusion.body.pose_file import pose_from_numbers, read_pose
 from primdiffusion.commands.frame_drawer import FrameDrawer
 from primdiffusion.commands.output import decoded, march_encoded
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.drawing.draw import draw as draw_scene
 from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.answers import DrawAnswer, RenderAnswer
 from primdiffusion.formats.requests import DrawRequest, RenderRequest
-from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.human import body_of, framing, place
 from primdiffusion.human_file import load_human
-from primdiffusion.pose_file import pose_from_numbers, read_pose
 from primdiffusion.render.image import depth_to_png, rgba_to_png
 from primdiffusion.render.march import RELEASED, MarchSettings, march
 

@@ -8,10 +8,10 @@ from typing import Any, TypeVar
 
 import torch
 
-from primdiffusion.device import best_device, device_info
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.encoder.model import EncoderModel, load_encoder
+from primdiffusion.runtime.device import best_device, device_info
 
 T = TypeVar("T")
 

@@ -16,7 +16,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from primdiffusion import tensor_file
 from primdiffusion.body.measures import LARGEST_BETA
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec, ReleasedSlab, WholeSlab
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
@@ -25,11 +24,12 @@ from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior, check_codec, check_parts
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
-from primdiffusion.formats.arrays import LARGEST_NUMBER
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import FileError, as_file_error, open_regular, read_regular
+from primdiffusion.files import tensor_file
+from primdiffusion.files.arrays import LARGEST_NUMBER
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import FileError, as_file_error, open_regular, read_regular
+from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.formats.schema import Open, Range, read
-from primdiffusion.formats.whole_files import write_atomically
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, find_body_setup

@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.formats.arrays import LARGEST_NUMBER
+from primdiffusion.files.arrays import LARGEST_NUMBER
 
 Attributes = Mapping[str, str | float]
 """Requested attributes of a person: {"sex": "female", "height": 1.7}."""

@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from primdiffusion.body.measures import LARGEST_BETA
-from primdiffusion.device import GRID_THREADS, SLAB_THREADS, each_with_fixed_threads, fixed_threads
 from primdiffusion.diffusion.codec import VALUES, CellCodec, Codec, LinearCodec
 from primdiffusion.diffusion.conditioning import NOTHING, Attributes, AttributeVocabulary
 from primdiffusion.diffusion.denoiser import PersonDenoiser
@@ -22,6 +21,7 @@ from primdiffusion.formats import requests
 from primdiffusion.geometry.records import TensorRecord, check_shapes
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import GRID, K, Payload
+from primdiffusion.runtime.device import GRID_THREADS, SLAB_THREADS, each_with_fixed_threads, fixed_threads
 
 BETAS = 10
 """Shape coefficients of a sampled body."""

@@ -12,8 +12,8 @@ from primdiffusion.diffusion.checkpoint import FORMAT, WEIGHTS, read_card, read_
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.schedule import schedule_name
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.whole_files import staged
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.whole_files import staged
 
 CONFIG, CARD = "config.json", "README.md"
 _LICENCE = re.compile(r"[A-Za-z0-9.+-]+", re.ASCII)

@@ -13,7 +13,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddpm_step, gaussian_noise
 from primdiffusion.diffusion.schedule import CLEAN, Schedule
@@ -32,6 +31,7 @@ from primdiffusion.editing.edit import (
 from primdiffusion.editing.regions import check_region, name_region
 from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
+from primdiffusion.runtime.device import on_fixed_threads
 
 JUMP = 1
 """Steps of each jump back to a higher noise level. Lugmayr et al. jump 10 of 250 steps; with a few dozen longer steps,

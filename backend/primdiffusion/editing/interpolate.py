@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.samplers import Denoise, SamplerStep, ddim
 from primdiffusion.diffusion.schedule import Schedule
@@ -29,6 +28,7 @@ from primdiffusion.editing.edit import (
 from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
 from primdiffusion.primitives.primitives import Payload
+from primdiffusion.runtime.device import on_fixed_threads
 
 
 @on_fixed_threads

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, default_body
-from primdiffusion.formats.arrays import read_numbers
+from primdiffusion.files.arrays import read_numbers
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import PARTS, SIDED_PARTS, WHOLE_PARTS
 from primdiffusion.geometry.surface import surface_points

@@ -7,7 +7,6 @@ from types import MappingProxyType
 
 import torch
 
-from primdiffusion.device import on_fixed_threads
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.reading import unfollowed
 from primdiffusion.diffusion.samplers import ddim, gaussian_noise
@@ -26,6 +25,7 @@ from primdiffusion.editing.edit import (
 )
 from primdiffusion.formats import requests
 from primdiffusion.human import Human, made_by
+from primdiffusion.runtime.device import on_fixed_threads
 
 
 def vary(

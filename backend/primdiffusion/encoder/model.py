@@ -28,12 +28,12 @@ from primdiffusion.encoder.config import EncoderConfig, config_from_json
 from primdiffusion.encoder.network import Encoder, motion_of
 from primdiffusion.encoder.texture import eroded, unproject_texture
 from primdiffusion.encoder.unproject import Unprojected, extents_of_hull, unproject_texels, unproject_voxels
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.tensor_file import load_network, save
+from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.primitives import Frames, K, Payload, Primitives
-from primdiffusion.tensor_file import load_network, save
 
 FORMAT_VERSION = 1
 

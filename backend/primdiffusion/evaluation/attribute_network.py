@@ -16,11 +16,11 @@ from jaxtyping import Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from primdiffusion import tensor_file
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.evaluation.gallery import PORTRAITS
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error
+from primdiffusion.files import tensor_file
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import as_file_error
 
 FEATURES = 96
 WIDTHS = (16, 32, 64, 96, 96)

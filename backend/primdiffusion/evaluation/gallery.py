@@ -17,10 +17,10 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from primdiffusion.evaluation.images import image_over
-from primdiffusion.formats.arrays import read_arrays
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error
-from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.files.arrays import read_arrays
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import as_file_error
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.people.assets import Assets

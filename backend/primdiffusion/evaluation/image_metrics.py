@@ -18,8 +18,8 @@ from primdiffusion.evaluation.pretrained_networks import (
     load_matching,
     read_weights,
 )
-from primdiffusion.failures import optional_package
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.runtime.failures import optional_package
 
 WINDOW = 11
 """Width of SSIM's Gaussian window, pixels."""

@@ -16,10 +16,10 @@ from torch import Tensor
 from torch.nn import functional
 
 from primdiffusion.body.model import BodyPose, PosedBody, default_body
-from primdiffusion.formats.arrays import read_npy
+from primdiffusion.files.arrays import read_npy
+from primdiffusion.files.json_files import read_json
+from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import as_file_error
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.pictures import opened_picture, strips
 from primdiffusion.geometry.srgb import encode_srgb

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from primdiffusion.evaluation.images import SIDE, TestImage
-from primdiffusion.failures import optional_package
+from primdiffusion.runtime.failures import optional_package
 
 Normalisation = Literal["imagenet", "half"]
 """Mean and standard deviation of a network's inputs: of ImageNet (RTMPose, ViTPose, MiDaS, Depth Anything), or 0.5 and

@@ -17,12 +17,12 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
-from primdiffusion import tensor_file
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.evaluation.attribute_network import attribute_heads, detail_energies
 from primdiffusion.evaluation.images import JOINTS
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error
+from primdiffusion.files import tensor_file
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import as_file_error
 
 INPUT = 128
 """Width and height of what the network sees, pixels: pictures are averaged down to it."""

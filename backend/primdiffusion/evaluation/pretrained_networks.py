@@ -16,8 +16,8 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from primdiffusion import tensor_file, torch_file
-from primdiffusion.formats.regular_files import FileError, as_file_error
+from primdiffusion.files import tensor_file, torch_file
+from primdiffusion.files.regular_files import FileError, as_file_error
 
 
 @dataclasses.dataclass(frozen=True)

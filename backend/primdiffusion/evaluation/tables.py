@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from primdiffusion.device import best_device
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
 from primdiffusion.evaluation.images import SIDE, TestImage
 from primdiffusion.evaluation.markdown import markdown_table
@@ -35,6 +34,7 @@ from primdiffusion.evaluation.pose_depth_network import (
 from primdiffusion.evaluation.pretrained_networks import ClipVision, Inception
 from primdiffusion.human import Human, framing, place
 from primdiffusion.render.march import MarchSettings, march
+from primdiffusion.runtime.device import best_device
 
 BATCH = 16
 SMALLEST = 8

@@ -19,8 +19,8 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from primdiffusion.export.surface import depth_below
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.requests import GaussiansRequest
-from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives

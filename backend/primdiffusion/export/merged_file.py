@@ -8,11 +8,11 @@ from types import ModuleType
 import numpy as np
 import torch
 
-from primdiffusion.failures import optional_package
-from primdiffusion.formats.arrays import write_deflated
+from primdiffusion.files.arrays import write_deflated
 from primdiffusion.formats.requests import VOXEL
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.merge import Merged, merge
+from primdiffusion.runtime.failures import optional_package
 
 Z_UP = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 """Blender's axes from the backend's; applied before voxelising, because a grid cannot be rotated without resampling."""

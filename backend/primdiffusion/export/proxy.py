@@ -16,9 +16,9 @@ from torch import Tensor
 
 from primdiffusion.export.simplify import simplified_and_unwrapped
 from primdiffusion.export.surface import OuterSurface, outside_surface
+from primdiffusion.files.whole_files import staged, written_whole
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import VOXEL, ProxySettings
-from primdiffusion.formats.whole_files import staged, written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart, vertex_normals
 from primdiffusion.human import Human, body_of, place, sole_height
@@ -27,7 +27,7 @@ from primdiffusion.primitives.anchors import anchor_skin_weights
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.uv_atlas import rasterise_uv
 from primdiffusion.render.merge import Merged, merge
-from primdiffusion.worker_process import run_in_process
+from primdiffusion.runtime.worker_process import run_in_process
 
 OUTSIDE = 0.008
 """Start of a texel's ray: distance outside the surface, metres."""

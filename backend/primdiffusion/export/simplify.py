@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray as Array
 
-from primdiffusion.failures import optional_package
+from primdiffusion.runtime.failures import optional_package
 
 SEAM = 4
 """Texels between charts."""

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import read_arrays
+from ..files.arrays import read_arrays
 
 GRID = 32
 """Primitives along a side of the UV grid; primitive k is at row k // GRID, column k % GRID."""

@@ -39,12 +39,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .arrays import read_numbers
+from ..files.arrays import read_numbers
+from ..files.json_files import parse_json, read_json
+from ..files.regular_files import FileError, check_inside, open_regular, read_regular, remove_file
+from ..files.whole_files import remove_abandoned, temporary_name, write_atomically
 from .camera_rig import View
-from .json_files import parse_json, read_json
-from .regular_files import FileError, check_inside, open_regular, read_regular, remove_file
 from .requests import LAYOUTS
-from .whole_files import remove_abandoned, temporary_name, write_atomically
 
 FORMAT, VERSION = "primdiffusion-captures", 1
 ENDINGS = {

@@ -6,6 +6,9 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from ..files.picture_files import is_whole_picture
+from ..files.regular_files import FileError, check_inside, remove_file
+from ..files.whole_files import is_abandoned
 from .capture_layout import (
     COMPLETE_FILE,
     DATASET_FILE,
@@ -18,9 +21,6 @@ from .capture_layout import (
     read_list,
     write_list,
 )
-from .picture_files import is_whole_picture
-from .regular_files import FileError, check_inside, remove_file
-from .whole_files import is_abandoned
 
 MOST_PICTURES = 1_000_000
 """Of a subject."""

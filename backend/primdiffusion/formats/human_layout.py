@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .json_files import parse_json, parse_message
+from ..files.json_files import parse_json, parse_message
 from .schema import FieldError, Open, Range, read
 
 COMPACT_VERSION = 3

@@ -9,8 +9,8 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+from ..files.regular_files import real_path
 from .joints import JOINT_NAMES
-from .regular_files import real_path
 from .schema import Ending, FieldError, Length, Option, Range, Shape, Slider
 
 Sampler = Literal["ddim", "dpmpp_2m", "ddpm"]

@@ -26,7 +26,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
-from .json_files import LARGEST_INTEGER
+from ..files.json_files import LARGEST_INTEGER
 
 Record = TypeVar("Record")
 Names = tuple[str | int, ...]

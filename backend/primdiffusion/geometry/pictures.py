@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from primdiffusion.formats.regular_files import FileError, check_regular, open_regular
+from primdiffusion.files.regular_files import FileError, check_regular, open_regular
 
 MOST_PIXELS = 8192 * 8192
 """Most pixels of a picture: what scans have."""

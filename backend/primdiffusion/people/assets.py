@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import UInt8
 from PIL import Image
 
-from primdiffusion.formats.regular_files import as_file_error, open_regular, read_regular, real_path
+from primdiffusion.files.regular_files import as_file_error, open_regular, read_regular, real_path
 from primdiffusion.geometry.pictures import decoded, opened_picture, strips
 from primdiffusion.people.mhclo import ObjMesh, Proxy, read_pair
 

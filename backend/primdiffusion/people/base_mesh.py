@@ -18,7 +18,7 @@ import importlib.resources
 import numpy as np
 from jaxtyping import Float, Int
 
-from primdiffusion.formats.arrays import array_names, read_arrays
+from primdiffusion.files.arrays import array_names, read_arrays
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -23,17 +23,17 @@ import torch
 
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.people_files import LARGEST_GLB
+from primdiffusion.files.json_files import read_json
+from primdiffusion.files.regular_files import FileError, as_file_error, read_regular, remove_folder
+from primdiffusion.files.whole_files import remove_abandoned, temporary_name, write_atomically
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import FileError, as_file_error, read_regular, remove_folder
 from primdiffusion.formats.requests import Count, Seed, check_seed
 from primdiffusion.formats.schema import Checked
-from primdiffusion.formats.whole_files import remove_abandoned, temporary_name, write_atomically
 from primdiffusion.people.assets import UNKNOWN, Assets, licence_of
 from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.gltf import Skeleton, glb
 from primdiffusion.people.person import Person, make_person
-from primdiffusion.worker_process import each
+from primdiffusion.runtime.worker_process import each
 
 FORMAT, VERSION = "primdiffusion-people", 1
 MANIFEST, GLB, CARD = "manifest.json", "person.glb", "person.json"

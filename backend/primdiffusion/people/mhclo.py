@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from primdiffusion.formats.regular_files import FileError, as_file_error, read_regular
+from primdiffusion.files.regular_files import FileError, as_file_error, read_regular
 
 LARGEST_TEXT = 64 * 2**20
 """Bytes of a file."""

@@ -32,9 +32,9 @@ from numpy import ndarray
 from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.formats.arrays import read_arrays, write_deflated
+from primdiffusion.files.arrays import read_arrays, write_deflated
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.requests import Making
-from primdiffusion.formats.whole_files import written_whole
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh
@@ -46,7 +46,7 @@ from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_fie
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.raster.rasterise import rasterise_colourings
 from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_colours, fit_payload
-from primdiffusion.worker_process import each
+from primdiffusion.runtime.worker_process import each
 
 VARIANT_STRIDE = 1 << 32
 """Variant j of seed s is coloured with seed s + j * VARIANT_STRIDE."""

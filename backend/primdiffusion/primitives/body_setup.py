@@ -17,8 +17,8 @@ from torch import Tensor
 
 from primdiffusion.body.model import BodyModel
 from primdiffusion.body.smpl_files import LARGEST_BODY_FILE, load_body, read_body_file
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import (
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import (
     FileContent,
     FileError,
     check_regular,

@@ -24,12 +24,12 @@ from primdiffusion.diffusion.unet import UNetConfig
 from primdiffusion.encoder.config import RELEASED as RELEASED_ENCODER
 from primdiffusion.encoder.model import EncoderModel, save_encoder
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.files.tensor_file import save
+from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.geometry.surface import surface_points
 from primdiffusion.primitives.anchors import released_half_extent
 from primdiffusion.primitives.body_setup import BodySetup
 from primdiffusion.primitives.slab import RELEASED_FULL_DENSITY
-from primdiffusion.tensor_file import save
 
 SCHEDULE = "sqrt_linear"
 """Name of the released schedule in `SCHEDULES`."""

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from torch import Tensor
 
-from primdiffusion import torch_file
+from primdiffusion.files import torch_file
 
 Fate = Literal["imported", "checked", "dropped"]
 """imported: in the new file; checked: validated, then not needed; dropped: not used by design."""

@@ -18,15 +18,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from primdiffusion.cuda_graph import Recorded
-from primdiffusion.failures import PictureOutOfMemory, out_of_memory
 from primdiffusion.formats.requests import Count, NotNegative, RayStep
 from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.render.cuda.graph import Recorded
 from primdiffusion.render.march import MarchSettings, Rendering, march
+from primdiffusion.runtime.failures import PictureOutOfMemory, out_of_memory
 
 BETAS = (0.7, 0.9)
 """Adam's decay rates; short averages, because a run is some tens or hundreds of steps."""

@@ -11,7 +11,7 @@ from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
-from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.srgb import encode_srgb
 
 Background = tuple[float, float, float]

@@ -28,7 +28,7 @@ from primdiffusion.formats.schema import Checked
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives, S
-from primdiffusion.render.cpu_linear import (
+from primdiffusion.render.cpu.linear import (
     ColourMatrix,
     PictureJacobian,
     add_colours_transposed,

@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from primdiffusion.formats.requests import VOXEL
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
-from primdiffusion.render.cpu_compiled import kernel, on_all_threads, take
+from primdiffusion.render.cpu.compiled import kernel, on_all_threads, take
 
 _HALF_POWER = WINDOW_POWER // 2
 

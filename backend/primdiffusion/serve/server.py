@@ -25,13 +25,13 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
 from primdiffusion.commands import FUNCTIONS, function_of
-from primdiffusion.failures import ErrorDescription, describe, shortened, traceback_of
+from primdiffusion.files.json_files import LARGEST_BYTES, parse_message
+from primdiffusion.files.regular_files import may_be_written, printable
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
-from primdiffusion.formats.json_files import LARGEST_BYTES, parse_message
-from primdiffusion.formats.regular_files import may_be_written, printable
 from primdiffusion.formats.requests import REQUESTS
 from primdiffusion.formats.schema import FieldError, read, written
-from primdiffusion.machine import memory, share_processors
+from primdiffusion.runtime.failures import ErrorDescription, describe, shortened, traceback_of
+from primdiffusion.runtime.machine import memory, share_processors
 from primdiffusion.version import __version__
 
 if TYPE_CHECKING:

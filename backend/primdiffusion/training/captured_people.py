@@ -19,10 +19,9 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.reader import Captures
 from primdiffusion.capture.render import SubjectResult
 from primdiffusion.encoder.model import EncoderModel, betas_of_frames
-from primdiffusion.failures import describe
-from primdiffusion.formats.arrays import read_arrays
-from primdiffusion.formats.json_files import parse_json, read_json
-from primdiffusion.formats.regular_files import as_file_error
+from primdiffusion.files.arrays import read_arrays
+from primdiffusion.files.json_files import parse_json, read_json
+from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.requests import Count, Seed
 from primdiffusion.formats.schema import Checked, Range
 from primdiffusion.human import Human
@@ -30,6 +29,7 @@ from primdiffusion.people.folder import CARD
 from primdiffusion.people.payloads import store_person, voxels_from_payload
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.render.descent import DescentSettings
+from primdiffusion.runtime.failures import describe
 from primdiffusion.training.refine import refine
 from primdiffusion.training.stored_people import read_person
 

@@ -10,8 +10,6 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
-from primdiffusion import tensor_file
-from primdiffusion.device import has_fast_bfloat16
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.diffusion.codec import CellCodec, LinearCodec
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
@@ -19,9 +17,11 @@ from primdiffusion.diffusion.denoiser import PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import DiffusionModel, ShapePrior
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error
-from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.files import tensor_file
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import as_file_error
+from primdiffusion.files.whole_files import write_atomically
+from primdiffusion.runtime.device import has_fast_bfloat16
 from primdiffusion.training.config import PhaseConfig, PriorConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.latents import LatentSet, encode_people, fit_codec_to, vocabulary_of

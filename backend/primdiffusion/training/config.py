@@ -11,8 +11,8 @@ import tyro
 
 from primdiffusion.diffusion.denoiser import DenoiserConfig
 from primdiffusion.diffusion.unet import PAPER, UNetConfig
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.requests import Count, NotNegative, Positive, Share
 from primdiffusion.formats.schema import Checked, Range
 

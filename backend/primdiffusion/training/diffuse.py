@@ -11,10 +11,10 @@ import torch
 import tyro
 from accelerate import PartialState
 
-from primdiffusion.device import device_info
 from primdiffusion.diffusion.checkpoint import file_hash, save_checkpoint
 from primdiffusion.diffusion.codec import VALUES
 from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.runtime.device import device_info
 from primdiffusion.training import loop
 from primdiffusion.training.cells import CellTask, load_base, prepare
 from primdiffusion.training.config import TrainingConfig

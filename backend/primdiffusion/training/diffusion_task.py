@@ -9,12 +9,12 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from primdiffusion.device import has_bfloat16
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import framing, generate_batch, place
 from primdiffusion.render.march import MarchSettings, march
+from primdiffusion.runtime.device import has_bfloat16
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.loop import Task
 from primdiffusion.training.muon import MuonAdamW

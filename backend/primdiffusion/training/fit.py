@@ -21,7 +21,7 @@ from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import psnr
-from primdiffusion.formats.json_files import parse_json
+from primdiffusion.files.json_files import parse_json
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings, march

@@ -24,12 +24,12 @@ from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import EncoderModel, frames_of
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.formats.arrays import read_arrays, write_deflated
-from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.whole_files import written_whole
+from primdiffusion.files.arrays import read_arrays, write_deflated
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import K, Payload, S
-from primdiffusion.reconstruction import targets_of
+from primdiffusion.reconstruction.from_captures import targets_of
 from primdiffusion.render.inverse import InverseSettings, TargetImage, fit_payload, influence
 from primdiffusion.training.fit_losses import RESIDUAL
 

@@ -29,8 +29,8 @@ from torch import Tensor, nn
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from primdiffusion.failures import out_of_memory
-from primdiffusion.formats.json_files import parse_message
+from primdiffusion.files.json_files import parse_message
+from primdiffusion.runtime.failures import out_of_memory
 from primdiffusion.training.config import RunSettings
 from primdiffusion.training.run_folder import PICTURES, Metrics, open_metrics, state_path
 from primdiffusion.training.state import PhaseSettings, TrainingState, adamw, agreed

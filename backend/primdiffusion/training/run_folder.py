@@ -27,11 +27,11 @@ from jaxtyping import Float
 from PIL import Image
 from torch import Tensor
 
-from primdiffusion.failures import optional_package
-from primdiffusion.folder_lock import lock_folder
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error, check_unlinked, open_to_append, read_regular, real_path
-from primdiffusion.formats.whole_files import remove_abandoned, replacing, write_atomically
+from primdiffusion.files.folder_lock import lock_folder
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import as_file_error, check_unlinked, open_to_append, read_regular, real_path
+from primdiffusion.files.whole_files import remove_abandoned, replacing, write_atomically
+from primdiffusion.runtime.failures import optional_package
 from primdiffusion.training.config import RunSettings, check_resumable, to_json
 from primdiffusion.training.state import accelerator_of, saved_step
 from primdiffusion.version import __version__

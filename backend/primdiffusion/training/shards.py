@@ -22,15 +22,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from primdiffusion import tensor_file
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
-from primdiffusion.formats.arrays import LARGEST_NUMBER
-from primdiffusion.formats.json_files import read_json
-from primdiffusion.formats.regular_files import FileError, as_file_error, is_plain_path, open_regular
-from primdiffusion.formats.whole_files import remove_abandoned, staged, write_atomically, written_whole
+from primdiffusion.files import tensor_file
+from primdiffusion.files.arrays import LARGEST_NUMBER
+from primdiffusion.files.json_files import read_json
+from primdiffusion.files.regular_files import FileError, as_file_error, is_plain_path, open_regular
+from primdiffusion.files.tensor_file import TensorFile
+from primdiffusion.files.whole_files import remove_abandoned, staged, write_atomically, written_whole
 from primdiffusion.primitives.primitives import K, S
-from primdiffusion.tensor_file import TensorFile
 from primdiffusion.training.stored_people import PersonDataset, PersonFolder, PersonVariants, attributes_of
 
 INDEX, FORMAT, VERSION = "index.json", "primdiffusion-payloads", 1

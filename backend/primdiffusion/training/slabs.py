@@ -8,13 +8,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from primdiffusion.device import has_fast_bfloat16
 from primdiffusion.diffusion.codec import WholeSlab
 from primdiffusion.diffusion.model import STANDARD_SHAPES, DiffusionModel
 from primdiffusion.diffusion.samplers import gaussian_noise
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
 from primdiffusion.diffusion.unet import SlabUNet
 from primdiffusion.primitives.slab import pack
+from primdiffusion.runtime.device import has_fast_bfloat16
 from primdiffusion.training.config import PhaseConfig, TrainingConfig
 from primdiffusion.training.diffusion_task import DiffusionTask
 from primdiffusion.training.loop import Step

@@ -14,10 +14,10 @@ from accelerate import Accelerator
 from accelerate.utils import InitProcessGroupKwargs
 from torch import Tensor, nn
 
-from primdiffusion import tensor_file
-from primdiffusion.device import best_device
-from primdiffusion.formats.regular_files import as_file_error
-from primdiffusion.formats.whole_files import write_atomically
+from primdiffusion.files import tensor_file
+from primdiffusion.files.regular_files import as_file_error
+from primdiffusion.files.whole_files import write_atomically
+from primdiffusion.runtime.device import best_device
 from primdiffusion.training.muon import BETAS, MuonAdamW
 
 PATIENCE = datetime.timedelta(hours=3)

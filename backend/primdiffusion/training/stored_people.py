@@ -17,9 +17,9 @@ from primdiffusion.body.measures import LARGEST_BETA, measure
 from primdiffusion.body.model import default_body
 from primdiffusion.diffusion.conditioning import Attributes
 from primdiffusion.diffusion.model import BETAS
-from primdiffusion.formats.arrays import LARGEST_NUMBER, array_shape, read_arrays
-from primdiffusion.formats.json_files import parse_json
-from primdiffusion.formats.regular_files import as_file_error
+from primdiffusion.files.arrays import LARGEST_NUMBER, array_shape, read_arrays
+from primdiffusion.files.json_files import parse_json
+from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.people.wardrobe import words_of
 from primdiffusion.primitives.primitives import K, Payload, S

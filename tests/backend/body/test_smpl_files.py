@@ -13,8 +13,8 @@ import scipy.sparse
 import torch
 from primdiffusion.body.model import BodyPose, J, default_body
 from primdiffusion.body.smpl_files import load_body
-from primdiffusion.failures import MissingPackageError
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.runtime.failures import MissingPackageError
 from smplx.lbs import lbs
 from support.errors import refused
 

@@ -17,10 +17,10 @@ from primdiffusion.capture.composed import Backgrounds, StoredView, compose, rea
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig, View
 from primdiffusion.formats.joints import JOINT_NAMES
-from primdiffusion.formats.regular_files import FileError
 from scipy import ndimage
 from support.errors import refused
 

@@ -15,10 +15,10 @@ from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.poses import built_in_poses, turned
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import render, set_up_together, srgb_bytes
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.group_places import GAP, places
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.raster.textures import LINEAR_OF_BYTE
 from support.errors import refused

@@ -20,9 +20,9 @@ from primdiffusion.capture.conditioning import (
 from primdiffusion.capture.reader import Subject, open_captures
 from primdiffusion.capture.render import render
 from primdiffusion.capture.smpl_parameters import SmplParameters
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.camera_rig import Rig
 from primdiffusion.formats.capture_layout import picture_path, write_npz, write_smpl
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from support.errors import refused
 

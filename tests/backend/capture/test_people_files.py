@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from capture_scenes import box_person, save_person
 from primdiffusion.capture.people_files import find_people, read_person
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from support.errors import refused
 
 FLOAT, BYTE = 5126, 5120

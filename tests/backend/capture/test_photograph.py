@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from primdiffusion.capture.photograph import LARGEST_SIDE, read_photographs
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from scipy import ndimage
 from support.errors import refused
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.body.pose_file import read_motion
 from primdiffusion.capture.poses import built_in_poses, choose_poses
-from primdiffusion.formats.regular_files import FileError
-from primdiffusion.pose_file import read_motion
+from primdiffusion.files.regular_files import FileError
 from support.errors import refused
 
 

@@ -20,10 +20,10 @@ from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import render, set_up_capture
 from primdiffusion.capture.sheet import body_joints, draw_sheet, reprojection_error
+from primdiffusion.files.arrays import read_numbers
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
-from primdiffusion.formats.arrays import read_numbers
 from primdiffusion.formats.capture_repair import verify
-from primdiffusion.formats.regular_files import FileError
 from primdiffusion.raster.multisample import render_view
 from support.errors import refused
 

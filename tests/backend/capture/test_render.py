@@ -16,9 +16,9 @@ from capture_scenes import captured, save_person, small_job
 from primdiffusion import cli
 from primdiffusion.capture.render import render
 from primdiffusion.commands.captures import parse_shard
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.capture_repair import verify
-from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 from support.runs import within
 

@@ -12,13 +12,13 @@ from primdiffusion.commands import frame_drawer
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings
-from primdiffusion.failures import describe
+from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.march import MarchSettings
-from primdiffusion.reshaping import reshaped
+from primdiffusion.runtime.failures import describe
 from tiny_model import tiny_model
 
 WIDTH, HEIGHT = 40, 56

@@ -10,13 +10,13 @@ import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands import merge as commands
 from primdiffusion.commands.session import Session
+from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.export.merged_file import upright_grid
 from primdiffusion.formats.answers import MergeAnswer, MergeFramesAnswer
 from primdiffusion.formats.requests import MergeFramesRequest, MergeRequest, PosedPerson
 from primdiffusion.human import generate, place, pose_body
 from primdiffusion.human_file import save_human
 from primdiffusion.render.merge import merge
-from primdiffusion.reshaping import reshaped
 from primdiffusion.serve.server import Cancelled
 from tiny_model import tiny_model
 

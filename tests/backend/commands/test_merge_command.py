@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from primdiffusion import cli
-from primdiffusion.failures import MissingPackageError
 from primdiffusion.human import generate
 from primdiffusion.human_file import save_human
+from primdiffusion.runtime.failures import MissingPackageError
 from tiny_model import tiny_model
 
 COARSE = ["--voxel", "0.03"]

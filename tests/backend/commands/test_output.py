@@ -203,7 +203,7 @@ def test_the_compiler_compiles_what_previews_need(monkeypatch):
 
 KERNEL = """
 import numpy as np
-from primdiffusion.render.cpu_compiled import is_compiled, kernel
+from primdiffusion.render.cpu.compiled import is_compiled, kernel
 
 @kernel
 def add(taken, values):

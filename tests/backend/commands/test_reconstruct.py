@@ -22,7 +22,7 @@ from primdiffusion.formats.requests import ReconstructRequest
 from primdiffusion.geometry.textured_mesh import TexturedMesh
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
-from primdiffusion.reconstruction import reconstruct
+from primdiffusion.reconstruction.from_captures import reconstruct
 from support.runs import ended_at_each_report
 from tiny_encoder import TINY, save_tiny_encoder, tiny_encoder
 from tiny_model import save_tiny_checkpoint

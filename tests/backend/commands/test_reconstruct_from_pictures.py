@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from primdiffusion import cli, from_pictures
+from primdiffusion import cli
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands.reconstruct import fit_posture
 from primdiffusion.commands.session import Session
@@ -15,7 +15,8 @@ from primdiffusion.formats.requests import FitPostureRequest
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import load_human
-from primdiffusion.posture.start import standing
+from primdiffusion.reconstruction import from_pictures
+from primdiffusion.reconstruction.posture_start import standing
 from primdiffusion.render.march import march
 from support.runs import ended_at_each_report
 from tiny_model import tiny_model

@@ -12,7 +12,7 @@ from primdiffusion.diffusion.model import DiffusionModel, sample
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.schedule import dense_steps, linear, trailing_steps
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.primitives.primitives import GRID, K
 from safetensors import safe_open
 from safetensors.torch import save_file

@@ -5,9 +5,9 @@ import json
 import pytest
 import torch
 from primdiffusion.diffusion.checkpoint import load_checkpoint
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.tensor_file import read, save
 from primdiffusion.human import generate
-from primdiffusion.tensor_file import read, save
 from support.errors import refused
 from tiny_model import save_tiny_checkpoint
 

@@ -10,7 +10,7 @@ from primdiffusion.diffusion.model import sample
 from primdiffusion.diffusion.model_card import model_card
 from primdiffusion.diffusion.pretrained import save_pretrained
 from primdiffusion.diffusion.schedule import linear
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from support.errors import refused
 from tiny_model import save_tiny_checkpoint, tiny_model
 

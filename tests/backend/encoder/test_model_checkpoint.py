@@ -7,7 +7,7 @@ import pytest
 import torch
 from primdiffusion.encoder.model import EncoderModel, load_encoder, save_encoder
 from primdiffusion.encoder.network import Encoder
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from support.errors import refused

@@ -15,7 +15,7 @@ from primdiffusion.evaluation.image_metrics import (
     ssim,
 )
 from primdiffusion.evaluation.pretrained_networks import ALEXNET, VGG16, PictureFeatures
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from safetensors.torch import save_file
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from support.errors import refused

@@ -12,7 +12,7 @@ from primdiffusion.evaluation.pretrained_networks import (
     load_clip_vision,
     load_inception,
 )
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from safetensors.torch import save_file
 from support.errors import refused
 from torch import nn

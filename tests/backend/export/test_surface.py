@@ -9,10 +9,10 @@ import trimesh
 from export_people import ball, person
 from primdiffusion.export.simplify import simplified, unwrapped
 from primdiffusion.export.surface import depth_below, outside_surface
-from primdiffusion.failures import MissingPackageError
 from primdiffusion.human import place
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.merge import merge
+from primdiffusion.runtime.failures import MissingPackageError
 from support.errors import refused
 
 

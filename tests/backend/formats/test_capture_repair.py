@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from primdiffusion.files.picture_files import write_png
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats import capture_layout
 from primdiffusion.formats.capture_repair import list_subjects, repair, verify
-from primdiffusion.formats.picture_files import write_png
-from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 

@@ -4,10 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.poses.files import read_motion
 from primdiffusion.formats.poses.mhr import JOINTS, REST
-from primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 from support.mhr_files import mhr_arrays, write_mhr
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import pytest
-from primdiffusion.formats.json_files import parse_message
+from primdiffusion.files.json_files import parse_message
 from primdiffusion.formats.requests import REQUESTS
 from primdiffusion.formats.schema import (
     Ending,

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from PIL import Image
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.people.assets import _decoded
 from support.errors import refused
 

@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import numpy as np
 import psutil
 import pytest
-from primdiffusion.formats.whole_files import writer
+from primdiffusion.files.whole_files import writer
 from primdiffusion.people import folder as folder_module
 from primdiffusion.people import load_base_mesh, make_person
 from primdiffusion.people.assets import licence_of

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.people.mhclo import parse_mhclo, parse_obj, read_pair
 from support.errors import refused
 

@@ -8,7 +8,7 @@ import shutil
 
 import numpy as np
 import pytest
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.primitives import body_setup as module
 from primdiffusion.primitives.body_setup import body_setup_from_files, find_body_setup
 from released_files import body_arrays, save_body

@@ -10,7 +10,7 @@ import pytest
 import safetensors
 import safetensors.torch
 import torch
-from primdiffusion import cli, tensor_file
+from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import load_checkpoint, read_card
@@ -18,7 +18,8 @@ from primdiffusion.diffusion.codec import ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps
 from primdiffusion.drawing.draw import draw
 from primdiffusion.drawing.scene import Scene, ViewSettings
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files import tensor_file
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, place_skinned
 from primdiffusion.human_file import load_human, save_human

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 import safetensors.torch
 import torch
-from primdiffusion import cli, tensor_file
+from primdiffusion import cli
 from primdiffusion.body.smpl_files import load_body
 from primdiffusion.capture.conditioning import captured_person
 from primdiffusion.diffusion.checkpoint import load_checkpoint
 from primdiffusion.encoder.config import RELEASED
 from primdiffusion.encoder.model import load_encoder, look_up
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files import tensor_file
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.human import place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.primitives import K, S

@@ -8,11 +8,11 @@ import torch
 from primdiffusion.commands.import_released import read_released
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet
-from primdiffusion.failures import describe
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.released.imported import SCHEDULE
 from primdiffusion.released.inventory import take_inventory
 from primdiffusion.released.reading import read_weights
+from primdiffusion.runtime.failures import describe
 from released_files import SMALL, T, blank, save_released, schedule_buffers, stage_one, state, template
 from support.errors import refused
 

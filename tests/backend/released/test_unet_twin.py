@@ -11,7 +11,7 @@ from primdiffusion.diffusion.codec import WholeSlab
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.schedule import linear
 from primdiffusion.diffusion.unet import UNetConfig
-from primdiffusion.tensor_file import save
+from primdiffusion.files.tensor_file import save
 from primdiffusion.training.config import TrainingConfig, check_resumable, to_json
 from released_files import random_network
 from safetensors import safe_open

@@ -11,7 +11,7 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.payloads import fitted_payloads, orbit_camera
 from primdiffusion.primitives.primitives import Payload, Primitives
-from primdiffusion.render.cpu import march_cpu
+from primdiffusion.render.cpu.march import march_cpu
 from primdiffusion.render.inverse import (
     BACKGROUND,
     InverseSettings,

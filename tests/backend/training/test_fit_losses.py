@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 from primdiffusion.evaluation.pretrained_networks import VGG16, VGG19, PictureFeatures
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.training.fit_config import LossConfig
 from primdiffusion.training.fit_losses import (
     VGG_LAYERS,

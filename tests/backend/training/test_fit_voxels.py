@@ -14,7 +14,7 @@ from primdiffusion.encoder.config import PRESETS
 from primdiffusion.encoder.model import EncoderModel, frames_of, load_encoder
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.primitives.primitives import K, Payload, Primitives, S
-from primdiffusion.reconstruction import targets_of
+from primdiffusion.reconstruction.from_captures import targets_of
 from primdiffusion.render.march import march
 from primdiffusion.training import fit_voxels
 from primdiffusion.training.fit import MODEL, fit

@@ -3,8 +3,8 @@
 import diffuse_runs
 import fit_scenes
 import pytest
-from primdiffusion.folder_lock import lock_folder
-from primdiffusion.formats.regular_files import FileError
+from primdiffusion.files.folder_lock import lock_folder
+from primdiffusion.files.regular_files import FileError
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.fit import fit
 from support.errors import refused

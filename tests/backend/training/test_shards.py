@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 from diffusion_people import write_people
-from primdiffusion import tensor_file
-from primdiffusion.formats.regular_files import FileError
-from primdiffusion.formats.whole_files import temporary_name
+from primdiffusion.files import tensor_file
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.whole_files import temporary_name
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import K
 from primdiffusion.training import shards

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from primdiffusion import tensor_file
+from primdiffusion.files import tensor_file
 from primdiffusion.training.config import PhaseConfig
 from primdiffusion.training.state import TrainingState, accelerator_of, learning_rate_factor
 from support.errors import refused

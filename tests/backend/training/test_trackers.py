@@ -6,7 +6,7 @@ import types
 import pytest
 from accelerate import PartialState
 from diffuse_runs import make_small, settings
-from primdiffusion.failures import MissingPackageError
+from primdiffusion.runtime.failures import MissingPackageError
 from primdiffusion.training.config import check_resumable, to_json
 from primdiffusion.training.diffuse import train
 from primdiffusion.training.run_folder import open_metrics

@@ -8,9 +8,9 @@ import bpy
 import numpy as np
 import pytest
 import scan_fixtures
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle, to_axis_angle
-from blender_primdiffusion.formats.regular_files import FileError
 from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load
 from support.errors import refused
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import synthetic
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.joints import JOINT_NAMES
-from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.capture.body import fit_joints, read_body

@@ -7,8 +7,8 @@ import json
 
 import numpy as np
 import pytest
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.camera_rig import Rig
-from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.capture import command

@@ -17,12 +17,12 @@ from unittest.mock import Mock
 import bpy
 import numpy as np
 import pytest
+from blender_primdiffusion.files.regular_files import FileError
+from blender_primdiffusion.files.whole_files import writer
 from blender_primdiffusion.formats.camera_rig import Rig, look_at
 from blender_primdiffusion.formats.capture_layout import COMPLETE_FILE, LIST_FILE, RELEASED_REFERENCE, picture_path
 from blender_primdiffusion.formats.capture_repair import repair, verify
 from blender_primdiffusion.formats.poses.motion import Motion
-from blender_primdiffusion.formats.regular_files import FileError
-from blender_primdiffusion.formats.whole_files import writer
 from capture_child import PEOPLE, small
 from capture_person import NamedPerson, files_of, load_painted, plain, two_poses
 from support.errors import refused

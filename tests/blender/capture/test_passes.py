@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 import numpy as np
 import pytest
-from blender_primdiffusion.formats.regular_files import FileError
+from blender_primdiffusion.files.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.capture.passes import read_colours, read_exr

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import scan_fixtures
 import synthetic
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.camera_rig import bounding_sphere
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.rigs import RIGS, map_bones
 from blender_primdiffusion.formats.poses.rotation import about_axis
-from blender_primdiffusion.formats.regular_files import FileError
 from loaded_scans import BETAS, BODY, MOVE, ROTATIONS, distance_m, load, own_person
 from support.errors import refused
 

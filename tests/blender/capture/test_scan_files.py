@@ -8,7 +8,7 @@ import bpy
 import numpy as np
 import pytest
 import scan_fixtures
-from blender_primdiffusion.formats.regular_files import FileError
+from blender_primdiffusion.files.regular_files import FileError
 from loaded_scans import BETAS, BODY, load
 from support.errors import refused
 

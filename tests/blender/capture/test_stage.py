@@ -8,11 +8,11 @@ import bpy
 import numpy as np
 import pytest
 import trimesh
+from blender_primdiffusion.files.picture_files import DEPTH_UNIT
 from blender_primdiffusion.formats.camera_rig import Rig, View, look_at
 from blender_primdiffusion.formats.capture_layout import COMPLETE_FILE, picture_path, view_seed
 from blender_primdiffusion.formats.capture_repair import verify
 from blender_primdiffusion.formats.joints import JOINT_NAMES
-from blender_primdiffusion.formats.picture_files import DEPTH_UNIT
 from bpy_extras.object_utils import world_to_camera_view
 from capture_person import NamedPerson, PaintedPerson, load_painted, plain, shader_of, two_poses
 from mathutils import Vector

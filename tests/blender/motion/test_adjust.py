@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import scan_fixtures
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.files import read_motion
 from blender_primdiffusion.formats.poses.motion import Motion
 from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle, slerp, to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
-from blender_primdiffusion.formats.regular_files import FileError
 from bvh_files import motion_of, write_bvh
 from support.errors import refused
 

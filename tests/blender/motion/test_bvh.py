@@ -8,13 +8,13 @@ import bpy
 import numpy as np
 import pytest
 import scan_fixtures
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses.bvh import parse_bvh
 from blender_primdiffusion.formats.poses.files import read_motion
 from blender_primdiffusion.formats.poses.rigs import map_bones
 from blender_primdiffusion.formats.poses.rotation import about_axis, axis_direction, between, to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS, chain, joint_positions
-from blender_primdiffusion.formats.regular_files import FileError
 from bvh_files import FRAMES, along_x, motion_of, write_bvh
 from support.errors import refused
 

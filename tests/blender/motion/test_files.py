@@ -8,12 +8,12 @@ import zipfile
 
 import numpy as np
 import pytest
-from blender_primdiffusion.formats.arrays import read_arrays
+from blender_primdiffusion.files.arrays import read_arrays
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.poses.files import read_motion
 from blender_primdiffusion.formats.poses.motion import DEFAULT_FPS
 from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle, to_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import REST_JOINTS
-from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 
 pytestmark = pytest.mark.any_blender

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.joints import JOINT_NAMES
 from blender_primdiffusion.formats.poses import soma
 from blender_primdiffusion.formats.poses.files import read_motion
 from blender_primdiffusion.formats.poses.rigs import map_bones
 from blender_primdiffusion.formats.poses.rotation import about_axis, from_axis_angle
 from blender_primdiffusion.formats.poses.skeleton import chain, joint_positions
-from blender_primdiffusion.formats.regular_files import FileError
 from support.errors import refused
 from support.joblib_files import dumped
 

@@ -7,7 +7,7 @@ import exporting
 import numpy as np
 import pytest
 import synthetic
-from blender_primdiffusion.formats.regular_files import FileError
+from blender_primdiffusion.files.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.scene.armature import keyframe_poses

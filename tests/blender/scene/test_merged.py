@@ -9,7 +9,7 @@ import bpy
 import numpy as np
 import pytest
 import synthetic
-from blender_primdiffusion.formats.regular_files import FileError
+from blender_primdiffusion.files.regular_files import FileError
 from blender_primdiffusion.formats.requests import DENSITY_GAIN
 from human_files import sequence_files, volume_path
 from support.errors import refused

@@ -14,8 +14,8 @@ import torch
 from primdiffusion.body.measures import betas_of_measures as backend_betas_of_measures
 from primdiffusion.body.measures import measure as backend_measure
 from primdiffusion.body.model import default_body
+from primdiffusion.editing.reshaping import box_growth
 from primdiffusion.primitives.anchors import attach, default_anchors
-from primdiffusion.reshaping import box_growth
 
 from blender_primdiffusion.scene.rest_human import default_body as default_body_here
 from blender_primdiffusion.scene.shape import betas_of_measures, measure, slider_names

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import bpy
 import numpy as np
 import pytest
-from blender_primdiffusion.formats.picture_files import write_png
+from blender_primdiffusion.files.picture_files import write_png
 from human_files import person_file
 from jobs_driven import drive, error_of, notice_of, shown, until_running
 from support.errors import refused

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...files.json_files import read_json
 from ..joints import JOINT_NAMES
-from ..json_files import read_json
 
 FILE = Path(__file__).with_suffix(".json")
 """72 axis-angle values by name; written by scripts/bake_poses."""

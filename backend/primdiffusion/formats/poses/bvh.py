@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ...files.regular_files import FileError, as_file_error, read_regular
 from ..joints import JOINT_NAMES
-from ..regular_files import FileError, as_file_error, read_regular
 from .motion import DEFAULT_FPS, LARGEST_NUMBER, NO_RATE, Detected, Motion
 from .rigs import MATCH_BONES, UNMATCHED, BoneMap, chosen_bones, map_bones, retarget
 from .rotation import about_axis

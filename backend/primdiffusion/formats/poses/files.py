@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arrays import array_names, read_arrays, read_npy
-from ..json_files import read_json
-from ..regular_files import FileError, read_regular
-from ..smpl_pickle import Inert, as_array, load_restricted
-from ..whole_files import replacing
+from ...files.arrays import array_names, read_arrays, read_npy
+from ...files.json_files import read_json
+from ...files.regular_files import FileError, read_regular
+from ...files.smpl_pickle import Inert, as_array, load_restricted
+from ...files.whole_files import replacing
 from . import mhr, soma
 from .bvh import read_bvh
 from .motion import (

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..regular_files import FileError
+from ...files.regular_files import FileError
 from .rotation import to_axis_angle
 from .skeleton import joint_positions
 

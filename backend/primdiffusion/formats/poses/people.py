@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from ..regular_files import FileError
-from ..smpl_pickle import Inert, as_array
+from ...files.regular_files import FileError
+from ...files.smpl_pickle import Inert, as_array
 
 WORLD = "smpl_params_global"
 _NUMBERS, _PARAMETERS = "tid", "smpl"

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..regular_files import FileError
+from ...files.regular_files import FileError
 from .mhr import frames_of, places_at_rest
 from .motion import DEFAULT_FPS, NO_RATE, RATES, Detected, Motion, check_numbers, stated_rate
 from .rigs import map_bones, retarget

@@ -1,0 +1,360 @@
+"""Reconstruct a captured subject as a `Human`: from several views with the encoder, or from one or more with the prior.
+
+The prior finds the person coefficients c of the diffusion model that explain the pictures. Near an
+estimate a picture is linear in c (`cpu_linear`), and the people of one outfit are Gaussian, so the posterior mean of c
+has a closed form; a few Gauss-Newton steps repeat it, for each outfit and then for each hair style of the outfits that
+explain the pictures best. What no picture shows thus has the most probable colours and shape given what they show: the
+back of a jacket belongs to its front. The network draws what c cannot. Then the voxels themselves are fitted to the
+pictures (`render.inverse`), which keeps the others close to that human.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float32
+from numpy import ndarray
+from torch import Tensor
+
+from primdiffusion.capture.conditioning import CapturedPerson
+from primdiffusion.capture.dataset import Views
+from primdiffusion.diffusion.codec import VOXEL_VALUES, CellCodec, LinearCodec, payload_from_cells
+from primdiffusion.diffusion.denoiser import PersonDenoiser
+from primdiffusion.diffusion.gaussian import GaussianOfKinds, PersonPrior
+from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.diffusion.samplers import ddim, gaussian_noise
+from primdiffusion.encoder.model import EncoderModel, betas_of_frames, frames_of
+from primdiffusion.formats import requests
+from primdiffusion.geometry.srgb import decode_srgb
+from primdiffusion.human import Human, default_frames, made_by
+from primdiffusion.primitives.primitives import Frames, Payload, S
+from primdiffusion.reconstruction.posture_fit import each
+from primdiffusion.render.cpu.linear import apply_to_codes
+from primdiffusion.render.descent import DescentSettings, PosedView, descend
+from primdiffusion.render.inverse import InverseSettings, LinearisedView, TargetImage, fit_payload
+from primdiffusion.version import __version__
+
+
+class Trial(NamedTuple):
+    """A round that thins out the candidates: the outfits, then their hair styles."""
+
+    side: int
+    """Largest side of the pictures, pixels."""
+    most: int
+    """Candidates left, those that explain the pictures best."""
+    steps: int
+    """Gauss-Newton steps of each."""
+
+
+OUTFITS = (Trial(64, sys.maxsize, 1), Trial(64, 4, 2))
+HEADS = (Trial(64, sys.maxsize, 1), Trial(176, 2, 3))
+"""Trials of whole outfits, and of the two best outfits with each head."""
+BEST_OUTFITS = 2
+DIRECTIONS = 128
+"""Leading directions of an outfit's people in which its coefficients are sought."""
+TRIAL_VIEWS = 2
+"""Views, evenly spaced, that trials look at."""
+STEPS = 2
+"""Gauss-Newton steps from there, in all views."""
+FIT_STEPS = STEPS + 1
+"""How often `PersonComponents.fit` reports."""
+OBSERVATIONS = 150.0
+"""Number of independent pixels that a view counts as. What person components cannot draw differs over patches, not over
+pixels; more would fit them to noise, fewer would ignore the view."""
+PIXEL_STD = 0.08
+"""Standard deviation of such a pixel from what the best coefficients draw, in encoded colour."""
+PULL, SMOOTHNESS = 2.0, 1.0
+"""Penalties of the voxels' fit to one view (`InverseSettings`), which each further view outweighs more. As small as for
+many views, they would let one view change what only other sides show."""
+DESCENT = DescentSettings(steps=28, views=3, step=0.015)
+"""Gradient descent from the encoder's human."""
+DESCENT_SIDE = 256
+"""Largest side of the images that its steps draw, pixels: every second pixel of images of 512 pixels."""
+COARSE_SIDE, FINE_SIDE = 176, 512
+"""Largest sides of the pictures for coefficients and for voxels, pixels."""
+
+
+def reconstruct(
+    model: EncoderModel | DiffusionModel,
+    person: CapturedPerson,
+    seed: int | None = None,
+    on_step: Callable[[], None] = lambda: None,
+) -> Human:
+    """Reconstruct the subject on the CPU, by an encoder or by the prior of a diffusion model, which takes one view too.
+
+    Deterministic for a model, views, seed and device. With a seed, the prior draws what no view shows from what is
+    probable given the views, instead of the most probable. `on_step` is called `steps_of(model)` times; an exception
+    that it raises cancels.
+
+        >>> found = pd.reconstruct(model, person)
+        >>> found.provenance["reconstructed_from"]
+        ['anna.png']
+
+    Raises ValueError if the encoder's output is not finite, or as `PersonComponents.of`.
+    """
+    origin: dict[str, Any] = {"reconstructed_from": person.subject}
+    if person.frame is not None:
+        origin |= {"frame": person.frame, "views": list(person.cameras)}
+    if isinstance(model, EncoderModel):
+        payload = encode_and_fit(model, person.views, person.betas)
+        origin |= {"checkpoint": model.card.get("name", "unnamed"), "full_density": model.config.full_density}
+        betas = betas_of_frames(model.config, person.betas)
+        return Human(payload, betas, {**origin, "version": __version__}, model.body_setup).to("cpu").validate()
+    components, views, generator = PersonComponents.of(model), person.views, None
+    if views.pose.translation.ndim > 1:
+        frames = [default_frames(person.betas, pose) for pose in each(views.pose)]
+    else:
+        frames = [default_frames(person.betas, views.pose)] * len(views.rgba)
+    if seed is not None:
+        origin["seed"], generator = seed, torch.Generator().manual_seed(seed)
+    payload = components.fit(views, frames, components.start(views, frames, on_step), on_step, generator)
+    return Human(payload, person.betas, {**origin, **made_by(model)}).validate()
+
+
+def steps_of(model: EncoderModel | DiffusionModel) -> int:
+    """How often `reconstruct` reports."""
+    return 0 if isinstance(model, EncoderModel) else PersonComponents.of(model).start_steps + FIT_STEPS
+
+
+def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"]) -> Payload:
+    """The encoder's payload, optimised on its images by a short gradient descent that adds detail.
+
+    Boxes of the released code (`compat`) stay as their network draws them. Images without the subject are ignored.
+    """
+    payload = model.encode(views, betas)
+    frames = frames_of(model.config, betas.cpu(), views.pose.to("cpu"), model.body_setup)[1]
+    views, frames = views.to(payload.density.device), frames.to(payload.density.device)
+    cameras = [views.camera.map(lambda values, i=i: values[i]) for i in range(len(views.rgba))]
+    images = [PosedView(frames, camera, rgba) for camera, rgba in zip(cameras, views.rgba, strict=True)]
+    seen = [image for image in images if _shows(image)]
+    if model.config.compat == "released" or not seen:
+        return payload
+    stride = math.ceil(max(views.camera.width, views.camera.height) / DESCENT_SIDE)
+    settings = dataclasses.replace(DESCENT, stride=stride, largest_density=model.config.full_density)
+    return descend(payload, seen, settings).payload
+
+
+def _shows(image: PosedView) -> bool:
+    """Whether an image shows the subject, and its camera faces it."""
+    depth = image.camera.project(image.frames.position)[1]
+    return bool(image.target[..., 3].any()) and bool((depth > 0).any())
+
+
+class Explanation(NamedTuple):
+    """People of one outfit, or of one outfit and head, or all people (None), after a step of Gauss-Newton."""
+
+    group: int | None
+    head: int | None
+    weights: Float[Tensor, "n"]
+    """Posterior mean of their `GaussianOfKinds`, or a draw, for pictures linearised at the weights before the step."""
+    evidence: float
+    """Logarithm of the probability of these pictures."""
+
+
+@dataclasses.dataclass(frozen=True)
+class PersonComponents:
+    """The person components of a diffusion model, and their prior."""
+
+    denoiser: PersonDenoiser
+    chain: list[int]
+    """Descending t at which the denoiser draws."""
+    prior: PersonPrior
+    codec: LinearCodec
+    full_density: float
+    _latest: list = dataclasses.field(default_factory=lambda: [None, None], repr=False)
+
+    @classmethod
+    def of(cls, model: DiffusionModel) -> PersonComponents:
+        """Those of a model; ValueError if it has none, or is of another body than the default one."""
+        if not isinstance(model.denoiser, PersonDenoiser) or not isinstance(model.codec, CellCodec):
+            raise ValueError("the model has no person components: give a checkpoint of the default architecture")
+        if model.body_setup is not None:
+            raise ValueError(
+                f"the model belongs to the body {model.body_setup.files.smpl.path}: give one of the default body"
+            )
+        chain = model.chain(model.schedule.length, requests.Sampling.steps)
+        codec = model.codec.codec.to("cpu")
+        return cls(model.denoiser, chain, model.denoiser.prior.to("cpu"), codec, model.full_density)
+
+    @property
+    def start_steps(self) -> int:
+        """How often `start` reports."""
+        groups = len(self.prior.log_weight)
+        heads = min(groups, BEST_OUTFITS) * max(len(self.prior.heads_of(group)) for group in range(groups))
+        rounds = [(trial, groups) for trial in OUTFITS] + [(trial, heads) for trial in HEADS]
+        return sum(min(trial.most, count) * trial.steps for trial, count in rounds)
+
+    @functools.cached_property
+    def _voxel_basis(self) -> Float32[ndarray, "b 512 4 c"]:
+        return self.codec.voxel_basis(self.prior.basis.shape[1]).contiguous().numpy()
+
+    @functools.cached_property
+    def _components(self) -> Float[Tensor, "k d n"]:
+        """What the components of a box's part add to its channels; boxes in their own order."""
+        order = self.prior.part.argsort(stable=True)
+        return self.prior.basis[order.argsort()]
+
+    def _kinds(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
+        """People of an outfit and head, and channels of each box by their weights; those asked for last are kept."""
+        if (group, head) != self._latest[0]:
+            self._latest[:] = [(group, head), self._kinds_of(group, head)]
+        return self._latest[1]
+
+    def _kinds_of(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
+        everyone = group is None
+        kinds = self.prior.gaussian_of_all(DIRECTIONS) if everyone else self.prior.gaussian_of(group, head, DIRECTIONS)
+        by_part = kinds.factor.unflatten(1, (-1, self.prior.basis.shape[2])).permute(1, 2, 0)
+        return kinds, torch.bmm(self._components, by_part[self.prior.part]).numpy()
+
+    def coefficients(self, explanation: Explanation) -> Float[Tensor, "r"]:
+        """Person coefficients of these people."""
+        kinds, _ = self._kinds(explanation.group, explanation.head)
+        return kinds.mean + explanation.weights @ kinds.factor
+
+    def payload(self, coefficients: Float[Tensor, "r"], rest: Float[Tensor, "c h w"] | float = 0.0) -> Payload:
+        """Decode."""
+        latents = self.prior.mean + self.prior.picture(coefficients[None]) + rest
+        return payload_from_cells(self.codec.decode(latents)[0], self.full_density, self.codec.zone)
+
+    def start(self, views: Views, frames: Sequence[Frames], on_step: Callable[[], None] = lambda: None) -> Explanation:
+        """The people nearest to the human in views with these frames; reports `start_steps` times."""
+        every, steps = math.ceil(len(frames) / TRIAL_VIEWS), self.start_steps
+        candidates = [self._mean_of(group, None) for group in range(len(self.prior.log_weight))]
+        for trials in (OUTFITS, HEADS):
+            for trial in trials:
+                targets = targets_of(views, frames, trial.side)[::every]
+                candidates = best(candidates, trial.most)
+                for number, explanation in enumerate(candidates):
+                    for _ in range(trial.steps):
+                        explanation = self.closer(explanation, targets)
+                        on_step()
+                        steps -= 1
+                    candidates[number] = explanation
+            if trials is OUTFITS:
+                groups = [int(one.group or 0) for one in best(candidates, BEST_OUTFITS)]
+                candidates = [self._mean_of(group, head) for group in groups for head in self.prior.heads_of(group)]
+        for _ in range(steps):  # of outfits with fewer hair styles than others
+            on_step()
+        return best(candidates, 1)[0]
+
+    def everyone(self) -> Explanation:
+        """All people, at the mean human."""
+        return self._mean_of(None, None)
+
+    def _mean_of(self, group: int | None, head: int | None) -> Explanation:
+        kinds, _ = self._kinds(group, head)
+        return Explanation(group, head, torch.zeros(len(kinds.factor)), 0.0)
+
+    def fit(
+        self,
+        views: Views,
+        frames: Sequence[Frames],
+        explanation: Explanation,
+        on_step: Callable[[], None] = lambda: None,
+        generator: torch.Generator | None = None,
+    ) -> Payload:
+        """The human in views with these frames: STEPS steps from there, then voxels. Reports FIT_STEPS times.
+
+        With a generator, coefficients are drawn from their distribution given the views, and the rest from that given
+        the coefficients, instead of their means: what no view shows varies with it.
+        """
+        targets = targets_of(views, frames, COARSE_SIDE)
+        for step in range(STEPS):
+            explanation = self.closer(explanation, targets, generator if step == STEPS - 1 else None)
+            on_step()
+        targets = targets_of(views, frames, FINE_SIDE)
+        settings = InverseSettings(pull=PULL / len(targets), smoothness=SMOOTHNESS / len(targets))
+        coefficients = self.coefficients(explanation)
+        rest = self.expected_rest(coefficients) if generator is None else self.drawn_rest(coefficients, generator)
+        start = self.payload(coefficients, rest)
+        payload = fit_payload(start, targets, self.full_density, settings)
+        on_step()
+        return payload
+
+    def expected_rest(self, coefficients: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
+        """The mean rest of humans with these coefficients: what the network makes of noise alone."""
+        noise = gaussian_noise(self.prior.mean[None], torch.Generator().manual_seed(0))
+        return self._denoised_rest(noise, self.denoiser.schedule.length - 1, coefficients)[0]
+
+    def drawn_rest(self, coefficients: Float[Tensor, "r"], generator: torch.Generator) -> Float[Tensor, "c h w"]:
+        """The rest of a human with these coefficients, drawn by DDIM."""
+        schedule, noise = self.denoiser.schedule, gaussian_noise(self.prior.mean[None], generator)
+
+        def denoise(x: Tensor, t: int) -> Tensor:
+            return self._denoised_rest(x, t, coefficients)
+
+        *_, last = ddim(denoise, schedule, schedule.noise(self.chain[0]) * noise, self.chain, generator)
+        return last.x0[0]
+
+    def _denoised_rest(self, x: Float[Tensor, "1 c h w"], t: int, coefficients: Float[Tensor, "r"]) -> Tensor:
+        """The clean guess of a rest that holds noise of step t."""
+        device = self.denoiser.component_std.device
+        level, person = torch.tensor([t], device=device), coefficients[None].to(device)
+        with torch.inference_mode():
+            rest = self.denoiser.rest(self.prior.outside(x).to(device), person, level)
+        return self.prior.outside(rest.cpu().clone())
+
+    def closer(
+        self, explanation: Explanation, targets: Sequence[TargetImage], generator: torch.Generator | None = None
+    ) -> Explanation:
+        """A step of Gauss-Newton from these weights, to their posterior mean or, with a generator, to a draw."""
+        prior, codec = self.prior, self.codec
+        kinds, codes = self._kinds(explanation.group, explanation.head)
+        weights = explanation.weights
+        latents = prior.mean + prior.picture((kinds.mean + weights @ kinds.factor)[None])
+        cells = codec.decode(latents)[0].requires_grad_()
+        payload = payload_from_cells(cells, self.full_density, codec.zone)
+        # Each colour and density depends on its own value of the cells, so the gradient of their sum has all
+        # derivatives.
+        (by_cell,) = torch.autograd.grad(payload.rgb.sum() + payload.density.sum(), cells)
+        slope = by_cell[:, :VOXEL_VALUES].unflatten(1, (4, S**3)).mT.flatten(0, 1).numpy()
+        payload, region = payload.map(Tensor.detach), codec.region.numpy()
+        precision, vector = torch.eye(len(weights)), torch.zeros(len(weights))
+        misfit = 0.0  # of weights of 0, by the linearisation
+        for target in targets:
+            view = LinearisedView.of(target, payload, InverseSettings())
+            seen = np.bincount(view.jacobian.ray, minlength=view.jacobian.rays) > 0
+            by_code = apply_to_codes(view.jacobian, slope, self._voxel_basis, region, codes, view.alpha_free)
+            matrix = torch.from_numpy(by_code[seen]).flatten(0, 1)
+            pixel_weights = view.weight * np.float32(OBSERVATIONS / PIXEL_STD**2)
+            weight = torch.from_numpy(pixel_weights[seen]).flatten()
+            wanted = torch.from_numpy(view.residual[seen]).flatten() + matrix @ weights
+            weighted = matrix.mT * weight
+            precision += weighted @ matrix
+            vector += weighted @ wanted
+            misfit += float(weight.double() @ wanted.double().square()) / 2
+            misfit += float((pixel_weights[~seen] * view.residual[~seen] ** 2).sum(dtype=np.float64)) / 2
+        factor = torch.linalg.cholesky(precision.double())
+        mean = torch.cholesky_solve(vector.double()[:, None], factor)[:, 0]
+        evidence = float(mean @ vector.double()) / 2 - float(factor.diagonal().log().sum()) - misfit
+        if generator is not None:
+            noise = torch.randn(len(mean), 1, generator=generator, dtype=mean.dtype)
+            mean = mean + torch.linalg.solve_triangular(factor.mT, noise, upper=True)[:, 0]
+        return Explanation(explanation.group, explanation.head, mean.float(), evidence)
+
+
+def best(candidates: Sequence[Explanation], count: int) -> list[Explanation]:
+    """Those that explain the pictures best."""
+    return sorted(candidates, key=lambda one: one.evidence, reverse=True)[:count]
+
+
+def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[TargetImage]:
+    """The views as linear pictures with sides of at most `largest` pixels, averaged over blocks."""
+    targets = []
+    for number, (rgba, boxes) in enumerate(zip(views.rgba.cpu(), frames, strict=True)):
+        camera = views.camera.to("cpu").map(lambda values, number=number: values[number])
+        picture = torch.cat([decode_srgb(rgba[..., :3].float() / 255), rgba[..., 3:].float() / 255], -1)
+        block = math.ceil(max(camera.width, camera.height) / largest)
+        height, width = camera.height // block, camera.width // block
+        picture = picture[: height * block, : width * block].unflatten(1, (width, block)).unflatten(0, (height, block))
+        intrinsics = torch.cat([camera.intrinsics[:2] / block, camera.intrinsics[2:]])
+        camera = dataclasses.replace(camera, intrinsics=intrinsics, width=width, height=height)
+        targets.append(TargetImage(boxes, camera, picture.mean((1, 3)).numpy()))
+    return targets

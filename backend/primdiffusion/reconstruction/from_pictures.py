@@ -1,0 +1,184 @@
+"""A human from plain pictures: what is known of pose, shape and camera is refined, then appearance is fitted.
+
+The two take turns from coarse to fine: the mean human finds the pose roughly by its outline, the person coefficients
+that then explain the pictures (`reconstruction`) give it the colours by which limbs find their places.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from primdiffusion.capture.conditioning import CapturedPerson
+from primdiffusion.capture.dataset import Views
+from primdiffusion.capture.photograph import Photograph, read_photographs, rgba_of
+from primdiffusion.diffusion.model import DiffusionModel
+from primdiffusion.formats.camera_rig import View
+from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
+from primdiffusion.reconstruction.posture_file import read_cameras, read_posture
+from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error
+from primdiffusion.reconstruction.posture_fit import overlap as overlap_of
+from primdiffusion.reconstruction.posture_start import (
+    STANDING_ARMS,
+    before_cameras,
+    cameras_of,
+    framed,
+    repeated,
+    standing,
+    turned_to_camera,
+    views_of,
+)
+from primdiffusion.render.inverse import TargetImage
+
+
+class Round(NamedTuple):
+    """A stage of the posture and the steps of Gauss-Newton on coefficients after it, both in pictures of one size."""
+
+    side: int
+    stage: Stage
+    coefficient_steps: int
+
+
+ROUNDS = (Round(96, Stage(60, 0.04), 2), Round(96, Stage(80, 0.02), 2), Round(192, Stage(60, 0.01), 0))
+POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
+OUTLINE_SIDE = 64
+"""Of the pictures that choose a standing body's arms."""
+LEAST_OVERLAP = 0.8
+"""Intersection over union of the human and the mask; of fits that look right it is above 0.9."""
+POSE_FILE_TIGHTNESS = 2.0
+"""Poses of files are known twice as well as a standing body."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Start:
+    """What is known before pictures are looked at."""
+
+    posture: Posture
+    """With cameras of the squares that are kept of pictures."""
+    tightness: float
+    """See `PostureFit`."""
+    complete: bool
+    """Pose and cameras are those of files."""
+
+
+def person_in_pictures(
+    model: DiffusionModel,
+    pictures: Sequence[str | Path],
+    masks: Sequence[str | Path] = (),
+    mask_label: int | None = None,
+    pose: str | Path | None = None,
+    cameras: str | Path | None = None,
+    *,
+    refine: bool = True,
+    on_step: Callable[[], None] = lambda: None,
+) -> CapturedPerson:
+    """The person in plain pictures, for `reconstruct`; the fields of `requests.Pictures` say what the files are.
+
+    Pose, shape and cameras are refined from those of the files, or of a standing body; otherwise both files are needed.
+    `on_step` is called POSTURE_STEPS times while refining; an exception that it raises cancels. Deterministic.
+
+        >>> person = pd.person_in_pictures(model, ["anna.png"])
+        >>> person.betas.shape
+        torch.Size([10])
+
+    Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PersonComponents.of`.
+    """
+    photographs = read_photographs(list(map(Path, pictures)), list(map(Path, masks)), mask_label=mask_label)
+    known = (None if path is None else Path(path) for path in (pose, cameras))
+    start, warnings = start_of(photographs, model, *known), []
+    posture = start.posture
+    if refine:
+        posture = fit_posture_in(model, photographs, start, on_step)
+    elif not start.complete:
+        raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
+    if pose is None:
+        warnings.append("no pose was given: the person is taken to stand upright, facing the camera")
+    overlap = outline_overlap(model, photographs, posture)
+    if overlap < LEAST_OVERLAP:
+        warnings.append(
+            f"the fitted body and the masks overlap by {100 * overlap:.0f} %: the pose was probably not found; give a "
+            "pose file that is nearer"
+        )
+    return person_in(photographs, posture, warnings)
+
+
+def person_in(photographs: Sequence[Photograph], posture: Posture, warnings: Sequence[str] = ()) -> CapturedPerson:
+    """The person in pictures whose posture is known."""
+    names, whole_views = [photograph.path.name for photograph in photographs], views_of(photographs, posture.camera)
+    views = _views(photographs, posture)
+    return CapturedPerson(names, None, (), views, posture.betas, tuple(warnings), tuple(whole_views))
+
+
+def start_of(
+    photographs: Sequence[Photograph],
+    model: DiffusionModel,
+    pose_path: Path | None = None,
+    cameras_path: Path | None = None,
+) -> Start:
+    """The posture to start from: of the files given, else of a standing body, seen as large as in the pictures.
+
+    Raises FileNotFoundError, and ValueError for files that are no poses or cameras, or not one for each picture.
+    """
+    sizes = [(photograph.width, photograph.height) for photograph in photographs]
+    views = None if cameras_path is None else read_cameras(cameras_path, sizes)
+    if pose_path is None:
+        return Start(_standing(photographs, model, views), 1.0, complete=False)
+    known = read_posture(pose_path, sizes)
+    pose = repeated(known.pose, len(photographs))
+    betas = model.shapes.bias.clone() if known.betas is None else known.betas
+    views = known.views if views is None else views
+    if views is None:
+        pose = turned_to_camera(pose)
+        camera = framed(photographs, pose, betas, [photograph.lens() for photograph in photographs])
+    else:
+        camera = cameras_of(photographs, views)
+    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=views is not None)
+
+
+def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: Sequence[View] | None) -> Posture:
+    """The standing body whose arms fit the outline best."""
+    components, betas = PersonComponents.of(model), model.shapes.bias.clone()
+    payload = components.payload(components.coefficients(components.everyone()))
+    lenses = [photograph.lens() for photograph in photographs] if views is None else views
+    found = []
+    for arms in STANDING_ARMS:
+        pose = standing(len(photographs), arms)
+        found.append(Posture(pose, betas, framed(photographs, pose, betas, lenses)))
+    best = min(found, key=lambda one: outline_error(payload, _targets(photographs, one, OUTLINE_SIDE)))
+    return best if views is None else before_cameras(best, cameras_of(photographs, views))
+
+
+def fit_posture_in(
+    model: DiffusionModel, photographs: Sequence[Photograph], start: Start, on_step: Callable[[], None]
+) -> Posture:
+    """The posture in the pictures; deterministic.
+
+    `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
+    """
+    components = PersonComponents.of(model)
+    fit, people = PostureFit(start.posture, model.shapes, start.tightness), components.everyone()
+    for side, stage, coefficient_steps in ROUNDS:
+        payload = components.payload(components.coefficients(people))
+        fit.refine(payload, _targets(photographs, fit.posture(), side), stage, on_step)
+        targets = _targets(photographs, fit.posture(), side)
+        for _ in range(coefficient_steps):
+            people = components.closer(people, targets)
+            on_step()
+    return fit.posture()
+
+
+def outline_overlap(model: DiffusionModel, photographs: Sequence[Photograph], posture: Posture) -> float:
+    """Intersection over union of the mean human in the posture and the masks."""
+    components = PersonComponents.of(model)
+    targets = _targets(photographs, posture, ROUNDS[0].side)
+    return overlap_of(components.payload(components.coefficients(components.everyone())), targets)
+
+
+def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:
+    return Views(rgba_of(photographs), posture.camera, posture.pose)
+
+
+def _targets(photographs: Sequence[Photograph], posture: Posture, side: int) -> list[TargetImage]:
+    return targets_of(_views(photographs, posture), posture.frames(), side)

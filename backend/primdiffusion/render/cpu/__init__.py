@@ -1,0 +1,1 @@
+"""The marcher on processors, compiled by numba."""

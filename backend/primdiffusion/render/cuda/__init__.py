@@ -1,0 +1,1 @@
+"""The marcher on NVIDIA GPUs, compiled by Triton."""

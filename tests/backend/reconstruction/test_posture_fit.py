@@ -1,0 +1,206 @@
+"""Postures: found again by the fit, framed by masks, and kept in files."""
+
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.capture.dataset import stack
+from primdiffusion.capture.photograph import Photograph
+from primdiffusion.capture.reader import Window
+from primdiffusion.diffusion.model import STANDARD_SHAPES
+from primdiffusion.files.regular_files import FileError
+from primdiffusion.formats.joints import JOINT_NAMES
+from primdiffusion.geometry.rotation import axis_angle_to_matrix
+from primdiffusion.human import framing, pose_body
+from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.reconstruction.posture_file import read_cameras, read_posture, write_posture
+from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, overlap
+from primdiffusion.reconstruction.posture_start import (
+    before_cameras,
+    cameras_of,
+    framed,
+    repeated,
+    standing,
+    turned_to_camera,
+    views_of,
+)
+from primdiffusion.render.inverse import TargetImage
+from primdiffusion.render.march import march
+from support.errors import refused
+from tiny_model import tiny_model
+
+MODEL = tiny_model()
+PAYLOAD = MODEL.decode(MODEL.denoiser.prior.mean).map(torch.Tensor.clone)
+
+
+def seen(posture: Posture) -> list[TargetImage]:
+    """Pictures of a posture by its own cameras."""
+    targets = []
+    for frames, camera in zip(posture.frames(), each(posture.camera), strict=True):
+        with torch.no_grad():
+            picture = march(Primitives.place(frames, PAYLOAD), camera)
+        targets.append(TargetImage(frames, camera, torch.cat([picture.rgb, picture.alpha[..., None]], -1).numpy()))
+    return targets
+
+
+def a_posture(count: int = 1, size: int = 64) -> Posture:
+    pose, betas = standing(count, 50.0), torch.linspace(-0.3, 0.3, 10)
+    posture = Posture(pose, betas, None)
+    cameras = [
+        framing(Primitives.place(frames, PAYLOAD), math.degrees(0.2) * i, size, size)
+        for i, frames in enumerate(posture.frames())
+    ]
+    return dataclasses.replace(posture, camera=stack(cameras))
+
+
+def joints_px(posture: Posture) -> torch.Tensor:
+    pairs = zip(each(posture.pose), each(posture.camera), strict=True)
+    return torch.stack([camera.project(pose_body(posture.betas, pose).joints[:, :3, 3])[0] for pose, camera in pairs])
+
+
+def disturbed(posture: Posture, degrees: float = 8.0) -> Posture:
+    turn = torch.randn(len(posture.pose.translation), 24, 3, generator=torch.Generator().manual_seed(3))
+    rotation = posture.pose.joint_rotation @ axis_angle_to_matrix(math.radians(degrees) / math.sqrt(3) * turn)
+    pose = BodyPose(rotation, posture.pose.translation + torch.tensor([0.06, -0.04, 0.1]))
+    return dataclasses.replace(posture, pose=pose, betas=torch.zeros(10))
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_disturbed_posture_is_found_again(count):
+    true = a_posture(count)
+    start = disturbed(true)
+    fit = PostureFit(start, STANDARD_SHAPES)
+    assert (joints_px(fit.posture()) - joints_px(start)).abs().max() < 1e-3
+    steps = []
+    fit.refine(PAYLOAD, [*seen(true)], Stage(60, 0.03), lambda: steps.append(1))
+    found = fit.posture()
+    before, after = ((joints_px(posture) - joints_px(true)).norm(dim=-1).mean() for posture in (start, found))
+    assert before > 1.5
+    assert after < 0.35 * before
+    assert len(steps) == 60
+    assert (
+        overlap(PAYLOAD, [dataclasses.replace(t, frames=f) for t, f in zip(seen(true), found.frames(), strict=True)])
+        > 0.9
+    )
+
+
+def test_what_pictures_do_not_show_stays_where_it_was():
+    true = a_posture()
+    fit = PostureFit(true, STANDARD_SHAPES)
+    fit.refine(PAYLOAD, seen(true), Stage(40, 0.02))
+    assert (fit.posture().pose.joint_rotation - true.pose.joint_rotation).abs().max() < 0.15
+    assert (joints_px(fit.posture()) - joints_px(true)).norm(dim=-1).max() < 1.0
+
+
+def test_shapes_stay_within_those_of_people():
+    true = a_posture()
+    tall = [dataclasses.replace(target, rgba=np.ones_like(target.rgba)) for target in seen(true)]
+    fit = PostureFit(true, STANDARD_SHAPES)
+    fit.refine(PAYLOAD, tall, Stage(60, 0.1))
+    assert fit.posture().betas.abs().max() <= STANDARD_SHAPES.limit.max()
+
+
+def test_an_exception_cancels():
+    true = a_posture()
+
+    def cancel() -> None:
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        PostureFit(true, STANDARD_SHAPES).refine(PAYLOAD, seen(true), Stage(10, 0.02), cancel)
+
+
+def photographed(posture: Posture, window: Window, width: int, height: int) -> Photograph:
+    (target,) = seen(posture)
+    return Photograph(Path("a.png"), (255 * target.rgba).round().astype(np.uint8), window, width, height, None)
+
+
+def test_a_framed_body_covers_the_mask_and_cameras_of_windows_are_those_of_pictures():
+    true = a_posture()
+    photograph = photographed(true, Window(300.5, -20, 640, 640), 1200, 600)
+    camera = framed([photograph], true.pose, true.betas, [photograph.lens()])
+    posture = dataclasses.replace(true, camera=camera)
+    assert overlap(PAYLOAD, [dataclasses.replace(seen(true)[0], camera=next(each(camera)))]) > 0.8
+    (view,) = views_of([photograph], camera)
+    assert (view.width, view.height) == (1200, 600)
+    assert view.intrinsics[:2, 2] == pytest.approx([600, 300], abs=1e-2)
+    again = cameras_of([photograph], [view])
+    assert torch.allclose(again.intrinsics, camera.intrinsics, rtol=1e-5)
+    assert joints_px(posture)[0, 0, 0] == pytest.approx(float(joints_px(true)[0, 0, 0]), abs=2)
+
+
+def test_a_posture_before_another_camera_looks_the_same():
+    posture = a_posture()
+    turned = framing(Primitives.place(posture.frames()[0], PAYLOAD), 109, 64, 64)
+    other = dataclasses.replace(posture.camera, world_to_camera=turned.world_to_camera[None])
+    moved = before_cameras(posture, other)
+    assert torch.allclose(joints_px(moved), joints_px(posture), atol=1e-2)
+
+
+def test_poses_in_a_cameras_axes_are_turned_upright():
+    pose = standing(1, 30.0)
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0]))
+    rotation = torch.cat([(flip @ pose.joint_rotation[:, :1]), pose.joint_rotation[:, 1:]], 1)
+    turned = turned_to_camera(BodyPose(rotation, torch.ones(1, 3)))
+    assert torch.allclose(turned.joint_rotation, pose.joint_rotation, atol=1e-6)
+    assert turned_to_camera(pose) is pose
+
+
+def test_one_pose_serves_all_pictures_and_others_must_be_as_many():
+    assert repeated(standing(1, 0.0), 3).joint_rotation.shape == (3, 24, 3, 3)
+    with refused(ValueError, "2 poses", "3 pictures"):
+        repeated(standing(2, 0.0), 3)
+
+
+def test_a_posture_is_read_as_it_was_written(tmp_path):
+    posture = a_posture(2)
+    photographs = [photographed(a_posture(), Window(10, 20, 128, 128), 300, 200)] * 2
+    views = views_of(photographs, posture.camera)
+    path = tmp_path / "posture.json"
+    write_posture(path, posture.pose, posture.betas, views)
+    found = read_posture(path, [(300, 200)] * 2)
+    assert torch.allclose(found.pose.joint_rotation, posture.pose.joint_rotation, atol=1e-5)
+    assert torch.allclose(found.betas, posture.betas, atol=1e-5)
+    for read in (found.views, read_cameras(path, [(300, 200)] * 2)):
+        assert all(np.allclose(a.intrinsics, b.intrinsics) for a, b in zip(read, views, strict=True))
+    with refused(FileError, str(path), "2 cameras", "1 pictures"):
+        read_posture(path, [(300, 200)])
+
+
+def test_pose_files_of_others_give_a_pose_alone(tmp_path):
+    path = tmp_path / "pose.npz"
+    np.savez(path, poses=np.zeros((1, 156)), betas=np.ones(16))
+    found = read_posture(path, [(10, 10)])
+    assert (found.betas, found.views) == (None, None)
+    assert found.pose.joint_rotation.shape == (1, 24, 3, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [({"betas": [9.0] * 10}, "betas"), ({"betas": [0.0]}, "betas"), ({"betas": "x"}, "betas"),
+     ({"pose": [[0.0] * 60]}, "pose"), ({"cameras": {}}, "cameras"), ({"cameras": {"camera0000": {}}}, "cameras"),
+     ({"cameras": {"camera0000": {"K": np.eye(3).tolist(), "R": (-np.eye(3)).tolist(), "T": [0] * 3}}}, "camera0000")],
+)  # fmt: skip
+def test_damaged_postures_are_refused(tmp_path, change, word):
+    path, posture = tmp_path / "posture.json", a_posture()
+    write_posture(
+        path,
+        posture.pose,
+        posture.betas,
+        views_of([photographed(posture, Window(0, 0, 64, 64), 64, 64)], posture.camera),
+    )
+    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
+    with refused(ValueError, str(path), word):
+        read_posture(path, [(64, 64)])
+
+
+def test_arms_of_a_standing_body_are_lowered():
+    body = default_body().shape(torch.zeros(10)).pose(standing(1, 60.0))
+    joints = body.joints[0, :, 1, 3]
+    shoulder, wrist = (joints[JOINT_NAMES.index(name)] for name in ("left_shoulder", "left_wrist"))
+    assert wrist < shoulder - 0.3

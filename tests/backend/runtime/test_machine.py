@@ -1,0 +1,153 @@
+"""What the machine says of itself."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+from primdiffusion import cli
+from primdiffusion.diffusion.gaussian import PersonPrior, _double
+from primdiffusion.runtime.device import best_device, device_info, has_bfloat16, has_fast_bfloat16
+from primdiffusion.runtime.machine import choose_device, memory, share_processors
+from tiny_model import tiny_model
+from torch._subclasses.fake_tensor import FakeTensor, FakeTensorMode, unset_fake_temporarily
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves
+
+
+def test_peak_memory_keeps_what_was_given_back_and_is_none_of_the_program_that_started_this_one():
+    code = """
+import subprocess, sys
+import numpy as np
+from primdiffusion.runtime.machine import peak_memory_gb
+before = peak_memory_gb()
+block = np.ones(int((before + 0.2) * 1e9 / 8))
+del block
+print(peak_memory_gb() - before)
+if len(sys.argv) == 1:
+    subprocess.run([sys.executable, "-c", "from primdiffusion.runtime.machine import peak_memory_gb; print(peak_memory_gb())"])
+"""
+    run = subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True, check=True)
+    grown, of_its_child = map(float, run.stdout.split())
+    assert grown > 0.15
+    assert of_its_child < 0.15
+
+
+def test_memory_and_device_are_stated_in_gigabytes():
+    assert 0.1 < memory()["memory_free_gb"] <= memory()["memory_gb"] < 10_000
+    assert device_info(torch.device("cpu"))["device"] == "cpu"
+    assert best_device().type in ("cpu", "cuda")
+
+
+def test_waiting_threads_sleep_unless_the_user_wants_otherwise(monkeypatch):
+    monkeypatch.delenv("OMP_WAIT_POLICY", raising=False)
+    share_processors()
+    assert os.environ["OMP_WAIT_POLICY"] == "PASSIVE"
+    monkeypatch.setenv("OMP_WAIT_POLICY", "ACTIVE")
+    share_processors()
+    assert os.environ["OMP_WAIT_POLICY"] == "ACTIVE"
+
+
+@pytest.fixture
+def undecided(monkeypatch):
+    """Environment variables as they were after the test."""
+    for name in ("PRIMDIFFUSION_DEVICE", "PYTORCH_ENABLE_MPS_FALLBACK"):
+        monkeypatch.setenv(name, "")
+
+
+@pytest.mark.usefixtures("undecided")
+def test_an_apple_gpu_is_used_where_asked_for_and_lends_the_cpu_what_it_cannot(monkeypatch):
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    choose_device("mps")
+    assert best_device() == torch.device("mps")
+    assert os.environ["PYTORCH_ENABLE_MPS_FALLBACK"] == "1"
+    monkeypatch.setattr(torch.mps, "recommended_max_memory", lambda: 12e9)
+    monkeypatch.setattr(torch.mps, "driver_allocated_memory", lambda: 2e9)
+    assert device_info(best_device())["device_memory_free_gb"] == 10
+
+
+@pytest.mark.usefixtures("undecided")
+@pytest.mark.parametrize(("name", "of"), [("mps", torch.backends.mps), ("cuda", torch.cuda)])
+def test_a_device_that_is_not_there_is_one_sentence(name, of, monkeypatch, fails):
+    monkeypatch.setattr(of, "is_available", lambda: False)
+    for line in (["--device", name, "info"], ["info", f"--device={name}"]):
+        failed = fails(*line)
+        assert (failed.code, failed.err.count("\n")) == (1, 1)
+        assert f"the device {name}" in failed.err
+
+
+@pytest.mark.usefixtures("undecided")
+def test_a_device_by_another_name_is_a_usage_error(capsys, fails):
+    for line in (["info", "--device", "tpu"], ["info", "--device"], ["info", "--device", "cpu", "--device=mps"]):
+        failed = fails(*line)
+        assert failed.code == cli.USAGE
+        assert "cpu, cuda, mps" in failed.err
+    cli.main(["info", "--device", "cpu"])
+    assert '"device": "cpu"' in capsys.readouterr().out
+
+
+class NoFloat64(TorchDispatchMode):
+    """Apple GPUs have no float64."""
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        out = func(*args, **(kwargs or {}))
+        for tensor in tree_leaves(out):
+            if isinstance(tensor, torch.Tensor):
+                assert (tensor.device.type, tensor.dtype) != ("mps", torch.float64), func
+        return out
+
+
+class PlainIndices(TorchFunctionMode):
+    """Indexing by slices and None without a device guard, which torch built for other devices lacks."""
+
+    def __init__(self, simulated):
+        super().__init__()
+        self.simulated = simulated
+
+    def __torch_function__(self, func, types, args=(), kwargs=None):
+        if func is not torch.Tensor.__getitem__ or args[0].device.type != "mps":
+            return func(*args, **(kwargs or {}))
+        shape = np.empty(args[0].shape, bool)[args[1]].shape
+        with unset_fake_temporarily():
+            return self.simulated(torch.empty(shape, dtype=args[0].dtype, device="meta"))
+
+
+def test_the_denoiser_needs_no_float64_on_an_apple_gpu(monkeypatch):
+    fake, model = FakeTensorMode(allow_non_fake_inputs=True), tiny_model()
+    components, latents = len(model.denoiser.prior.parity), model.codec.shape
+
+    def simulated(tensor):
+        return FakeTensor(fake, tensor.to("meta"), torch.device("mps"))
+
+    for name, buffer in model.denoiser.named_buffers():
+        model.denoiser._buffers[name] = simulated(buffer)
+    x, t = simulated(torch.empty(2, *latents)), simulated(torch.tensor([0, 1]))
+    # which cells a part has, and which kinds are possible, are values, and simulated tensors have none
+    shapes = {"_along": (components,), "picture": latents, "denoise_coefficients": (components,)}
+    for name, shape in shapes.items():
+        monkeypatch.setattr(
+            PersonPrior, name, lambda self, of, *_, shape=shape: simulated(torch.empty(len(of), *shape))
+        )
+    with fake, NoFloat64(), PlainIndices(simulated):
+        x0 = model.denoiser(x, t)
+        in_float64 = _double(x)
+    assert (in_float64.device.type, in_float64.dtype) == ("cpu", torch.float64)
+    assert (x0.device.type, x0.dtype, x0.shape) == ("mps", torch.float32, x.shape)
+
+
+@pytest.mark.parametrize(
+    ("capabilities", "has", "fast"),
+    [
+        ({"avx2": True}, False, False),
+        ({"avx512_bf16": True, "amx_bf16": False}, True, False),
+        ({"avx512_bf16": True, "amx_bf16": True}, True, True),
+        ({"sve_bf16": True}, True, True),
+    ],
+)
+def test_a_processor_is_fast_in_bfloat16_with_matrix_instructions(monkeypatch, capabilities, has, fast):
+    monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    device = torch.device("cpu")
+    assert (has_bfloat16(device), has_fast_bfloat16(device)) == (has, fast)
