@@ -71,7 +71,7 @@ from primdiffusion.human import Human, default_frames, place
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.reconstruction.from_captures import PersonComponents, reconstruct, reconstruct_by_prior, targets_of
+from primdiffusion.reconstruction.from_captures import PersonComponents, reconstruct, targets_of
 from primdiffusion.render.inverse import fit_payload
 from primdiffusion.render.march import march
 from record import command_line, report, run, surroundings
@@ -112,7 +112,7 @@ def main() -> None:
         captures = captured(Path(scratch), arguments.assets, arguments.people)
         for number, name in enumerate(captures.subjects):
             case = case_of(captures, name, number % POSES)
-            many = {count: reconstruct_by_prior(model, person) for count, person in case.by_frames.items()}
+            many = {count: reconstruct(model, person) for count, person in case.by_frames.items()}
             one = many[1]
             pictures, targets = pictures_of(one, case.unseen), over_grey(case.unseen)
             seen = [psnr_of(human, case.given.views) for human in (one, many[EIGHT])]
@@ -160,10 +160,10 @@ def seconds() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         captures = captured(Path(scratch), arguments.assets, arguments.people)
         cases = [case_of(captures, name, number % POSES) for number, name in enumerate(captures.subjects)]
-        reconstruct_by_prior(model, cases[0].given)  # compiles the marcher
+        reconstruct(model, cases[0].given)  # compiles the marcher
         for case in cases:
             began = time.perf_counter()
-            reconstruct_by_prior(model, case.given)
+            reconstruct(model, case.given)
             taken.append(time.perf_counter() - began)
     add({"one_view_seconds_cpu": round(float(np.mean(taken)), 4)}, arguments.json)
 
@@ -193,8 +193,8 @@ def distance() -> None:
         cases = [case_of(captures, name, number % POSES).given for number, name in enumerate(captures.subjects)]
         pictures = made_gallery(place(human) for human in generated(model, range(arguments.generated)))
         made = kernel_distance(features(pictures), features(held.pictures))
-        probable = distance_of(reconstruct_by_prior(model, case) for case in cases)
-        drawn = distance_of(reconstruct_by_prior(model, case, seed=seed) for seed, case in enumerate(cases))
+        probable = distance_of(reconstruct(model, case) for case in cases)
+        drawn = distance_of(reconstruct(model, case, seed=seed) for seed, case in enumerate(cases))
     figures = {
         "one_view_unseen_distance": round(probable, 4),
         "one_view_drawn_unseen_distance": round(drawn, 4),

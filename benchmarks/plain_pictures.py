@@ -48,8 +48,8 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place, pose_body
-from primdiffusion.reconstruction.from_captures import reconstruct_by_prior
-from primdiffusion.reconstruction.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, human_in, start_of
+from primdiffusion.reconstruction.from_captures import reconstruct
+from primdiffusion.reconstruction.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, person_in, start_of
 from primdiffusion.reconstruction.posture_fit import Posture
 from primdiffusion.reconstruction.posture_start import framed, views_of
 from primdiffusion.render.march import march
@@ -110,14 +110,14 @@ def main() -> None:
             start = given(case, photograph, model, Fault(), number)
             began = time.perf_counter()
             posture = fit_posture_in(model, [photograph], start, lambda: None)
-            human = human_in(model, [photograph], posture)
+            human = reconstruct(model, person_in([photograph], posture))
             seconds = time.perf_counter() - began
             views = aligned(case, human)
             row = {
                 "camera_error_px": camera_error(case, photograph, posture),
                 "camera_error_px_start": camera_error(case, photograph, start.posture),
                 "picture_psnr": psnr(human, case, views),
-                "picture_known_psnr": psnr(reconstruct_by_prior(model, case.given), case),
+                "picture_known_psnr": psnr(reconstruct(model, case.given), case),
                 "picture_seconds_cpu": seconds,
             }
             if not number % POSES:
@@ -172,7 +172,7 @@ def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, se
     photograph = photographed(case, folder, fault)
     start = given(case, photograph, model, fault, seed)
     posture = fit_posture_in(model, [photograph], start, lambda: None)
-    human = human_in(model, [photograph], posture)
+    human = reconstruct(model, person_in([photograph], posture))
     return camera_error(case, photograph, posture), psnr(human, case, aligned(case, human))
 
 

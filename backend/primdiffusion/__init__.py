@@ -7,7 +7,7 @@
     image = pd.march(boxes, pd.framing(boxes, yaw_degrees=30, width=512, height=512))
     image.save("front.png")
 
-These names, and the types they take and return, are imported when they are first used: torch is not loaded before.
+Names are imported when they are first used: torch is not loaded before.
 """
 
 from importlib import import_module
@@ -16,23 +16,53 @@ from typing import TYPE_CHECKING, Any
 from primdiffusion.version import __version__
 
 if TYPE_CHECKING:
+    from primdiffusion.body.model import BodyPose
+    from primdiffusion.body.pose_file import read_pose
     from primdiffusion.diffusion.checkpoint import load_checkpoint
+    from primdiffusion.editing.inpaint import inpaint
+    from primdiffusion.editing.interpolate import interpolate
+    from primdiffusion.editing.regions import region_of
+    from primdiffusion.editing.transfer import transfer_garment, transfer_texture
+    from primdiffusion.editing.vary import vary
     from primdiffusion.geometry.camera import Camera
     from primdiffusion.human import Human, framing, generate, place
+    from primdiffusion.human_file import load_human, save_human
     from primdiffusion.primitives.primitives import Primitives
+    from primdiffusion.reconstruction.from_captures import reconstruct
+    from primdiffusion.reconstruction.from_pictures import person_in_pictures
     from primdiffusion.render.march import march
 
-__all__ = ["Camera", "Human", "Primitives", "__version__", "framing", "generate", "load_checkpoint", "march", "place"]
+__all__ = [
+    "load_checkpoint", "generate",
+    "read_pose", "place", "framing", "march",
+    "vary", "interpolate", "region_of", "inpaint", "transfer_texture", "transfer_garment",
+    "person_in_pictures", "reconstruct",
+    "save_human", "load_human",
+    "Human", "BodyPose", "Primitives", "Camera",
+    "__version__",
+]  # fmt: skip
 
 _MODULES = {
-    "Camera": "geometry.camera",
-    "Human": "human",
-    "Primitives": "primitives.primitives",
-    "framing": "human",
-    "generate": "human",
     "load_checkpoint": "diffusion.checkpoint",
-    "march": "render.march",
+    "generate": "human",
+    "read_pose": "pose_file",
     "place": "human",
+    "framing": "human",
+    "march": "render.march",
+    "vary": "editing.vary",
+    "interpolate": "editing.interpolate",
+    "region_of": "editing.regions",
+    "inpaint": "editing.inpaint",
+    "transfer_texture": "editing.transfer",
+    "transfer_garment": "editing.transfer",
+    "person_in_pictures": "from_pictures",
+    "reconstruct": "reconstruction",
+    "save_human": "human_file",
+    "load_human": "human_file",
+    "Human": "human",
+    "BodyPose": "body.model",
+    "Primitives": "primitives.primitives",
+    "Camera": "geometry.camera",
 }
 
 

@@ -95,6 +95,11 @@ def generate(
     `attributes` condition the sample on attributes in `model.vocabulary`; those left open are drawn from the seed.
     `on_step` is called after each step; raise an exception from it to cancel.
     `end` is the level at which the sampler ddim ends: `samplers.RELEASED_END` as in the released code.
+
+        >>> human = pd.generate(model, seed=10)
+        >>> human.payload.density.shape  # boxes, and the voxels along their sides
+        torch.Size([1024, 8, 8, 8])
+
     Raises ValueError for an unknown sampler or attribute, a number of steps outside 1 ... T, or a seed outside
     0 ... 2^63-1.
     """
@@ -184,6 +189,10 @@ def place(
     """The human's primitives in the world; None is the T pose, and the human's own body and anchors.
 
     Anchors belong to a body: give both or neither. Differentiable in the pose and the human.
+
+        >>> boxes = pd.place(human, pose)
+        >>> boxes.position.shape
+        torch.Size([1024, 3])
     """
     return Primitives.place(frames_of(human, pose, body, anchors), human.payload)
 
@@ -280,6 +289,11 @@ def framing(primitives: Primitives, yaw_degrees: float = 0.0, width: int = 512, 
     """A level camera that frames all of `primitives`, at the height of their centre.
 
     `yaw_degrees`: 0 shows the front of the human, 90 the left side. The vertical field of view is 30 degrees.
+
+        >>> camera = pd.framing(boxes, yaw_degrees=30, width=48, height=64)
+        >>> camera.width, camera.height
+        (48, 64)
+
     Raises ValueError for an image side outside 1 ... LARGEST_PICTURE pixels.
     """
     if not 1 <= min(width, height) <= max(width, height) <= LARGEST_PICTURE:

@@ -65,6 +65,9 @@ class NoPersonError(FileError):
 def save_human(path: str | Path, human: Human, *, compact: bool = False) -> None:
     """Write the human atomically: losslessly in 8.4 MB, or `compact` in 2.1 MB, with 8-bit colours and densities.
 
+        >>> pd.save_human("anna.human.safetensors", human)
+        >>> pd.save_human("small.human.safetensors", human, compact=True)
+
     Raises ValueError for NaN, betas out of range and a provenance that is not JSON; OSError.
     """
     _check_values(human.validate())
@@ -95,6 +98,10 @@ def format_version(human: Human) -> int:
 
 def load_human(path: str | Path) -> Human:
     """Read and validate a `.human.safetensors` file.
+
+        >>> anna = pd.load_human("anna.human.safetensors")
+        >>> anna.payload.rgb.equal(human.payload.rgb)
+        True
 
     Raises FileNotFoundError, and FileError (a ValueError) for a file that is damaged, newer or of another kind.
     """

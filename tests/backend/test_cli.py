@@ -217,10 +217,10 @@ def test_without_a_package_one_sentence_has_the_line_that_installs_it(tmp_path, 
 
 
 def test_a_defect_keeps_its_traceback_and_has_a_code_of_its_own(monkeypatch, fails):
-    def broken(_arguments):
+    def broken(*_):
         raise KeyError("a defect")
 
-    monkeypatch.setattr(info, "run", broken)
+    monkeypatch.setattr(info, "info", broken)
     failed = fails("info")
     assert failed.code == cli.DEFECT
     assert "Traceback" in failed.err

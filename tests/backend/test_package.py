@@ -1,11 +1,15 @@
 """`import primdiffusion` is enough for a first script, and loads torch when it is needed."""
 
+import doctest
+import inspect
 import subprocess
 import sys
 
+import numpy as np
 import primdiffusion as pd
 import pytest
 from PIL import Image
+from primdiffusion.reconstruction import from_pictures
 from tiny_model import save_tiny_checkpoint
 
 
@@ -20,6 +24,24 @@ def test_the_names_of_a_first_script_are_there(tmp_path):
         assert (saved.mode, saved.size) == ("RGBA", (24, 32))
     assert (type(human), type(boxes)) == (pd.Human, pd.Primitives)
     assert set(pd.__all__) <= set(dir(pd))
+
+
+def test_the_example_of_each_name_runs_after_those_before_it(tmp_path, checkpoint, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.savez("walk.npz", poses=np.zeros((6, 72)))
+    monkeypatch.setattr("primdiffusion.diffusion.checkpoint.default_checkpoint", lambda: checkpoint)
+    monkeypatch.setattr(from_pictures, "ROUNDS", [from_pictures.Round(48, from_pictures.Stage(4, 0.03), 1)])
+    names = [name for name in pd.__all__ if inspect.isfunction(getattr(pd, name))]
+    parser, seen = doctest.DocTestParser(), {"pd": pd}
+    for name in names:
+        function = getattr(pd, name)
+        example = parser.get_doctest(inspect.getdoc(function), seen, name, inspect.getsourcefile(function), None)
+        assert example.examples, f"{name} has no example"
+        said = []
+        doctest.DocTestRunner().run(example, out=said.append, clear_globs=False)
+        assert not said, "".join(said)
+        seen = example.globs
+    assert names.index("place") < names.index("march") < names.index("reconstruct")
 
 
 def test_torch_is_loaded_with_the_first_name_that_is_used():

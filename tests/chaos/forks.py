@@ -159,7 +159,8 @@ def _serve() -> None:
 def _import_all() -> None:
     import importlib
 
-    from primdiffusion.cli import COMMANDS
+    from primdiffusion.cli import PROGRAMS
+    from primdiffusion.commands import FUNCTIONS
     from primdiffusion.runtime.machine import share_processors
 
     share_processors()
@@ -167,7 +168,8 @@ def _import_all() -> None:
               "people.assets", "encoder.model", "training.captured_people", "training.refine", "export.proxy",
               "export.gaussians", "export.merged_file", "capture.dataset", "capture.sheet",
               "render.march")  # fmt: skip
-    for module in (*(path.partition(":")[0] for path, _ in COMMANDS.values()), *lazily):
+    verbs = {f"commands.{place.partition(':')[0]}" for place in FUNCTIONS.values()}
+    for module in (*verbs, *PROGRAMS.values(), *lazily):
         importlib.import_module(f"primdiffusion.{module}")
     optimisers = ("torch._dynamo", "torch.distributed.fsdp", "torch.fx.experimental.symbolic_shapes")
     for module in ("diffuse_runs", "fit_scenes", *optimisers):

@@ -25,7 +25,14 @@ def read_motion(path: str | Path, person: str = "") -> BodyPose:
 
 
 def read_pose(path: str | Path, frame: int = 0, person: str = "") -> BodyPose:
-    """Read a `frame` of a file as `read_motion`, or its only pose. Raises FileNotFoundError and ValueError."""
+    """Read a `frame` of a file as `read_motion`, or its only pose.
+
+        >>> pose = pd.read_pose("walk.npz", frame=5)
+        >>> pose.joint_rotation.shape
+        torch.Size([24, 3, 3])
+
+    Raises FileNotFoundError and ValueError.
+    """
     return _frame(read_motion(path, person), str(path), frame)
 
 

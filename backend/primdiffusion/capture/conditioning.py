@@ -43,18 +43,22 @@ _NAMED = 3
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CapturedPerson:
-    """The encoder's input for a subject."""
+    """A subject to reconstruct."""
 
-    subject: str
-    frame: int
+    subject: str | list[str]
+    """Name of the subject, or those of plain pictures."""
+    frame: int | None
+    """None for plain pictures."""
     cameras: tuple[int, ...]
     """Indices of the views in cameras.json."""
     views: Views
-    """Unbatched, [v]."""
+    """Unbatched, [v]; in plain pictures the pose is [v] too."""
     betas: Float[Tensor, "10"]
     """Betas of the encoder's body."""
     warnings: tuple[str, ...]
-    """Messages for the user about problems of the captures."""
+    """Messages for the user about problems of the captures or pictures."""
+    whole_views: tuple[View, ...] = ()
+    """Cameras of plain pictures, as found; those of `views` see squares cut out of them."""
 
 
 def captured_person(

@@ -1,5 +1,38 @@
-"""Subcommands and requests: a function each, which gets a record of `formats.requests` or `options`, checked.
+"""Requests and subcommands: a function each, `function(request, session, report)`, for the child and the command line.
 
-`serve` and the command line import these modules, which load torch, when the first request runs, so that the child
-answers `hello`, and the command line --help, at once.
+It gets a record of `formats.requests` or `options`, checked, and returns its answer. Its module, which loads torch, is
+imported when the first request runs, so that the child answers `hello`, and the command line --help, at once.
 """
+
+from collections.abc import Callable
+from importlib import import_module
+from typing import Any
+
+FUNCTIONS = {
+    "generate": "generate:generate",
+    "variations": "generate:variations",
+    **dict.fromkeys(("vary", "interpolate", "inpaint", "transfer"), "edit:edit"),
+    "reconstruct": "reconstruct:reconstruct",
+    "fit_posture": "reconstruct:fit_posture",
+    "refine": "reconstruct:refine_human",
+    "render": "render:render",
+    "draw": "render:draw",
+    "export": "export:export",
+    "proxy": "export:proxy",
+    "gaussians": "export:gaussians",
+    "open_human": "export:open_human",
+    "merge": "merge:merge",
+    "merge_frames": "merge:merge_frames",
+    "info": "info:info",
+    "attributes": "info:attributes",
+    "people": "people:people",
+    "payloads": "people:payloads",
+    "payloads encode": "people:encode",
+}
+"""Module and function by method of JSON-RPC and by subcommand."""
+
+
+def function_of(name: str) -> Callable[..., Any]:
+    """Import the function of a method or subcommand."""
+    module, _, function = FUNCTIONS[name].partition(":")
+    return getattr(import_module(f"{__name__}.{module}"), function)

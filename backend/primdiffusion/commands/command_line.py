@@ -3,16 +3,32 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import operator
 from collections.abc import Sequence
-from typing import Annotated, Any, TypeVar, get_origin
+from typing import Annotated, Any, TypeVar, get_args, get_origin
 
 import tyro
 
+from primdiffusion.commands import function_of
+from primdiffusion.commands.options import OPTIONS
+from primdiffusion.commands.progress import progress_bar, show
 from primdiffusion.formats.schema import Option, Range, descriptions, field_types, read, split
 
 Record = TypeVar("Record")
 _HUGE = 1e18
 """Limits beyond this are those of the computer, not of the option."""
+
+
+def run_record(name: str, arguments: Sequence[str]) -> None:
+    """Run a subcommand of `OPTIONS` as the child runs a request, and print its answer; raises its errors."""
+    request = parse(OPTIONS[name], arguments, name)
+    from primdiffusion.commands.session import Session  # after --help, which does not need torch
+
+    function = function_of(name)
+    with progress_bar() as report:
+        answer = function(request, Session(), report)
+    show(answer)
 
 
 def parse(record: type[Record], arguments: Sequence[str], command: str) -> Record:
@@ -22,19 +38,16 @@ def parse(record: type[Record], arguments: Sequence[str], command: str) -> Recor
 
 
 def _with_options(record: type) -> type:
-    """A subclass whose annotations tyro understands."""
-    about, kinds = descriptions(record), field_types(record)
-    fields = {field.name: field for field in dataclasses.fields(record)}
-    namespace: dict[str, Any] = {
-        "__annotations__": {name: _with_option(kind, about.get(name, "")) for name, kind in kinds.items()},
-        "__doc__": record.__doc__,
-        **{
-            name: dataclasses.field(default_factory=field.default_factory)
-            for name, field in fields.items()
-            if field.default_factory is not dataclasses.MISSING
-        },
-    }
-    return dataclasses.dataclass(frozen=True, kw_only=True)(type(record.__name__, (record,), namespace))
+    """A record of the fields that the command line has, with annotations that tyro understands."""
+    about, fields = descriptions(record), []
+    for field in dataclasses.fields(record):
+        kind = field_types(record)[field.name]
+        if Option(hidden=True) not in split(kind)[1]:
+            default = dataclasses.field(default=field.default, default_factory=field.default_factory)
+            fields.append((field.name, _with_option(kind, about.get(field.name, "")), default))
+    options = dataclasses.make_dataclass(record.__name__, fields, kw_only=True)
+    options.__doc__ = record.__doc__
+    return options
 
 
 def _with_option(kind: Any, about: str) -> Any:
@@ -44,8 +57,8 @@ def _with_option(kind: Any, about: str) -> Any:
         plain = Annotated[plain, _NAMES_AND_VALUES]
     if option.positional:
         plain = tyro.conf.Positional[plain]
-    if option.hidden:
-        plain = tyro.conf.Suppress[plain]
+    if list in get_args(plain):  # numbers come in files
+        plain = functools.reduce(operator.or_, (part for part in get_args(plain) if part is not list))
     words = " ".join([about, *(_limits(mark) for mark in marks if isinstance(mark, Range))]).strip()
     return Annotated[plain, tyro.conf.arg(name=option.name or None, help=words)]
 

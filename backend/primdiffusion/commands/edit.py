@@ -1,4 +1,4 @@
-"""Edit a human: `vary`, `interpolate`, `inpaint` and `transfer`, on the command line and of JSON-RPC."""
+"""Edit a human: `vary`, `interpolate`, `inpaint` and `transfer`."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from contextlib import AbstractContextManager
 from jaxtyping import Bool
 from torch import Tensor
 
-from primdiffusion.commands.output import FILES, Decode, step_previews, write_human
-from primdiffusion.commands.progress import ReportProgress, print_warnings, progress_bar, step_reporter
+from primdiffusion.commands.output import FILES, Decode, previews_wait, step_previews, write_human
+from primdiffusion.commands.progress import ReportProgress, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.reading import warnings_of
@@ -45,18 +45,6 @@ def edit(request: EditRequest, session: Session, report: ReportProgress) -> Huma
 
     Raises OSError first of all if the folder cannot be written to; raises as load_human, load_checkpoint and edits.
     """
-    return _edit(request, session, report)[1]
-
-
-def run(request: EditRequest) -> None:
-    """Edit, and print the output folder; raises as `edit`."""
-    with progress_bar() as report:
-        human, answer = _edit(request, Session(), report)
-    print(f"{request.out_dir}  {human.provenance['edits'][-1]['edit']}, {answer.seconds:.1f} s")
-    print_warnings(answer.warnings)
-
-
-def _edit(request: EditRequest, session: Session, report: ReportProgress) -> tuple[Human, HumanAnswer]:
     began, steps = time.perf_counter(), request.steps
     with staged(request.out_dir) as folder:
         report("load", 0, steps, None)
@@ -70,18 +58,19 @@ def _edit(request: EditRequest, session: Session, report: ReportProgress) -> tup
         human = _EDITS[type(request)](request, load_human(request.person), session, sampling)
         edited = time.perf_counter()
         report("write", steps, steps, None)
-        write_human(folder, human, request.size)
+        drawn = not previews_wait(request.picture_px)
+        write_human(folder, human, request.size, previews=drawn)
         report("write", steps, steps, 0.0)  # the last chance to cancel
-    answer = HumanAnswer(
-        **FILES.in_folder(request.out_dir),
+    return HumanAnswer(
+        **FILES.in_folder(request.out_dir, previews=drawn),
         warnings=warnings_of(human.provenance["edits"][-1]),
         seed=getattr(request, "seed", None),  # interpolations have none
         steps=steps,
+        edit=human.provenance["edits"][-1]["edit"],
         seconds=round(time.perf_counter() - began, 3),
         seconds_sampling=round(edited - began, 3),
         peak_gb=round(peak_memory_gb(), 3),
     )
-    return human, answer
 
 
 def _vary(request: VaryRequest, human: Human, session: Session, sampling: Sampling) -> Human:

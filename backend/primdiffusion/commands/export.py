@@ -1,4 +1,4 @@
-"""Export humans: `primdiffusion export`, and `proxy`, `gaussians` and `open_human` of JSON-RPC."""
+"""Humans as other files: `export`, `proxy`, `gaussians` and `open_human`."""
 
 from __future__ import annotations
 
@@ -80,8 +80,8 @@ def _shaped(person: Path, betas: list[float] | None) -> Human:
     return human if betas is None else reshaped(human, torch.tensor(betas, dtype=torch.float32))
 
 
-def run(command: ExportCommand) -> None:
-    """Export, and print the path."""
+def export(command: ExportCommand, session: Session, report: ReportProgress) -> Path:
+    """Write a file of the format that its extension names."""
     if not command.out.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {command.out.parent}: create it, or choose another")
     human = load_human(command.human)
@@ -92,4 +92,4 @@ def run(command: ExportCommand) -> None:
         write_proxy_glb(command.out, mesh_proxy(human, command), human.provenance)
     else:
         write_proxy_obj(command.out, mesh_proxy(human, command))
-    print(command.out)
+    return command.out

@@ -1,26 +1,26 @@
-"""Generate humans: `primdiffusion generate`, and `generate` and `variations` of JSON-RPC."""
+"""Generate humans: `generate` and `variations`."""
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from torch import Tensor
 
-from primdiffusion.commands.options import GenerateCommand
 from primdiffusion.commands.output import (
     FILES,
     INTERVAL_S,
     PreviewBudget,
     PreviewFiles,
     draw_front_and_back,
+    previews_wait,
     step_previews,
     write_files,
     write_human,
 )
-from primdiffusion.commands.progress import Pace, ReportProgress, print_warnings, progress_bar, step_reporter
+from primdiffusion.commands.progress import Pace, ReportProgress, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.diffusion.reading import warnings_of
@@ -38,36 +38,30 @@ from primdiffusion.runtime.machine import peak_memory_gb
 
 
 def generate(request: GenerateRequest, session: Session, report: ReportProgress) -> HumanAnswer:
-    """Write all files or none. Raises OSError first of all if the folder cannot be written to."""
-    began = time.perf_counter()
-    (human,), sampled = generate_humans(request, {request.seed: request.out_dir}, session, report)
-    return HumanAnswer(
-        **FILES.in_folder(request.out_dir),
-        warnings=warnings_of(human.provenance),
-        seed=request.seed,
-        steps=request.steps,
-        seconds=round(time.perf_counter() - began, 3),
-        seconds_sampling=round(sampled - began, 3),
-        peak_gb=round(peak_memory_gb(), 3),
-    )
+    """Sample batch by batch, and write the files of a batch, all or none; return those of the last human.
 
-
-def generate_humans(
-    request: GenerateRequest,
-    folders: dict[int, Path],
-    session: Session,
-    report: ReportProgress,
-    *,
-    compact: bool = False,
-) -> tuple[list[Human], float]:
-    """Sample a human for each seed as one batch and write each to its folder, all of them or none; see `save_human`.
-
-    Returns them, and the time (of `perf_counter`) when sampling ended. Raises as load_checkpoint and generate_batch,
-    and OSError.
+    The humans before it are reported when they are finished. Raises OSError first of all if a folder cannot be written
+    to; raises as load_checkpoint and generate_batch.
     """
-    seeds, steps = list(folders), request.steps
-    with contextlib.ExitStack() as files:
-        unfinished = files.enter_context(staged_together(list(folders.values())))
+    seeds, answer = range(request.seed, request.seed + request.count), None
+    for first in seeds[:: request.batch]:
+        batch = list(range(first, min(first + request.batch, seeds.stop)))
+        for answer in _generate_batch(request, batch, session, report):
+            if answer.seed != seeds[-1]:
+                report("write", request.steps, request.steps, None, human=answer)
+    assert answer is not None, "count is 1 or more"
+    return answer
+
+
+def _generate_batch(
+    request: GenerateRequest, seeds: Sequence[int], session: Session, report: ReportProgress
+) -> list[HumanAnswer]:
+    began, steps, folders = time.perf_counter(), request.steps, [request.out_dir]
+    if request.count > 1:
+        folders = [request.out_dir / f"seed_{seed:06d}" for seed in seeds]
+        for folder in folders:
+            check_unlinked(folder)
+    with staged_together(folders) as unfinished:
         report("load", 0, steps, None)
         model = session.model(request.checkpoint)
         report("sample", 0, steps, None)
@@ -90,28 +84,24 @@ def generate_humans(
             )
         sampled = time.perf_counter()
         report("write", steps, steps, None)
+        drawn = not previews_wait(request.picture_px)
+        looks = {"compact": request.compact, "compositing": request.compositing, "previews": drawn}
         for folder, human in zip(unfinished, humans, strict=True):
-            write_human(folder, human, request.size, compact=compact, compositing=request.compositing)
+            write_human(folder, human, request.size, **looks)
         report("write", steps, steps, 0.0)  # the last chance to cancel
-    return humans, sampled
-
-
-def run(command: GenerateCommand) -> None:
-    """Generate batch by batch; print the folder of each human."""
-    session, end = Session(), command.seed + command.count
-    for first in range(command.seed, end, command.batch):
-        began, seeds = time.perf_counter(), range(first, min(first + command.batch, end))
-        folders = {
-            seed: command.out_dir if command.count == 1 else command.out_dir / f"seed_{seed:06d}" for seed in seeds
-        }
-        for folder in folders.values() if command.count > 1 else ():
-            check_unlinked(folder)
-        with progress_bar(f"seed {', '.join(map(str, seeds))}") as report:
-            humans, _ = generate_humans(command, folders, session, report, compact=command.compact)
-        seconds = (time.perf_counter() - began) / len(seeds)
-        for (seed, folder), human in zip(folders.items(), humans, strict=True):
-            print(f"{folder}  seed {seed}, {command.steps} steps, {seconds:.1f} s")
-            print_warnings(f"seed {seed}: {warning}" for warning in warnings_of(human.provenance))
+    seconds = (time.perf_counter() - began) / len(seeds)
+    return [
+        HumanAnswer(
+            **FILES.in_folder(folder, previews=drawn),
+            warnings=[f"seed {seed}: {text}" if request.count > 1 else text for text in warnings_of(human.provenance)],
+            seed=seed,
+            steps=steps,
+            seconds=round(seconds, 3),
+            seconds_sampling=round((sampled - began) / len(seeds), 3),
+            peak_gb=round(peak_memory_gb(), 3),
+        )
+        for seed, folder, human in zip(seeds, folders, humans, strict=True)
+    ]
 
 
 def variations(request: VariationsRequest, session: Session, report: ReportProgress) -> VariationsAnswer:

@@ -1,4 +1,4 @@
-"""Describe an installation, a checkpoint or a human: `primdiffusion info`, and `attributes` of JSON-RPC."""
+"""Describe an installation, a checkpoint or a human: `info` and `attributes`."""
 
 from __future__ import annotations
 
@@ -17,15 +17,14 @@ from primdiffusion.encoder.model import default_encoder
 from primdiffusion.formats.answers import AttributesAnswer
 from primdiffusion.formats.requests import AttributesRequest
 from primdiffusion.human_file import NoPersonError, format_version, load_human
-from primdiffusion.runtime.device import best_device, device_info
 from primdiffusion.runtime.machine import memory
 from primdiffusion.version import __version__
 
 
-def run(command: InfoCommand) -> None:
-    """Print one JSON object."""
+def info(command: InfoCommand, session: Session, report: ReportProgress) -> str:
+    """Return one JSON object."""
     if command.file is None:
-        about = _installation()
+        about = _installation(session)
     else:
         try:
             human = load_human(command.file)
@@ -35,15 +34,15 @@ def run(command: InfoCommand) -> None:
             betas = [round(beta, 4) for beta in human.betas.tolist()]
             body = "default" if human.body_setup is None else dataclasses.asdict(human.body_setup.files)
             about = {"format_version": format_version(human), **human.provenance, "betas": betas, "body": body}
-    print(json.dumps(about, indent=2))
+    return json.dumps(about, indent=2)
 
 
-def _installation() -> dict[str, Any]:
+def _installation(session: Session) -> dict[str, Any]:
     cards = {
         name: read_card(path) if path.exists() else None
         for name, path in (("checkpoint", default_checkpoint()), ("encoder", default_encoder()))
     }
-    return {"version": __version__, "torch": torch.__version__, **device_info(best_device()), **memory(), **cards}
+    return {"version": __version__, "torch": torch.__version__, **session.device_info(), **memory(), **cards}
 
 
 def attributes(request: AttributesRequest, session: Session, report: ReportProgress) -> AttributesAnswer:

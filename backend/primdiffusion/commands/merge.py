@@ -1,19 +1,14 @@
-"""Merge humans into voxel grids for other renderers.
-
-`primdiffusion merge`, and `merge` and `merge_frames` of JSON-RPC.
-"""
+"""Merge humans into voxel grids for other renderers: `merge` and `merge_frames`."""
 
 from __future__ import annotations
 
 import dataclasses
 import functools
 import time
-from pathlib import Path
 
 import torch
 
 from primdiffusion.body.pose_file import read_pose
-from primdiffusion.commands.options import MergeCommand
 from primdiffusion.commands.progress import Pace, ReportProgress
 from primdiffusion.commands.session import Session
 from primdiffusion.editing.reshaping import reshaped
@@ -27,14 +22,22 @@ from primdiffusion.primitives.primitives import Primitives
 
 
 def merge(request: MergeRequest, session: Session, report: ReportProgress) -> MergeAnswer:
-    """Write a grid of all humans. Raises as load_human, place_skinned and merge."""
+    """Write a grid of all humans. Raises OSError, and as load_human, place_skinned and merge."""
     began = time.perf_counter()
+    if not request.out.parent.is_dir():
+        raise FileNotFoundError(f"there is no folder {request.out.parent}: create it, or choose another")
+    write = write_grid_npz
+    if request.out.suffix.lower() == ".vdb":
+        load_openvdb()
+        write = write_grid_vdb
     report("merge", 0, 1, None)
-    primitives = Primitives.together([_placed(load_human(person.human), person) for person in request.people])
+    posed = [_placed(load_human(person.human), person) for person in request.people]
+    grid = upright_grid(Primitives.together(posed or _side_by_side(request)), request.voxel)
     with written_whole(request.out) as path:
-        shape = _write(path, primitives, request.voxel)
+        write(path, grid)
         report("merge", 1, 1, 0.0)  # the last chance to cancel
-    return MergeAnswer(out=request.out, shape=shape, seconds=round(time.perf_counter() - began, 3))
+    shape, seconds = list(grid.density.shape), round(time.perf_counter() - began, 3)
+    return MergeAnswer(out=request.out, shape=shape, seconds=seconds)
 
 
 def merge_frames(request: MergeFramesRequest, session: Session, report: ReportProgress) -> MergeFramesAnswer:
@@ -50,7 +53,7 @@ def merge_frames(request: MergeFramesRequest, session: Session, report: ReportPr
     for index, person in enumerate(request.people):
         file = request.out_dir / f"{index:04d}.npz"
         with written_whole(file) as path:
-            _write(path, _placed(load(person.human), person), request.voxel)
+            write_grid_npz(path, upright_grid(_placed(load(person.human), person), request.voxel))
         files.append(file)
         report("merge", index + 1, count, pace.left(index + 1, count))
     return MergeFramesAnswer(files=files, seconds=round(time.perf_counter() - began, 3))
@@ -63,26 +66,11 @@ def _placed(human: Human, person: PosedPerson) -> Primitives:
     return place_skinned(human, joints, matrix)
 
 
-def _write(path: Path, primitives: Primitives, voxel: float) -> list[int]:
-    grid = upright_grid(primitives, voxel)
-    write_grid_npz(path, grid)
-    return list(grid.density.shape)
-
-
-def run(command: MergeCommand) -> None:
-    """Merge, and print the path."""
-    if not command.out.parent.is_dir():
-        raise FileNotFoundError(f"there is no folder {command.out.parent}: create it, or choose another")
-    as_vdb = command.out.suffix.lower() == ".vdb"
-    if as_vdb:
-        load_openvdb()
-    pose = None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
+def _side_by_side(request: MergeRequest) -> list[Primitives]:
+    pose = None if request.pose is None else read_pose(request.pose, request.frame, request.tracked_person)
     people = []
-    for number, path in enumerate(command.humans):
+    for number, path in enumerate(request.humans):
         placed = place_on_floor(load_human(path), pose)
-        aside = torch.tensor([(number - (len(command.humans) - 1) / 2) * command.apart, 0.0, 0.0])
+        aside = torch.tensor([(number - (len(request.humans) - 1) / 2) * request.apart, 0.0, 0.0])
         people.append(dataclasses.replace(placed, position=placed.position + aside))
-    grid = upright_grid(Primitives.together(people), command.voxel)
-    with written_whole(command.out) as path:
-        (write_grid_vdb if as_vdb else write_grid_npz)(path, grid)
-    print(command.out)
+    return people

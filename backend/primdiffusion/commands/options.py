@@ -1,116 +1,31 @@
-"""Command lines with more, fewer or other options than a request of JSON-RPC. Needs no torch, for --help."""
+"""Subcommands: requests of JSON-RPC, and those that the command line alone has. Needs no torch, for --help."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
-from primdiffusion.files.regular_files import real_path
 from primdiffusion.formats.requests import (
-    LARGEST_SEED,
-    RAY_STEP,
-    VOXEL,
-    Compositing,
     Count,
     GaussiansRequest,
     GenerateRequest,
     InpaintRequest,
     InterpolateRequest,
     Making,
-    OutDir,
+    MergeRequest,
     Person,
     Pixels,
+    PoseOptions,
     ProxySettings,
-    RayStep,
     ReconstructRequest,
     RenderRequest,
     Seed,
     TransferRequest,
     VaryRequest,
-    View,
-    Voxel,
 )
-from primdiffusion.formats.schema import Ending, FieldError, Length, Option, Range
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class GenerateCommand(GenerateRequest):
-    """Generate humans: person.human.safetensors and previews."""
-
-    out_dir: OutDir
-    """Output folder; with --count above 1, of a folder for each human."""
-    seed: Seed = 0
-    count: Count = 1
-    """Number of humans, with consecutive seeds."""
-    batch: Count = 1
-    """Humans sampled at once: faster, above all on a GPU, and needs more memory. Results differ from those of single
-    humans in the last digits."""
-    compact: bool = False
-    """Store colours and densities of person.human.safetensors in 8 bits: 2 MB instead of 8, without visible loss."""
-
-    def check(self) -> None:
-        """Raise FieldError for seeds beyond the largest."""
-        if self.seed + self.count - 1 > LARGEST_SEED:
-            raise FieldError(("count",), f"is {self.count}: the last seed would be above 2^63 - 1")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class PoseOptions:
-    """A pose on the command line."""
-
-    pose: Path | None = None
-    """Pose file (.npz, .npy, .json, .pkl, .bvh), such as 72 axis-angle numbers (24 x 3, radians); default: T pose."""
-    frame: int = 0
-    """Frame of a pose file with several."""
-    tracked_person: str = ""
-    """Name or number of a person in a tracker's pose file of several people; default: who is in the most frames."""
-
-    def check(self) -> None:
-        """Raise FieldError for a frame or person without a pose file."""
-        for name, value in (("frame", self.frame), ("tracked_person", self.tracked_person)):
-            if value and self.pose is None:
-                raise FieldError((name,), f"is {value} without a pose file: give one with --pose")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class RenderCommand(PoseOptions):
-    """Render a human in a pose."""
-
-    human: Person
-    """A .human.safetensors file."""
-    out: Annotated[Path, Ending((".png",))]
-    """Output PNG."""
-    yaw: float = 0.0
-    """Camera position around the human, degrees: 0 in front, 90 at the human's left."""
-    size: Pixels = RenderRequest.width
-    """Width and height, pixels."""
-    width: Pixels | None = None
-    """Pixels; the default is --size."""
-    height: Pixels | None = None
-    """Pixels; the default is --size."""
-    view: View = "colour"
-    """colour; depth in false colours, bright where near; alpha in grey; boxes: the primitives."""
-    step: RayStep = RAY_STEP
-    """Metres between samples of a ray; finer is slower and more accurate."""
-    compositing: Compositing = "linear"
-    """linear, as in Blender; released, as the authors' code: sRGB-encoded colours, boxes in index order, a sample each
-    millimetre, rays through pixel corners."""
-    background: Literal["black", "white", "transparent"] = "black"
-    """Background behind the human."""
-    depth: Annotated[Path, Ending((".png",))] | None = None
-    """A second PNG: depth in false colours, bright where near."""
-
-    def check(self) -> None:
-        """Raise FieldError for one file with two contents, for what `released` does not have, as `PoseOptions`."""
-        super().check()
-        if self.depth is not None and real_path(self.depth) == real_path(self.out):
-            raise FieldError(("depth",), f"is {self.depth}, as out: give two different files")
-        if self.compositing == "released" and (self.view, self.step) != ("colour", RAY_STEP):
-            raise FieldError(
-                ("compositing",), "is released, which has its own step and the view colour: omit the others"
-            )
+from primdiffusion.formats.schema import Ending, FieldError, Option, Range
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -129,20 +44,6 @@ class ExportCommand(ProxySettings, PoseOptions):
         super().check()
         if self.pose is not None and self.out.suffix.lower() != ".ply":
             raise FieldError(("pose",), f"cannot be stored in {self.out.name}: omit it, or export Gaussians to a .ply")
-
-
-@dataclasses.dataclass(frozen=True, kw_only=True)
-class MergeCommand(PoseOptions):
-    """Merge humans into one voxel grid; the extension of --out selects the format: .vdb or .npz."""
-
-    humans: Annotated[tuple[Path, ...], Length(1), Option(positional=True)]
-    """.human files (or .human.safetensors)."""
-    out: Annotated[Path, Ending((".vdb", ".npz"))]
-    """.vdb: grids density and Cd (needs Python's module openvdb); .npz: density, colour, origin, voxel. z up."""
-    voxel: Voxel = VOXEL
-    """Voxel size, metres; half the size shows more detail at eight times the memory."""
-    apart: float = 1.0
-    """Distance between neighbours, side by side, metres."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -183,14 +84,6 @@ class RefineCommand:
     """Time limit of the optimisation."""
     seed: int = 0
     """Seed of the order of views; the same seed gives the same human unless time runs out."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ServeCommand:
-    """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
-
-    about: bool = False
-    """Print the versions of this program, torch and Python as one line of JSON, and end."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -264,20 +157,19 @@ class EncodePayloadsCommand:
 
 
 OPTIONS: dict[str, type] = {
-    "generate": GenerateCommand,
+    "generate": GenerateRequest,
     "vary": VaryRequest,
     "interpolate": InterpolateRequest,
     "inpaint": InpaintRequest,
     "transfer": TransferRequest,
     "reconstruct": ReconstructRequest,
     "refine": RefineCommand,
-    "render": RenderCommand,
+    "render": RenderRequest,
     "export": ExportCommand,
-    "merge": MergeCommand,
-    "serve": ServeCommand,
+    "merge": MergeRequest,
     "info": InfoCommand,
     "people": PeopleCommand,
     "payloads": PayloadsCommand,
     "payloads encode": EncodePayloadsCommand,
 }
-"""Command lines that are read before the command's module, which loads torch, is imported."""
+"""Records of subcommands, which are read before the command's module, which loads torch, is imported."""

@@ -1,12 +1,19 @@
-"""The files of a human in an output folder, and previews while it is sampled."""
+"""The files of a human in an output folder, and previews while it is sampled.
+
+Requests that show previews while sampling do not wait for the marcher's compiler (half a minute, once on a machine): it
+runs in a process of its own at low priority, and their humans come without previews until it has ended.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
 import math
+import multiprocessing
+import os
 import time
 from collections.abc import Callable, Iterator
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +22,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from primdiffusion.body.model import BodyPose
+from primdiffusion.diffusion.model import BETAS
 from primdiffusion.diffusion.samplers import SamplerStep
 from primdiffusion.files.regular_files import remove_file
 from primdiffusion.formats.joints import JOINT_NAMES
@@ -23,9 +31,12 @@ from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.human import Human, framing, place
 from primdiffusion.human_file import save_body, save_human
-from primdiffusion.primitives.primitives import Primitives
+from primdiffusion.primitives.primitives import K, Payload, Primitives, S
+from primdiffusion.render.cpu.compiled import is_compiled
+from primdiffusion.render.cpu.forward import march_tiles
 from primdiffusion.render.image import Background, depth_to_png, rgba_to_png
 from primdiffusion.render.march import RELEASED, Rendering, march
+from primdiffusion.runtime.worker_process import end_with_parent
 
 INTERVAL_S = 0.4
 """Seconds between two previews."""
@@ -53,23 +64,31 @@ class OutputFiles:
     side: str = "side.png"
     depth: str = "depth.png"
 
-    def in_folder(self, folder: Path) -> dict[str, Any]:
+    def in_folder(self, folder: Path, *, previews: bool = True) -> dict[str, Any]:
         """Return the paths by their names in answers."""
-        names = {"person": self.human, "preview": self.front, "side": self.side, "depth": self.depth}
-        return {name: folder / file for name, file in names.items()}
+        pictures = {"preview": self.front, "side": self.side, "depth": self.depth} if previews else {}
+        return {name: folder / file for name, file in {"person": self.human, **pictures}.items()}
 
 
 FILES = OutputFiles()
 
 
 def write_human(
-    folder: Path, human: Human, size: int, *, compact: bool = False, compositing: Compositing = "linear"
+    folder: Path,
+    human: Human,
+    size: int,
+    *,
+    compact: bool = False,
+    compositing: Compositing = "linear",
+    previews: bool = True,
 ) -> None:
-    """Write all FILES: the human, and previews of size x size pixels in the T pose.
+    """Write all FILES: the human, and unless `previews` is false, previews of size x size pixels in the T pose.
 
-    The first preview on a machine takes some seconds longer: the marcher is compiled, and cached. Raises OSError.
+    The first preview on a machine takes half a minute longer: the marcher is compiled, and cached. Raises OSError.
     """
     write_files(folder / FILES.human, human, compact=compact)
+    if not previews:
+        return
     primitives = place(human)
     front = draw(folder / FILES.front, primitives, framing(primitives, 0, size, size), BLACK, compositing)
     depth_to_png(folder / FILES.depth, front.depth, front.alpha)
@@ -81,6 +100,28 @@ def write_files(path: Path, human: Human, *, compact: bool = False) -> None:
     save_human(path, human, compact=compact)
     if human.body_setup is not None:
         save_body(path.with_name(FILES.body), human.body_setup.body, human.body_setup.anchors)
+
+
+_compiler: list[BaseProcess] = []
+
+
+def previews_wait(px: int) -> bool:
+    """Whether a request with previews of px pixels while sampling is ready before the compiler; starts the compiler."""
+    if px == 0 or is_compiled(march_tiles):
+        return False
+    if not _compiler:
+        _compiler.append(multiprocessing.get_context("spawn").Process(target=_compile, daemon=True))
+        _compiler[0].start()
+    return _compiler[0].is_alive()
+
+
+def _compile() -> None:
+    end_with_parent()
+    if hasattr(os, "nice"):  # Windows has it not
+        os.nice(10)
+    nothing = Payload(torch.zeros(K, 3, S, S, S), torch.zeros(K, S, S, S), torch.zeros(K, 3))
+    primitives = place(Human(nothing, torch.zeros(BETAS), {}))
+    march(primitives, framing(primitives, 0, 2, 2))
 
 
 class PreviewBudget:
@@ -149,7 +190,7 @@ def step_previews(
     budget = PreviewBudget()
 
     def preview(step: SamplerStep) -> Path | None:
-        if step.index + 1 == step.total or not budget.granted():  # the result follows the last step
+        if step.index + 1 == step.total or not budget.granted() or previews_wait(px):  # the result follows the last
             return None
         with budget.spending():
             human = decode(step.x0)

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections import Counter
-
-from tqdm import tqdm
+from pathlib import Path
 
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.commands.options import (
@@ -13,24 +11,24 @@ from primdiffusion.commands.options import (
     PayloadsCommand,
     PeopleCommand,
 )
-from primdiffusion.encoder.model import load_encoder
+from primdiffusion.commands.progress import ReportProgress
+from primdiffusion.commands.session import Session
 from primdiffusion.files.folder_lock import lock_folder
 from primdiffusion.files.regular_files import printable
 from primdiffusion.people.assets import open_assets
 from primdiffusion.people.folder import PeopleSet, make_people, unknown_licences
 from primdiffusion.people.payloads import make_payloads
 from primdiffusion.people.wardrobe import required_meshes
-from primdiffusion.runtime.device import best_device
 from primdiffusion.training.captured_people import EncodeSettings, encode_people, read_cards
 
 
-def run_people(command: PeopleCommand) -> None:
-    """Make the humans, show progress, and print the folder. Raises ValueError, FileNotFoundError, OSError."""
-    people = PeopleSet(command.out, command.seed, command.count)
+def people(command: PeopleCommand, session: Session, report: ReportProgress) -> Path:
+    """Make the humans; return the folder. Raises ValueError, FileNotFoundError, OSError."""
+    wanted = PeopleSet(command.out, command.seed, command.count)
     assets = open_assets(command.assets, required_meshes())
-    with lock_folder(command.out), tqdm(total=command.count, unit="human", desc="people", disable=None) as bar:
-        for done in make_people(assets, people, command.workers):
-            bar.update(done - bar.n)
+    with lock_folder(command.out):
+        for done in make_people(assets, wanted, command.workers):
+            report("people", done, command.count, None)
     unknown = unknown_licences(command.out)
     if unknown:
         print(
@@ -38,31 +36,25 @@ def run_people(command: PeopleCommand) -> None:
             "manifest lists it as unknown: list them in a LICENSES.txt beside the asset folder",
             file=sys.stderr,
         )
-    print(command.out)
+    return command.out
 
 
-def run_payloads(command: PayloadsCommand) -> None:
-    """Make the payloads and show progress. Raises ValueError, FileNotFoundError, OSError."""
-    assets = open_assets(command.assets, required_meshes())
-    with tqdm(total=command.count, unit="human", desc="payloads") as bar:
-
-        def report(done: int, total: int) -> None:
-            bar.update(done - bar.n)
-
-        make_payloads(
-            assets,
-            command.out,
-            command.count,
-            command.variants,
-            command.seed,
-            command.workers,
-            command.making,
-            command.checkpoint,
-            report,
-        )
+def payloads(command: PayloadsCommand, session: Session, report: ReportProgress) -> None:
+    """Make the payloads. Raises ValueError, FileNotFoundError, OSError."""
+    make_payloads(
+        open_assets(command.assets, required_meshes()),
+        command.out,
+        command.count,
+        command.variants,
+        command.seed,
+        command.workers,
+        command.making,
+        command.checkpoint,
+        lambda done, total: report("payloads", done, total, None),
+    )
 
 
-def run_encode(command: EncodePayloadsCommand) -> None:
+def encode(command: EncodePayloadsCommand, session: Session, report: ReportProgress) -> None:
     """Encode, and print a line for each subject.
 
     Raises:
@@ -71,14 +63,14 @@ def run_encode(command: EncodePayloadsCommand) -> None:
     settings = EncodeSettings(command.views, command.looks, command.refine_steps, command.refine_size, command.seed)
     captures = open_captures(command.captures)
     cards = {} if command.people is None else read_cards(command.people)
-    model = load_encoder(command.encoder, best_device())
-    outcomes = Counter()
-    work = encode_people(model, captures, command.out, settings, cards)
+    model = session.encoder(command.encoder)
+    failed, total = 0, len(captures.subjects)
     with lock_folder(command.out):
-        for outcome in tqdm(work, total=len(captures.subjects), unit="human", disable=None):
-            outcomes[outcome.status] += 1
+        for done, outcome in enumerate(encode_people(model, captures, command.out, settings, cards), 1):
+            failed += outcome.status == "failed"
             unknown = command.people is not None and outcome.subject not in cards
             note = outcome.error or ("attributes unknown" if unknown else "")
             print(printable(f"{outcome.subject}  {outcome.status}  {note}").rstrip(), flush=True)
-    if outcomes["failed"]:
-        raise ValueError(f"{outcomes['failed']} of {len(captures.subjects)} humans failed: see the lines above")
+            report("encode", done, total, None)
+    if failed:
+        raise ValueError(f"{failed} of {total} humans failed: see the lines above")

@@ -69,16 +69,27 @@ def step_reporter(
 
 
 @contextlib.contextmanager
-def progress_bar(label: str | None = None) -> Iterator[ReportProgress]:
-    """Show the sampler's steps on stderr, if that is a terminal."""
-    with tqdm(desc=label, unit="step", disable=None) as bar:
+def progress_bar() -> Iterator[ReportProgress]:
+    """Show the steps of a stage on stderr, if that is a terminal, and print humans as they are finished."""
+    with tqdm(disable=None) as bar:
 
-        def report(stage: str, step: int, total: int, _eta_s: float | None, /, **_more: Any) -> None:
-            if stage == "sample":
+        def report(stage: str, step: int, total: int, _eta_s: float | None, /, **more: Any) -> None:
+            if "human" in more:
+                with bar.external_write_mode(sys.stdout):
+                    show(more["human"])
+            if total > 1:
+                bar.set_description(stage, refresh=False)
                 bar.total = total
                 bar.update(step - bar.n)
 
         yield report
+
+
+def show(answer: Any) -> None:
+    """Print an answer, if there is one, and its warnings."""
+    if answer is not None:
+        print(answer, flush=True)
+        print_warnings(getattr(answer, "warnings", ()))
 
 
 def print_warnings(warnings: Iterable[str]) -> None:

@@ -1,7 +1,4 @@
-"""Reconstruct a human from pictures or captures, and refine it on captures.
-
-`primdiffusion reconstruct` and `refine`; `reconstruct` and `fit_posture` of JSON-RPC.
-"""
+"""A human from pictures or captures: `reconstruct`, `fit_posture` and `refine`."""
 
 from __future__ import annotations
 
@@ -10,10 +7,9 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
-from pathlib import Path
+from typing import Any
 
 from torch import Tensor
-from tqdm import tqdm
 
 from primdiffusion.capture.conditioning import (
     CapturedPerson,
@@ -22,35 +18,22 @@ from primdiffusion.capture.conditioning import (
     conditioning_views,
     default_betas,
 )
-from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.capture.reader import Captures
 from primdiffusion.commands.options import RefineCommand
 from primdiffusion.commands.output import FILES, write_human
-from primdiffusion.commands.progress import ReportProgress, print_warnings, progress_bar
+from primdiffusion.commands.progress import ReportProgress, print_warnings
 from primdiffusion.commands.session import Session
-from primdiffusion.diffusion.model import DiffusionModel
-from primdiffusion.encoder.model import EncoderModel, load_encoder
+from primdiffusion.encoder.model import EncoderModel
 from primdiffusion.files.whole_files import staged
 from primdiffusion.formats.answers import FitPostureAnswer, ReconstructAnswer
-from primdiffusion.formats.requests import FitPostureRequest, ReconstructRequest
+from primdiffusion.formats.requests import FitPostureRequest, Pictures, ReconstructRequest
 from primdiffusion.human import Human
 from primdiffusion.human_file import load_human
 from primdiffusion.reconstruction.from_captures import reconstruct as reconstruct_human
-from primdiffusion.reconstruction.from_captures import reconstruct_by_prior
-from primdiffusion.reconstruction.from_pictures import (
-    POSTURE_STEPS,
-    Start,
-    fit_posture_in,
-    human_in,
-    human_steps,
-    outline_overlap,
-    start_of,
-)
+from primdiffusion.reconstruction.from_captures import steps_of
+from primdiffusion.reconstruction.from_pictures import POSTURE_STEPS, person_in_pictures
 from primdiffusion.reconstruction.posture_file import write_posture
-from primdiffusion.reconstruction.posture_fit import Posture
-from primdiffusion.reconstruction.posture_start import views_of
-from primdiffusion.render.descent import DescentSettings, DescentStep
-from primdiffusion.runtime.device import best_device
+from primdiffusion.render.descent import DescentSettings
 from primdiffusion.runtime.machine import peak_memory_gb
 from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr
 
@@ -59,61 +42,65 @@ STAGES = 4
 ENCODER_VIEWS = 8
 """Images to encode for a start from the encoder."""
 POSTURE_FILE = "posture.json"
-LEAST_OVERLAP = 0.8
-"""Intersection over union of the human and the mask; of fits that look right it is above 0.9."""
 
 
 def reconstruct(request: ReconstructRequest, session: Session, report: ReportProgress) -> ReconstructAnswer:
-    """Write the human, all files or none; return their paths, the views used and the time taken.
+    """Open the pictures, refine the pose unless it is known, fit a human, and write its files, all or none.
 
-    Raises OSError first of all if the folder cannot be written to; raises as captured_person and load_encoder.
+    Raises OSError first of all if the folder cannot be written to; raises as Session, person_in_pictures and
+    captured_person.
     """
-    if request.pictures:
-        return reconstruct_pictures(request, session, report)
-    assert request.capture is not None, "checked by the request"
-    began = time.perf_counter()
+    began, warnings = time.perf_counter(), []
     with staged(request.out_dir) as folder:
         report("load", 0, STAGES, None)
-        model = session.encoder(request.checkpoint) if request.by == "encoder" else session.model(request.checkpoint)
+        by_encoder = request.capture is not None and request.by == "encoder"
+        model = session.encoder(request.checkpoint) if by_encoder else session.model(request.checkpoint)
+        on_step = _steps(report, steps_of(model) + (POSTURE_STEPS if request.pictures and request.refine else 0))
         report("read", 1, STAGES, None)
-        body = model.body if isinstance(model, EncoderModel) else None
-        person = captured_person(request.capture, request.subject, request.frame, request.views, body)
-        report("encode", 2, STAGES, None)
-        loaded = time.perf_counter()
-        if isinstance(model, EncoderModel):
-            human = reconstruct_human(model, person)
+        if request.capture is None:
+            model = session.model(request.checkpoint)
+            person = person_in_pictures(model, *_files(request), refine=request.refine, on_step=on_step)
+            write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views)
+            if len(request.pictures) == 1:
+                warnings.append("only one picture: the sides that it does not show are guessed")
         else:
-            on_step = lambda done, total: report("fit", done, total, None)  # noqa: E731
-            human = reconstruct_by_prior(model, person, on_step, request.seed)
+            body = model.body if isinstance(model, EncoderModel) else None
+            person = captured_person(request.capture, request.subject, request.frame, request.views, body)
+        report("encode", 2, STAGES, None)
+        found = time.perf_counter()
+        human = reconstruct_human(model, person, request.seed, on_step)
         encoded = time.perf_counter()
         report("write", 3, STAGES, None)
         write_human(folder, human, request.size)
         report("write", STAGES, STAGES, 0.0)  # the last chance to cancel
+    of_capture = {} if person.frame is None else {"subject": person.subject, "views": list(person.cameras)}
     return ReconstructAnswer(
         **FILES.in_folder(request.out_dir),
-        subject=person.subject,
+        **of_capture,
         frame=person.frame,
-        views=list(person.cameras),
-        warnings=list(person.warnings),
+        posture=None if request.capture else request.out_dir / POSTURE_FILE,
+        seed=request.seed,
+        warnings=[*warnings, *person.warnings],
         seconds=round(time.perf_counter() - began, 3),
-        seconds_encoding=round(encoded - loaded, 3),
+        seconds_encoding=round(encoded - found, 3),
         peak_gb=round(peak_memory_gb(), 3),
     )
 
 
-def run(request: ReconstructRequest) -> None:
-    """Reconstruct, and print the output folder; raises as `reconstruct`."""
-    with progress_bar() as report:
-        answer = reconstruct(request, Session(), report)
-    print_warnings(answer.warnings)
-    if request.pictures:
-        print(f"{request.out_dir}  {len(request.pictures)} pictures, {answer.seconds:.1f} s")
-        return
-    seconds = f"{answer.seconds:.1f} s, of which the {request.by} {answer.seconds_encoding:.1f} s"
-    print(f"{request.out_dir}  {answer.subject}, frame {answer.frame}, {len(answer.views or ())} views, {seconds}")
+def fit_posture(request: FitPostureRequest, session: Session, report: ReportProgress) -> FitPostureAnswer:
+    """Write posture.json, whole or not at all. Raises as `reconstruct`."""
+    began = time.perf_counter()
+    with staged(request.out_dir) as folder:
+        report("load", 0, 1, None)
+        model = session.model(request.checkpoint)
+        report("read", 0, 1, None)
+        person = person_in_pictures(model, *_files(request), on_step=_steps(report, POSTURE_STEPS))
+        write_posture(folder / POSTURE_FILE, person.views.pose, person.betas, person.whole_views)
+    seconds, warnings = round(time.perf_counter() - began, 3), list(person.warnings)
+    return FitPostureAnswer(posture=request.out_dir / POSTURE_FILE, seconds=seconds, warnings=warnings)
 
 
-def run_refine(command: RefineCommand) -> None:
+def refine_human(command: RefineCommand, session: Session, report: ReportProgress) -> None:
     """Refine; print the folder and the PSNR before and after.
 
     Raises:
@@ -128,13 +115,9 @@ def run_refine(command: RefineCommand) -> None:
         frames = range(person.frames)
         views = [conditioning_views(captures, name, frame, given, command.size) for frame in frames]
         held_out = [conditioning_views(captures, name, frame, held, command.size) for frame in frames if held]
-        human = _start(command, captures, name, betas, given).to(best_device())
-        with tqdm(total=command.steps, desc=name, unit="step", disable=None) as bar:
-
-            def on_step(step: DescentStep) -> None:
-                bar.update()
-
-            refined = refine(human, views, settings, on_step)
+        human = _start(command, session, captures, name, betas, given).to(session.device)
+        done = itertools.count(1)
+        refined = refine(human, views, settings, lambda _: report("refine", next(done), command.steps, None))
         write_human(folder, refined.human, command.size)
     seconds = f"{refined.steps} steps, {refined.seconds:.1f} s"
     print(f"{command.out}  {name}, {person.frames} frames, {len(given)} cameras, {seconds}")
@@ -148,15 +131,18 @@ def run_refine(command: RefineCommand) -> None:
         print_warnings([f"the time limit of {command.minutes:g} minutes was reached after {seconds}"])
 
 
-def _start(command: RefineCommand, captures: Captures, name: str, betas: Tensor, given: Sequence[int]) -> Human:
+def _start(
+    command: RefineCommand, session: Session, captures: Captures, name: str, betas: Tensor, given: Sequence[int]
+) -> Human:
     """Return the initial human with the subject's betas."""
     if command.start == "body":
         human = bare_body(betas)
     elif command.start == "encoder":
         cameras = tuple(given[:: math.ceil(len(given) / ENCODER_VIEWS)])
         views = conditioning_views(captures, name, 0, cameras)
-        model = load_encoder(command.checkpoint, best_device())
-        human = reconstruct_human(model, CapturedPerson(name, 0, cameras, views, betas, ()))
+        human = reconstruct_human(
+            session.encoder(command.checkpoint), CapturedPerson(name, 0, cameras, views, betas, ())
+        )
     elif command.start.endswith(".glb"):
         human = meshed_person(command.start)
     else:
@@ -180,78 +166,10 @@ def split_cameras(count: int, held: int) -> tuple[list[int], list[int]]:
     return out, [camera for camera in range(count) if camera not in out]
 
 
-def reconstruct_pictures(request: ReconstructRequest, session: Session, report: ReportProgress) -> ReconstructAnswer:
-    """Write the human and its posture, all files or none; return their paths, warnings and the time taken.
-
-    Raises OSError first of all if the folder cannot be written to; raises as read_photographs, start_of and Session.
-    """
-    began = time.perf_counter()
-    with staged(request.out_dir) as folder:
-        model, photographs, start, warnings = _read(request, session, report)
-        posture = start.posture
-        on_step = _steps(report, human_steps(model) + (POSTURE_STEPS if request.refine else 0))
-        if request.refine:
-            posture = fit_posture_in(model, photographs, start, on_step)
-        elif not start.complete:
-            raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
-        human = human_in(model, photographs, posture, request.seed, on_step)
-        warnings += _doubts(model, photographs, posture)
-        report("write", 0, 1, None)
-        write_human(folder, human, request.size)
-        _write_posture(folder / POSTURE_FILE, photographs, posture)
-        report("write", 1, 1, 0.0)  # the last chance to cancel
-    return ReconstructAnswer(
-        **FILES.in_folder(request.out_dir),
-        posture=request.out_dir / POSTURE_FILE,
-        seed=request.seed,
-        warnings=warnings,
-        seconds=round(time.perf_counter() - began, 3),
-        peak_gb=round(peak_memory_gb(), 3),
-    )
-
-
-def fit_posture(request: FitPostureRequest, session: Session, report: ReportProgress) -> FitPostureAnswer:
-    """Write posture.json, whole or not at all. Raises as `reconstruct_pictures`."""
-    began = time.perf_counter()
-    with staged(request.out_dir) as folder:
-        model, photographs, start, warnings = _read(request, session, report)
-        posture = fit_posture_in(model, photographs, start, _steps(report, POSTURE_STEPS))
-        warnings += _doubts(model, photographs, posture)
-        _write_posture(folder / POSTURE_FILE, photographs, posture)
-    seconds = round(time.perf_counter() - began, 3)
-    return FitPostureAnswer(posture=request.out_dir / POSTURE_FILE, seconds=seconds, warnings=warnings)
-
-
-def _read(
-    request: ReconstructRequest | FitPostureRequest, session: Session, report: ReportProgress
-) -> tuple[DiffusionModel, list[Photograph], Start, list[str]]:
-    report("read", 0, 1, None)
-    photographs = read_photographs(request.pictures, request.masks, mask_label=request.mask_label)
-    report("load", 0, 1, None)
-    model = session.model(request.checkpoint)
-    start = start_of(photographs, model, request.pose, request.cameras)
-    warnings = []
-    if len(photographs) == 1 and isinstance(request, ReconstructRequest):
-        warnings.append("only one picture: the sides that it does not show are guessed")
-    if request.pose is None:
-        warnings.append("no pose was given: the person is taken to stand upright, facing the camera")
-    return model, photographs, start, warnings
+def _files(request: Pictures) -> tuple[Any, ...]:
+    return request.pictures, request.masks, request.mask_label, request.pose, request.cameras
 
 
 def _steps(report: ReportProgress, total: int) -> Callable[[], None]:
     done = itertools.count(1)
     return lambda: report("fit", next(done), total, None)
-
-
-def _doubts(model: DiffusionModel, photographs: list[Photograph], posture: Posture) -> list[str]:
-    overlap = outline_overlap(model, photographs, posture)
-    if overlap >= LEAST_OVERLAP:
-        return []
-    return [
-        f"the fitted body and the masks overlap by {100 * overlap:.0f} %: the pose was probably not found; give a pose "
-        "file that is nearer"
-    ]
-
-
-def _write_posture(path: Path, photographs: list[Photograph], posture: Posture) -> None:
-    write_posture(path, posture.pose, posture.betas, views_of(photographs, posture.camera))

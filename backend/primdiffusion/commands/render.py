@@ -1,4 +1,4 @@
-"""Render humans: `primdiffusion render`, and `render` and `draw` of JSON-RPC."""
+"""Render humans: `render` and `draw`."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 
 from primdiffusion.body.pose_file import pose_from_numbers, read_pose
 from primdiffusion.commands.frame_drawer import FrameDrawer
-from primdiffusion.commands.options import RenderCommand
 from primdiffusion.commands.output import decoded, march_encoded
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
@@ -31,18 +30,27 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
     """Render, and return the paths. Raises as load_human and read_pose, and OSError."""
     began = time.perf_counter()
     report("load", 0, 1, None)
-    human = load_human(request.human)
-    pose = None
-    if request.pose is not None:
-        given = request.pose
-        pose = read_pose(given) if isinstance(given, Path) else pose_from_numbers(given, "the parameter pose")
+    human, pose, given = load_human(request.human), None, request.pose
+    if isinstance(given, Path):
+        pose = read_pose(given, request.frame, request.tracked_person)
+    elif given is not None:
+        pose = pose_from_numbers(given, "the parameter pose")
     primitives = place(human, pose)
+    width, height = (request.size if side is None else side for side in (request.width, request.height))
+    camera, background = framing(primitives, request.yaw_degrees, width, height), BACKGROUNDS[request.background]
     report("render", 0, 1, None)
-    rendering = march(primitives, framing(primitives, request.yaw_degrees, request.width, request.height))
+    if request.compositing == "released":
+        settings = RELEASED
+        rgba = decoded(march_encoded(primitives, camera), background)
+    else:
+        settings = MarchSettings(step=request.step)
+        scene = Scene(primitives, chart=body_of(human)[1].chart)
+        rgba = torch.from_numpy(draw_scene(scene, camera, ViewSettings(request.view, settings=settings)).combined)
     report("write", 1, 1, 0.0)
     with contextlib.ExitStack() as files:  # both files or none
-        rendering.save(files.enter_context(written_whole(request.out)), BACKGROUNDS["black"])
+        rgba_to_png(files.enter_context(written_whole(request.out)), rgba, background)
         if request.depth is not None:
+            rendering = march(primitives, camera, settings)
             depth_to_png(files.enter_context(written_whole(request.depth)), rendering.depth, rendering.alpha)
     return RenderAnswer(out=request.out, depth=request.depth, seconds=round(time.perf_counter() - began, 3))
 
@@ -50,27 +58,3 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
 def draw(request: DrawRequest, session: Session, report: ReportProgress) -> DrawAnswer:
     """See `FrameDrawer.draw`."""
     return session.cached(FrameDrawer).draw(request, report)
-
-
-def run(command: RenderCommand) -> None:
-    """Render, and print the path."""
-    look = ViewSettings(command.view, settings=MarchSettings(step=command.step))
-    human = load_human(command.human)
-    primitives = place(
-        human, None if command.pose is None else read_pose(command.pose, command.frame, command.tracked_person)
-    )
-    width, height = (command.size if side is None else side for side in (command.width, command.height))
-    camera = framing(primitives, command.yaw, width, height)
-    background = BACKGROUNDS[command.background]
-    if command.compositing == "released":
-        look = ViewSettings(settings=RELEASED)
-        rgba = decoded(march_encoded(primitives, camera), background)
-    else:
-        picture = draw_scene(Scene(primitives, chart=body_of(human)[1].chart), camera, look)
-        rgba = torch.from_numpy(picture.combined)
-    with contextlib.ExitStack() as files:  # both files or none
-        rgba_to_png(files.enter_context(written_whole(command.out)), rgba, background)
-        if command.depth is not None:
-            rendering = march(primitives, camera, look.settings)
-            depth_to_png(files.enter_context(written_whole(command.depth)), rendering.depth, rendering.alpha)
-    print(command.out)

@@ -203,6 +203,9 @@ def read_card(path: Path | str | None = None) -> dict[str, Any]:
 def load_checkpoint(path: Path | str | None = None, device: torch.device | str = "cpu") -> DiffusionModel:
     """Load a model in float32, trained here or imported (`released`), from the file that `checkpoint_file` finds.
 
+        >>> model = pd.load_checkpoint()
+        >>> outfits = model.vocabulary.categories["outfit"]
+
     Raises FileNotFoundError for a missing file and FileError (a ValueError) for one that is truncated, of another
     format or version, does not match its own architecture or holds values that are not finite, and for a user's body
     file that is missing or has changed, which an imported one needs; as `checkpoint_file`.

@@ -152,6 +152,10 @@ def inpaint(
     2 * `steps` denoiser calls. Deterministic as `human.generate`. With `masking` "released" the sampler is
     `paste_after_steps`, at `steps` calls.
 
+        >>> changed = pd.inpaint(model, human, region, seed=1)
+        >>> changed.payload.rgb[~region].equal(human.payload.rgb[~region])
+        True
+
     Raises ValueError for a region that is empty, whole or not a mask of K, steps outside 1 ... T, a seed outside
     0 ... 2^63-1, unknown attributes and an unknown masking.
     """

@@ -45,7 +45,13 @@ def interpolate(
     Both are inverted with DDIM (Song et al. 2021, sec. 4.3), the noises are interpolated spherically, and the result is
     sampled with DDIM. The reconstruction residuals of a and b are interpolated and added, so that fractions 0 and 1
     return them exactly. Betas are interpolated linearly. Needs no seed; deterministic as `human.generate`. The
-    provenance is that of the nearer end. Raises ValueError for a fraction outside 0 ... 1 and steps outside 2 ... T.
+    provenance is that of the nearer end.
+
+        >>> between = pd.interpolate(model, human, varied, 0.5)
+        >>> between.provenance["edits"][-1]["edit"]
+        'interpolate'
+
+    Raises ValueError for a fraction outside 0 ... 1 and steps outside 2 ... T.
     """
     check_unit_interval("fraction", fraction)
     chain = inversion_steps(model.schedule, steps)

@@ -81,6 +81,10 @@ def read_weights(path: str | Path) -> Float[Tensor, "v"]:
 def region_of(names: Sequence[str], body_setup: BodySetup | None = None) -> Bool[Tensor, "k"]:
     """Return the union of the named parts on a body (None: the default body).
 
+        >>> region = pd.region_of(["top", "shoes"])
+        >>> region.shape  # a mask of boxes
+        torch.Size([1024])
+
     Raises ValueError for no names or an unknown one.
     """
     if not names:

@@ -31,9 +31,16 @@ class HumanAnswer(Open):
     seed: Count | None = None
     """None where nothing is drawn at random."""
     steps: Count | None = None
+    edit: str | None = None
+    """Kind of the edit; None for a new human."""
     seconds_sampling: Seconds | None = None
     peak_gb: float | None = None
     """Most memory in use."""
+
+    def __str__(self) -> str:
+        """As the command line prints it."""
+        made = f"seed {self.seed}, {self.steps} steps" if self.edit is None else self.edit
+        return f"{self.person.parent}  {made}, {self.seconds:.1f} s"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -47,6 +54,13 @@ class ReconstructAnswer(HumanAnswer):
     seconds_encoding: Seconds | None = None
     posture: Path | None = None
     """posture.json: pose, shape and cameras in pictures; None for captures."""
+
+    def __str__(self) -> str:
+        """As the command line prints it."""
+        seen = (
+            "pictures" if self.subject is None else f"{self.subject}, frame {self.frame}, {len(self.views or ())} views"
+        )
+        return f"{self.person.parent}  {seen}, {self.seconds:.1f} s"
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -98,6 +112,10 @@ class RenderAnswer(Open):
     seconds: Seconds | None = None
     depth: Path | None = None
 
+    def __str__(self) -> str:
+        """As the command line prints it."""
+        return str(self.out)
+
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class DrawAnswer(Open):
@@ -118,6 +136,10 @@ class MergeAnswer(Open):
     out: Path
     seconds: Seconds
     shape: list[Count] | None = None
+
+    def __str__(self) -> str:
+        """As the command line prints it."""
+        return str(self.out)
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -206,6 +228,8 @@ class Progress(Open):
     """A new preview, PNG. Read it immediately: it is deleted when newer ones arrive."""
     index: Count | None = None
     """The human that the preview shows, of several."""
+    human: HumanAnswer | None = None
+    """A finished human, of several; the last is the answer."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

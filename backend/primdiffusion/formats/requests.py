@@ -9,6 +9,7 @@ import dataclasses
 from pathlib import Path
 from typing import Annotated, Literal, get_args
 
+from ..files.regular_files import real_path
 from .joints import JOINT_NAMES
 from .schema import Ending, FieldError, Length, Option, Range, Shape, Slider
 
@@ -118,15 +119,27 @@ class StepPreviews(Sampling, Previews):
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
 class GenerateRequest(StepPreviews, Conditioning):
-    """Generate a human: person.human.safetensors and previews."""
+    """Generate humans: person.human.safetensors and previews."""
 
-    seed: Seed
+    seed: Seed = 0
     """Another seed gives another human; the same seed gives the same human."""
+    count: Count = 1
+    """Number of humans, with consecutive seeds; several are in a folder each, seed_000000 and so on."""
+    batch: Count = 1
+    """Humans sampled at once: faster, above all on a GPU, and needs more memory. Results differ from those of single
+    humans in the last digits."""
+    compact: bool = False
+    """Store colours and densities of person.human.safetensors in 8 bits: 2 MB instead of 8, without visible loss."""
     sampler: Sampler = "ddim"
     """ddim: few steps; dpmpp_2m: even fewer; ddpm: the paper's, needs hundreds."""
     compositing: Compositing = "linear"
     """linear: previews as in Blender; released, as the authors' code: previews of sRGB-encoded colours, boxes in index
     order, and the sampler ddim stops at the schedule's lowest level of noise instead of at none."""
+
+    def check(self) -> None:
+        """Raise FieldError for seeds beyond the largest."""
+        if self.seed + self.count - 1 > LARGEST_SEED:
+            raise FieldError(("count",), f"is {self.count}: the last seed would be above 2^63 - 1")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -301,21 +314,63 @@ class FitPostureRequest(Pictures):
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class RenderRequest:
-    """Render a saved human on black."""
+class PoseOptions:
+    """Fields of requests that take a pose."""
 
-    human: Path
+    pose: Path | None = None
+    """Pose file (.npz, .npy, .json, .pkl, .bvh), such as 72 axis-angle numbers (24 x 3, radians); default: T pose."""
+    frame: int = 0
+    """Frame of a pose file with several."""
+    tracked_person: str = ""
+    """Name or number of a person in a tracker's pose file of several people; default: who is in the most frames."""
+
+    def check(self) -> None:
+        """Raise FieldError for a frame or person without a pose file."""
+        for name, value in (("frame", self.frame), ("tracked_person", self.tracked_person)):
+            if value and self.pose is None:
+                raise FieldError((name,), f"is {value} without a pose file: give one with --pose")
+
+
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class RenderRequest(PoseOptions):
+    """Render a human in a pose."""
+
+    human: Person
     """A .human.safetensors file."""
     out: Annotated[Path, Ending((".png",))]
     """Output PNG."""
-    width: Pixels = 512
-    height: Pixels = 512
-    yaw_degrees: float = 0.0
-    """Camera position around the human: 0 in front, 90 at the human's left."""
     pose: Path | list | None = None
-    """72 axis-angle values (24 x 3, radians), or a pose file; None for the T pose."""
+    """72 axis-angle numbers (24 x 3, radians), or a pose file with them (.npz, .npy, .json, .pkl, .bvh); default: T
+    pose."""
+    yaw_degrees: Annotated[float, Range(-1e30, 1e30), Option(name="yaw")] = 0.0
+    """Camera position around the human, degrees: 0 in front, 90 at the human's left."""
+    size: Pixels = 512
+    """Width and height, pixels."""
+    width: Pixels | None = None
+    """Pixels; the default is the size."""
+    height: Pixels | None = None
+    """Pixels; the default is the size."""
+    view: View = "colour"
+    """colour; depth in false colours, bright where near; alpha in grey; boxes: the primitives."""
+    step: RayStep = RAY_STEP
+    """Metres between samples of a ray; finer is slower and more accurate."""
+    compositing: Compositing = "linear"
+    """linear, as in Blender; released, as the authors' code: sRGB-encoded colours, boxes in index order, a sample each
+    millimetre, rays through pixel corners."""
+    background: Literal["black", "white", "transparent"] = "black"
+    """Background behind the human."""
     depth: Annotated[Path, Ending((".png",))] | None = None
-    """A second PNG, of the depth."""
+    """A second PNG: depth in false colours, bright where near."""
+
+    def check(self) -> None:
+        """Raise FieldError for one file with two contents, for what `released` does not have, as `PoseOptions`."""
+        super().check()
+        if self.depth is not None and real_path(self.depth) == real_path(self.out):
+            raise FieldError(("depth",), f"is {self.depth}, as out: give two different files")
+        if self.compositing == "released" and (self.view, self.step) != ("colour", RAY_STEP):
+            raise FieldError(
+                ("compositing",), "is released, which has its own step and the view colour: omit the others"
+            )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -388,14 +443,27 @@ class DrawRequest:
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
-class MergeRequest:
-    """Merge humans into one grid, z up. Needs no checkpoint."""
+class MergeRequest(PoseOptions):
+    """Merge humans into one voxel grid; the extension of --out selects the format: .vdb or .npz."""
 
-    people: Annotated[list[PosedPerson], Length(1)]
-    out: Annotated[Path, Ending((".npz",))]
-    """Output .npz."""
+    humans: Annotated[tuple[Path, ...], Option(positional=True)] = ()
+    """.human files (or .human.safetensors), side by side."""
+    people: Annotated[list[PosedPerson], Option(hidden=True)] = dataclasses.field(default_factory=list)
+    """Instead of `humans`."""
+    out: Annotated[Path, Ending((".vdb", ".npz"))]
+    """.vdb: grids density and Cd (needs Python's module openvdb); .npz: density, colour, origin, voxel. z up."""
     voxel: Voxel = VOXEL
-    """Voxel size, metres."""
+    """Voxel size, metres; half the size shows more detail at eight times the memory."""
+    apart: float = 1.0
+    """Distance between neighbours, side by side, metres."""
+
+    def check(self) -> None:
+        """Raise FieldError unless humans are given in exactly one way, and as `PoseOptions`."""
+        super().check()
+        if not self.humans and not self.people:
+            raise FieldError(("humans",), "is empty: give at least one")
+        if self.humans and self.people:
+            raise FieldError(("humans",), "and people exclude each other: give files, or humans posed by armatures")
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)

@@ -1,6 +1,6 @@
 """Reconstruct a captured subject as a `Human`: from several views with the encoder, or from one or more with the prior.
 
-`reconstruct_by_prior` finds the person coefficients c of the diffusion model that explain the pictures. Near an
+The prior finds the person coefficients c of the diffusion model that explain the pictures. Near an
 estimate a picture is linear in c (`cpu_linear`), and the people of one outfit are Gaussian, so the posterior mean of c
 has a closed form; a few Gauss-Newton steps repeat it, for each outfit and then for each hair style of the outfits that
 explain the pictures best. What no picture shows thus has the most probable colours and shape given what they show: the
@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import math
 import sys
 from collections.abc import Callable, Sequence
@@ -36,6 +35,7 @@ from primdiffusion.formats import requests
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.human import Human, default_frames, made_by
 from primdiffusion.primitives.primitives import Frames, Payload, S
+from primdiffusion.reconstruction.posture_fit import each
 from primdiffusion.render.cpu.linear import apply_to_codes
 from primdiffusion.render.descent import DescentSettings, descend
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, fit_payload
@@ -82,20 +82,46 @@ COARSE_SIDE, FINE_SIDE = 176, 512
 """Largest sides of the pictures for coefficients and for voxels, pixels."""
 
 
-def reconstruct(model: EncoderModel, person: CapturedPerson) -> Human:
-    """Reconstruct the subject on the CPU; deterministic for a model, views and device.
+def reconstruct(
+    model: EncoderModel | DiffusionModel,
+    person: CapturedPerson,
+    seed: int | None = None,
+    on_step: Callable[[], None] = lambda: None,
+) -> Human:
+    """Reconstruct the subject on the CPU, by an encoder or by the prior of a diffusion model, which takes one view too.
 
-    Raises ValueError if the model's output is not finite.
+    Deterministic for a model, views, seed and device. With a seed, the prior draws what no view shows from what is
+    probable given the views, instead of the most probable. `on_step` is called `steps_of(model)` times; an exception
+    that it raises cancels.
+
+        >>> found = pd.reconstruct(model, person)
+        >>> found.provenance["reconstructed_from"]
+        ['anna.png']
+
+    Raises ValueError if the encoder's output is not finite, or as `PersonComponents.of`.
     """
-    payload = encode_and_fit(model, person.views, person.betas)
-    provenance = {
-        **_origin(person),
-        "checkpoint": model.card.get("name", "unnamed"),
-        "full_density": model.config.full_density,
-        "version": __version__,
-    }
-    betas = betas_of_frames(model.config, person.betas)
-    return Human(payload, betas, provenance, model.body_setup).to("cpu").validate()
+    origin: dict[str, Any] = {"reconstructed_from": person.subject}
+    if person.frame is not None:
+        origin |= {"frame": person.frame, "views": list(person.cameras)}
+    if isinstance(model, EncoderModel):
+        payload = encode_and_fit(model, person.views, person.betas)
+        origin |= {"checkpoint": model.card.get("name", "unnamed"), "full_density": model.config.full_density}
+        betas = betas_of_frames(model.config, person.betas)
+        return Human(payload, betas, {**origin, "version": __version__}, model.body_setup).to("cpu").validate()
+    components, views, generator = PersonComponents.of(model), person.views, None
+    if views.pose.translation.ndim > 1:
+        frames = [default_frames(person.betas, pose) for pose in each(views.pose)]
+    else:
+        frames = [default_frames(person.betas, views.pose)] * len(views.rgba)
+    if seed is not None:
+        origin["seed"], generator = seed, torch.Generator().manual_seed(seed)
+    payload = components.fit(views, frames, components.start(views, frames, on_step), on_step, generator)
+    return Human(payload, person.betas, {**origin, **made_by(model)}).validate()
+
+
+def steps_of(model: EncoderModel | DiffusionModel) -> int:
+    """How often `reconstruct` reports."""
+    return 0 if isinstance(model, EncoderModel) else PersonComponents.of(model).start_steps + FIT_STEPS
 
 
 def encode_and_fit(model: EncoderModel, views: Views, betas: Float[Tensor, "n"]) -> Payload:
@@ -120,34 +146,6 @@ def _shows(image: PosedView) -> bool:
     """Whether an image shows the subject, and its camera faces it."""
     depth = image.camera.project(image.frames.position)[1]
     return bool(image.rgba[..., 3].any()) and bool((depth > 0).any())
-
-
-def reconstruct_by_prior(
-    model: DiffusionModel,
-    person: CapturedPerson,
-    on_step: Callable[[int, int], None] | None = None,
-    seed: int | None = None,
-) -> Human:
-    """Reconstruct the subject from one or more views, on the CPU; deterministic for a model, views and seed.
-
-    With a seed, what no view shows is drawn from what is probable given the views, instead of the most probable.
-    `on_step` is called with the number of completed steps and of all; an exception that it raises cancels.
-
-    Raises ValueError if the model has no person components, or is of another body than the default one.
-    """
-    components = PersonComponents.of(model)
-    frames = [default_frames(person.betas, person.views.pose)] * len(person.views.rgba)
-    done = itertools.count(1)
-
-    def report() -> None:
-        if on_step is not None:
-            on_step(next(done), components.start_steps + FIT_STEPS)
-
-    generator = None if seed is None else torch.Generator().manual_seed(seed)
-    explanation = components.start(person.views, frames, report)
-    payload = components.fit(person.views, frames, explanation, report, generator)
-    drawn = {} if seed is None else {"seed": seed}
-    return Human(payload, person.betas, {**_origin(person), **drawn, **made_by(model)}).validate()
 
 
 class Explanation(NamedTuple):
@@ -361,7 +359,3 @@ def targets_of(views: Views, frames: Sequence[Frames], largest: int) -> list[Pos
         camera = dataclasses.replace(camera, intrinsics=intrinsics, width=width, height=height)
         targets.append(PosedView(boxes, camera, picture.mean((1, 3))))
     return targets
-
-
-def _origin(person: CapturedPerson) -> dict[str, Any]:
-    return {"reconstructed_from": person.subject, "frame": person.frame, "views": list(person.cameras)}

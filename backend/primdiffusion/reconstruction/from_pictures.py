@@ -9,18 +9,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import torch
-
-from primdiffusion.capture.photograph import Photograph, rgba_of
+from primdiffusion.capture.conditioning import CapturedPerson
+from primdiffusion.capture.photograph import Photograph, read_photographs, rgba_of
 from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
-from primdiffusion.human import Human, made_by
-from primdiffusion.reconstruction.from_captures import FIT_STEPS, PersonComponents, targets_of
+from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
 from primdiffusion.reconstruction.posture_file import read_cameras, read_posture
-from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error, overlap
+from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error
+from primdiffusion.reconstruction.posture_fit import overlap as overlap_of
 from primdiffusion.reconstruction.posture_start import (
     STANDING_ARMS,
     before_cameras,
@@ -29,6 +28,7 @@ from primdiffusion.reconstruction.posture_start import (
     repeated,
     standing,
     turned_to_camera,
+    views_of,
 )
 from primdiffusion.render.view import PosedView
 
@@ -45,6 +45,8 @@ ROUNDS = (Round(96, Stage(60, 0.04), 2), Round(96, Stage(80, 0.02), 2), Round(19
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
+LEAST_OVERLAP = 0.8
+"""Intersection over union of the human and the mask; of fits that look right it is above 0.9."""
 POSE_FILE_TIGHTNESS = 2.0
 """Poses of files are known twice as well as a standing body."""
 
@@ -59,6 +61,54 @@ class Start:
     """See `PostureFit`."""
     complete: bool
     """Pose and cameras are those of files."""
+
+
+def person_in_pictures(
+    model: DiffusionModel,
+    pictures: Sequence[str | Path],
+    masks: Sequence[str | Path] = (),
+    mask_label: int | None = None,
+    pose: str | Path | None = None,
+    cameras: str | Path | None = None,
+    *,
+    refine: bool = True,
+    on_step: Callable[[], None] = lambda: None,
+) -> CapturedPerson:
+    """The person in plain pictures, for `reconstruct`; the fields of `requests.Pictures` say what the files are.
+
+    Pose, shape and cameras are refined from those of the files, or of a standing body; otherwise both files are needed.
+    `on_step` is called POSTURE_STEPS times while refining; an exception that it raises cancels. Deterministic.
+
+        >>> person = pd.person_in_pictures(model, ["anna.png"])
+        >>> person.betas.shape
+        torch.Size([10])
+
+    Raises FileNotFoundError, FileError and ValueError, as `read_photographs`, `start_of` and `PersonComponents.of`.
+    """
+    photographs = read_photographs(list(map(Path, pictures)), list(map(Path, masks)), mask_label=mask_label)
+    known = (None if path is None else Path(path) for path in (pose, cameras))
+    start, warnings = start_of(photographs, model, *known), []
+    posture = start.posture
+    if refine:
+        posture = fit_posture_in(model, photographs, start, on_step)
+    elif not start.complete:
+        raise ValueError("without refining, a pose file and cameras are needed: give both, or refine")
+    if pose is None:
+        warnings.append("no pose was given: the person is taken to stand upright, facing the camera")
+    overlap = outline_overlap(model, photographs, posture)
+    if overlap < LEAST_OVERLAP:
+        warnings.append(
+            f"the fitted body and the masks overlap by {100 * overlap:.0f} %: the pose was probably not found; give a "
+            "pose file that is nearer"
+        )
+    return person_in(photographs, posture, warnings)
+
+
+def person_in(photographs: Sequence[Photograph], posture: Posture, warnings: Sequence[str] = ()) -> CapturedPerson:
+    """The person in pictures whose posture is known."""
+    names, whole_views = [photograph.path.name for photograph in photographs], views_of(photographs, posture.camera)
+    views = _views(photographs, posture)
+    return CapturedPerson(names, None, (), views, posture.betas, tuple(warnings), tuple(whole_views))
 
 
 def start_of(
@@ -119,37 +169,11 @@ def fit_posture_in(
     return fit.posture()
 
 
-def human_steps(model: DiffusionModel) -> int:
-    """How often `human_in` reports."""
-    return PersonComponents.of(model).start_steps + FIT_STEPS
-
-
-def human_in(
-    model: DiffusionModel,
-    photographs: Sequence[Photograph],
-    posture: Posture,
-    seed: int | None = None,
-    on_step: Callable[[], None] = lambda: None,
-) -> Human:
-    """The human in pictures whose posture is known, on the CPU; `on_step` is called `human_steps` times.
-
-    With a seed, what no picture shows is drawn instead of the most probable. Raises ValueError as
-    `PersonComponents.of`.
-    """
-    components, views, frames = PersonComponents.of(model), _views(photographs, posture), posture.frames()
-    generator = None if seed is None else torch.Generator().manual_seed(seed)
-    people = components.start(views, frames, on_step)
-    payload = components.fit(views, frames, people, on_step, generator)
-    names = [photograph.path.name for photograph in photographs]
-    origin: dict[str, Any] = {"reconstructed_from": names} | ({} if seed is None else {"seed": seed})
-    return Human(payload, posture.betas, {**origin, **made_by(model)}).validate()
-
-
 def outline_overlap(model: DiffusionModel, photographs: Sequence[Photograph], posture: Posture) -> float:
     """Intersection over union of the mean human in the posture and the masks."""
     components = PersonComponents.of(model)
     targets = _targets(photographs, posture, ROUNDS[0].side)
-    return overlap(components.payload(components.coefficients(components.everyone())), targets)
+    return overlap_of(components.payload(components.coefficients(components.everyone())), targets)
 
 
 def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:

@@ -40,6 +40,9 @@ def march(
     composited behind rgb and does not change alpha. Rotations that reflect mirror the contents of a box; boxes with an
     extent of zero or less are not rendered.
 
+        >>> image = pd.march(boxes, camera)
+        >>> image.save("anna.png")  # transparent
+
     Differentiable in every tensor except the span. float32 runs on the fast back end of its device (`march_cpu`, or
     `march_cuda` if Triton is installed; for Apple GPUs `march_cpu`), everything else on `march_reference`, which is
     slow. Raises ValueError as `check_scene` does, and if leading dimensions do not broadcast.

@@ -3,7 +3,7 @@
 A message is a line of UTF-8 JSON without line breaks (json escapes them). There are no batches.
 
     reader thread     parses lines; answers hello, cancel and shutdown itself, so that they work while a request runs
-    main thread       loads torch, then runs one request of FUNCTIONS at a time
+    main thread       loads torch, then runs one request at a time
     heartbeat thread  sends a notification every 0.5 s, so that the client can tell busy from hung
 
 `hello` is answered before torch is loaded: `device` is null until the `ready` notification, which has a `problem` if
@@ -14,7 +14,6 @@ closes, because its parent has exited. File descriptor 1 is redirected to stderr
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import json
 import math
 import os
@@ -22,10 +21,10 @@ import platform
 import queue
 import sys
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, BinaryIO, NoReturn
 
-from primdiffusion.commands.options import ServeCommand
+from primdiffusion.commands import FUNCTIONS, function_of
 from primdiffusion.files.json_files import LARGEST_BYTES, parse_message
 from primdiffusion.files.regular_files import may_be_written, printable
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
@@ -50,25 +49,6 @@ PROTOCOL = 1
 HEARTBEAT_S = 0.5
 LONGEST_LINE = LARGEST_BYTES + 2
 """Bytes read of a line; a longer one is answered as no JSON, and its rest is skipped."""
-FUNCTIONS = {
-    "generate": "generate:generate",
-    "variations": "generate:variations",
-    "attributes": "info:attributes",
-    "vary": "edit:edit",
-    "interpolate": "edit:edit",
-    "inpaint": "edit:edit",
-    "transfer": "edit:edit",
-    "reconstruct": "reconstruct:reconstruct",
-    "fit_posture": "reconstruct:fit_posture",
-    "render": "render:render",
-    "draw": "render:draw",
-    "merge": "merge:merge",
-    "merge_frames": "merge:merge_frames",
-    "proxy": "export:proxy",
-    "gaussians": "export:gaussians",
-    "open_human": "export:open_human",
-}
-"""Module of `commands` and function by method; the functions run on the main thread, one at a time."""
 OUTPUTS = ("out_dir", "out", "depth", "frame")
 """Fields of requests that are files and folders to write."""
 GRACE_S = 3.0
@@ -184,7 +164,7 @@ class Server:
             "hello": self._hello,
             "cancel": self._cancel,
             "shutdown": self._shutdown,
-            **dict.fromkeys(FUNCTIONS, self._accept),
+            **dict.fromkeys(REQUESTS.keys() & FUNCTIONS.keys(), self._accept),
         }
 
     def run(self) -> None:
@@ -301,9 +281,7 @@ class Server:
         try:
             if isinstance(session, RpcError):
                 raise session
-            module, _, function = FUNCTIONS[running.message.method].partition(":")
-            run = getattr(importlib.import_module(f"primdiffusion.commands.{module}"), function)
-            result = run(running.request, session, report)
+            result = function_of(running.message.method)(running.request, session, report)
         except Cancelled:
             outcome: Any = RpcError(CANCELLED, "cancelled")
         except Exception as e:
@@ -375,9 +353,19 @@ def guard_streams() -> tuple[BinaryIO, BinaryIO]:
     return os.fdopen(source, "rb"), os.fdopen(sink, "wb")
 
 
-def run(command: ServeCommand) -> None:
+@dataclasses.dataclass(frozen=True)
+class ServeCommand:
+    """Answer JSON-RPC requests on stdin and stdout: the backend of the Blender extension."""
+
+    about: bool = False
+    """Print the versions of this program, torch and Python as one line of JSON, and end."""
+
+
+def run(arguments: Sequence[str]) -> None:
     """`primdiffusion serve`."""
-    if command.about:
+    from primdiffusion.commands.command_line import parse  # the child does not need tyro
+
+    if parse(ServeCommand, arguments, "serve").about:
         import torch  # `hello` is answered before it is loaded
 
         about = {"version": __version__, "torch": torch.__version__, "python": sys.version.split()[0]}

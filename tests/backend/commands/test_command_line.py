@@ -7,8 +7,8 @@ from typing import Annotated
 
 import pytest
 from primdiffusion.commands.command_line import parse
-from primdiffusion.commands.options import OPTIONS, GenerateCommand
-from primdiffusion.formats.requests import Attributes
+from primdiffusion.commands.options import OPTIONS
+from primdiffusion.formats.requests import Attributes, GenerateRequest
 from primdiffusion.formats.schema import FieldError, Option, Range
 
 
@@ -63,9 +63,9 @@ def test_a_value_out_of_range_is_named(level):
 
 def test_the_last_seed_is_within_the_limit_too():
     line = ["--out", "o", "--count", "2", "--seed"]
-    assert parse(GenerateCommand, [*line, str(2**63 - 2)], "generate").count == 2
+    assert parse(GenerateRequest, [*line, str(2**63 - 2)], "generate").count == 2
     with pytest.raises(FieldError) as error:
-        parse(GenerateCommand, [*line, str(2**63 - 1)], "generate")
+        parse(GenerateRequest, [*line, str(2**63 - 1)], "generate")
     assert error.value.field == "count"
 
 

@@ -1,6 +1,10 @@
 """Pictures while a person is made: of the guess at that step, seldom enough, and gone in the end."""
 
 import itertools
+import os
+import subprocess
+import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -152,3 +156,69 @@ def test_a_person_is_drawn_from_both_sides_in_halves_of_a_square(checkpoint, tmp
     assert columns[:32].any()
     assert columns[32:].any()
     assert not columns[[0, 31, 32, 63]].any(), "nothing is cut off"
+
+
+class Compiler:
+    """A process that compiles until the test says that it has ended."""
+
+    def __init__(self, target=None, daemon=None):
+        self.starts, self.alive = 0, True
+
+    def start(self):
+        self.starts += 1
+
+    def is_alive(self):
+        return self.alive
+
+
+def test_a_human_does_not_wait_for_the_compiler_and_comes_without_previews(checkpoint, tmp_path, always, monkeypatch):
+    compiler = Compiler()
+    monkeypatch.setattr(output, "is_compiled", lambda _: False)
+    monkeypatch.setattr(output, "_compiler", [])
+    monkeypatch.setattr(output.multiprocessing, "get_context", lambda _: SimpleNamespace(Process=lambda **_: compiler))
+    listener, session, same = Listener(), Session(), {"checkpoint": checkpoint, "size": 8, "steps": 4}
+    answer = generate(GenerateRequest(out_dir=tmp_path / "a", picture_px=8, **same), session, listener)
+    varied = VaryRequest(out_dir=tmp_path / "b", person=answer.person, picture_px=8, **same)
+    for made, folder in ((answer, "a"), (edit(varied, session, listener), "b")):
+        assert (made.preview, made.side, made.depth) == (None, None, None)
+        assert [path.name for path in (tmp_path / folder).iterdir()] == ["person.human.safetensors"]
+    assert (listener.pictures, compiler.starts) == ([], 1)
+    compiler.alive = False  # also if it has failed: then this process compiles
+    assert edit(varied, session, listener).preview.is_file()
+    assert len(listener.pictures) >= 2
+    compiler.alive = True
+    answer = generate(GenerateRequest(out_dir=tmp_path / "c", **same), session, listener)
+    assert answer.preview.is_file(), "previews are all that a command line waits for"
+
+
+def test_the_compiler_compiles_what_previews_need(monkeypatch):
+    lowered = []
+    monkeypatch.setattr(output, "end_with_parent", lambda: None)
+    monkeypatch.setattr(output.os, "nice", lowered.append, raising=False)
+    output._compile()
+    assert output.is_compiled(output.march_tiles)
+    assert lowered == [10]
+    assert not output.previews_wait(8)
+
+
+KERNEL = """
+import numpy as np
+from primdiffusion.render.cpu.compiled import is_compiled, kernel
+
+@kernel
+def add(taken, values):
+    values[0] += 1
+
+print(is_compiled(add))
+add(np.zeros(1, np.int64), np.zeros(1))
+print(is_compiled(add))
+"""
+
+
+def test_a_kernel_is_compiled_once_it_is_in_the_cache(tmp_path):
+    script = tmp_path / "kernel.py"
+    script.write_text(KERNEL)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    for expected in (["False", "True"], ["True", "True"]):
+        done = subprocess.run([sys.executable, script], env=environment, capture_output=True, text=True, check=True)
+        assert done.stdout.split() == expected

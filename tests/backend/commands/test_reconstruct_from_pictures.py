@@ -105,7 +105,7 @@ def test_a_fit_alone_writes_the_posture_and_can_be_cancelled_at_every_report(pic
     assert answer.posture == tmp_path / "out" / "posture.json"
     assert answer.posture.is_file()
     assert not any("sides" in warning for warning in answer.warnings)  # a fit makes none
-    assert [report[0] for report in reports[:2]] == ["read", "load"]
+    assert [report[0] for report in reports[:2]] == ["load", "read"]
     ended_at_each_report(lambda report: fit_posture(request, Session(), report), tmp_path / "out")
 
 

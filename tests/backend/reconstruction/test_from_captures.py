@@ -22,7 +22,8 @@ from primdiffusion.reconstruction.from_captures import (
     PIXEL_STD,
     PersonComponents,
     encode_and_fit,
-    reconstruct_by_prior,
+    reconstruct,
+    steps_of,
     targets_of,
 )
 from primdiffusion.render.descent import Descent, DescentSettings
@@ -58,7 +59,7 @@ def captured(human: Human, pose: BodyPose, yaws: list[float]) -> CapturedPerson:
 @pytest.mark.parametrize("yaws", [[0.0], [0.0, 90.0]], ids=["one view", "two views"])
 def test_what_no_view_shows_has_the_most_probable_colours_given_what_they_show(yaws):
     human, pose = human_of(COLOURS), BodyPose.from_axis_angle(torch.linspace(-0.2, 0.2, 72))
-    found = reconstruct_by_prior(MODEL, captured(human, pose, yaws))
+    found = reconstruct(MODEL, captured(human, pose, yaws))
     wanted, got, mean = (encode_srgb(one.payload.rgb) for one in (human, found, human_of(torch.zeros(3))))
     assert (mean - wanted).abs().mean() > 0.03
     assert (got - wanted).abs().mean() < 0.006
@@ -74,7 +75,7 @@ def test_the_more_views_the_nearer_the_human_is_to_what_they_show():
     errors = []
     for count in (1, 4):  # the same view again: it tells nothing new
         person = captured(noisy, BodyPose.rest(), [0.0] * count)
-        found = reconstruct_by_prior(MODEL, person)
+        found = reconstruct(MODEL, person)
         target = targets_of(person.views, [frames_of(found)] * count, 128)[0]
         drawn = march(place(found), target.camera).rgb
         errors.append(float((encode_srgb(drawn) - encode_srgb(target.rgba[..., :3])).abs().mean()))
@@ -92,24 +93,17 @@ def test_smaller_pictures_are_what_their_cameras_see():
         assert (drawn - target.rgba).abs().mean() < 0.012
 
 
-def test_steps_are_reported_and_an_exception_cancels():
+def test_every_step_is_reported_and_an_exception_cancels():
     person, steps = captured(human_of(COLOURS), BodyPose.rest(), [0.0]), []
+    reconstruct(MODEL, person, on_step=lambda: steps.append(None))
+    assert len(steps) == steps_of(MODEL) > FIT_STEPS
+    assert steps_of(tiny_encoder()) == 0
 
-    def cancel(done: int, total: int) -> None:
-        steps.append((done, total))
-        if done == 2:
-            raise KeyboardInterrupt
+    def cancel() -> None:
+        raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        reconstruct_by_prior(MODEL, person, cancel)
-    total = PersonComponents.of(MODEL).start_steps + FIT_STEPS
-    assert steps == [(1, total), (2, total)]
-
-
-def test_every_step_is_reported():
-    steps = []
-    reconstruct_by_prior(MODEL, captured(human_of(COLOURS), BodyPose.rest(), [0.0]), lambda *step: steps.append(step))
-    assert [done for done, _ in steps] == list(range(1, steps[-1][1] + 1))
+        reconstruct(MODEL, person, on_step=cancel)
 
 
 def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
@@ -154,7 +148,7 @@ def test_evidence_is_the_pictures_probability_where_the_prior_leaves_no_choice()
 def test_a_seed_draws_the_rest_too():
     person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
     behind = frames_of(human_of(COLOURS)).rotation[:, 2, 2] < -0.7
-    one, other = (reconstruct_by_prior(MODEL, person, seed=seed).payload.density[behind] for seed in (1, 2))
+    one, other = (reconstruct(MODEL, person, seed=seed).payload.density[behind] for seed in (1, 2))
     assert (one - other).abs().mean() > 0.1  # coefficients are of colours alone
     components = PersonComponents.of(MODEL)
     rest = components.drawn_rest(COLOURS, torch.Generator().manual_seed(0))
@@ -175,7 +169,7 @@ def test_what_components_cannot_draw_comes_from_the_network():
 def test_a_model_without_person_components_is_refused():
     person = captured(human_of(COLOURS), BodyPose.rest(), [0.0])
     with refused(ValueError, "person components"):
-        reconstruct_by_prior(dataclasses.replace(MODEL, denoiser=torch.nn.Identity()), person)
+        reconstruct(dataclasses.replace(MODEL, denoiser=torch.nn.Identity()), person)
 
 
 def test_the_fit_after_the_encoder_draws_the_views_closer():

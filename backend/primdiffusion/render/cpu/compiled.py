@@ -48,6 +48,14 @@ def kernel(function: Function) -> Any:
     return dispatcher
 
 
+def is_compiled(dispatcher: Any) -> bool:
+    """Whether a kernel was called or is in the cache, for this processor."""
+    if dispatcher.overloads:
+        return True
+    here = dispatcher.targetctx.codegen().magic_tuple()
+    return any(processor == here for _, processor, *_ in dispatcher._cache._cache_file._load_index())
+
+
 def part(*, inline: bool = False) -> Callable[[Function], Any]:
     """Compile a function that only kernels and other parts call.
 
