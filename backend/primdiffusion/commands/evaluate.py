@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from primdiffusion.body.model import BodyPose
 from primdiffusion.body.pose_file import read_motion
+from primdiffusion.capture.coco import JOINTS
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.diffusion.checkpoint import load_checkpoint
@@ -33,7 +34,6 @@ from primdiffusion.evaluation.generation import compare, open_reference_set, rea
 from primdiffusion.evaluation.image_metrics import load_lpips
 from primdiffusion.evaluation.images import (
     HEAD,
-    JOINTS,
     SIDE,
     TestImage,
     folder_images,

@@ -133,11 +133,11 @@ class PersonPrior(PersonComponents):
         inner = self.axes.shape[2]
         centre, shared = _double(self.centre).flatten(0, 1)[kinds], _double(self.shared)
         clothes = Block(
-            *(_double(each) for each in (self.axes, self.variance, self.left)),
+            _double(self.axes), _double(self.variance), _double(self.left),
             kinds // self.head.shape[1], centre[:, :inner], shared[..., :inner],
         )  # fmt: skip
         heads = Block(
-            *(_double(each) for each in (self.head_axes, self.head_variance, self.head_left)),
+            _double(self.head_axes), _double(self.head_variance), _double(self.head_left),
             self.head.flatten().to(kinds.device)[kinds], centre[:, inner:],
             shared[:1, :, inner:].expand(len(self.head_left), -1, -1),
         )  # fmt: skip

@@ -77,14 +77,14 @@ def posterior(
 ) -> tuple[Float[Tensor, "b n"], Float[Tensor, "b n q"]]:
     """Probability of each kind of the blocks given y, for log weights [b, n], and the shared part that it expects."""
     each_y = y.split([block.centre.shape[1] for block in blocks], dim=1)
-    found = [_evidence(block, own, signal, noise) for block, own in zip(blocks, each_y, strict=True)]
+    clothes, head = (_evidence(block, own, signal, noise) for block, own in zip(blocks, each_y, strict=True))
     pairs, pair = torch.stack([block.of for block in blocks], dim=1).unique(dim=0, return_inverse=True)
-    gram = sum(one.gram[:, of] for one, of in zip(found, pairs.unbind(1), strict=True))
+    gram = clothes.gram[:, pairs[:, 0]] + head.gram[:, pairs[:, 1]]
     factor = torch.linalg.cholesky(gram + torch.eye(gram.shape[-1]).to(gram))
-    pull = sum(one.pull for one in found)
+    pull = clothes.pull + head.pull
     u = torch.cholesky_solve(pull[..., None], factor[:, pair])[..., 0]
     determinant = 2 * factor.diagonal(dim1=-2, dim2=-1).log().sum(-1)[:, pair]
-    distance = sum(one.distance for one in found) - (pull * u).sum(-1) + determinant
+    distance = clothes.distance + head.distance - (pull * u).sum(-1) + determinant
     return (log_weights - distance / 2).softmax(1), u
 
 

@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor, nn
 from torch.nn import functional
 
+from primdiffusion.capture.coco import JOINTS
 from primdiffusion.diffusion.conditioning import AttributeVocabulary
 from primdiffusion.evaluation.attribute_network import attribute_heads, detail_energies
-from primdiffusion.evaluation.images import JOINTS
 from primdiffusion.files import tensor_file
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import as_file_error

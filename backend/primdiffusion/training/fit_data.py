@@ -16,10 +16,9 @@ from primdiffusion.capture.dataset import (
     Position,
     ProcessRank,
     SampleSet,
-    Views,
     batches,
 )
-from primdiffusion.capture.reader import Captures
+from primdiffusion.capture.reader import Captures, Views
 from primdiffusion.encoder.config import EncoderConfig
 from primdiffusion.encoder.model import frames_of, look_up
 from primdiffusion.encoder.network import motion_of
