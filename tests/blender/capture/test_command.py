@@ -1,4 +1,4 @@
-"""The command `capture` says how long it will take, and asks a user at a terminal."""
+"""The command `capture` reads its options as the panel does its settings."""
 
 from __future__ import annotations
 

@@ -293,6 +293,14 @@ def test_the_panels_defaults_are_the_commands(extension, tmp_path):
     assert (from_line.camera_count, from_line.pose_count, from_line.size, from_line.samples) == (36, 20, (512, 512), 16)
 
 
+def test_paths_that_begin_with_a_hyphen_are_no_options(extension, tmp_path):
+    asked = extension.scene.primdiffusion_captures
+    for people, out in (("-people", str(tmp_path)), (str(tmp_path), "--out")):
+        asked.people, asked.out = people, out
+        with refused(ValueError, "whole path"):
+            command_args(asked, extension, tmp_path)
+
+
 def test_cameras_of_the_scene_are_taken_by_name(extension, tmp_path):
     scene, asked = extension.scene, extension.scene.primdiffusion_captures
     asked.people = asked.out = str(tmp_path)
