@@ -37,9 +37,7 @@ class PRIMDIFFUSION_OT_apply_result(bpy.types.Operator):
 
     bl_idname = "primdiffusion.apply_result"
     bl_label = "Apply Result"
-    bl_options = {
-        "INTERNAL"
-    }  # not UNDO: the step has the job's own name, and a failure that changed nothing makes none
+    bl_options = {"INTERNAL"}  # no UNDO: the step has the job's name, and a failure that changed nothing makes none
 
     @classmethod
     def poll(cls, _context: bpy.types.Context) -> bool:

@@ -14,7 +14,7 @@ _EVERY_S = 0.005
 _SHOWN = 5
 _NOTICED_S = 0.1
 _OURS = (
-    ("jobs.follow", "", "enter"),
+    ("jobs.follow", "", "apply_ready_result"),
     ("jobs.volumes", "VolumesJob", "advance"),
     ("engine.gpu.overlay", "Overlay", "advance"),
     ("engine.gpu.overlay", "Overlay", "draw"),

@@ -67,12 +67,13 @@ try:
     press.generate(seed=7)
 except RuntimeError as error:
     report["generate"] = str(error)
-panels = ("generate", "variations", "from_file", "human", "edit", "render")
+panels = ("generate", "from_file", "human", "render")
 polls = {name: getattr(getattr(bpy.types, f"PRIMDIFFUSION_PT_{name}"), "poll", None) for name in panels}
 report["panels"] = [name for name, poll in polls.items() if poll is None or poll(bpy.context)]
 report["rejected"] = []
+bpy.context.scene.primdiffusion_export.format = "GLB"
 for operator, words in (
-    (press.export, {"format": "GLB", "filepath": str(folder / "mesh.glb")}),
+    (press.export, {"filepath": str(folder / "mesh.glb")}),
     (press.set_up_engine, {"engine": "PRIMDIFFUSION"}),
 ):
     try:

@@ -292,12 +292,18 @@ def test_a_waiting_result_enters_the_scene_or_reports_why_not(anna, situation, a
         assert (after[0], *after[2:]) == (before[0], *before[2:]), str(error)
 
 
+class _Layout(MagicMock):
+    """Takes everything, and has all sections open."""
+
+    def panel(self, *_: object, **__: object) -> tuple[MagicMock, MagicMock]:
+        return self, self
+
+
 class _Drawn:
     """A panel that is drawn into nothing."""
 
     def __init__(self, cls: type) -> None:
-        self._cls, self.layout = cls, MagicMock()
-        self.layout.panel.side_effect = lambda *_, **__: (MagicMock(), MagicMock())
+        self._cls, self.layout = cls, _Layout()
 
     def __getattr__(self, name: str):
         found = getattr(self._cls, name)
@@ -319,4 +325,4 @@ def test_every_panel_draws(anna, situation):
         except Exception:
             faults.append(f"{cls.__name__}: {traceback.format_exc()}")
     assert not faults, "\n".join(faults)
-    assert drawn > 10
+    assert drawn >= 10

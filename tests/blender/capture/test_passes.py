@@ -12,7 +12,7 @@ from blender_primdiffusion.files.regular_files import FileError
 from support.errors import refused
 
 from blender_primdiffusion.capture.passes import read_colours, read_exr
-from blender_primdiffusion.formats import picture_files
+from blender_primdiffusion.files import picture_files
 
 WIDTH, HEIGHT = 6, 4
 CHANNELS = tuple(f"ViewLayer.Combined.{name}" for name in "ABGR")
