@@ -11,7 +11,7 @@ from contextlib import AbstractContextManager
 from jaxtyping import Bool
 from torch import Tensor
 
-from primdiffusion.commands.output import FILES, Decode, previews_wait, step_previews, write_human
+from primdiffusion.commands.output import FILES, Decode, skips_previews, step_previews, write_human
 from primdiffusion.commands.progress import ReportProgress, step_reporter
 from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.model import DiffusionModel
@@ -58,7 +58,7 @@ def edit(request: EditRequest, session: Session, report: ReportProgress) -> Huma
         human = _EDITS[type(request)](request, load_human(request.person), session, sampling)
         edited = time.perf_counter()
         report("write", steps, steps, None)
-        drawn = not previews_wait(request.picture_px)
+        drawn = not skips_previews(request.picture_px)
         write_human(folder, human, request.size, previews=drawn)
         report("write", steps, steps, 0.0)  # the last chance to cancel
     return HumanAnswer(

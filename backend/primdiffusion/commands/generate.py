@@ -15,7 +15,7 @@ from primdiffusion.commands.output import (
     PreviewBudget,
     PreviewFiles,
     draw_front_and_back,
-    previews_wait,
+    skips_previews,
     step_previews,
     write_files,
     write_human,
@@ -84,7 +84,7 @@ def _generate_batch(
             )
         sampled = time.perf_counter()
         report("write", steps, steps, None)
-        drawn = not previews_wait(request.picture_px)
+        drawn = not skips_previews(request.picture_px)
         looks = {"compact": request.compact, "compositing": request.compositing, "previews": drawn}
         for folder, human in zip(unfinished, humans, strict=True):
             write_human(folder, human, request.size, **looks)

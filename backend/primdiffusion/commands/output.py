@@ -105,8 +105,8 @@ def write_files(path: Path, human: Human, *, compact: bool = False) -> None:
 _compiler: list[BaseProcess] = []
 
 
-def previews_wait(px: int) -> bool:
-    """Whether a request with previews of px pixels while sampling is ready before the compiler; starts the compiler."""
+def skips_previews(px: int) -> bool:
+    """Whether previews of px pixels are left out because the marcher is being compiled; starts that where needed."""
     if px == 0 or is_compiled(march_tiles):
         return False
     if not _compiler:
@@ -190,7 +190,7 @@ def step_previews(
     budget = PreviewBudget()
 
     def preview(step: SamplerStep) -> Path | None:
-        if step.index + 1 == step.total or not budget.granted() or previews_wait(px):  # the result follows the last
+        if step.index + 1 == step.total or not budget.granted() or skips_previews(px):  # the result follows the last
             return None
         with budget.spending():
             human = decode(step.x0)

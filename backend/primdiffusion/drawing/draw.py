@@ -48,8 +48,8 @@ def draw_into(picture: Picture, scene: Scene, camera: Camera, look: ViewSettings
     behind = None if scene.solids is None else backdrop(scene.solids, camera, look.clip)
     end = None if behind is None else behind.end
     if scene.primitives is None or scene.primitives.position.shape[0] == 0:
-        nobody = Image.blank(camera.width, camera.height)
-        people = People(nobody, nobody.depth, 0.0)
+        empty = Image.blank(camera.width, camera.height)
+        people = People(empty, empty.depth, 0.0)
     elif look.view == "boxes":
         people = _boxes(draw_boxes(scene.primitives, camera, scene.chart, look.clip), end)
     else:

@@ -198,7 +198,7 @@ def test_the_compiler_compiles_what_previews_need(monkeypatch):
     output._compile()
     assert output.is_compiled(output.march_tiles)
     assert lowered == [10]
-    assert not output.previews_wait(8)
+    assert not output.skips_previews(8)
 
 
 KERNEL = """

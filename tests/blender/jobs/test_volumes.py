@@ -8,6 +8,7 @@ import synthetic_shape
 from human_files import copy_of, folder_of, forget_session_files
 from jobs_driven import error_of, notice_of
 
+import blender_primdiffusion
 from benchmarks.cycles_preview import setup_cycles_preview
 from blender_primdiffusion.engine.engine import ENGINE
 from blender_primdiffusion.jobs.queue import queue
@@ -142,6 +143,12 @@ def test_what_a_render_cannot_write_is_told_once(person, full_disk, capsys):
     write_before_rendering(bpy.context.scene)
     assert faults.text == ""
     assert are_written(person)
+
+
+def test_what_was_wrong_is_forgotten_when_the_extension_is_disabled(person):
+    faults.report("the human 'Anna' cannot be drawn")
+    blender_primdiffusion.unregister()
+    assert faults.text == ""
 
 
 def test_cycles_merges_humans_that_stand_still_and_leaves_those_that_move(person):
