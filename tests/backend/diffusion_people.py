@@ -70,7 +70,7 @@ def prior_of_parts(seed: int, asked: int = 0) -> PersonPrior:
     kind = torch.nn.functional.one_hot(torch.arange(groups * kinds) % max(asked, 1), max(asked, 1))[:, :asked].double()
     return PersonPrior(
         mean=normal(*shape),
-        basis=torch.cat(basis),
+        basis=torch.cat(basis).permute(2, 0, 1).contiguous(),
         part=part,
         parity=torch.ones(6),
         rest_variance=0.02 + 0.05 * uniform(*shape),

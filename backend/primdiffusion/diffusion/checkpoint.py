@@ -49,6 +49,10 @@ WEIGHTS = "model.safetensors"
 _COMMIT = re.compile(r"[0-9a-zA-Z_-]{1,64}", re.ASCII)
 SYMMETRIC = 1e-4
 """Largest difference between an entry of a person component and its mirror image; entries are up to 1."""
+RANK = 1e-5
+"""Smallest singular value of the centres of kinds that is kept, as a share of the largest."""
+MOST_CENTRES = 2**26
+"""Most numbers that factors in a file may be multiplied out to."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -128,6 +132,7 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
         codec = model.codec.codec
         tensors |= _fields("codec", codec)
         _store_half(tensors, codec)
+        _store_effects(tensors)
         tensors |= _fields("shapes", model.shapes)
         architecture |= {"kind": "person"}
     else:
@@ -242,17 +247,34 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
 def _store_half(tensors: dict[str, Tensor], codec: LinearCodec) -> None:
     """Keep the left half of each person component where the right one is its mirror image times its parity."""
     part, parity = tensors["denoiser.prior_part"], tensors["denoiser.prior_parity"]
-    basis = tensors["denoiser.prior_basis"][part.argsort(stable=True).argsort()].permute(2, 1, 0)
+    basis = tensors["denoiser.prior_basis"][:, part.argsort(stable=True).argsort()].mT
     half = basis.unflatten(2, (GRID, GRID))[..., : GRID // 2]
     if torch.allclose(_whole_components(half, part, parity, codec), basis, atol=SYMMETRIC):
         del tensors["denoiser.prior_basis"]
         tensors["denoiser.prior_basis_half"] = half
 
 
+def _store_effects(tensors: dict[str, Tensor]) -> None:
+    """Keep the centres of kinds, which are sums of few effects (`training.prior`), as a product of two factors."""
+    centre = tensors["denoiser.prior_centre"].flatten(0, 1)
+    kinds, size, effects = torch.linalg.svd(centre, full_matrices=False)
+    rank = int((size > RANK * size[0]).sum())
+    if rank * sum(centre.shape) < centre.numel():
+        del tensors["denoiser.prior_centre"]
+        root = size[:rank].sqrt()
+        tensors["denoiser.prior_kinds"] = kinds[:, :rank] * root
+        tensors["denoiser.prior_effects"] = root[:, None] * effects[:rank]
+
+
 def _restore_prior(weights: dict[str, Tensor], codec: LinearCodec) -> None:
-    """Undo `_store_half`, in what `_model` reads, and complete priors of older files, whose components are of the whole
-    body.
+    """Undo `_store_half` and `_store_effects`, in what `_model` reads, and complete priors of older files, whose
+    components are of the whole body.
     """
+    if "prior_effects" in weights:
+        kinds, effects = weights.pop("prior_kinds"), weights.pop("prior_effects")
+        if len(kinds) * effects.shape[1] > MOST_CENTRES:
+            raise ValueError(f"centres of kinds are {len(kinds)} times {effects.shape[1]} numbers")
+        weights["prior_centre"] = (kinds @ effects).unflatten(0, weights["prior_log_weight"].shape)
     older = "prior_part" not in weights
     part = torch.zeros(K, dtype=torch.int64) if older else weights["prior_part"].long()
     half = weights.pop("prior_basis_half", None)
@@ -260,7 +282,7 @@ def _restore_prior(weights: dict[str, Tensor], codec: LinearCodec) -> None:
         if half.ndim != 4 or half.shape[2:] != (GRID, GRID // 2) or half.shape[1] > codec.channels:
             raise ValueError(f"halves of person components have shape {tuple(half.shape)}")
         whole = _whole_components(half, part, weights["prior_parity"], codec)
-        weights["prior_basis"] = whole.flatten(1) if older else whole.permute(2, 1, 0)[part.argsort(stable=True)]
+        weights["prior_basis"] = whole.flatten(1) if older else whole.mT[:, part.argsort(stable=True)].contiguous()
     if older:
         prior = PersonPrior.of_whole_body(**under(weights, "prior_"))
         weights |= {f"prior_{field.name}": getattr(prior, field.name) for field in dataclasses.fields(prior)}

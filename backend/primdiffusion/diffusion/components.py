@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from jaxtyping import Float, Int
-from torch import Tensor, cat, zeros_like
+from torch import Tensor, cat, einsum, zeros_like
 
 from primdiffusion.geometry.records import TensorRecord
 
@@ -15,8 +15,8 @@ class PersonComponents(TensorRecord):
     """Latents [C, H, W] on K = H*W cells as P parts of N components (R = P*N), and a rest orthogonal to these."""
 
     mean: Float[Tensor, "c h w"]
-    basis: Float[Tensor, "k d n"]
-    """Components, orthonormal in each part, in the order of their variance: [i, :, j] is what component j of a cell's
+    basis: Float[Tensor, "n k d"]
+    """Components, orthonormal in each part, in the order of their variance: [j, i] is what component j of a cell's
     part adds to its d leading channels. Cells are in the order of their parts, `part.argsort(stable=True)`."""
     part: Int[Tensor, "k"]
     """Part of each cell, equal to its own mirror image; the last one is the head."""
@@ -39,18 +39,18 @@ class PersonComponents(TensorRecord):
 
     def picture(self, coefficients: Float[Tensor, "b r"]) -> Float[Tensor, "b c h w"]:
         """Return the contribution of person coefficients to latents, without the mean."""
-        own = coefficients.unflatten(1, (-1, self.basis.shape[2])).unbind(1)
-        drawn = cat([part @ basis.flatten(0, 1).T for part, basis in zip(own, self._bases(), strict=True)], dim=1)
-        channels = self.basis.shape[1]
+        own = coefficients.unflatten(1, (-1, len(self.basis))).unbind(1)
+        drawn = cat([part @ basis.flatten(1) for part, basis in zip(own, self._bases(), strict=True)], dim=1)
+        channels = self.basis.shape[2]
         picture = coefficients.new_zeros((len(coefficients), *self.mean.flatten(1).shape))
         picture[:, :channels, self._order] = drawn.unflatten(1, (-1, channels)).mT
         return picture.unflatten(2, self.mean.shape[1:])
 
     def _along(self, z: Float[Tensor, "b c h w"]) -> Float[Tensor, "b r"]:
-        cells = z.flatten(2)[:, : self.basis.shape[1], self._order].mT
-        own = cells.split([len(basis) for basis in self._bases()], dim=1)
+        cells = z.flatten(2)[:, : self.basis.shape[2], self._order].mT
+        own = cells.split([basis.shape[1] for basis in self._bases()], dim=1)
         return cat(
-            [part.flatten(1) @ basis.flatten(0, 1) for part, basis in zip(own, self._bases(), strict=True)], dim=1
+            [part.flatten(1) @ basis.flatten(1).T for part, basis in zip(own, self._bases(), strict=True)], dim=1
         )
 
     @property
@@ -58,13 +58,13 @@ class PersonComponents(TensorRecord):
         return self.part.argsort(stable=True)
 
     def _bases(self) -> tuple[Tensor, ...]:
-        """The components of each part [cells, d, n]."""
-        return self.basis.split(self.part.bincount().tolist())
+        """The components of each part [n, cells, d]."""
+        return self.basis.split(self.part.bincount().tolist(), dim=1)
 
     def picture_variance(self, variance: Float[Tensor, "r"]) -> Float[Tensor, "c h w"]:
         """Variance of `picture` for independent coefficients of these variances."""
-        own = variance.unflatten(0, (-1, self.basis.shape[2]))
-        drawn = cat([basis.square() @ part for part, basis in zip(own, self._bases(), strict=True)])
+        own = variance.unflatten(0, (-1, len(self.basis)))
+        drawn = cat([einsum("nkd,n->kd", basis.square(), part) for part, basis in zip(own, self._bases(), strict=True)])
         picture = zeros_like(self.mean).flatten(1)
         picture[: drawn.shape[1], self._order] = drawn.T
         return picture.view_as(self.mean)

@@ -277,6 +277,7 @@ class PersonDenoiser(nn.Module):
         super().__init__()
         self.config, self.schedule = config, schedule
         self.network_dtype = torch.float32
+        self._prior: PersonPrior | None = None
         for field in dataclasses.fields(PersonPrior):
             self.register_buffer(f"prior_{field.name}", getattr(prior, field.name))
         component_std = prior.marginal_variance().sqrt()
@@ -286,17 +287,18 @@ class PersonDenoiser(nn.Module):
         channels, grid, components = prior.mean.shape[0], prior.mean.shape[-1], len(prior.parity)
         asked = prior.kind.shape[-1]
         self.person = PersonNetwork(components, asked, config.person) if config.person else None
-        drawn = prior.basis.shape[1]
+        drawn = prior.basis.shape[2]
         self.local = LocalUNet(channels, components, grid, asked, config.local, drawn) if config.local else None
         if self.local is not None:
             self.local = self.local.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
     @property
     def prior(self) -> PersonPrior:
-        """The closed-form part."""
-        return PersonPrior(
-            **{field.name: self.get_buffer(f"prior_{field.name}") for field in dataclasses.fields(PersonPrior)}
-        )
+        """The closed-form part; the same object until its tensors are others, for it keeps what it computes once."""
+        fields = {field.name: self.get_buffer(f"prior_{field.name}") for field in dataclasses.fields(PersonPrior)}
+        if self._prior is None or any(getattr(self._prior, name) is not value for name, value in fields.items()):
+            self._prior = PersonPrior(**fields)
+        return self._prior
 
     def forward(
         self,

@@ -19,6 +19,7 @@ the tone of the skin. Kinds are many, with few people each, so what is common to
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -34,7 +35,7 @@ IMPOSSIBLE = -1e4
 """Log weight of a kind that contradicts the condition, or is padding."""
 CLEAN_NOISE = 1e-3
 """Noise of coefficients that are read as they are; some directions have no variance of their own."""
-TOGETHER = 32
+TOGETHER = 8
 """Samples whose distances to all kinds are in memory at once."""
 
 
@@ -81,7 +82,7 @@ class PersonPrior(PersonComponents):
         """One part, whose components are rows over whole channels, with one Gaussian for each group."""
         cells, groups = mean[0].numel(), len(log_weight)
         return cls(
-            mean=mean, basis=basis.unflatten(1, (-1, cells)).permute(2, 1, 0).contiguous(),
+            mean=mean, basis=basis.unflatten(1, (-1, cells)).mT.contiguous(),
             part=torch.zeros(cells, dtype=torch.int64), parity=parity, rest_variance=rest_variance,
             log_weight=log_weight, centre=centre, axes=axes, variance=variance, left=variance.new_zeros(groups),
             head=torch.zeros(log_weight.shape, dtype=torch.int64), head_axes=axes.new_zeros(1, 0, 0),
@@ -108,11 +109,12 @@ class PersonPrior(PersonComponents):
         Computed in float64: distances to centres are squares of numbers up to a hundred over noise down to 0.01;
         on the CPU for Apple GPUs, which have no float64.
         """
-        log_weights = _double(self.log_weights(condition)).flatten(1).expand(len(y), -1)
-        possible = (log_weights > IMPOSSIBLE / 2).any(0).nonzero()[:, 0]
-        blocks = self._blocks(possible)
+        log_weights, blocks = _double(self.log_weights(condition)).flatten(1).expand(len(y), -1), self._blocks
+        if condition is not None:
+            possible = (log_weights > IMPOSSIBLE / 2).any(0).nonzero()[:, 0]
+            log_weights, blocks = log_weights[:, possible], (blocks[0].chosen(possible), blocks[1].chosen(possible))
         found = [
-            expected(blocks, weights[:, possible], *(_double(each) for each in chunk))
+            expected(blocks, weights, *(_double(each) for each in chunk))
             for weights, *chunk in zip(*(each.split(TOGETHER) for each in (log_weights, y, signal, noise)), strict=True)
         ]
         return torch.cat(found).to(y)
@@ -120,26 +122,27 @@ class PersonPrior(PersonComponents):
     def kind_shares(self, c: Float[Tensor, "b r"]) -> Float[Tensor, "b g m"]:
         """Probability of each kind given clean person coefficients."""
         weights = _double(self.log_weight).flatten()[None]
-        blocks = self._blocks(torch.arange(weights.shape[1], device=weights.device))
         one = torch.ones(len(c), 1, device=c.device)
         shares = [
-            posterior(blocks, weights, *(_double(each) for each in chunk))[0]
+            posterior(self._blocks, weights, *(_double(each) for each in chunk))[0]
             for chunk in zip(*(each.split(TOGETHER) for each in (c, one, CLEAN_NOISE * one)), strict=True)
         ]
         return torch.cat(shares).unflatten(1, self.log_weight.shape)
 
-    def _blocks(self, kinds: Int[Tensor, "n"]) -> tuple[Block, Block]:
-        """Clothes and heads of some kinds, given as places in the flattened [G, M]."""
-        inner = self.axes.shape[2]
-        centre, shared = _double(self.centre).flatten(0, 1)[kinds], _double(self.shared)
-        clothes = Block(
+    @functools.cached_property
+    def _blocks(self) -> tuple[Block, Block]:
+        """Clothes and heads of all kinds."""
+        inner, kinds = self.axes.shape[2], self.log_weight.numel()
+        centre, shared = _double(self.centre).flatten(0, 1), _double(self.shared)
+        group = torch.arange(kinds, device=centre.device) // self.head.shape[1]
+        clothes = Block.of_kinds(
             _double(self.axes), _double(self.variance), _double(self.left),
-            kinds // self.head.shape[1], centre[:, :inner], shared[..., :inner],
+            shared[..., :inner], group, centre[:, :inner],
         )  # fmt: skip
-        heads = Block(
+        heads = Block.of_kinds(
             _double(self.head_axes), _double(self.head_variance), _double(self.head_left),
-            self.head.flatten().to(kinds.device)[kinds], centre[:, inner:],
-            shared[:1, :, inner:].expand(len(self.head_left), -1, -1),
+            shared[:1, :, inner:].repeat(len(self.head_left), 1, 1),
+            self.head.flatten().to(centre.device), centre[:, inner:],
         )  # fmt: skip
         return clothes, heads
 

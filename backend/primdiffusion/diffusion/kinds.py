@@ -1,14 +1,13 @@
 """Bayes' rule for kinds of people: which kind noisy person coefficients are of, and what they are without the noise.
 
 A kind has a centre, a Gaussian of its clothes, one of its head, and directions that the two share (`gaussian`). Kinds
-are many and Gaussians few, so distances are computed for all kinds of a Gaussian together. Covariances have variances
-along some axes and one in all other directions: their inverses are written down, and shared directions enter by
-Woodbury's identity. Everything is in float64.
+are many and Gaussians few. Covariances have variances along some axes and one in all other directions: their inverses
+are written down, and shared directions enter by Woodbury's identity. Everything is in float64, and for all kinds at
+once; what does not depend on the noise is computed once (`Block.of_kinds`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import torch
@@ -22,15 +21,36 @@ class Block(NamedTuple):
     axes: Float[Tensor, "g a i"]
     variance: Float[Tensor, "g a"]
     left: Float[Tensor, "g"]
+    shared: Float[Tensor, "g q i"]
+    shared_along: Float[Tensor, "g q a"]
+    """Shared directions along the axes."""
+    shared_gram: Float[Tensor, "g q q"]
     of: Int[Tensor, "n"]
     """The Gaussian of each kind."""
     centre: Float[Tensor, "n i"]
-    shared: Float[Tensor, "g q i"]
+    along: Float[Tensor, "n a"]
+    """Centres along the axes of their Gaussians."""
+    by_shared: Float[Tensor, "n q"]
+    """Inner products of centres and shared directions."""
 
-    def groups(self) -> Iterator[tuple[int, Int[Tensor, "m"]]]:
-        """Each Gaussian that a kind has, and the places of its kinds."""
-        for group in self.of.unique().tolist():
-            yield group, (self.of == group).nonzero()[:, 0]
+    @classmethod
+    def of_kinds(
+        cls, axes: Tensor, variance: Tensor, left: Tensor, shared: Tensor, of: Tensor, centre: Tensor
+    ) -> Block:
+        """A block of the fields of these names."""
+        along, by_shared = centre.new_zeros(len(of), axes.shape[1]), centre.new_zeros(len(of), shared.shape[1])
+        for group in of.unique().tolist():
+            members = of == group
+            along[members] = centre[members] @ axes[group].T
+            by_shared[members] = centre[members] @ shared[group].T
+        shared_along, gram = shared @ axes.mT, shared @ shared.mT
+        return cls(axes, variance, left, shared, shared_along, gram, of, centre, along, by_shared)
+
+    def chosen(self, kinds: Int[Tensor, "m"]) -> Block:
+        """The block of some kinds, with their Gaussians."""
+        groups, of = self.of[kinds].unique(return_inverse=True)
+        gaussians = (each[groups] for each in self[:6])
+        return Block(*gaussians, of, self.centre[kinds], self.along[kinds], self.by_shared[kinds])
 
 
 class _Evidence(NamedTuple):
@@ -45,31 +65,29 @@ class _Evidence(NamedTuple):
 
 
 def _evidence(block: Block, y: Tensor, signal: Tensor, noise: Tensor) -> _Evidence:
-    samples, kinds, directions = len(y), len(block.of), block.shared.shape[1]
-    distance, pull = y.new_empty(samples, kinds), y.new_empty(samples, kinds, directions)
-    gram = y.new_zeros(samples, len(block.left), directions, directions)
-    for group, members in block.groups():
-        axes, centre, shared = block.axes[group], block.centre[members], block.shared[group]
-        total = signal**2 * block.variance[group] + noise**2
-        total_left = signal**2 * block.left[group] + noise**2
-        extra = 1 / total - 1 / total_left  # inner products: x.z / total_left + (x axes) extra (z axes)
-        y_along, centre_along, shared_along = y @ axes.T, centre @ axes.T, shared @ axes.T
-        weighted = y_along * extra
-        own = y.square().sum(1, keepdim=True) / total_left + (weighted * y_along).sum(1, keepdim=True)
-        cross = y @ centre.T / total_left + weighted @ centre_along.T
-        between = centre.square().sum(1) / total_left + extra @ centre_along.square().T
-        determinant = total.log().sum(1, keepdim=True) + (axes.shape[1] - axes.shape[0]) * total_left.log()
-        distance[:, members] = own - 2 * signal * cross + signal**2 * between + determinant
-        by_y = y @ shared.T / total_left + weighted @ shared_along.T
-        by_centre = centre @ shared.T / total_left[..., None] + torch.einsum(
-            "ba,na,qa->bnq", extra, centre_along, shared_along
-        )
-        pull[:, members] = signal[..., None] * (by_y[:, None] - signal[..., None] * by_centre)
-        inner = shared @ shared.T / total_left[..., None]
-        gram[:, group] = signal[..., None] ** 2 * (
-            inner + torch.einsum("ba,pa,qa->bpq", extra, shared_along, shared_along)
-        )
-    return _Evidence(distance, pull, gram)
+    """Inner products are x.z / total_left + (x axes) extra (z axes)."""
+    of, wide = block.of, signal[..., None]
+    total = wide**2 * block.variance + noise[..., None] ** 2
+    total_left = signal**2 * block.left + noise**2
+    extra = 1 / total - 1 / total_left[..., None]
+    y_along = torch.einsum("bi,gai->bga", y, block.axes)
+    weighted = y_along * extra
+    determinant = total.log().sum(2) + (block.axes.shape[2] - block.axes.shape[1]) * total_left.log()
+    own = y.square().sum(1, keepdim=True) / total_left + (weighted * y_along).sum(2) + determinant
+    extra_along = extra[:, of] * block.along
+    cross = y @ block.centre.T / total_left[:, of] + (weighted[:, of] * block.along).sum(2)
+    between = block.centre.square().sum(1) / total_left[:, of] + (extra_along * block.along).sum(2)
+    by_y = torch.einsum("bi,gqi->bgq", y, block.shared) / total_left[..., None]
+    by_y += torch.einsum("bga,gqa->bgq", weighted, block.shared_along)
+    by_centre = block.by_shared / total_left[:, of, None]
+    by_centre += torch.einsum("bna,nqa->bnq", extra_along, block.shared_along[of])
+    gram = block.shared_gram / total_left[..., None, None]
+    gram += torch.einsum("bga,gpa,gqa->bgpq", extra, block.shared_along, block.shared_along)
+    return _Evidence(
+        own[:, of] - 2 * signal * cross + signal**2 * between,
+        wide * (by_y[:, of] - wide * by_centre),
+        wide[..., None] ** 2 * gram,
+    )
 
 
 def posterior(
@@ -101,13 +119,22 @@ def expected(
 def _mean_of_block(
     block: Block, share: Tensor, u: Tensor, y: Tensor, signal: Tensor, noise: Tensor
 ) -> Float[Tensor, "b i"]:
-    """E[c | y] of a block for kinds of these shares, whose shared directions are expected at u [b, n, q]."""
-    mean = torch.zeros_like(y)
-    for group, members in block.groups():
-        own, axes = share[:, members], block.axes[group]
-        expected = own @ block.centre[members] + (own[..., None] * u[:, members]).sum(1) @ block.shared[group]
-        difference = own.sum(1, keepdim=True) * y - signal * expected
-        gain_left = signal * block.left[group] / (signal**2 * block.left[group] + noise**2)
-        gain = signal * block.variance[group] / (signal**2 * block.variance[group] + noise**2)
-        mean += expected + gain_left * difference + ((gain - gain_left) * (difference @ axes.T)) @ axes
-    return mean
+    """E[c | y] of a block for kinds of these shares, whose shared directions are expected at u [b, n, q].
+
+    That of one kind is e + gain (y - signal e), where e is its centre and shared part, with a gain for each direction.
+    """
+    gain_left = signal * block.left / (signal**2 * block.left + noise**2)
+    wide = signal[..., None]
+    gain = wide * block.variance / (wide**2 * block.variance + noise[..., None] ** 2) - gain_left[..., None]
+
+    def of_groups(values: Float[Tensor, "b n ..."]) -> Float[Tensor, "b g ..."]:
+        return values.new_zeros(len(values), len(block.left), *values.shape[2:]).index_add(1, block.of, values)
+
+    shares, shared = of_groups(share), of_groups(share[..., None] * u)
+    remaining = 1 - signal * gain_left
+    mean = (share * remaining[:, block.of]) @ block.centre
+    mean += torch.einsum("bgq,gqi->bi", remaining[..., None] * shared, block.shared)
+    mean += (shares * gain_left).sum(1, keepdim=True) * y
+    expected = of_groups(share[..., None] * block.along) + torch.einsum("bgq,gqa->bga", shared, block.shared_along)
+    difference = shares[..., None] * torch.einsum("bi,gai->bga", y, block.axes) - wide * expected
+    return mean + torch.einsum("bga,gai->bi", gain * difference, block.axes)

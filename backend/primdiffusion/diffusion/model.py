@@ -243,7 +243,7 @@ def check_parts(codec: LinearCodec, prior: PersonPrior, shapes: ShapePrior, voca
     check_shapes(codec, prior)
     check_shapes(shapes)
     _check_values(prior, shapes)
-    cells, drawn, own = prior.basis.shape
+    own, cells, drawn = prior.basis.shape
     parts, components = int(prior.part.max()) + 1, len(prior.parity)
     if cells != K or not 0 < drawn <= codec.channels:
         raise ValueError(f"components draw {drawn} channels of {cells} cells, not up to {codec.channels} of {K}")

@@ -194,13 +194,13 @@ class PersonComponents:
 
     @functools.cached_property
     def _voxel_basis(self) -> Float32[ndarray, "b 512 4 c"]:
-        return self.codec.voxel_basis(self.prior.basis.shape[1]).contiguous().numpy()
+        return self.codec.voxel_basis(self.prior.basis.shape[2]).contiguous().numpy()
 
     @functools.cached_property
     def _components(self) -> Float[Tensor, "k d n"]:
         """What the components of a box's part add to its channels; boxes in their own order."""
         order = self.prior.part.argsort(stable=True)
-        return self.prior.basis[order.argsort()]
+        return self.prior.basis[:, order.argsort()].permute(1, 2, 0)
 
     def _kinds(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
         """People of an outfit and head, and channels of each box by their weights; those asked for last are kept."""
@@ -211,7 +211,7 @@ class PersonComponents:
     def _kinds_of(self, group: int | None, head: int | None) -> tuple[GaussianOfKinds, Float32[ndarray, "k d w"]]:
         everyone = group is None
         kinds = self.prior.gaussian_of_all(DIRECTIONS) if everyone else self.prior.gaussian_of(group, head, DIRECTIONS)
-        by_part = kinds.factor.unflatten(1, (-1, self.prior.basis.shape[2])).permute(1, 2, 0)
+        by_part = kinds.factor.unflatten(1, (-1, len(self.prior.basis))).permute(1, 2, 0)
         return kinds, torch.bmm(self._components, by_part[self.prior.part]).numpy()
 
     def coefficients(self, explanation: Explanation) -> Float[Tensor, "r"]:

@@ -202,7 +202,7 @@ def fit_prior(
     mean = (mean + codec.mirror(mean)) / 2
     fitted = [_components(people, codec, cells, config) for cells in _cells_of(part)]
     count = min(len(one.signs) for one in fitted)
-    basis = torch.cat([one.basis[..., :count] for one in fitted])
+    basis = torch.cat([one.basis[:count] for one in fitted], dim=1)
     signs = torch.cat([one.signs[:count] for one in fitted])
     kept = torch.cat([one.kept[:count] for one in fitted])
     inside = PersonComponents(mean, basis, part, signs)
@@ -237,7 +237,7 @@ def _cells_of(part: Int[Tensor, "k"]) -> list[Int[Tensor, "n"]]:
 class _Components(NamedTuple):
     """Components of one part of the body, in the order of their variance."""
 
-    basis: Float[Tensor, "k d n"]
+    basis: Float[Tensor, "n k d"]
     signs: Float[Tensor, "n"]
     kept: Float[Tensor, "n"]
     """Variance of new people over that of fitted people."""
@@ -256,7 +256,7 @@ def _components(people: LatentSet, codec: LinearCodec, cells: Int[Tensor, "k"], 
             for part, (variance, vector) in zip(parts, vectors, strict=True)
         ]
     )
-    basis = torch.linalg.qr(rows[order].T)[0].unflatten(0, (-1, len(cells))).transpose(0, 1).contiguous()
+    basis = torch.linalg.qr(rows[order].T)[0].T.unflatten(1, (-1, len(cells))).mT.contiguous()
     kept, rest_ratio = _held_out_ratios(grams, people.geometry, config)
     return _Components(basis, signs, kept, rest_ratio)
 

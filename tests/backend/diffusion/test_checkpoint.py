@@ -74,7 +74,7 @@ def test_symmetric_person_components_are_stored_by_half(path):
 
 def in_cells(rows: torch.Tensor) -> torch.Tensor:
     """Rows of components of the whole body as `PersonPrior.basis`."""
-    return rows.unflatten(1, (-1, K)).permute(2, 1, 0)
+    return rows.unflatten(1, (-1, K)).mT
 
 
 def test_components_of_parts_are_stored_by_half_and_read_again(path):
@@ -87,7 +87,7 @@ def test_components_of_parts_are_stored_by_half_and_read_again(path):
     parity = torch.tensor([1.0, -1.0, 1.0, -1.0, -1.0, 1.0])
     signs = parity.view(2, -1)[denoiser.prior_part].T.reshape(-1, 1, GRID, GRID)
     whole = (pictures + signs * codec.mirror(pictures)) / 100
-    basis = in_cells(whole.flatten(1))[order].contiguous()
+    basis = in_cells(whole.flatten(1))[:, order].contiguous()
     prior = dataclasses.replace(denoiser.prior, basis=basis, parity=parity)
     model = dataclasses.replace(model, denoiser=PersonDenoiser(DenoiserConfig(None, None), prior, model.schedule))
     save_checkpoint(path, model, "linear")
@@ -105,7 +105,7 @@ def test_a_prior_of_before_parts_is_one_of_the_whole_body(path):
 
     def before(tensors):
         kept = {key: value for key, value in tensors.items() if key.removeprefix("denoiser.prior_") not in later}
-        return kept | {"denoiser.prior_basis": tensors["denoiser.prior_basis"].permute(2, 1, 0).flatten(1).contiguous()}
+        return kept | {"denoiser.prior_basis": tensors["denoiser.prior_basis"].mT.flatten(1).contiguous()}
 
     rewrite(path, before)
     read, prior = load_checkpoint(path).denoiser.prior, model.denoiser.prior

@@ -51,7 +51,7 @@ def covariance_of(prior, group, kind):
 def test_components_of_a_part_are_orthonormal_and_inside_of_it(prior):
     basis = pictures_of(prior)
     assert torch.allclose(basis @ basis.T, torch.eye(len(basis), dtype=F64), atol=1e-12)
-    own = torch.arange(len(basis)) // prior.basis.shape[2]
+    own = torch.arange(len(basis)) // len(prior.basis)
     outside = prior.part[None] != own[:, None]
     assert not basis.view(len(basis), SHAPE[0], -1).abs().sum(1)[outside].any()
 

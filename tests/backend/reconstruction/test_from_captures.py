@@ -112,7 +112,7 @@ def test_an_outfit_is_found_that_steps_from_the_mean_human_do_not_reach():
     white[:3] = 150 / 32
     prior = PersonPrior.of_whole_body(
         mean=white,
-        basis=PRIOR.basis.permute(2, 1, 0).flatten(1),
+        basis=PRIOR.basis.mT.flatten(1),
         parity=PRIOR.parity,
         rest_variance=PRIOR.rest_variance,
         log_weight=torch.tensor([[0.8], [0.2]]).log(),

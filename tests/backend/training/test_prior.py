@@ -51,7 +51,7 @@ def test_person_components_live_in_the_leading_channels_alone(prepared_once):
     prior = fit_prior(
         prepared.train, prepared.codec, prepared.vocabulary, dataclasses.replace(config.prior, channels=2)
     )
-    assert prior.basis.shape[:2] == (GRID * GRID, 2)
+    assert prior.basis.shape[1:] == (GRID * GRID, 2)
     coefficients, rest = prior.split(z)
     assert torch.equal(rest[:, 2:], z[:, 2:] - prior.mean[2:])
     assert torch.allclose(prior.join(coefficients, rest), z, atol=1e-4)
