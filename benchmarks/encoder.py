@@ -454,7 +454,7 @@ def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) ->
 def drawn_view(primitives: Primitives, camera: Camera, look: str) -> Tensor:
     """The depth or the primitives, drawn over black, sRGB-encoded."""
     drawn = draw(Scene(primitives, chart=default_anchors().chart), camera, ViewSettings(look))
-    return encode_srgb(torch.from_numpy(drawn.combined[..., :3]).clamp(0, 1))
+    return encode_srgb(torch.from_numpy(drawn.rgb).clamp(0, 1))
 
 
 def cropped(image: Tensor, mask: Tensor) -> np.ndarray:

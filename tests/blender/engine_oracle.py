@@ -113,7 +113,7 @@ def compose(
     arrays = (np.array(solids[name], dtype) for name, dtype in (("corners", "f4"), ("colour", "f4"), ("holdout", "?")))
     look = ViewSettings("colour", None if background is None else tuple(background), tuple(clip))
     picture = compose_scene(Scene(primitives, Solids(*arrays)), Camera(*matrices, width, height), look)
-    np.savez(out, combined=picture.combined, depth=picture.depth)
+    np.savez(out, combined=picture.rgba, depth=picture.depth)
 
 
 for line in sys.stdin:

@@ -45,7 +45,7 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
     else:
         settings = MarchSettings(step=request.step)
         scene = Scene(primitives, chart=body_of(human)[1].chart)
-        rgba = torch.from_numpy(draw_scene(scene, camera, ViewSettings(request.view, settings=settings)).combined)
+        rgba = torch.from_numpy(draw_scene(scene, camera, ViewSettings(request.view, settings=settings)).rgba)
     report("write", 1, 1, 0.0)
     with contextlib.ExitStack() as files:  # both files or none
         rgba_to_png(files.enter_context(written_whole(request.out)), rgba, background)

@@ -1,13 +1,11 @@
-"""Records for drawing: the scene, the view settings and the resulting picture."""
+"""Records for drawing: the scene and the view settings."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 
-import numpy as np
-from jaxtyping import Float32, Int
-from numpy import ndarray
+from jaxtyping import Int
 from torch import Tensor
 
 from primdiffusion.formats.requests import VIEWS, View
@@ -16,7 +14,7 @@ from primdiffusion.render.march import MarchSettings
 from primdiffusion.render.solids import Solids
 
 NOTHING = 1e10
-"""Depth of the background, metres, as in Blender's Depth pass."""
+"""Depth of the background in drawn images, metres, as in Blender's Depth pass."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -48,22 +46,3 @@ class ViewSettings:
         start, end = self.clip
         if not 0 <= start < end:
             raise ValueError(f"the clip distances are {start} and {end} m: give a start of at least 0 and a larger end")
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Picture:
-    """An image buffer, top row first. The arrays may be memory-mapped."""
-
-    combined: Float32[ndarray, "h w 4"]
-    """Linear RGB, premultiplied by alpha, and alpha."""
-    depth: Float32[ndarray, "h w"]
-    """Metres along the optical axis to where opacity reaches one half; NOTHING if it never does."""
-
-    @classmethod
-    def blank(cls, width: int, height: int) -> Picture:
-        """An empty, transparent picture."""
-        return cls(np.zeros((height, width, 4), np.float32), np.full((height, width), NOTHING, np.float32))
-
-    def rows(self, top: int, bottom: int) -> Picture:
-        """A view of the rows `top` to `bottom` (exclusive); writing to it writes to this picture."""
-        return Picture(self.combined[top:bottom], self.depth[top:bottom])

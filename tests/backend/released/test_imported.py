@@ -124,9 +124,9 @@ def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_
         )  # fmt: skip
         FrameDrawer(torch.device("cpu")).draw(params, lambda *_: None)
         want = draw(Scene(primitives, chart=chart), camera, ViewSettings(view, clip=(0.0, 1e10)))
-        found = map_frame(params.frame, 40, 56).combined
-        assert (want.combined[..., 3] > 0.5).mean() > 0.2
-        assert np.abs(found - want.combined).mean() < 2e-3
+        found = map_frame(params.frame, 40, 56).rgba
+        assert (want.alpha > 0.5).mean() > 0.2
+        assert np.abs(found - want.rgba).mean() < 2e-3
 
 
 def test_no_file_of_ours_holds_any_of_smpl(person, folder):
