@@ -11,8 +11,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+import torch
+
 from primdiffusion.capture.conditioning import CapturedPerson
-from primdiffusion.capture.photograph import Photograph, read_photographs, rgba_of
+from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
@@ -177,7 +180,8 @@ def outline_overlap(model: DiffusionModel, photographs: Sequence[Photograph], po
 
 
 def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:
-    return Views(rgba_of(photographs), posture.camera, posture.pose)
+    rgba = np.stack([photograph.rgba for photograph in photographs])
+    return Views(torch.from_numpy(rgba), posture.camera, posture.pose)
 
 
 def _targets(photographs: Sequence[Photograph], posture: Posture, side: int) -> list[PosedView]:
