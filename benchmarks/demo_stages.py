@@ -22,8 +22,7 @@ import bpy
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.drawing.draw import Scene, ViewSettings, draw
 from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import default_anchors

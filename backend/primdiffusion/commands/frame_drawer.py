@@ -14,8 +14,7 @@ import torch
 
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.commands.progress import ReportProgress
-from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
-from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, Scene, ViewSettings, draw_in_bands
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.files.arrays import read_numbers
 from primdiffusion.files.regular_files import as_file_error

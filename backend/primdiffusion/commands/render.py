@@ -13,8 +13,8 @@ from primdiffusion.commands.frame_drawer import FrameDrawer
 from primdiffusion.commands.output import decoded, march_encoded
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
+from primdiffusion.drawing.draw import Scene, ViewSettings
 from primdiffusion.drawing.draw import draw as draw_scene
-from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.answers import DrawAnswer, RenderAnswer
 from primdiffusion.formats.requests import DrawRequest, RenderRequest

@@ -15,12 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
-from primdiffusion.drawing.scene import NOTHING
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import Image
 from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.solids import Solids, shade_solids
 
+NOTHING = 1e10
+"""Depth of the background in drawn images, metres, as in Blender's Depth pass."""
 FINER = 2
 """Samples per pixel along each axis for solids."""
 STEEPEST = 6.0

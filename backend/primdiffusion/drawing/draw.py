@@ -14,22 +14,54 @@ from collections.abc import Iterator
 import numba
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 from numpy import ndarray
+from torch import Tensor
 
 from primdiffusion.drawing.compositing import Backdrop, backdrop, over_background, over_solids
-from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.formats.requests import VIEWS, View
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.lattice import check_camera
-from primdiffusion.render.march import Span, march
-from primdiffusion.render.solids import draw_boxes
+from primdiffusion.render.march import MarchSettings, Span, march
+from primdiffusion.render.solids import Solids, draw_boxes
 
 
-def draw(scene: Scene, camera: Camera, look: ViewSettings = ViewSettings()) -> Image:  # noqa: B008
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """Humans and opaque meshes in world space."""
+
+    primitives: Primitives | None
+    """Primitives of all humans, unbatched (`Primitives.together`); None if there are none."""
+    solids: Solids | None = None
+    chart: Int[Tensor, "k"] | None = None
+    """The body region of each primitive; sets its hue in the view "boxes"."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewSettings:
+    """View settings."""
+
+    view: View = VIEWS[0]
+    background: tuple[float, float, float] | None = None
+    """Linear RGB; None is transparent."""
+    clip: tuple[float, float] = (0.0, math.inf)
+    """Near and far clipping depths along the optical axis, metres."""
+    settings: MarchSettings = MarchSettings()  # noqa: RUF009  frozen
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an unknown view or clip planes in the wrong order."""
+        if self.view not in VIEWS:
+            raise ValueError(f"unknown view {self.view!r}; choose from {', '.join(VIEWS)}")
+        start, end = self.clip
+        if not 0 <= start < end:
+            raise ValueError(f"the clip distances are {start} and {end} m: give a start of at least 0 and a larger end")
+
+
+def draw(scene: Scene, camera: Camera, look: ViewSettings = ViewSettings()) -> Image:
     """Draw `scene`: humans over solids over the background.
 
     Depth is the nearer of a human's first hit (opacity one half) and a solid; NOTHING without either. A holdout hides

@@ -20,7 +20,6 @@ from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
-from primdiffusion.reconstruction.posture_file import read_cameras, read_posture
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error
 from primdiffusion.reconstruction.posture_fit import overlap as overlap_of
 from primdiffusion.reconstruction.posture_start import (
@@ -28,12 +27,14 @@ from primdiffusion.reconstruction.posture_start import (
     before_cameras,
     cameras_of,
     framed,
+    read_cameras,
+    read_posture,
     repeated,
     standing,
     turned_to_camera,
     views_of,
 )
-from primdiffusion.render.view import PosedView
+from primdiffusion.render.image import PosedView
 
 
 class Round(NamedTuple):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 import torch
 from march_scenes import camera_at, one_box, random_boxes
-from primdiffusion.drawing.draw import FIRST_PIXELS, GROWTH, depth_span, draw, draw_in_bands
-from primdiffusion.drawing.scene import NOTHING, Scene, ViewSettings
+from primdiffusion.drawing.compositing import NOTHING
+from primdiffusion.drawing.draw import FIRST_PIXELS, GROWTH, Scene, ViewSettings, depth_span, draw, draw_in_bands
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.srgb import encode_srgb
