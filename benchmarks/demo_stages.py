@@ -22,8 +22,7 @@ import bpy
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
-from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.drawing.draw import Scene, ViewSettings, draw
 from primdiffusion.human import framing, place
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import default_anchors
@@ -176,7 +175,7 @@ def march_pictures(arguments: argparse.Namespace) -> dict[str, float]:
     march(walking, framing(walking)).save(arguments.out / "march_posed.png", BACKGROUND)
     march(walking, framing(walking, 70)).save(arguments.out / "march_side.png", BACKGROUND)
     boxes = draw(Scene(rest, chart=default_anchors().chart), front, ViewSettings("boxes"))
-    rgba_to_png(arguments.out / "march_boxes.png", torch.from_numpy(boxes.combined), BACKGROUND)
+    rgba_to_png(arguments.out / "march_boxes.png", torch.from_numpy(boxes.rgba), BACKGROUND)
     return {"seconds_march_512": seconds, "grid_share_on_body": share_on_body(rest.position)}
 
 

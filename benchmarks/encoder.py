@@ -44,8 +44,7 @@ from primdiffusion.capture.people_files import find_people
 from primdiffusion.capture.poses import choose_poses
 from primdiffusion.capture.reader import Captures, Views, open_captures
 from primdiffusion.capture.render import RenderJob, render
-from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.drawing.draw import Scene, ViewSettings, draw
 from primdiffusion.encoder.model import EncoderModel, load_encoder, look_up
 from primdiffusion.encoder.network import Encoder
 from primdiffusion.evaluation.image_metrics import Lpips, load_lpips
@@ -454,7 +453,7 @@ def row(model: EncoderModel, captures: Captures, name: str, novel_frame: int) ->
 def drawn_view(primitives: Primitives, camera: Camera, look: str) -> Tensor:
     """The depth or the primitives, drawn over black, sRGB-encoded."""
     drawn = draw(Scene(primitives, chart=default_anchors().chart), camera, ViewSettings(look))
-    return encode_srgb(torch.from_numpy(drawn.combined[..., :3]).clamp(0, 1))
+    return encode_srgb(torch.from_numpy(drawn.rgb).clamp(0, 1))
 
 
 def cropped(image: Tensor, mask: Tensor) -> np.ndarray:

@@ -42,9 +42,9 @@ from primdiffusion.primitives.anchors import default_texels
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, from_mesh
 from primdiffusion.primitives.primitives import GRID, Frames, K, Payload, Primitives, S
 from primdiffusion.raster.rasterise import rasterise
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import fit_colours, fit_payload
 from primdiffusion.render.march import march
-from primdiffusion.render.view import PosedView
 from record import command_line, report
 from torch import Tensor
 

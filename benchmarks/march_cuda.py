@@ -35,11 +35,11 @@ import torch
 from marching import OPERATIONS_PER_SAMPLE, leaves, portrait
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu.march import count_samples
 from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda.march import Shapes, available, march_cuda
 from primdiffusion.render.cuda.marcher import Marcher
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings
 from primdiffusion.render.reference import march_reference
 from record import command_line, report

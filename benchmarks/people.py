@@ -38,7 +38,7 @@ from primdiffusion.primitives.from_mesh import colour, surface_field
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.rasterise import rasterise
 from primdiffusion.raster.shade import TriangleSoup, draw, flatten, shade
-from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.march import march
 from record import command_line, report, run
 

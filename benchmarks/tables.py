@@ -174,7 +174,7 @@ def judged(
             continue
         one = look_at_pictures(images(some), networks)
         features = {key: values.tolist() for key, values in one.features.items()}
-        parts.append({"features": features, "own": one.correct["own"], "depth": one.depth["own"]})
+        parts.append({"features": features, "own": one.correct, "depth": one.depth})
         if path is not None:
             path.parent.mkdir(parents=True, exist_ok=True)
             with written_whole(path) as unfinished:
@@ -182,7 +182,7 @@ def judged(
         print(name, first + len(some), "of", len(seeds), flush=True)
     features = {key: torch.cat([torch.tensor(part["features"][key]) for part in parts]) for key in parts[0]["features"]}
     correct, depth = ([value for part in parts for value in part[key]] for key in ("own", "depth"))
-    return Scores(len(features["own"]), features, {"own": correct, "pose": []}, {"own": depth, "depth": []})
+    return Scores(len(features["own"]), features, correct, depth)
 
 
 def figures_of(rows: Mapping[str, Mapping[str, Cell]], models: Mapping[str, Model]) -> Figures:

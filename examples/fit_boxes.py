@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from primdiffusion.human import frames_of
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Payload
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import InverseSettings, fit_payload
-from primdiffusion.render.view import PosedView
 from primdiffusion.training.refine import bare_body
 from torch import Tensor
 

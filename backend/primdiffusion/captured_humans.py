@@ -20,7 +20,7 @@ from primdiffusion.geometry.image import Image
 from primdiffusion.human import Human, body_of, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives, S
-from primdiffusion.raster.multisample import Draw, check_samples
+from primdiffusion.raster.rasterise import Draw, check_samples
 from primdiffusion.render.march import march
 
 ENDINGS = (".human.safetensors", ".human")

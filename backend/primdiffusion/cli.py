@@ -53,7 +53,6 @@ PROGRAMS = {
     "fit": "training.fit",
     "train": "training.diffuse",
     "evaluate": "commands.evaluate",
-    "import-released": "commands.import_released",
 }
 """Modules, imported when they are used, whose `run` reads the arguments of a command; the others are records of
 `commands.options`."""

@@ -32,7 +32,7 @@ from .queue import PREVIEW_PX, Job, chosen_checkpoint
 from .target import HumanTarget
 
 POSTURE_FORMAT = "primdiffusion-posture"
-"""As `reconstruction/posture_file.py` of the backend writes it."""
+"""As `reconstruction/posture_start.py` of the backend writes it."""
 
 
 def on_own_body(person: bpy.types.Object) -> bool:

@@ -9,11 +9,11 @@ import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda import scene as cuda_scene
 from primdiffusion.render.cuda.march import Shapes, march_cuda
 from primdiffusion.render.cuda.marcher import Marcher
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import RELEASED, UNIFORM_MILLIMETRE, MarchSettings, Span
 from primdiffusion.render.reference import march_reference
 from support.errors import refused

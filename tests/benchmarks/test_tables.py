@@ -95,7 +95,7 @@ def test_what_was_seen_is_not_looked_at_again(tmp_path, monkeypatch):
         seeds = list(images)
         asked.extend(seeds)
         features = {"own": torch.tensor(seeds)[:, None].float(), "detail": torch.zeros(len(seeds), 3)}
-        return Scores(len(seeds), features, {"own": [0.5] * len(seeds)}, {"own": []})
+        return Scores(len(seeds), features, [0.5] * len(seeds), [])
 
     monkeypatch.setattr(tables, "look_at_pictures", evaluate)
     first = judged("ours", iter, list(range(10)), Networks(None), tmp_path)
@@ -103,4 +103,4 @@ def test_what_was_seen_is_not_looked_at_again(tmp_path, monkeypatch):
     assert asked == list(range(10))
     assert torch.equal(first.features["own"], again.features["own"])
     assert again.features["own"][:, 0].tolist() == asked
-    assert len(again.correct["own"]) == again.pictures == 10
+    assert len(again.correct) == again.pictures == 10

@@ -15,8 +15,8 @@ from pathlib import Path
 import numpy as np
 import torch
 from primdiffusion.body.model import BodyPose, default_body
+from primdiffusion.drawing.draw import Scene, ViewSettings
 from primdiffusion.drawing.draw import draw as compose_scene
-from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
@@ -113,7 +113,7 @@ def compose(
     arrays = (np.array(solids[name], dtype) for name, dtype in (("corners", "f4"), ("colour", "f4"), ("holdout", "?")))
     look = ViewSettings("colour", None if background is None else tuple(background), tuple(clip))
     picture = compose_scene(Scene(primitives, Solids(*arrays)), Camera(*matrices, width, height), look)
-    np.savez(out, combined=picture.combined, depth=picture.depth)
+    np.savez(out, combined=picture.rgba, depth=picture.depth)
 
 
 for line in sys.stdin:

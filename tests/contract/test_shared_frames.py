@@ -33,7 +33,7 @@ def test_the_file_of_a_frame_that_nobody_maps_goes_when_another_is_taken(frames)
 def test_what_the_child_writes_is_what_blender_sees_and_the_folder_goes_with_its_users(frames):
     frame = frames.take(8, 4)
     picture = map_frame(frame.path, 8, 4)
-    picture.combined[:] = 0.5
+    picture.rgb[:] = picture.alpha[:] = 0.5
     assert (frame.combined == 0.5).all()
     folder = frame.path.parent
     del frame, picture

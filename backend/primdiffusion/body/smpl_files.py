@@ -98,7 +98,7 @@ class _ArrayFile:
         if suffix not in (".pkl", ".npz"):
             raise FileError(file, f"ends in {suffix!r}, not in .pkl or .npz", "give a body model in SMPL's format")
         self._pickled = read_pickle(file) if suffix == ".pkl" else None
-        self._names = _npz_names(file) if self._pickled is None else set(self._pickled)
+        self._names = set(array_names(file)) if self._pickled is None else set(self._pickled)
 
     def __contains__(self, name: str) -> bool:
         return name in self._names
@@ -149,10 +149,6 @@ class _ArrayFile:
         if not np.array_equal(number, array) or number.min() < 0 or number.max() >= limit:
             raise self.wrong(name, f"holds numbers that are not whole and from 0 to {limit - 1}")
         return number
-
-
-def _npz_names(file: FileContent) -> set[str]:
-    return set(array_names(file))
 
 
 def _parents(arrays: _ArrayFile) -> np.ndarray:

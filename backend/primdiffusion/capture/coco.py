@@ -22,18 +22,11 @@ from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8, UInt16
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel, BodyPose, J, default_body
-from primdiffusion.capture.composed import (
-    Backgrounds,
-    StoredView,
-    composed_path,
-    drawn_box,
-    uncovered,
-    write_composed,
-)
+from primdiffusion.capture.composed import Backgrounds, composed_path, drawn_box, uncovered, write_composed
 from primdiffusion.capture.reader import Captures, Subject
 from primdiffusion.capture.sheet import joints_from_body, joints_of
 from primdiffusion.files.picture_files import DEPTH_UNIT
@@ -173,7 +166,10 @@ def _face() -> BodyModel:
 
 
 def visibility(
-    view: View, points: Float[np.ndarray, "17 3"], humans: Sequence[StoredView]
+    view: View,
+    points: Float[np.ndarray, "17 3"],
+    masks: Sequence[UInt8[np.ndarray, "H W"]],
+    depths: Sequence[UInt16[np.ndarray, "H W"]],
 ) -> tuple[Float[np.ndarray, "17 2"], list[int]]:
     """Pixels of keypoints in the world, pixel centres at +0.5, and COCO's visibility of each among all humans in view.
 
@@ -188,8 +184,8 @@ def visibility(
             seen.append(0)
             continue
         at = int(y), int(x)
-        surface = min((human.depth[at] for human in humans if human.depth[at]), default=np.inf) * DEPTH_UNIT
-        beyond = z > _FARTHEST and any(human.mask[at] >= THRESHOLD for human in humans)
+        surface = min((depth[at] for depth in depths if depth[at]), default=np.inf) * DEPTH_UNIT
+        beyond = z > _FARTHEST and any(mask[at] >= THRESHOLD for mask in masks)
         seen.append(1 if beyond or z - surface > thickness else 2)
     return pixels, seen
 
@@ -238,20 +234,24 @@ class _Image:
 
     def annotations(self, points: Sequence[Float[np.ndarray, "F 17 3"]]) -> Iterator[dict[str, Any]]:
         """All subjects of which the image shows a pixel, without ids; writes the image if it is composed."""
-        views = [self._stored(subject, own[self.frame]) for subject, own in zip(self.subjects, points, strict=True)]
-        box = drawn_box(views)
-        parts = [view.cut(box) for view in views]
-        shares = uncovered(parts)
+        kinds = PASSES if self.is_composed else PASSES[1:]
+        stored = [subject.pictures(kinds, self.frame, self.camera) for subject in self.subjects]
+        images, masks, depths = ([one[kind] for one in stored if kind in one] for kind in PASSES)
+        hips = [self.view.project(own[self.frame][_HIPS].mean(0))[1] for own in points]
+        box = drawn_box([*images, *masks])
+        parts = [mask[box] for mask in masks]
+        shares = uncovered(parts, [depth[box] for depth in depths], hips)
         if self.is_composed:
-            write_composed(parts, shares, box, self.subjects[0], self.frame, self.camera, self.background)
-        for subject, view, part, share, own in zip(self.subjects, views, parts, shares[:-1], points, strict=True):
-            seen = np.zeros(view.mask.shape, np.bool_)
-            seen[box] = share * part.mask >= THRESHOLD
+            cut = [image[box] for image in images]
+            write_composed(cut, shares, box, self.subjects[0], self.frame, self.camera, self.background)
+        for subject, mask, part, share, own in zip(self.subjects, masks, parts, shares[:-1], points, strict=True):
+            seen = np.zeros(mask.shape, np.bool_)
+            seen[box] = share * part >= THRESHOLD
             if seen.any():
-                pixels, visible = visibility(self.view, own[self.frame], views)
+                pixels, visible = visibility(self.view, own[self.frame], masks, depths)
                 yield {
                     **_outline(seen),
-                    **({"amodal": _mask(view.mask >= THRESHOLD)} if len(views) > 1 else {}),
+                    **({"amodal": _mask(mask >= THRESHOLD)} if len(masks) > 1 else {}),
                     **_keypoints(pixels, visible),
                     "subject": subject.name,
                     "smpl": {
@@ -260,12 +260,6 @@ class _Image:
                         "translation": _rounded(subject.smpl.translation[self.frame], 6),
                     },
                 }
-
-    def _stored(self, subject: Subject, points: Float[np.ndarray, "17 3"]) -> StoredView:
-        stored = subject.pictures(PASSES if self.is_composed else PASSES[1:], self.frame, self.camera)
-        _, distance = self.view.project(points[_HIPS].mean(0))
-        img = stored.get("img", np.zeros((0, 0, 3), np.uint8))
-        return StoredView(img, stored["mask"], stored["depth"], float(distance))
 
 
 def _mask(inside: Bool[np.ndarray, "H W"]) -> dict[str, Any]:

@@ -44,7 +44,7 @@ def composed_path(subject: Subject, frame: int, camera: int) -> Path:
 
 
 def write_composed(
-    views: Sequence[StoredView],
+    images: Sequence[UInt8[np.ndarray, "h w 3"]],
     shares: Float32[np.ndarray, "n+1 h w"],
     box: Box,
     subject: Subject,
@@ -54,7 +54,7 @@ def write_composed(
 ) -> None:
     """Write an image of all humans in a view, of whom `subject` is the first, over a background or black, atomically.
 
-    `views` and their `uncovered` shares are of the box alone.
+    `images` and their `uncovered` shares are of the box alone.
 
     Raises:
         FileNotFoundError, FileError: an image or the background is missing or damaged.
@@ -64,7 +64,7 @@ def write_composed(
     image = np.zeros((view.height, view.width, 3), np.uint8)
     if background is not None:
         image = read_background(background, view.width, view.height)
-    image[box] = compose(views, shares, image[box])
+    image[box] = compose(images, shares, image[box])
     with replacing(path, subject.folder.parent) as partial:
         Image.fromarray(image).save(partial, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
 
@@ -73,24 +73,8 @@ Box = tuple[slice, slice]
 """Rows and columns of a picture."""
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class StoredView:
-    """The passes of a human in a view, as stored, and where the human is."""
-
-    img: UInt8[np.ndarray, "H W 3"]
-    mask: UInt8[np.ndarray, "H W"]
-    depth: UInt16[np.ndarray, "H W"]
-    distance: float
-    """Depth of the hips, metres, for pixels of the mask without a depth: edges."""
-
-    def cut(self, box: Box) -> StoredView:
-        """The view in a box."""
-        return StoredView(self.img[box], self.mask[box], self.depth[box], self.distance)
-
-
-def drawn_box(views: Sequence[StoredView]) -> Box:
-    """The smallest box around all pixels of the images and masks that are not 0: there are no humans outside of it."""
-    pictures = [picture for view in views for picture in (view.img, view.mask) if picture.size]
+def drawn_box(pictures: Sequence[UInt8[np.ndarray, "H W ..."]]) -> Box:
+    """The smallest box around all pixels of images and masks that are not 0: there are no humans outside of it."""
     rows = _extent([picture.reshape(len(picture), -1).max(1) for picture in pictures])
     highest = [picture[rows].max(0, initial=0) for picture in pictures]
     return rows, _extent([of_column.reshape(len(of_column), -1).max(1) for of_column in highest])
@@ -102,23 +86,29 @@ def _extent(values: Sequence[UInt8[np.ndarray, "n"]]) -> slice:
     return slice(places[0], places[-1] + 1) if len(places) else slice(0)
 
 
-def uncovered(views: Sequence[StoredView]) -> Float32[np.ndarray, "n+1 H W"]:
-    """The share of each pixel that nearer humans leave to each human, and, last, to the background."""
-    masks, depths = np.stack([view.mask for view in views]), np.stack([view.depth for view in views])
-    shares = np.ones((len(views) + 1, *masks.shape[1:]), np.float32)
-    _uncovered(masks, depths, np.array([view.distance for view in views]), _LEFT_BY_BYTE, shares)
+def uncovered(
+    masks: Sequence[UInt8[np.ndarray, "H W"]], depths: Sequence[UInt16[np.ndarray, "H W"]], distances: Sequence[float]
+) -> Float32[np.ndarray, "n+1 H W"]:
+    """The share of each pixel that nearer humans leave to each human, and, last, to the background.
+
+    `distances` are the depths of the hips, metres, for pixels of a mask without a depth: edges.
+    """
+    shares = np.ones((len(masks) + 1, *masks[0].shape), np.float32)
+    _uncovered(np.stack(masks), np.stack(depths), np.array(distances), _LEFT_BY_BYTE, shares)
     return shares
 
 
 def compose(
-    views: Sequence[StoredView], shares: Float32[np.ndarray, "n+1 H W"], background: UInt8[np.ndarray, "H W 3"]
+    images: Sequence[UInt8[np.ndarray, "H W 3"]],
+    shares: Float32[np.ndarray, "n+1 H W"],
+    background: UInt8[np.ndarray, "H W 3"],
 ) -> UInt8[np.ndarray, "H W 3"]:
     """Draw all humans and the background in linear light, nearer over farther; colours are premultiplied over black.
 
     `shares` are those of `uncovered`.
     """
     image = np.empty_like(background, order="C")
-    layers = np.stack([*(view.img for view in views), background])
+    layers = np.stack([*images, background])
     _compose(layers, shares, LINEAR_OF_BYTE, BYTE_OF_LINEAR, image)
     return image
 

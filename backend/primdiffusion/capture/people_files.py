@@ -26,7 +26,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.pictures import MOST_PIXELS, decoded, decoded_bytes, opened_picture
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.raster.multisample import Draw, Figure, figure_from_mesh
+from primdiffusion.raster.rasterise import Draw, Figure, figure_from_mesh
 
 MAGIC, JSON_CHUNK, BINARY_CHUNK = b"glTF", b"JSON", b"BIN\x00"
 NUMBERS = {5120: np.int8, 5121: np.uint8, 5122: np.int16, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}

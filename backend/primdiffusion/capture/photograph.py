@@ -14,11 +14,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 from PIL import ExifTags, Image
 from scipy import ndimage
-from torch import Tensor
 
 from primdiffusion.capture.reader import Window, resample
 from primdiffusion.files.regular_files import FileError
@@ -53,7 +51,7 @@ class Photograph:
     """The person in a picture."""
 
     path: Path
-    rgba: UInt8[np.ndarray, "side side 4"]
+    rgba: UInt8[np.ndarray, "h w 4"]
     """The square around the person: sRGB over black, and the mask."""
     window: Window
     """That square in the upright picture; it may reach beyond."""
@@ -90,36 +88,19 @@ def read_photographs(
     pairs = zip(pictures, masks or [None] * len(pictures), strict=True)
     found = [_figure(path, mask, mask_label) for path, mask in pairs]
     side = min(side, max(math.ceil(figure.window.width) for figure in found))
-    return [figure.photograph(side) for figure in found]
+    return [_scaled(figure, side) for figure in found]
 
 
-def rgba_of(photographs: Sequence[Photograph]) -> UInt8[Tensor, "v side side 4"]:
-    """The squares of all."""
-    return torch.from_numpy(np.stack([photograph.rgba for photograph in photographs]))
+def _scaled(figure: Photograph, side: int) -> Photograph:
+    """The square of a figure, of which there is the part within the picture, from the nearest whole pixels on."""
+    window = figure.window
+    left, top = max(math.floor(window.left), 0), max(math.floor(window.top), 0)
+    inside = dataclasses.replace(window, left=window.left - left, top=window.top - top)
+    return dataclasses.replace(figure, rgba=resample(figure.rgba, inside, side))
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Figure:
+def _figure(path: Path, mask_path: Path | None, mask_label: int | None) -> Photograph:
     """A person before it is scaled."""
-
-    path: Path
-    rgba: UInt8[np.ndarray, "h w 4"]
-    """The part of the picture within the window, over black."""
-    left: int
-    """Of that part in the picture."""
-    top: int
-    window: Window
-    width: int
-    height: int
-    focal: float | None
-
-    def photograph(self, side: int) -> Photograph:
-        inside = dataclasses.replace(self.window, left=self.window.left - self.left, top=self.window.top - self.top)
-        rgba = resample(self.rgba, inside, side)
-        return Photograph(self.path, rgba, self.window, self.width, self.height, self.focal)
-
-
-def _figure(path: Path, mask_path: Path | None, mask_label: int | None) -> _Figure:
     with _picture(path) as picture:
         focal, bands = _focal_length(picture), picture.getbands()
         pixels = _upright(decoded(picture, "RGBA"), picture)
@@ -144,7 +125,7 @@ def _figure(path: Path, mask_path: Path | None, mask_label: int | None) -> _Figu
     rows = slice(max(math.floor(window.top), 0), min(math.ceil(window.top + window.height), height))
     columns = slice(max(math.floor(window.left), 0), min(math.ceil(window.left + window.width), width))
     rgba = _over_black(pixels[rows, columns], (mask * keep if keep.shape == mask.shape else mask)[rows, columns])
-    return _Figure(path, rgba, columns.start, rows.start, window, width, height, focal and focal * max(width, height))
+    return Photograph(path, rgba, window, width, height, focal and focal * max(width, height))
 
 
 @contextlib.contextmanager

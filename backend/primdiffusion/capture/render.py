@@ -34,7 +34,7 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.formats.requests import FLOAT_DEPTH, PASSES
 from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.rotation import matrix_to_axis_angle
-from primdiffusion.raster.multisample import Draw
+from primdiffusion.raster.rasterise import Draw
 from primdiffusion.raster.textures import BYTE_OF_LINEAR, encode_bytes
 from primdiffusion.runtime.failures import describe
 from primdiffusion.runtime.worker_process import begin_worker

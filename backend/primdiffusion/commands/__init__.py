@@ -28,6 +28,7 @@ FUNCTIONS = {
     "people": "people:people",
     "payloads": "people:payloads",
     "payloads encode": "people:encode",
+    "import-released": "import_released:import_released",
 }
 """Module and function by method of JSON-RPC and by subcommand."""
 

@@ -41,7 +41,6 @@ from primdiffusion.evaluation.images import (
     human_images,
     mesh_images_of_seeds,
 )
-from primdiffusion.evaluation.onnx_networks import DepthValues, Normalisation, open_depth_network, open_pose_network
 from primdiffusion.evaluation.pose_depth_network import PCK_SHARE, load_pose_depth_network
 from primdiffusion.evaluation.pretrained_networks import (
     ClipVision,
@@ -155,14 +154,6 @@ class TableOptions:
     """Weights of FID's Inception-V3, pt_inception-2015-12-05-6726825d.pth or torch-fidelity's file."""
     clip: Path | None = None
     """Weights of CLIP's ViT-B/32, under OpenAI's names."""
-    pose: Path | None = None
-    """ONNX file of a 2D pose network of COCO's 17 keypoints."""
-    depth: Path | None = None
-    """ONNX file of a monocular depth network."""
-    depth_normalisation: Normalisation = "imagenet"
-    """Normalisation of the depth network's input; DPT needs `half`."""
-    depth_values: DepthValues = "inverted"
-    """Output of the depth network: inverted depth, or depth."""
     resize: Resize = "torch-fidelity"
     """Resizing of pictures for Inception and CLIP."""
     kid_subsets: Count = 100
@@ -256,7 +247,6 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
 
     Raises:
         ValueError, FileNotFoundError: files are missing, damaged or of other networks, or there are too few pictures.
-        ImportError: an ONNX file is named and onnxruntime is not installed.
     """
     options, number = command.tables, int(command.tables.table or 1)
     poses = choose_poses([read_motion(path) for path in options.motion], options.poses, 0)
@@ -271,10 +261,6 @@ def measure(command: EvaluateGeneration) -> tuple[dict[str, Any], str]:
         load_pose_depth_network(),
         None if options.inception is None else load_inception(options.inception, options.resize),
         None if options.clip is None else load_clip_vision(options.clip, options.resize),
-        None if options.pose is None else open_pose_network(options.pose),
-        None
-        if options.depth is None
-        else open_depth_network(options.depth, options.depth_normalisation, options.depth_values),
     )
     model, fps, resolution = None, None, None
     if options.fake is None:
@@ -339,13 +325,8 @@ def _choices(command: EvaluateGeneration, fake: Scores, real: Scores) -> dict[st
         "KID": f"{options.kid_subsets} subsets of {options.kid_subset_size}, seed {options.kid_seed}, cubic kernel",
         "PCKh": f"within {PCK_SHARE} of the distance {HEAD[0]}-{HEAD[1]} in the picture, occluded joints included; "
         f"{', '.join(JOINTS)}",
-        "pose network": f"{options.pose}" if options.pose else None,
         "depth error": "inverted depths inside the human, means and standard deviations aligned, mean squared "
         "difference x 100",
-        "depth network": f"{options.depth}, {options.depth_normalisation} normalisation, predicts "
-        f"{options.depth_values}"
-        if options.depth
-        else None,
         "FPS": f"median of {FRAMES_TIMED} frames of one placed human on {best_device()}"
         if options.fake is None
         else None,

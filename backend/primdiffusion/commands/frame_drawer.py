@@ -14,14 +14,14 @@ import torch
 
 from primdiffusion.body.model import BodyModel, default_body
 from primdiffusion.commands.progress import ReportProgress
-from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, draw_in_bands
-from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
+from primdiffusion.drawing.draw import BAND_SECONDS, FIRST_PIXELS, Scene, ViewSettings, draw_in_bands
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.files.arrays import read_numbers
 from primdiffusion.files.regular_files import as_file_error
 from primdiffusion.formats.answers import DrawAnswer
 from primdiffusion.formats.requests import DrawRequest
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.image import Image
 from primdiffusion.human import Human, place_skinned
 from primdiffusion.human_file import load_human
 from primdiffusion.primitives.anchors import Anchors, default_anchors
@@ -120,7 +120,7 @@ class FrameDrawer:
     def _load(self, file: Stamp) -> Human:
         return load_human(file[0]).to(self._device)
 
-    def _fill(self, picture: Picture, scene: Scene, frame: DrawRequest, report: ReportProgress) -> float:
+    def _fill(self, picture: Image, scene: Scene, frame: DrawRequest, report: ReportProgress) -> float:
         """Draw the scene; return the seconds spent in the marcher."""
         look = ViewSettings(
             frame.view,
@@ -143,7 +143,7 @@ class FrameDrawer:
         return whole if frame.region is None else whole.crop(*frame.corner, *frame.size)
 
 
-def map_frame(path: Path, width: int, height: int) -> Picture:
+def map_frame(path: Path, width: int, height: int) -> Image:
     """Map a frame file as an image; writing to it writes to the file.
 
     Raises FileNotFoundError, ValueError for a file of another size, OSError.
@@ -157,7 +157,8 @@ def map_frame(path: Path, width: int, height: int) -> Picture:
         )
     values = np.asarray(np.memmap(path, np.float32, "r+", shape=(width * height * CHANNELS,)))
     combined, depth = values[: width * height * 4], values[width * height * 4 :]
-    return Picture(combined.reshape(height, width, 4)[::-1], depth.reshape(height, width)[::-1])
+    rgba = combined.reshape(height, width, 4)[::-1]
+    return Image(rgba[..., :3], rgba[..., 3], depth.reshape(height, width)[::-1])
 
 
 def _first_guess(frame: DrawRequest) -> float:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-import tyro
 from torch import Tensor
 
 from primdiffusion.body.model import BodyModel
 from primdiffusion.capture.smpl_parameters import read_smpl
+from primdiffusion.commands.options import ImportReleasedCommand
+from primdiffusion.commands.progress import ReportProgress
+from primdiffusion.commands.session import Session
 from primdiffusion.diffusion.checkpoint import file_hash, under
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.files.regular_files import FileError
@@ -43,62 +45,33 @@ def read_released(path: Path) -> tuple[dict[str, Tensor], Inventory]:
         raise FileError(f"{path}: {error}") from error
 
 
-@dataclasses.dataclass(frozen=True)
-class ImportReleased:
-    """Convert the authors' primdiffusion.pt to a checkpoint for generate, render, the extension and everything else,
-    and an encoder for reconstruct and payloads encode.
-
-    The new files contain nothing of SMPL: they store the path and checksum of your SMPL file, which they need wherever
-    they are used. A stage-1 file gives the encoder only.
-    """
-
-    checkpoint: tyro.conf.Positional[Path]
-    """The authors' file. Only tensors are read; no code in it is executed."""
-    smpl: Path
-    """Your SMPL_NEUTRAL.pkl, or a body of the same format as .npz."""
-    uv: tuple[Path, ...]
-    """The UV layout it was trained with: SMPL's UV .obj, an .npz with vt and ft, or the pair vt.npy ft.npy."""
-    out: Path
-    """Output .safetensors: the denoiser, or the encoder of a stage-1 file."""
-    encoder: Path | None = None
-    """Output .safetensors of the encoder; the default is beside `out`, NAME.encoder.safetensors."""
-    reference: Path | None = None
-    """Folder of the dataset's subject seq_000016-rp_alison_rigged_002, whose first frame determined the box sizes; the
-    default is the mean body in the T pose, which differs by millimetres."""
-    chain: Literal["released", "trailing"] = "released"
-    """Timesteps of samplers: 991, 981, ... 1 as in the released code, or from the last step of the schedule."""
-    report: Path | None = None
-    """Output .json with a report on every tensor."""
-
-    def run(self) -> None:
-        """Import, and print a report on every group of tensors."""
-        weights, inventory = read_released(self.checkpoint)
-        print(inventory.account.table())
-        if not 1 <= len(self.uv) <= 2:
-            raise ValueError(f"uv names {len(self.uv)} files: give one .obj or .npz, or the pair vt.npy ft.npy")
-        body_setup = body_setup_from_files(self.smpl, self.uv)
-        stage_one = under(weights, STAGE_ONE) or weights
-        notes = [*_about_body(stage_one, body_setup.body), _about_layout(body_setup)]
-        encoder, reference = encoder_tensors(stage_one), _reference(self.reference)
-        encoder_card = card = _card(self.checkpoint, inventory, encoder, self.reference, "encoder")
-        encoder_out, files = self.encoder or self.out, [self.encoder or self.out]
+def import_released(command: ImportReleasedCommand, session: Session, report: ReportProgress) -> None:
+    """Import, and print a report on every group of tensors. Raises ValueError, FileNotFoundError, OSError."""
+    weights, inventory = read_released(command.checkpoint)
+    print(inventory.account.table())
+    if not 1 <= len(command.uv) <= 2:
+        raise ValueError(f"uv names {len(command.uv)} files: give one .obj or .npz, or the pair vt.npy ft.npy")
+    body_setup = body_setup_from_files(command.smpl, command.uv)
+    stage_one = under(weights, STAGE_ONE) or weights
+    notes = [*_about_body(stage_one, body_setup.body), _about_layout(body_setup)]
+    encoder, reference = encoder_tensors(stage_one), _reference(command.reference)
+    encoder_card = card = _card(command.checkpoint, inventory, encoder, command.reference, "encoder")
+    encoder_out, files = command.encoder or command.out, [command.encoder or command.out]
+    if inventory.unet is not None:
+        encoder_out = command.encoder or command.out.with_name(f"{command.out.stem}.encoder.safetensors")
+        if encoder_out.absolute() == command.out.absolute():
+            raise ValueError(f"{command.out} is the output of both stages: give --encoder another name")
+        files = [command.out, encoder_out]
+        card = _card(command.checkpoint, inventory, under(weights, PREFIX), command.reference, "denoiser")
+    with contextlib.ExitStack() as all_or_none:
         if inventory.unet is not None:
-            encoder_out = self.encoder or self.out.with_name(f"{self.out.stem}.encoder.safetensors")
-            if encoder_out.absolute() == self.out.absolute():
-                raise ValueError(f"{self.out} is the output of both stages: give --encoder another name")
-            files = [self.out, encoder_out]
-            card = _card(self.checkpoint, inventory, under(weights, PREFIX), self.reference, "denoiser")
-        with contextlib.ExitStack() as all_or_none:
-            if inventory.unet is not None:
-                out = all_or_none.enter_context(replacing(self.out))
-                write_imported(out, under(weights, PREFIX), inventory.unet, body_setup, reference, self.chain, card)
-            write_encoder(
-                all_or_none.enter_context(replacing(encoder_out)), encoder, body_setup, reference, encoder_card
-            )
-            if self.report is not None:
-                report = all_or_none.enter_context(replacing(self.report))
-                _write_report(report, inventory, card, notes, body_setup)
-        print(*notes, *files, sep="\n")
+            out = all_or_none.enter_context(replacing(command.out))
+            write_imported(out, under(weights, PREFIX), inventory.unet, body_setup, reference, command.chain, card)
+        write_encoder(all_or_none.enter_context(replacing(encoder_out)), encoder, body_setup, reference, encoder_card)
+        if command.report is not None:
+            described = all_or_none.enter_context(replacing(command.report))
+            _write_report(described, inventory, card, notes, body_setup)
+    print(*notes, *files, sep="\n")
 
 
 def _reference(folder: Path | None) -> Reference:
@@ -164,8 +137,3 @@ def _write_report(
         "tensors": [dataclasses.asdict(entry) for entry in inventory.account.entries],
     }
     write_atomically(path, json.dumps(content, indent=1))
-
-
-def run(arguments: Sequence[str]) -> None:
-    """Run a command line; raises its errors."""
-    tyro.cli(ImportReleased, args=arguments, prog="primdiffusion import-released").run()

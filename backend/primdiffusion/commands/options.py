@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from primdiffusion.formats.requests import (
     Count,
@@ -156,6 +156,34 @@ class EncodePayloadsCommand:
     """Seed of the order of images in refinement."""
 
 
+@dataclasses.dataclass(frozen=True, kw_only=True)
+class ImportReleasedCommand:
+    """Convert the authors' primdiffusion.pt to a checkpoint for generate, render, the extension and everything else,
+    and an encoder for reconstruct and payloads encode.
+
+    The new files contain nothing of SMPL: they store the path and checksum of your SMPL file, which they need wherever
+    they are used. A stage-1 file gives the encoder only.
+    """
+
+    checkpoint: Person
+    """The authors' file. Only tensors are read; no code in it is executed."""
+    smpl: Path
+    """Your SMPL_NEUTRAL.pkl, or a body of the same format as .npz."""
+    uv: tuple[Path, ...]
+    """The UV layout it was trained with: SMPL's UV .obj, an .npz with vt and ft, or the pair vt.npy ft.npy."""
+    out: Path
+    """Output .safetensors: the denoiser, or the encoder of a stage-1 file."""
+    encoder: Path | None = None
+    """Output .safetensors of the encoder; the default is beside `out`, NAME.encoder.safetensors."""
+    reference: Path | None = None
+    """Folder of the dataset's subject seq_000016-rp_alison_rigged_002, whose first frame determined the box sizes; the
+    default is the mean body in the T pose, which differs by millimetres."""
+    chain: Literal["released", "trailing"] = "released"
+    """Timesteps of samplers: 991, 981, ... 1 as in the released code, or from the last step of the schedule."""
+    report: Path | None = None
+    """Output .json with a report on every tensor."""
+
+
 OPTIONS: dict[str, type] = {
     "generate": GenerateRequest,
     "vary": VaryRequest,
@@ -171,5 +199,6 @@ OPTIONS: dict[str, type] = {
     "people": PeopleCommand,
     "payloads": PayloadsCommand,
     "payloads encode": EncodePayloadsCommand,
+    "import-released": ImportReleasedCommand,
 }
 """Records of subcommands, which are read before the command's module, which loads torch, is imported."""

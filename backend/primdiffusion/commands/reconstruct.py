@@ -32,7 +32,7 @@ from primdiffusion.human_file import load_human
 from primdiffusion.reconstruction.from_captures import reconstruct as reconstruct_human
 from primdiffusion.reconstruction.from_captures import steps_of
 from primdiffusion.reconstruction.from_pictures import POSTURE_STEPS, person_in_pictures
-from primdiffusion.reconstruction.posture_file import write_posture
+from primdiffusion.reconstruction.posture_start import write_posture
 from primdiffusion.render.descent import DescentSettings
 from primdiffusion.runtime.machine import peak_memory_gb
 from primdiffusion.training.refine import bare_body, meshed_person, refine, view_psnr

@@ -13,8 +13,8 @@ from primdiffusion.commands.frame_drawer import FrameDrawer
 from primdiffusion.commands.output import decoded, march_encoded
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
+from primdiffusion.drawing.draw import Scene, ViewSettings
 from primdiffusion.drawing.draw import draw as draw_scene
-from primdiffusion.drawing.scene import Scene, ViewSettings
 from primdiffusion.files.whole_files import written_whole
 from primdiffusion.formats.answers import DrawAnswer, RenderAnswer
 from primdiffusion.formats.requests import DrawRequest, RenderRequest
@@ -45,7 +45,7 @@ def render(request: RenderRequest, session: Session, report: ReportProgress) -> 
     else:
         settings = MarchSettings(step=request.step)
         scene = Scene(primitives, chart=body_of(human)[1].chart)
-        rgba = torch.from_numpy(draw_scene(scene, camera, ViewSettings(request.view, settings=settings)).combined)
+        rgba = torch.from_numpy(draw_scene(scene, camera, ViewSettings(request.view, settings=settings)).rgba)
     report("write", 1, 1, 0.0)
     with contextlib.ExitStack() as files:  # both files or none
         rgba_to_png(files.enter_context(written_whole(request.out)), rgba, background)

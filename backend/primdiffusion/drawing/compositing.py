@@ -15,12 +15,13 @@ import numpy as np
 from jaxtyping import Bool, Float32
 from numpy import ndarray
 
-from primdiffusion.drawing.scene import NOTHING, Picture
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import Image
 from primdiffusion.raster.z_buffer import nearest_triangles
 from primdiffusion.render.solids import Solids, shade_solids
 
+NOTHING = 1e10
+"""Depth of the background in drawn images, metres, as in Blender's Depth pass."""
 FINER = 2
 """Samples per pixel along each axis for solids."""
 STEEPEST = 6.0
@@ -57,15 +58,15 @@ def backdrop(solids: Solids, camera: Camera, clip: tuple[float, float]) -> Backd
     return Backdrop(shaded, np.zeros(shaded.alpha.shape, np.bool_) if hole is None else hole, end, outline)
 
 
-def over_background(picture: Picture, people: Image, background: tuple[float, float, float] | None) -> None:
+def over_background(picture: Image, people: Image, background: tuple[float, float, float] | None) -> None:
     """Write humans over the background into `picture`."""
     wall = np.float32(background is not None)
     colour = np.array(background or (0, 0, 0), np.float32)
-    _compose_alone(people.rgb, people.alpha, people.depth, wall, colour, picture.combined, picture.depth)
+    _compose_alone(people.rgb, people.alpha, people.depth, wall, colour, picture.rgb, picture.alpha, picture.depth)
 
 
 def over_solids(
-    picture: Picture,
+    picture: Image,
     people: Image,
     expected: Float32[ndarray, "h w"],
     behind: Backdrop,
@@ -76,7 +77,7 @@ def over_solids(
     colour = np.array(background or (0, 0, 0), np.float32)
     solids = (behind.solids.rgb, behind.solids.alpha, behind.solids.depth, behind.hole, behind.outline)
     front = (people.rgb, people.alpha, people.depth, expected)
-    _compose(*front, *solids, wall, colour, picture.combined, picture.depth)
+    _compose(*front, *solids, wall, colour, picture.rgb, picture.alpha, picture.depth)
 
 
 @numba.njit(cache=True, nogil=True)
@@ -94,19 +95,19 @@ def _find_ends(triangle, depth, pixel, end, outline):
 
 
 @numba.njit(cache=True, nogil=True)
-def _compose_alone(rgb, alpha, hit, wall, colour, combined, depth):
+def _compose_alone(rgb, alpha, hit, wall, colour, out_rgb, out_alpha, depth):
     for row in range(alpha.shape[0]):
         for column in range(alpha.shape[1]):
             through = (np.float32(1) - alpha[row, column]) * wall
             for channel in range(3):
-                combined[row, column, channel] = rgb[row, column, channel] + through * colour[channel]
-            combined[row, column, 3] = alpha[row, column] + through
+                out_rgb[row, column, channel] = rgb[row, column, channel] + through * colour[channel]
+            out_alpha[row, column] = alpha[row, column] + through
             depth[row, column] = min(hit[row, column], NOTHING)
 
 
 @numba.njit(cache=True, nogil=True)
 def _compose(
-    rgb, alpha, hit, expected, solid_rgb, solid_alpha, solid_depth, hole, outline, wall, colour, combined, depth
+    rgb, alpha, hit, expected, solid_rgb, solid_alpha, solid_depth, hole, outline, wall, colour, out_rgb, out_alpha, out
 ):
     share = np.float32(1 / (FINER * FINER))
     light = np.empty(4, np.float32)
@@ -125,8 +126,9 @@ def _compose(
                     light[channel] += person + through * (solid_rgb[y, x, channel] + free * colour[channel])
                 light[3] += np.float32(1) - through + through * (solid_alpha[y, x] + free)
                 nearest, second, inverse = min(nearest, z), min(second, max(nearest, z)), inverse + 1.0 / z
-            for channel in range(4):
-                combined[row, column, channel] = light[channel] * share
+            for channel in range(3):
+                out_rgb[row, column, channel] = light[channel] * share
+            out_alpha[row, column] = light[3] * share
             # The depth at which half of the samples are covered: opacity one half, the same definition as for humans.
             solid = second if outline[row, column] or inverse == 0.0 else 1.0 / (share * inverse)
-            depth[row, column] = min(hit[row, column], solid, NOTHING)
+            out[row, column] = min(hit[row, column], solid, NOTHING)

@@ -14,35 +14,68 @@ from collections.abc import Iterator
 import numba
 import numpy as np
 import torch
-from jaxtyping import Float32
+from jaxtyping import Float32, Int
 from numpy import ndarray
+from torch import Tensor
 
 from primdiffusion.drawing.compositing import Backdrop, backdrop, over_background, over_solids
-from primdiffusion.drawing.scene import Picture, Scene, ViewSettings
+from primdiffusion.formats.requests import VIEWS, View
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.render.image import depth_colours
 from primdiffusion.render.lattice import check_camera
-from primdiffusion.render.march import Span, march
-from primdiffusion.render.solids import draw_boxes
+from primdiffusion.render.march import MarchSettings, Span, march
+from primdiffusion.render.solids import Solids, draw_boxes
 
 
-def draw(scene: Scene, camera: Camera, look: ViewSettings = ViewSettings()) -> Picture:  # noqa: B008
+@dataclasses.dataclass(frozen=True, eq=False)
+class Scene:
+    """Humans and opaque meshes in world space."""
+
+    primitives: Primitives | None
+    """Primitives of all humans, unbatched (`Primitives.together`); None if there are none."""
+    solids: Solids | None = None
+    chart: Int[Tensor, "k"] | None = None
+    """The body region of each primitive; sets its hue in the view "boxes"."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ViewSettings:
+    """View settings."""
+
+    view: View = VIEWS[0]
+    background: tuple[float, float, float] | None = None
+    """Linear RGB; None is transparent."""
+    clip: tuple[float, float] = (0.0, math.inf)
+    """Near and far clipping depths along the optical axis, metres."""
+    settings: MarchSettings = MarchSettings()  # noqa: RUF009  frozen
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for an unknown view or clip planes in the wrong order."""
+        if self.view not in VIEWS:
+            raise ValueError(f"unknown view {self.view!r}; choose from {', '.join(VIEWS)}")
+        start, end = self.clip
+        if not 0 <= start < end:
+            raise ValueError(f"the clip distances are {start} and {end} m: give a start of at least 0 and a larger end")
+
+
+def draw(scene: Scene, camera: Camera, look: ViewSettings = ViewSettings()) -> Image:
     """Draw `scene`: humans over solids over the background.
 
-    Depth is the nearer of a human's first hit (opacity one half) and a solid. A holdout hides humans behind it and
-    leaves a hole (combined 0, no depth) unless a human is in front of it. The view "alpha" is opaque, with the humans'
-    coverage as grey; "depth" colours humans (by expected depth) and solids with `depth_colours`.
+    Depth is the nearer of a human's first hit (opacity one half) and a solid; NOTHING without either. A holdout hides
+    humans behind it and leaves a hole (colours 0, no depth) unless a human is in front of it. The view "alpha" is
+    opaque, with the humans' coverage as grey; "depth" colours humans (by expected depth) and solids with
+    `depth_colours`.
     Computes on the device of `scene.primitives`; the result is on the CPU. Raises ValueError as `march` does.
     """
-    picture = Picture.blank(camera.width, camera.height)
+    picture = Image.blank(camera.width, camera.height)
     draw_into(picture, scene, camera, look)
     return picture
 
 
-def draw_into(picture: Picture, scene: Scene, camera: Camera, look: ViewSettings) -> float:
+def draw_into(picture: Image, scene: Scene, camera: Camera, look: ViewSettings) -> float:
     """As `draw`, into an existing picture of the camera's size; return the seconds spent in the marcher."""
     check_camera(camera)
     behind = None if scene.solids is None else backdrop(scene.solids, camera, look.clip)
@@ -141,10 +174,10 @@ def _solids_in_black(behind: Backdrop | None) -> Backdrop | None:
     return dataclasses.replace(behind, solids=dataclasses.replace(behind.solids, rgb=np.zeros_like(behind.solids.rgb)))
 
 
-def _encode_coverage(picture: Picture) -> None:
+def _encode_coverage(picture: Image) -> None:
     """Replace coverage by opaque linear grey whose sRGB encoding equals the coverage."""
-    picture.combined[..., :3] = decode_srgb(picture.combined[..., :3])
-    picture.combined[..., 3] = 1
+    picture.rgb[:] = decode_srgb(picture.rgb)
+    picture.alpha[:] = 1
 
 
 def _secants(camera: Camera) -> Float32[ndarray, "h w"]:
@@ -206,7 +239,7 @@ class DrawProgress:
 
 
 def draw_in_bands(
-    picture: Picture, scene: Scene, camera: Camera, look: ViewSettings, pixels_a_second: float | None = None
+    picture: Image, scene: Scene, camera: Camera, look: ViewSettings, pixels_a_second: float | None = None
 ) -> Iterator[DrawProgress]:
     """As `draw`, but fill `picture` in bands from the top; `pixels_a_second` is the measured speed, if known."""
     top, rows, seconds = 0, camera.height, 0.0
@@ -215,7 +248,8 @@ def draw_in_bands(
         rows = min(_rows(camera.width, pixels_a_second), rows * GROWTH, camera.height - top)
         began = time.perf_counter()
         part = camera.crop(0, top, camera.width, rows)
-        seconds += draw_into(picture.rows(top, top + rows), scene, part, look)
+        band = Image(*(values[top : top + rows] for values in (picture.rgb, picture.alpha, picture.depth)))
+        seconds += draw_into(band, scene, part, look)
         pixels_a_second = rows * camera.width / max(time.perf_counter() - began, 1e-6)
         speeds.append(pixels_a_second)
         top += rows

@@ -1,7 +1,7 @@
 """The paper's Tables 1 and 2 of any pictures of humans, beside the measures of our own network (SPEC 7).
 
-FID, FID_CLIP, KID, PCKh and depth errors of published networks need weights that the user names; without them a
-cell is empty and says why. The own network's distance, PCKh and depth error are always there.
+FID, FID_CLIP and KID of published networks need weights that the user names; without them a cell is empty and says
+why. The own network's distance, PCKh and depth error are always there.
 """
 
 from __future__ import annotations
@@ -21,7 +21,6 @@ from torch import Tensor
 from primdiffusion.evaluation.distances import frechet_distance, kernel_distance_of_subsets, too_few_samples
 from primdiffusion.evaluation.images import SIDE, TestImage
 from primdiffusion.evaluation.markdown import markdown_table
-from primdiffusion.evaluation.onnx_networks import DepthNetwork, PoseNetwork
 from primdiffusion.evaluation.pose_depth_network import (
     PoseDepthNetwork,
     cell_means,
@@ -51,8 +50,6 @@ class Networks:
     own: PoseDepthNetwork
     inception: Inception | None = None
     clip: ClipVision | None = None
-    pose: PoseNetwork | None = None
-    depth: DepthNetwork | None = None
 
 
 class Cell(NamedTuple):
@@ -74,22 +71,19 @@ class Scores:
     pictures: int
     features: Mapping[str, Float[Tensor, "n d"]]
     """Features by network: "inception", "clip", "own" and "detail"."""
-    correct: Mapping[str, Sequence[float]]
-    """Share of correct joints of each picture with known joints, by network: "pose" and "own"."""
-    depth: Mapping[str, Sequence[float]]
-    """Depth error of each picture with known depth, by network: "depth" and "own"."""
+    correct: Sequence[float]
+    """Share of correct joints of each picture with known joints."""
+    depth: Sequence[float]
+    """Depth error of each picture with known depth."""
 
 
 def look_at_pictures(
     images: Iterable[TestImage], networks: Networks, report: Callable[[int], None] = lambda done: None
 ) -> Scores:
-    """Look at every picture once. A picture in which a network finds no human has no correct joint.
-
-    Raises ValueError for a network that does not fit, and what `images` raises.
-    """
+    """Look at every picture once. Raises what `images` raises."""
     features: dict[str, list[Tensor]] = {"own": [], "detail": []}
-    correct: dict[str, list[float]] = {"own": [], "pose": []}
-    depth: dict[str, list[float]] = {"own": [], "depth": []}
+    correct: list[float] = []
+    depth: list[float] = []
     count = 0
     iterator = iter(images)
     while batch := list(itertools.islice(iterator, BATCH)):
@@ -105,20 +99,13 @@ def look_at_pictures(
         found = joint_positions(seen.heatmaps)
         for number, image in enumerate(batch):
             if image.joints is not None and image.head_size is not None:
-                joints: dict[str, Tensor | None] = {"own": found[number] * image.rgb.shape[0]}
-                if networks.pose is not None:
-                    joints["pose"] = networks.pose.joints(image)
-                for name, own in joints.items():
-                    right = None if own is None else correct_joints(own, image.joints, image.head_size)
-                    correct[name].append(0.0 if right is None else float(right.double().mean()))
+                right = correct_joints(found[number] * image.rgb.shape[0], image.joints, image.head_size)
+                correct.append(float(right.double().mean()))
             if image.depth is not None:
                 cells = cell_means(torch.where(image.mask, 1 / image.depth, 0.0), image.mask)
-                errors = {"own": depth_error(seen.depth[number], 1 / cells, cells > 0)}
-                if networks.depth is not None:
-                    errors["depth"] = depth_error(networks.depth.inverted(image), image.depth, image.mask)
-                for name, error in errors.items():
-                    if error is not None:
-                        depth[name].append(error)
+                error = depth_error(seen.depth[number], 1 / cells, cells > 0)
+                if error is not None:
+                    depth.append(error)
         count += len(batch)
         report(count)
     stacked = {name: torch.cat(parts).clone() for name, parts in features.items() if parts}
@@ -154,11 +141,9 @@ def compare_pictures(
             "fid_clip": _frechet(fake, real, "clip", "--clip") if made else compared,
             "fid": _frechet(fake, real, "inception", "--inception") if made else compared,
             "kid": _kid(fake, real, kid_subsets, kid_subset_size, seed) if made else compared,
-            "pckh": _mean(result.correct["pose"], result.correct["own"], "joints", "--pose"),
-            "depth": _mean(result.depth["depth"], result.depth["own"], "depth", "--depth"),
             "fps": Cell(None, reason="pictures of a folder or of meshes have no frame rate"),
-            "own_pckh": _mean(result.correct["own"], result.correct["own"], "joints"),
-            "own_depth": _mean(result.depth["own"], result.depth["own"], "depth"),
+            "own_pckh": _mean(result.correct, "joints"),
+            "own_depth": _mean(result.depth, "depth"),
             "own_distance": distance,
         }
     return rows
@@ -187,15 +172,13 @@ def _kid(fake: Scores, real: Scores, subsets: int, size: int, seed: int) -> Cell
     return Cell(100 * found.mean, 100 * found.std)
 
 
-def _mean(values: Sequence[float], known: Sequence[float], truth: str, option: str = "") -> Cell:
-    """100 times the mean over pictures, and its standard deviation; `known` is empty for pictures without truth."""
-    if not known:
+def _mean(values: Sequence[float], truth: str) -> Cell:
+    """100 times the mean over pictures with truth, and its standard deviation."""
+    if not values:
         return Cell(
             None,
             reason=f"the {truth} of these pictures are not known: docs/design/evaluation.md says where to put them",
         )
-    if not values:
-        return Cell(None, reason=f"no weights file: name one with {option}")
     found = 100 * torch.tensor(values, dtype=torch.float64)
     return Cell(float(found.mean()), float(found.std(correction=0)))
 
@@ -245,8 +228,6 @@ COLUMNS = {
     "fid_clip": "FID_CLIP",
     "fid": "FID",
     "kid": "KID x 100",
-    "pckh": "PCKh@0.5",
-    "depth": "depth x 100",
     "fps": "FPS",
     "own_distance": "own distance",
     "own_pckh": "own PCKh@0.5",
@@ -254,13 +235,13 @@ COLUMNS = {
 }
 OWN = ("own_distance", "own_pckh", "own_depth")
 OF_TABLE = {
-    1: ("fid_clip", "fid", "kid", "pckh", "depth", "fps", *OWN),
-    2: ("fid_clip", "fid", "kid", "depth", *OWN),
+    1: ("fid_clip", "fid", "kid", "fps", *OWN),
+    2: ("fid_clip", "fid", "kid", *OWN),
 }
 """Columns of the paper's tables, then our own network's."""
 
 
-NETWORK_SCORES = {"pckh": 1, "own_pckh": 1, "depth": -1, "own_depth": -1}
+NETWORK_SCORES = {"own_pckh": 1, "own_depth": -1}
 """Columns that score how well a network reads joints or depth from pictures; 1: higher is better, -1: lower is."""
 
 

@@ -30,7 +30,8 @@ def load(path: Path) -> object:
         archive = file.read(len(_ZIP_MAGIC)) == _ZIP_MAGIC
         file.seek(0)
         try:
-            _check_archive(file, path) if archive else _check_start(file)
+            # before torch 1.6, names stand before numbers
+            _check_archive(file, path) if archive else _check_globals(file.read(LARGEST_PICKLE))
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # torch warns about pickles that it then rejects
                 # mapped: torch does not compare the sizes that an archive states with those of its storages
@@ -55,11 +56,6 @@ def _check_archive(file: io.BufferedReader | io.BytesIO, path: Path) -> None:
                 if member.file_size > LARGEST_PICKLE:
                     raise FileError(path, f"holds {member.file_size} bytes of names", "save the weights alone")
                 _check_globals(archive.read(member))
-
-
-def _check_start(file: io.BufferedReader | io.BytesIO) -> None:
-    """Check a file of torch before 1.6, whose names stand before its numbers."""
-    _check_globals(file.read(LARGEST_PICKLE))
 
 
 def _check_globals(content: bytes) -> None:

@@ -41,7 +41,6 @@ PASSES = ("img", "mask", "depth", "normal", "part")
 """Images of a captured view."""
 FLOAT_DEPTH = "depth_float"
 """One more, written only if asked for."""
-"""Camera files of other projects beside captures; the released code's files are always written."""
 RAY_STEP = 0.004
 """Metres between samples of a ray."""
 DENSITY_GAIN = 1.6

@@ -29,3 +29,8 @@ class Image:
         """An empty image without normals and parts."""
         size = (height, width)
         return cls(np.zeros((*size, 3), np.float32), np.zeros(size, np.float32), np.full(size, np.inf, np.float32))
+
+    @property
+    def rgba(self) -> Float32[ndarray, "h w 4"]:
+        """Colours and opacity; a copy."""
+        return np.concatenate([self.rgb, self.alpha[..., None]], axis=-1)

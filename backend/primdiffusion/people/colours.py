@@ -42,11 +42,6 @@ def bytes_from_linear(linear: Float[np.ndarray, "*b 3"]) -> UInt8[np.ndarray, "*
     return _ENCODED[np.clip(linear * 4095 + 0.5, 0, 4095).astype(np.int16)]
 
 
-def linear_from_bytes(encoded: UInt8[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b 3"]:
-    """Convert sRGB-encoded bytes to float64 linear values."""
-    return _DECODED[encoded]
-
-
 def luminance(encoded: UInt8[np.ndarray, "*b 3"]) -> Float[np.ndarray, "*b"]:
     """Compute the relative luminance (linear) of sRGB-encoded bytes."""
     return _DECODED[encoded] @ XYZ_FROM_RGB[1]
@@ -124,4 +119,4 @@ def _near(code: str, draws: np.random.Generator, spread: tuple[float, float, flo
     lab = lab_from_bytes(np.frombuffer(bytes.fromhex(code), np.uint8))
     moved = lab + draws.normal(0, spread).astype(np.float64)
     moved[0] = np.clip(moved[0], 3, 97)
-    return linear_from_bytes(bytes_from_lab(moved)).astype(np.float64)
+    return _DECODED[bytes_from_lab(moved)].astype(np.float64)

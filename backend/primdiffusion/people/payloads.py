@@ -45,8 +45,8 @@ from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Frames, K, Payload, S
 from primdiffusion.raster.rasterise import rasterise_colourings
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import InverseSettings, fit_colours, fit_payload
-from primdiffusion.render.view import PosedView
 from primdiffusion.runtime.worker_process import each
 
 VARIANT_STRIDE = 1 << 32

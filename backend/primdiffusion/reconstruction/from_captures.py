@@ -38,8 +38,8 @@ from primdiffusion.primitives.primitives import Frames, Payload, S
 from primdiffusion.reconstruction.posture_fit import each
 from primdiffusion.render.cpu.linear import apply_to_codes
 from primdiffusion.render.descent import DescentSettings, descend
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import InverseSettings, LinearisedView, fit_payload
-from primdiffusion.render.view import PosedView
 from primdiffusion.version import __version__
 
 

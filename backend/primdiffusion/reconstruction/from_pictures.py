@@ -11,13 +11,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+import torch
+
 from primdiffusion.capture.conditioning import CapturedPerson
-from primdiffusion.capture.photograph import Photograph, read_photographs, rgba_of
+from primdiffusion.capture.photograph import Photograph, read_photographs
 from primdiffusion.capture.reader import Views
 from primdiffusion.diffusion.model import DiffusionModel
 from primdiffusion.formats.camera_rig import View
 from primdiffusion.reconstruction.from_captures import PersonComponents, targets_of
-from primdiffusion.reconstruction.posture_file import read_cameras, read_posture
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error
 from primdiffusion.reconstruction.posture_fit import overlap as overlap_of
 from primdiffusion.reconstruction.posture_start import (
@@ -25,12 +27,14 @@ from primdiffusion.reconstruction.posture_start import (
     before_cameras,
     cameras_of,
     framed,
+    read_cameras,
+    read_posture,
     repeated,
     standing,
     turned_to_camera,
     views_of,
 )
-from primdiffusion.render.view import PosedView
+from primdiffusion.render.image import PosedView
 
 
 class Round(NamedTuple):
@@ -177,7 +181,8 @@ def outline_overlap(model: DiffusionModel, photographs: Sequence[Photograph], po
 
 
 def _views(photographs: Sequence[Photograph], posture: Posture) -> Views:
-    return Views(rgba_of(photographs), posture.camera, posture.pose)
+    rgba = np.stack([photograph.rgba for photograph in photographs])
+    return Views(torch.from_numpy(rgba), posture.camera, posture.pose)
 
 
 def _targets(photographs: Sequence[Photograph], posture: Posture, side: int) -> list[PosedView]:

@@ -27,9 +27,9 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import default_frames
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import BACKGROUND
 from primdiffusion.render.march import MarchSettings, march
-from primdiffusion.render.view import PosedView
 
 Record = TypeVar("Record", bound=TensorRecord)
 

@@ -272,17 +272,14 @@ def _check_attention(found: Mapping[str, Tensor], prefix: str) -> None:
         for part in parts:
             key = f"{prefix}transformer.{part}"
             if key not in found:
-                unknown = ", ".join(sorted(found.keys() - _attention_keys(prefix))) or "none"
+                expected = {f"{prefix}transformer.{part}" for parts in ATTENTION.values() for part in parts}
+                unknown = ", ".join(sorted(found.keys() - expected)) or "none"
                 raise ValueError(f"{key!r} is missing; the transformer has unknown tensors instead: {unknown:.120}")
             if [side for side in found[key].shape if side != 1] != expected:
                 raise ValueError(
                     f"{key!r} has shape {tuple(found[key].shape)}, not {tuple(expected)}: the checkpoint is of another "
                     "version of the released code, or damaged"
                 )
-
-
-def _attention_keys(prefix: str) -> set[str]:
-    return {f"{prefix}transformer.{part}" for parts in ATTENTION.values() for part in parts}
 
 
 def _written(shape: Sequence[int]) -> str:

@@ -25,8 +25,8 @@ from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
 from primdiffusion.primitives.from_mesh import FULL_DENSITY
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
 from primdiffusion.render.cuda.graph import Recorded
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import MarchSettings, Rendering, march
-from primdiffusion.render.view import PosedView
 from primdiffusion.runtime.failures import PictureOutOfMemory, out_of_memory
 
 BETAS = (0.7, 0.9)

@@ -1,18 +1,22 @@
-"""Write renderings as PNG files."""
+"""Images of primitives: the marcher's output and its compositing (SPEC 4), PNG files, and targets of fits."""
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 from torch import Tensor
 
 from primdiffusion.files.whole_files import written_whole
+from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.geometry.srgb import encode_srgb, to_bytes
+from primdiffusion.primitives.primitives import Frames
 
 Background = tuple[float, float, float]
 NEAR_TO_FAR = ((1.0, 0.95, 0.75), (0.98, 0.62, 0.25), (0.80, 0.25, 0.33), (0.42, 0.12, 0.47), (0.10, 0.07, 0.28))
@@ -55,3 +59,82 @@ def depth_colours(depth: Float[ndarray, "*r"], near: float, far: float) -> Float
 def _save(path: str | Path, encoded: Float[Tensor, "h w c"]) -> None:
     with written_whole(path) as unfinished:
         Image.fromarray(to_bytes(encoded).cpu().numpy()).save(unfinished, format="PNG")
+
+
+SURFACE_OPACITY = 0.5
+"""Accumulated opacity that defines the first hit."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Rendering(TensorRecord):
+    """An image of the primitives."""
+
+    rgb: Float[Tensor, "*r 3"]
+    """Linear RGB, premultiplied by alpha (over black)."""
+    alpha: Float[Tensor, "*r"]
+    """Opacity in [0, 1]."""
+    depth: Float[Tensor, "*r"]
+    """Expected depth: the weighted mean of the samples' distances along the ray, metres; inf where alpha is 0."""
+    first_hit: Float[Tensor, "*r"]
+    """Distance along the ray, metres, of the first sample at which the opacity has reached 0.5; inf if there is none.
+    Not differentiable."""
+
+    def save(self, path: str | Path, background: Background | None = None) -> None:
+        """Write an image [h, w] as an 8-bit sRGB PNG: with straight alpha, or over a background (linear RGB).
+
+        The file appears whole or not at all. Raises ValueError for a name that does not end in .png, and OSError.
+        """
+        if Path(path).suffix.lower() != ".png":
+            raise ValueError(f"{path} does not end in .png: pictures are saved as PNG")
+        rgba_to_png(path, torch.cat([self.rgb, self.alpha[..., None]], dim=-1), background)
+
+    def over(self, background: Background) -> Float[Tensor, "*r 3"]:
+        """The image over a background; both linear RGB."""
+        return over(self.rgb, self.alpha, background)
+
+
+def composite(
+    opacity: Float[Tensor, "*r n"], weighted_rgb: Float[Tensor, "*r n 3"], distance: Float[Tensor, "*r n"]
+) -> Rendering:
+    """Additive, clamped accumulation A <- min(A + a, 1), front to back along the last axis (SPEC 4).
+
+    `opacity` is a = density * window * length >= 0 of each sample, `weighted_rgb` a * colour, `distance` its position
+    along the ray (metres). The sample that takes A to 1 contributes the missing part, kappa * a; later samples
+    contribute nothing and receive no gradient, so marching may stop there. A sample with a = 0 receives the gradient in
+    the limit a -> 0, so empty voxels can become opaque.
+    """
+    reached = opacity.cumsum(-1)
+    missing = 1 - torch.cat([torch.zeros_like(opacity[..., :1]), reached[..., :-1]], dim=-1)
+    saturating = (opacity > missing) & (missing > 0)
+    part = missing / torch.where(saturating, opacity, torch.ones_like(opacity))
+    share = torch.where(saturating, part, (missing > 0).to(opacity.dtype))
+    alpha = (share * opacity).sum(-1).clamp_max(1)
+    infinity = torch.full_like(alpha, torch.inf)
+    visible = alpha > 0
+    expected = (share * opacity * distance).sum(-1) / torch.where(visible, alpha, torch.ones_like(alpha))
+    surface = torch.where((reached >= SURFACE_OPACITY) & (opacity > 0), distance, infinity[..., None])
+    return Rendering(
+        rgb=(share[..., None] * weighted_rgb).sum(-2),
+        alpha=alpha,
+        depth=torch.where(visible, expected, infinity),
+        first_hit=torch.cat([surface, infinity[..., None]], dim=-1).amin(-1).detach(),
+    )
+
+
+@dataclasses.dataclass(frozen=True)
+class PosedView(TensorRecord):
+    """A picture with its camera and the boxes in its pose, unbatched."""
+
+    frames: Frames
+    camera: Camera
+    rgba: UInt8[Tensor, "height width 4"] | Float32[Tensor, "height width 4"]
+    """Colours over black, and the mask: sRGB-encoded bytes for `descend`, linear floats for `fit_payload`."""
+    weight: float = 1.0
+    """Weight of the picture's mean square error in `fit_payload`."""
+
+    def __post_init__(self) -> None:
+        """Raise ValueError if the picture does not fit its camera or is not finite."""
+        expected = (self.camera.height, self.camera.width, 4)
+        if self.rgba.shape != expected or (self.rgba.is_floating_point() and not self.rgba.isfinite().all()):
+            shape = tuple(self.rgba.shape)
+            raise ValueError(f"a picture of shape {shape} does not fit its camera, or is not finite: give {expected}")

@@ -37,7 +37,7 @@ from primdiffusion.render.cpu.linear import (
     apply_colours,
     linearise,
 )
-from primdiffusion.render.view import PosedView
+from primdiffusion.render.image import PosedView
 
 BACKGROUND = float(decode_srgb(torch.tensor(0.5)))
 """Linear grey behind target and image, in contrast to dark and light humans."""

@@ -13,9 +13,9 @@ from torch import Tensor
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu.march import march_cpu
 from primdiffusion.render.cuda import march as cuda
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span, check_camera, check_one_device
 from primdiffusion.render.reference import march_reference
 

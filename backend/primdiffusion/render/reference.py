@@ -11,7 +11,7 @@ from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import WINDOW_POWER, WINDOW_SHARPNESS, Primitives
-from primdiffusion.render.compositing import Rendering, composite
+from primdiffusion.render.image import Rendering, composite
 from primdiffusion.render.lattice import (
     Compositing,
     MarchSettings,

@@ -30,7 +30,7 @@ from primdiffusion.files.regular_files import may_be_written, printable
 from primdiffusion.formats.answers import CancelAnswer, Done, HelloAnswer, Progress, Ready
 from primdiffusion.formats.requests import REQUESTS
 from primdiffusion.formats.schema import FieldError, read, written
-from primdiffusion.runtime.failures import ErrorDescription, describe, shortened, traceback_of
+from primdiffusion.runtime.failures import describe, shortened, traceback_of
 from primdiffusion.runtime.machine import memory, share_processors
 from primdiffusion.version import __version__
 
@@ -332,11 +332,7 @@ def _as_rpc_error(error: Exception) -> RpcError:
         sentence = printable(f"defect in the backend: {type(error).__name__}: {error}")
         remedy = "report it with the lines of the backend's log"
         return RpcError(INTERNAL_ERROR, sentence, {"kind": "defect", "remedy": remedy})
-    return RpcError(DOMAIN_ERROR, failure.sentence, _data(failure))
-
-
-def _data(failure: ErrorDescription) -> dict[str, str]:
-    return {"kind": failure.kind, "remedy": failure.remedy}
+    return RpcError(DOMAIN_ERROR, failure.sentence, {"kind": failure.kind, "remedy": failure.remedy})
 
 
 def guard_streams() -> tuple[BinaryIO, BinaryIO]:

@@ -108,7 +108,7 @@ def _card(
         "full_density": people.full_density,
         "schedule": config.schedule,
         "seed": config.seed,
-        "device": _device_name(task.device),
+        "device": "CPU" if task.device.type == "cpu" else device_info(task.device)["device_name"],
         **versions(),
         "steps": {name: state.step for name, state in states.items()},
         "seconds": {name: round(state.seconds, 1) for name, state in states.items()},
@@ -136,10 +136,6 @@ def _limits(config: TrainingConfig) -> list[str]:
 
 def _rounded(errors: Mapping[str, Mapping[int, float]]) -> dict[str, dict[str, float]]:
     return {name: {str(level): round(e, 5) for level, e in by.items()} for name, by in errors.items()}
-
-
-def _device_name(device: torch.device) -> str:
-    return "CPU" if device.type == "cpu" else device_info(device)["device_name"]
 
 
 def run(arguments: Sequence[str] | None = None) -> None:

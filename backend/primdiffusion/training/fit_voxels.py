@@ -30,8 +30,8 @@ from primdiffusion.files.whole_files import written_whole
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.primitives import K, Payload, S
 from primdiffusion.reconstruction.from_captures import targets_of
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import InverseSettings, fit_payload, influence
-from primdiffusion.render.view import PosedView
 from primdiffusion.training.fit_losses import RESIDUAL
 
 SETTINGS = InverseSettings(iterations=8, pull=0.003, smoothness=0.02)

@@ -200,7 +200,8 @@ def fit_prior(
     detailed = int(people.detailed)
     mean = torch.stack([chunk.float().sum(0) for chunk in people.latents[:detailed].split(CHUNK)]).sum(0) / detailed
     mean = (mean + codec.mirror(mean)) / 2
-    fitted = [_components(people, codec, cells, config) for cells in _cells_of(part)]
+    groups = [(part == number).nonzero()[:, 0] for number in range(int(part.max()) + 1)]
+    fitted = [_components(people, codec, cells, config) for cells in groups]
     count = min(len(one.signs) for one in fitted)
     basis = torch.cat([one.basis[:count] for one in fitted], dim=1)
     signs = torch.cat([one.signs[:count] for one in fitted])
@@ -228,10 +229,6 @@ def body_parts() -> Int[Tensor, "k"]:
     names = (("torso", "hips", "neck"), ("arms",), ("legs",), ("feet",), ("hands",), ("face", "hair"))
     inside = torch.stack([region_of(part) for part in names])
     return inside.int().argmax(0)
-
-
-def _cells_of(part: Int[Tensor, "k"]) -> list[Int[Tensor, "n"]]:
-    return [(part == number).nonzero()[:, 0] for number in range(int(part.max()) + 1)]
 
 
 class _Components(NamedTuple):

@@ -30,8 +30,8 @@ from primdiffusion.primitives.anchors import attach
 from primdiffusion.primitives.from_mesh import from_mesh
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.render.descent import DescentSettings, DescentStep, descend, render_view
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import MarchSettings
-from primdiffusion.render.view import PosedView
 from primdiffusion.version import __version__
 
 MEASURED = 32

@@ -13,7 +13,7 @@ from PIL import Image
 from primdiffusion import cli
 from primdiffusion.body.model import default_body
 from primdiffusion.capture.coco import FACE, KEYPOINTS, keypoints_of, run_lengths, visibility, write_coco
-from primdiffusion.capture.composed import Backgrounds, StoredView, compose, read_background, uncovered
+from primdiffusion.capture.composed import Backgrounds, compose, read_background, uncovered
 from primdiffusion.capture.poses import built_in_poses
 from primdiffusion.capture.reader import open_captures
 from primdiffusion.capture.render import RenderJob, render
@@ -153,12 +153,11 @@ def test_points_before_behind_and_outside():
     points[8] = (0, 0, 20)
     points[9] = (np.nan, 0, 1)
     mask, depth = np.full((10, 10), 255, np.uint8), np.full((10, 10), round(0.87 / 0.00025), np.uint16)
-    image = np.zeros((10, 10, 3), np.uint8)
-    shown, nothing = StoredView(image, mask, depth, 1.0), StoredView(image, mask, np.zeros_like(depth), 1.0)
-    pixels, seen = visibility(view, points, [nothing, shown])
+    nothing = np.zeros_like(depth)
+    pixels, seen = visibility(view, points, [mask, mask], [nothing, depth])
     assert seen == [1, 1, 1, 1, 1, 2, 0, 0, 1, 0, 1, 2, 2, 2, 2, 2, 2]  # 0.13 m behind: wrists hidden, hips not
     assert pixels[5].tolist() == [5, 5]
-    assert visibility(view, points, [nothing])[1] == [2] * 6 + [0, 0, 1, 0] + [2] * 7
+    assert visibility(view, points, [mask], [nothing])[1] == [2] * 6 + [0, 0, 1, 0] + [2] * 7
 
 
 @pytest.mark.parametrize("rows", ["10", "01", "11", "00"])
@@ -312,8 +311,8 @@ def test_backgrounds_fill_what_the_human_leaves_and_the_seed_draws_them(root, ba
 
 def test_half_covered_pixels_mix_in_linear_light():
     image, mask = np.array([[[0, 0, 0], [188, 0, 0], [255, 255, 255]]], np.uint8), np.array([[0, 128, 255]], np.uint8)
-    view = StoredView(image, mask, np.full((1, 3), 4000, np.uint16), 1.0)
-    mixed = compose([view], uncovered([view]), np.full((1, 3, 3), 255, np.uint8))
+    shares = uncovered([mask], [np.full((1, 3), 4000, np.uint16)], [1.0])
+    mixed = compose([image], shares, np.full((1, 3, 3), 255, np.uint8))
     assert mixed.tolist() == [[[255, 255, 255], [255, 187, 187], [255, 255, 255]]]
 
 

@@ -10,7 +10,7 @@ from capture_scenes import decoded, small_job
 from PIL import Image
 from primdiffusion import cli
 from primdiffusion.capture.coco import KEYPOINTS, groups, write_coco
-from primdiffusion.capture.composed import Backgrounds, StoredView, compose, drawn_box, uncovered
+from primdiffusion.capture.composed import Backgrounds, compose, drawn_box, uncovered
 from primdiffusion.capture.people_files import read_person
 from primdiffusion.capture.poses import built_in_poses, turned
 from primdiffusion.capture.reader import open_captures
@@ -145,66 +145,66 @@ def test_a_joint_behind_another_human_is_hidden(root):
 
 
 def test_nearer_layers_cover_farther_ones_whatever_their_order():
-    near = StoredView(np.full((1, 2, 3), 128, np.uint8), np.array([[255, 128]], np.uint8),
-                      np.array([[4000, 0]], np.uint16), 1.0)  # fmt: skip
-    far = StoredView(np.full((1, 2, 3), 255, np.uint8), np.array([[255, 255]], np.uint8),
-                     np.array([[8000, 8000]], np.uint16), 2.0)  # fmt: skip
+    images = [np.full((1, 2, 3), 128, np.uint8), np.full((1, 2, 3), 255, np.uint8)]
+    masks = [np.array([[255, 128]], np.uint8), np.array([[255, 255]], np.uint8)]
+    depths = [np.array([[4000, 0]], np.uint16), np.array([[8000, 8000]], np.uint16)]
     half = 127 / 255
-    assert np.allclose(uncovered([near, far]), [[[1, 1]], [[0, half]], [[0, 0]]])
-    assert np.allclose(uncovered([far, near]), [[[0, half]], [[1, 1]], [[0, 0]]])
+    shares, turned = uncovered(masks, depths, [1.0, 2.0]), uncovered(masks[::-1], depths[::-1], [2.0, 1.0])
+    assert np.allclose(shares, [[[1, 1]], [[0, half]], [[0, 0]]])
+    assert np.allclose(turned, [[[0, half]], [[1, 1]], [[0, 0]]])
     behind = np.full((1, 2, 3), 255, np.uint8)
-    image, same = (compose(views, uncovered(views), behind) for views in ([far, near], [near, far]))
+    image, same = compose(images, shares, behind), compose(images[::-1], turned, behind)
     assert np.array_equal(image, same)
     assert image[0, 0].tolist() == [128] * 3
     assert decode_srgb(image[0, 1] / 255) == pytest.approx(float(decode_srgb(np.array(128 / 255))) + half, abs=0.004)
 
 
-def random_views(rng, humans, size=(40, 50)) -> list[StoredView]:
-    """Blobs with soft edges, some of them at the same depth or without one."""
-    views = []
+def random_passes(rng, humans, size=(40, 50)):
+    """Images, masks, depths and distances of blobs with soft edges, some at the same depth or without one."""
+    found = []
     for _ in range(humans):
         rows, columns = np.indices(size)
         far = np.hypot(rows - rng.uniform(0, size[0]), columns - rng.uniform(0, size[1]))
         mask = np.clip((rng.uniform(3, 15) - far) * 60, 0, 255).astype(np.uint8)
         depth = np.where(mask > rng.integers(0, 255), rng.integers(3990, 4010, size), 0).astype(np.uint16)
         image = np.where(mask[..., None] > 0, rng.integers(0, 256, (*size, 3)), 0).astype(np.uint8)
-        views.append(StoredView(image, mask, depth, rng.uniform(0.9, 1.1)))
-    return views
+        found.append((image, mask, depth, rng.uniform(0.9, 1.1)))
+    return zip(*found, strict=True)
 
 
 def test_shares_and_images_are_those_of_sorting_all_pixels():
     rng = np.random.default_rng(8)
     for humans in (1, 2, 3, 8):
         for _ in range(5):
-            views = random_views(rng, humans)
-            depth = np.stack([np.where(one.depth > 0, one.depth * 0.00025, one.distance) for one in views])
-            order = depth.argsort(axis=0, kind="stable")
-            left = np.take_along_axis(np.stack([1 - one.mask / np.float32(255) for one in views]), order, axis=0)
+            images, masks, depths, distances = random_passes(rng, humans)
+            filled = [np.where(depth > 0, depth * 0.00025, far) for depth, far in zip(depths, distances, strict=True)]
+            order = np.stack(filled).argsort(axis=0, kind="stable")
+            left = np.take_along_axis(1 - np.stack(masks) / np.float32(255), order, axis=0)
             left = np.cumprod(np.concatenate([np.ones((1, *left.shape[1:]), np.float32), left]), axis=0)
             expected = left.copy()
             np.put_along_axis(expected[:-1], order, left[:-1], axis=0)
-            shares = uncovered(views)
+            shares = uncovered(masks, depths, distances)
             assert np.array_equal(shares, expected)
-            behind = rng.integers(0, 256, (*depth.shape[1:], 3)).astype(np.uint8)
-            layers = [*(one.img for one in views), behind]
+            behind = rng.integers(0, 256, (*order.shape[1:], 3)).astype(np.uint8)
+            layers = [*images, behind]
             linear = sum(share[..., None] * LINEAR_OF_BYTE[layer] for share, layer in zip(shares, layers, strict=True))
-            assert np.array_equal(compose(views, shares, behind), srgb_bytes(np.minimum(linear, 1)))
+            assert np.array_equal(compose(images, shares, behind), srgb_bytes(np.minimum(linear, 1)))
 
 
 def test_outside_of_the_box_there_is_only_the_background():
     rng = np.random.default_rng(9)
     for humans in (1, 3):
-        views = random_views(rng, humans)
-        box = drawn_box(views)
-        parts = [view.cut(box) for view in views]
-        behind = rng.integers(0, 256, (*views[0].mask.shape, 3)).astype(np.uint8)
-        whole, shares = compose(views, uncovered(views), behind), uncovered(parts)
+        images, masks, depths, distances = random_passes(rng, humans)
+        box = drawn_box([*images, *masks])
+        behind = rng.integers(0, 256, (*masks[0].shape, 3)).astype(np.uint8)
+        whole = compose(images, uncovered(masks, depths, distances), behind)
+        shares = uncovered([mask[box] for mask in masks], [depth[box] for depth in depths], distances)
         assert behind[box].size < behind.size
-        assert np.array_equal(compose(parts, shares, behind[box]), whole[box])
+        assert np.array_equal(compose([image[box] for image in images], shares, behind[box]), whole[box])
         behind[box] = whole[box]
         assert np.array_equal(behind, whole)
-    empty = StoredView(np.zeros((4, 5, 3), np.uint8), np.zeros((4, 5), np.uint8), np.zeros((4, 5), np.uint16), 1.0)
-    assert empty.mask[drawn_box([empty])].size == 0
+    empty = np.zeros((4, 5), np.uint8)
+    assert empty[drawn_box([np.zeros((4, 5, 3), np.uint8), empty])].size == 0
 
 
 def test_all_bytes_come_back_from_linear_light():

@@ -10,8 +10,7 @@ import torch
 from primdiffusion.body.model import BodyPose
 from primdiffusion.commands import frame_drawer
 from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
-from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.drawing.draw import Scene, ViewSettings, draw
 from primdiffusion.editing.reshaping import reshaped
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
 from primdiffusion.human import framing, generate, place, pose_body
@@ -64,12 +63,12 @@ def drawn(params: DrawRequest, drawer: FrameDrawer | None = None, reports: list 
 def test_the_frame_holds_the_picture_of_the_placed_person_from_its_bottom_row(human, pose, params):
     primitives = place(human, pose)
     want = draw(Scene(primitives), framing(primitives, 23, WIDTH, HEIGHT), ViewSettings(clip=(0.0, 1e10)))
-    assert (want.combined[..., 3] > 0.9).mean() > 0.05
+    assert (want.alpha > 0.9).mean() > 0.05
     drawn(params)
     values = np.fromfile(params.frame, np.float32)
     combined = values[: WIDTH * HEIGHT * 4].reshape(HEIGHT, WIDTH, 4)
     depth = values[WIDTH * HEIGHT * 4 :].reshape(HEIGHT, WIDTH)
-    assert np.allclose(combined[::-1], want.combined, atol=2e-3)
+    assert np.allclose(combined[::-1], want.rgba, atol=2e-3)
     assert np.allclose(depth[::-1], want.depth, rtol=2e-3)
 
 
@@ -77,10 +76,10 @@ def test_other_betas_draw_the_reshaped_person_whose_boxes_have_grown(human, pose
     betas = human.betas + torch.tensor([0.0, 3.0, 1.0, 2.0, 0.0, 4.0, 0.0, 0.0, 0.0, 0.0])
     joints = pose_body(betas, pose).skinning[:, :3].tolist()
     person = dataclasses.replace(params.people[0], joints=joints, betas=betas.tolist())
-    got = drawn(dataclasses.replace(params, people=[person])).combined
+    got = drawn(dataclasses.replace(params, people=[person])).rgba
     camera = framing(place(human, pose), 23, WIDTH, HEIGHT)
     grown, ungrown = (
-        draw(Scene(place(one, pose)), camera, ViewSettings(clip=(0.0, 1e10))).combined
+        draw(Scene(place(one, pose)), camera, ViewSettings(clip=(0.0, 1e10))).rgba
         for one in (reshaped(human, betas), dataclasses.replace(human, betas=betas))
     )
     assert np.abs(grown - ungrown).max() > 0.1
@@ -89,10 +88,10 @@ def test_other_betas_draw_the_reshaped_person_whose_boxes_have_grown(human, pose
 
 @pytest.mark.parametrize("region", [[0, 0, 40, 56], [5, 7, 20, 30], [39, 55, 1, 1], [0, 20, 40, 1]])
 def test_a_region_is_the_part_of_the_picture_counted_from_the_bottom_left(params, tmp_path, region):
-    whole = drawn(params).combined.copy()[::-1]
+    whole = drawn(params).rgba[::-1]
     x, y, w, h = region
     part = dataclasses.replace(params, region=region, frame=new_frame(tmp_path / "part", w, h))
-    assert np.allclose(drawn(part).combined[::-1], whole[y : y + h, x : x + w], atol=1e-3)
+    assert np.allclose(drawn(part).rgba[::-1], whole[y : y + h, x : x + w], atol=1e-3)
 
 
 def test_the_first_band_is_small_where_samples_or_people_are_many(params):
@@ -132,13 +131,13 @@ def test_several_people_stand_in_one_picture(human, pose, params):
     camera = framing(first, 23, WIDTH, HEIGHT)
     want = draw(Scene(Primitives.together([first, second])), camera, ViewSettings())
     alone = draw(Scene(first), camera, ViewSettings())
-    assert np.allclose(drawn(two).combined, want.combined, atol=2e-3)
-    assert want.combined[..., 3].mean() > 1.2 * alone.combined[..., 3].mean()
+    assert np.allclose(drawn(two).rgba, want.rgba, atol=2e-3)
+    assert want.alpha.mean() > 1.2 * alone.alpha.mean()
 
 
 def test_no_human_is_a_picture_too(params):
     empty = drawn(dataclasses.replace(params, people=[], background=[0.1, 0.2, 0.3]))
-    assert np.allclose(empty.combined, (0.1, 0.2, 0.3, 1))
+    assert np.allclose(empty.rgba, (0.1, 0.2, 0.3, 1))
     assert (empty.depth == np.float32(1e10)).all()
 
 
@@ -150,12 +149,12 @@ def test_solids_come_from_a_file_of_plain_arrays_and_are_read_again_when_it_chan
     drawer = FrameDrawer(torch.device("cpu"))
     scene = dataclasses.replace(params, solids=str(tmp_path / "s.npz"))
     write((0.9, 0.0, 0.0))
-    red = drawn(scene, drawer).combined.copy()
+    red = drawn(scene, drawer).rgba
     assert red[20, 20, 0] > 0.4
     assert red[20, 20, 1] == 0
     write((0.0, 0.9, 0.0))
     os.utime(tmp_path / "s.npz", ns=(1, 1))
-    assert drawn(scene, drawer).combined[20, 20, 0] == 0
+    assert drawn(scene, drawer).rgba[20, 20, 0] == 0
 
 
 def test_out_of_memory_names_the_resolution(params, monkeypatch):
@@ -172,12 +171,12 @@ def test_out_of_memory_names_the_resolution(params, monkeypatch):
 @pytest.mark.parametrize("scale", [0.001, 0.03, 0.8, 300.0])
 def test_a_person_of_any_size_looks_the_same(params, tmp_path, scale):
     """Dolls would fall between lattice points made for people, and giants would take a thousand times as long."""
-    plain = drawn(params).combined.copy()
+    plain = drawn(params).rgba
     pose = np.array(params.world_to_camera)
     pose[:, 3] *= scale
     person = dataclasses.replace(params.people[0], object=(scale * np.eye(3, 4)).tolist())
     scaled = dataclasses.replace(params, people=[person], world_to_camera=pose.tolist())
-    difference = np.abs(drawn(scaled).combined - plain)
+    difference = np.abs(drawn(scaled).rgba - plain)
     assert difference.max() < 0.02
     assert difference.mean() < 1e-4
 

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 import torch
 from march_scenes import camera_at, one_box, random_boxes
-from primdiffusion.drawing.draw import FIRST_PIXELS, GROWTH, depth_span, draw, draw_in_bands
-from primdiffusion.drawing.scene import NOTHING, Picture, Scene, ViewSettings
+from primdiffusion.drawing.compositing import NOTHING
+from primdiffusion.drawing.draw import FIRST_PIXELS, GROWTH, Scene, ViewSettings, depth_span, draw, draw_in_bands
 from primdiffusion.geometry.camera import Camera
+from primdiffusion.geometry.image import Image
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.raster.z_buffer import nearest_triangles
@@ -64,11 +65,11 @@ def test_a_solid_through_people_hides_exactly_what_is_behind_it(boxes, camera, z
 
     got = draw(Scene(boxes, solids), camera, ViewSettings(background=BACKGROUND, settings=SETTINGS))
     free = draw(Scene(boxes), camera, ViewSettings(background=BACKGROUND, settings=SETTINGS))
-    assert np.abs(free.combined[..., :3] - want).max() > 0.2, "the solid matters"
-    error = np.abs(got.combined[..., :3] - want).max(-1)
+    assert np.abs(free.rgb - want).max() > 0.2, "the solid matters"
+    error = np.abs(got.rgb - want).max(-1)
     assert error.max() < 0.07, "a sample on the very surface may fall to either side"
     assert np.quantile(error, 0.98) < 1e-3
-    assert np.allclose(got.combined[..., 3], 1, atol=1e-6)
+    assert np.allclose(got.alpha, 1, atol=1e-6)
     depth = np.minimum(people.first_hit.numpy(), far) * cosine
     assert np.quantile(np.abs(got.depth - np.where(np.isfinite(depth), depth, NOTHING)), 0.98) < 1e-5
 
@@ -78,10 +79,10 @@ def test_clip_planes_are_at_depths_and_not_at_distances(boxes, camera):
     start, end = 0.61, 0.65
     want = slow(boxes, camera, start / cosine, end / cosine)
     got = draw(Scene(boxes), camera, ViewSettings(clip=(start, end), settings=SETTINGS))
-    error = np.abs(got.combined[..., 3] - want.alpha.numpy())
+    error = np.abs(got.alpha - want.alpha.numpy())
     assert error.max() < 0.07
     assert np.quantile(error, 0.98) < 1e-3
-    assert 0.05 < want.alpha.mean() < draw(Scene(boxes), camera, ViewSettings()).combined[..., 3].mean() - 0.02
+    assert 0.05 < want.alpha.mean() < draw(Scene(boxes), camera, ViewSettings()).alpha.mean() - 0.02
     distances = slow(boxes, camera, np.full_like(cosine, start), np.full_like(cosine, end))
     assert np.abs(distances.alpha - want.alpha).max() > 0.1, "the test can tell them apart"
 
@@ -92,7 +93,7 @@ def test_planes_that_cut_nothing_change_nothing(boxes, camera):
     loose = draw(Scene(boxes), camera, ViewSettings(clip=(near - 1e-4, far + 1e-4)))
     behind_all = draw(Scene(boxes, wall(-50.0)), camera, ViewSettings(clip=(0.1, 10)))
     for other in (loose, behind_all):
-        assert np.allclose(other.combined, free.combined, atol=1e-6)
+        assert np.allclose(other.rgba, free.rgba, atol=1e-6)
         assert np.array_equal(other.depth, free.depth)
 
 
@@ -106,11 +107,11 @@ def test_all_boxes_lie_within_the_depth_span_and_touch_its_ends(boxes, camera):
 
 def test_before_a_person_a_solid_is_all_there_is_and_behind_it_is_what_is_left(boxes, camera):
     before = draw(Scene(boxes, wall(0.4)), camera)
-    assert np.array_equal(before.combined, draw(Scene(None, wall(0.4)), camera).combined)
+    assert np.array_equal(before.rgba, draw(Scene(None, wall(0.4)), camera).rgba)
     people, behind = draw(Scene(boxes), camera), draw(Scene(boxes, wall(-0.4)), camera)
     solid = draw(Scene(None, wall(-0.4)), camera)
-    alpha = people.combined[..., 3:]
-    assert np.allclose(behind.combined, people.combined + (1 - alpha) * solid.combined, atol=1e-6)
+    alpha = people.rgba[..., 3:]
+    assert np.allclose(behind.rgba, people.rgba + (1 - alpha) * solid.rgba, atol=1e-6)
     hit = people.depth < NOTHING
     assert np.array_equal(behind.depth[hit], people.depth[hit])
     assert np.allclose(behind.depth[~hit], solid.depth[~hit])
@@ -122,11 +123,11 @@ def test_a_solids_outline_is_smooth_and_where_it_is_nearer_it_hides_people(boxes
         corners = np.array([[[-9, -9, z], [3, -9, z], [-3, 9, z]], [[-9, -9, z], [-3, 9, z], [-9, 9, z]]])
         corners += [0.1 * z / 0.6, 0.15 * z / 0.6, 0.0]  # so that the edge passes through the middle of the picture
         half = Solids(corners.astype(np.float32), np.array([RED] * 2, np.float32), np.zeros(2, bool))
-        alone = draw(Scene(None, half), camera).combined
+        alone = draw(Scene(None, half), camera).rgba
         covered = alone[..., 3]
         assert set(np.unique(covered)) == {0.0, 0.25, 0.5, 0.75, 1.0}
-        people = draw(Scene(boxes), camera).combined
-        got = draw(Scene(boxes, half), camera).combined
+        people = draw(Scene(boxes), camera).rgba
+        got = draw(Scene(boxes, half), camera).rgba
         over = people + (1 - people[..., 3:]) * alone
         under = alone + (1 - covered[..., None]) * people
         assert np.abs(over - under).max() > 0.1
@@ -142,19 +143,19 @@ def test_far_and_narrow_views_find_outlines_too(boxes):
     half = Solids(corners.astype(np.float32), np.array([RED] * 2, np.float32), np.zeros(2, bool))
     far = wall(-0.3)
     both = Solids(*(np.concatenate([getattr(half, n), getattr(far, n)]) for n in ("corners", "colour", "holdout")))
-    people_before_far, near = draw(Scene(boxes, far), camera).combined, draw(Scene(None, half), camera).combined
+    people_before_far, near = draw(Scene(boxes, far), camera).rgba, draw(Scene(None, half), camera).rgba
     want = near + (1 - near[..., 3:]) * people_before_far
     outline = (near[..., 3] > 0) & (near[..., 3] < 1)
-    assert (np.abs(want - draw(Scene(None, both), camera).combined).max(-1) > 0.1)[outline].any(), "people are there"
-    assert np.allclose(draw(Scene(boxes, both), camera).combined, want, atol=1e-4)
+    assert (np.abs(want - draw(Scene(None, both), camera).rgba).max(-1) > 0.1)[outline].any(), "people are there"
+    assert np.allclose(draw(Scene(boxes, both), camera).rgba, want, atol=1e-4)
 
 
 def test_without_a_background_the_picture_is_premultiplied_and_transparent(boxes, camera):
     clear, full = draw(Scene(boxes), camera), draw(Scene(boxes), camera, ViewSettings(background=BACKGROUND))
-    alpha = clear.combined[..., 3:]
+    alpha = clear.rgba[..., 3:]
     assert alpha.min() == 0
-    assert np.allclose(full.combined[..., :3], clear.combined[..., :3] + (1 - alpha) * BACKGROUND, atol=1e-6)
-    assert (clear.combined[alpha[..., 0] == 0] == 0).all()
+    assert np.allclose(full.rgb, clear.rgb + (1 - alpha) * BACKGROUND, atol=1e-6)
+    assert (clear.rgba[alpha[..., 0] == 0] == 0).all()
     assert (clear.depth[alpha[..., 0] < 0.5] == np.float32(NOTHING)).all()
 
 
@@ -162,11 +163,11 @@ def test_a_holdout_leaves_a_hole_in_all_but_what_is_before_it(boxes, camera):
     held = draw(Scene(boxes, wall(0.0, holdout=True)), camera, ViewSettings(background=BACKGROUND))
     kept = draw(Scene(boxes, wall(0.0)), camera)
     solid = draw(Scene(None, wall(0.0)), camera)
-    alpha = (kept.combined[..., :3] - held.combined[..., :3]) / solid.combined[..., :3]
-    assert np.allclose(held.combined[..., 3], 1 - alpha.mean(-1), atol=1e-4), "what is not a person is a hole"
-    assert 0.1 < held.combined[..., 3].mean() < 0.9
+    alpha = (kept.rgb - held.rgb) / solid.rgb
+    assert np.allclose(held.alpha, 1 - alpha.mean(-1), atol=1e-4), "what is not a person is a hole"
+    assert 0.1 < held.alpha.mean() < 0.9
     no_human = draw(Scene(None, wall(0.0, holdout=True)), camera, ViewSettings(background=BACKGROUND))
-    assert (no_human.combined == 0).all()
+    assert (no_human.rgba == 0).all()
     assert (no_human.depth == np.float32(NOTHING)).all()
 
 
@@ -176,20 +177,20 @@ def test_the_view_depth_shows_expected_depth_in_colours(boxes, camera):
     people = slow(boxes, camera, free, free + np.inf)
     span = depth_span(boxes, camera, (0, math.inf))
     solid = people.alpha.numpy() > 0.999
-    got = draw(Scene(boxes), camera, ViewSettings("depth", settings=SETTINGS)).combined[solid]
+    got = draw(Scene(boxes), camera, ViewSettings("depth", settings=SETTINGS)).rgba[solid]
     want = depth_colours(people.depth.numpy() * cosine, *span)[solid]
     assert np.abs(encode_srgb(got[:, :3]) - want).max() < 0.01
     assert len(got) > 50
     with_wall = draw(Scene(boxes, wall(0.5)), camera, ViewSettings("depth"))
-    assert np.allclose(encode_srgb(with_wall.combined[..., :3]), depth_colours(np.zeros(()), *span), atol=1e-5)
+    assert np.allclose(encode_srgb(with_wall.rgb), depth_colours(np.zeros(()), *span), atol=1e-5)
 
 
 def test_the_view_alpha_shows_coverage_by_people_that_solids_do_not_hide(boxes, camera):
-    people = draw(Scene(boxes), camera).combined[..., 3]
-    got = draw(Scene(boxes, wall(-0.4)), camera, ViewSettings("alpha", background=BACKGROUND)).combined
+    people = draw(Scene(boxes), camera).alpha
+    got = draw(Scene(boxes, wall(-0.4)), camera, ViewSettings("alpha", background=BACKGROUND)).rgba
     assert np.allclose(encode_srgb(got[..., :3]), people[..., None], atol=1e-5)
     assert (got[..., 3] == 1).all()
-    hidden = draw(Scene(boxes, wall(0.4)), camera, ViewSettings("alpha")).combined
+    hidden = draw(Scene(boxes, wall(0.4)), camera, ViewSettings("alpha")).rgba
     assert (hidden[..., :3] == 0).all()
 
 
@@ -198,9 +199,9 @@ def test_the_view_boxes_shows_boxes_before_solids(boxes, camera):
     got = draw(Scene(boxes, wall(-0.4)), camera, ViewSettings("boxes"))
     seen = drawn.alpha > 0
     assert 0.1 < seen.mean() < 0.9
-    assert np.array_equal(got.combined[seen, :3], drawn.rgb[seen])
+    assert np.array_equal(got.rgba[seen, :3], drawn.rgb[seen])
     assert np.array_equal(got.depth[seen], drawn.depth[seen])
-    assert np.allclose(got.combined[~seen], draw(Scene(None, wall(-0.4)), camera).combined[~seen])
+    assert np.allclose(got.rgba[~seen], draw(Scene(None, wall(-0.4)), camera).rgba[~seen])
     through = draw(Scene(boxes, wall(0.0)), camera, ViewSettings("boxes"))
     wall_depth = draw(Scene(None, wall(0.0)), camera).depth
     assert np.array_equal(through.depth, np.minimum(np.where(seen, drawn.depth, np.inf), wall_depth))
@@ -210,11 +211,11 @@ def test_the_view_boxes_shows_boxes_before_solids(boxes, camera):
 @pytest.mark.parametrize("speed", [None, 1.0, 2000.0, 1e9])
 def test_bands_make_the_picture(boxes, camera, view, speed):
     scene, look = Scene(boxes, wall(0.0, 0.4)), ViewSettings(view, BACKGROUND, (0.1, 10))
-    whole, picture = draw(scene, camera, look), Picture.blank(camera.width, camera.height)
-    picture.combined[:] = np.nan
+    whole, picture = draw(scene, camera, look), Image.blank(camera.width, camera.height)
+    picture.rgb[:] = picture.alpha[:] = np.nan
     rows = [done.rows for done in draw_in_bands(picture, scene, camera, look, speed)]
     assert rows[-1] == camera.height
-    assert np.quantile(np.abs(picture.combined - whole.combined), 0.99) < 1e-4
+    assert np.quantile(np.abs(picture.rgba - whole.rgba), 0.99) < 1e-4
     assert np.quantile(np.abs(picture.depth - whole.depth), 0.99) < 1e-5
     if speed == 1.0:
         assert rows[0] == 1, "a band has a row at least"
@@ -225,7 +226,7 @@ def test_bands_make_the_picture(boxes, camera, view, speed):
 
 def test_the_first_band_of_an_unknown_machine_is_small():
     camera = camera_at((0.0, 0.0, 1.0), width=1024, height=512).to(dtype=torch.float32)
-    picture = Picture.blank(1024, 512)
+    picture = Image.blank(1024, 512)
     bands = draw_in_bands(picture, Scene(None), camera, ViewSettings())
     assert next(bands).rows == FIRST_PIXELS // 1024
 
@@ -235,7 +236,7 @@ def test_an_empty_scene_is_the_background(camera):
     for scene in (Scene(None), Scene(no_boxes)):
         for view in ("colour", "depth", "boxes"):
             picture = draw(scene, camera, ViewSettings(view, BACKGROUND))
-            assert np.allclose(picture.combined, (*BACKGROUND, 1), atol=1e-6)
+            assert np.allclose(picture.rgba, (*BACKGROUND, 1), atol=1e-6)
             assert (picture.depth == np.float32(NOTHING)).all()
 
 

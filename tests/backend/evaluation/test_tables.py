@@ -27,12 +27,11 @@ from support.errors import refused
 from tiny_model import tiny_model
 
 
-def judged(count: int, seed: int, shift: float = 0.0, **lists: list[float]) -> Scores:
+def judged(count: int, seed: int, shift: float = 0.0, correct: list[float] | None = None) -> Scores:
     generator = torch.Generator().manual_seed(seed)
     widths = {"own": 6, "detail": 3, "inception": 8, "clip": 5}
     features = {name: torch.randn(count, width, generator=generator) + shift for name, width in widths.items()}
-    values = {"own": lists.get("own", []), "pose": lists.get("pose", []), "depth": lists.get("depth", [])}
-    return Scores(count, features, values, values)
+    return Scores(count, features, correct or [], [])
 
 
 def images(count: int, seed: int) -> list[Picture]:
@@ -74,10 +73,8 @@ def test_own_distances_are_of_sets_of_one_size():
 
 
 def test_a_known_share_of_joints_is_the_pckh():
-    rows = compare_pictures(judged(10, 1, pose=[1.0] * 9 + [0.5], own=[0.25] * 10), judged(10, 0), 5, 8, 0)
-    assert rows["generated"]["pckh"].value == pytest.approx(95)
-    assert rows["generated"]["pckh"].spread == pytest.approx(15)
-    assert rows["generated"]["own_pckh"][:2] == pytest.approx((25, 0))
+    rows = compare_pictures(judged(10, 1, correct=[1.0] * 9 + [0.5]), judged(10, 0), 5, 8, 0)
+    assert rows["generated"]["own_pckh"][:2] == pytest.approx((95, 15))
 
 
 def test_empty_columns_say_why():
@@ -87,7 +84,7 @@ def test_empty_columns_say_why():
     assert all(cells[column].value is None for column in OF_TABLE[1] if column != "own_distance")
     assert "--inception" in cells["fid"].reason
     assert "--clip" in cells["fid_clip"].reason
-    assert "joints" in cells["pckh"].reason
+    assert "joints" in cells["own_pckh"].reason
     assert "100 need" in compare_pictures(fake, fake, 5, 100, 0)["generated"]["kid"].reason
     text = table(1, {"generated": cells}, {"poses": ["a", "b"], "FPS": None})
     assert f"FID is empty: {cells['fid'].reason}." in text
@@ -98,7 +95,7 @@ def test_scores_that_real_pictures_do_not_win_are_said_not_to_discriminate():
     """Figures of docs/results/tables_table.md: no ranking can be read from a score that renders of meshes lose."""
 
     def row(joints: float | None, depth: float | None) -> dict[str, Cell]:
-        return {"own_pckh": Cell(joints), "own_depth": Cell(depth), "pckh": Cell(None, reason="no weights file")}
+        return {"own_pckh": Cell(joints), "own_depth": Cell(depth), "fid": Cell(None, reason="no weights file")}
 
     rows = {
         "ours": row(49.28, 133.5),
@@ -151,10 +148,9 @@ def test_joints_are_judged_against_the_truth_of_each_picture():
         [dataclasses.replace(image, joints=SIDE * own) for image, own in zip(given, seen, strict=True)],
         Networks(network),
     )
-    assert right.correct["own"] == [1.0] * 3
+    assert right.correct == [1.0] * 3
     first = look_at_pictures(given, Networks(network))
-    assert first.pictures == len(first.correct["own"]) == len(first.depth["own"]) == 3
-    assert (len(first.correct["pose"]), len(first.depth["depth"])) == (0, 0)
+    assert first.pictures == len(first.correct) == len(first.depth) == 3
     assert first.features["own"].shape == (3, 64)
     assert torch.equal(look_at_pictures(given, Networks(network)).features["own"], first.features["own"])
 

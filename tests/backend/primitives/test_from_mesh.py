@@ -10,7 +10,7 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, from_mesh, nearest, surface_field, voxel_centres
 from primdiffusion.primitives.primitives import Frames, Primitives
 from primdiffusion.raster.rasterise import rasterise
-from primdiffusion.render.compositing import Rendering
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.march import march
 from support.errors import refused
 

@@ -18,19 +18,21 @@ from primdiffusion.formats.joints import JOINT_NAMES
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.human import framing, pose_body
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.reconstruction.posture_file import read_cameras, read_posture, write_posture
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, overlap
 from primdiffusion.reconstruction.posture_start import (
     before_cameras,
     cameras_of,
     framed,
+    read_cameras,
+    read_posture,
     repeated,
     standing,
     turned_to_camera,
     views_of,
+    write_posture,
 )
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.march import march
-from primdiffusion.render.view import PosedView
 from support.errors import refused
 from tiny_model import tiny_model
 

@@ -16,8 +16,7 @@ from primdiffusion.commands.frame_drawer import FrameDrawer, map_frame
 from primdiffusion.diffusion.checkpoint import load_checkpoint, read_card
 from primdiffusion.diffusion.codec import ReleasedSlab
 from primdiffusion.diffusion.schedule import released_steps
-from primdiffusion.drawing.draw import draw
-from primdiffusion.drawing.scene import Scene, ViewSettings
+from primdiffusion.drawing.draw import Scene, ViewSettings, draw
 from primdiffusion.files import tensor_file
 from primdiffusion.files.regular_files import FileError
 from primdiffusion.formats.requests import DrawRequest, PosedPerson
@@ -124,9 +123,9 @@ def test_the_engines_frames_and_boxes_show_people_on_the_users_body(person, tmp_
         )  # fmt: skip
         FrameDrawer(torch.device("cpu")).draw(params, lambda *_: None)
         want = draw(Scene(primitives, chart=chart), camera, ViewSettings(view, clip=(0.0, 1e10)))
-        found = map_frame(params.frame, 40, 56).combined
-        assert (want.combined[..., 3] > 0.5).mean() > 0.2
-        assert np.abs(found - want.combined).mean() < 2e-3
+        found = map_frame(params.frame, 40, 56).rgba
+        assert (want.alpha > 0.5).mean() > 0.2
+        assert np.abs(found - want.rgba).mean() < 2e-3
 
 
 def test_no_file_of_ours_holds_any_of_smpl(person, folder):

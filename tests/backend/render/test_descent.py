@@ -11,7 +11,7 @@ from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.people.payloads import orbit_camera
 from primdiffusion.primitives.primitives import Payload
 from primdiffusion.render.descent import LARGEST_CHANGE, DescentSettings, descend, render_view
-from primdiffusion.render.view import PosedView
+from primdiffusion.render.image import PosedView
 from support.errors import refused
 
 SIDE = 3

@@ -7,8 +7,7 @@ import pytest
 import torch
 from PIL import Image
 from primdiffusion.geometry.srgb import decode_srgb, encode_srgb
-from primdiffusion.render.compositing import Rendering
-from primdiffusion.render.image import depth_to_png
+from primdiffusion.render.image import Rendering, depth_to_png
 from support.errors import refused
 
 KNOWN = {0.0: 0.0, 0.0031308: 0.04044994, 0.2140411: 0.5, 0.5: 0.7353570, 1.0: 1.0}

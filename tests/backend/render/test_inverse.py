@@ -12,6 +12,7 @@ from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
 from primdiffusion.people.payloads import fitted_payloads, orbit_camera
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.cpu.march import march_cpu
+from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import (
     BACKGROUND,
     InverseSettings,
@@ -20,7 +21,6 @@ from primdiffusion.render.inverse import (
     fit_payload,
     influence,
 )
-from primdiffusion.render.view import PosedView
 from support.errors import refused
 
 FULL = 200.0

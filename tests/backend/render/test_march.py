@@ -11,9 +11,9 @@ import torch
 from march_scenes import camera_at, one_box, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu.march import march_cpu
 from primdiffusion.render.cuda import march as cuda
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import RELEASED, MarchSettings, Span
 from primdiffusion.render.march import march
 from primdiffusion.render.reference import march_reference

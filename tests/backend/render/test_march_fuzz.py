@@ -9,8 +9,8 @@ import torch
 from primdiffusion.geometry.camera import Camera, look_at
 from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu.march import march_cpu
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span
 from primdiffusion.render.reference import march_reference
 from torch import Tensor

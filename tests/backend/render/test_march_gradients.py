@@ -7,8 +7,8 @@ import torch
 from march_scenes import camera_at, random_boxes
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu.march import march_cpu
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import UNIFORM_MILLIMETRE, MarchSettings, Span
 from primdiffusion.render.reference import march_reference
 from support.errors import refused

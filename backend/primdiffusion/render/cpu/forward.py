@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float32, Int32, Int64, UInt64
 from numpy import ndarray
 
-from primdiffusion.render.compositing import SURFACE_OPACITY
 from primdiffusion.render.cpu.compiled import TILE, index, kernel, part, take
 from primdiffusion.render.cpu.sampling import (
     ENTER,
@@ -26,6 +25,7 @@ from primdiffusion.render.cpu.sampling import (
     tabulate,
     tile_rays,
 )
+from primdiffusion.render.image import SURFACE_OPACITY
 
 CHUNK = 16
 """Lattice points accumulated before compositing: enough to amortise the loop, few enough to stop early."""

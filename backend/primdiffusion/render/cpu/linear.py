@@ -18,7 +18,6 @@ from numpy import ndarray
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu.adjoint import counted_steps
 from primdiffusion.render.cpu.compiled import THREADS, TILE, at_once, index, kernel, on_all_threads, part, take
 from primdiffusion.render.cpu.forward import NEVER
@@ -44,6 +43,7 @@ from primdiffusion.render.cpu.segments import (
     add_transposed_product,
     merge_sample,
 )
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings
 
 DENSITY, OPACITY, COLOUR = 0, 3, 4

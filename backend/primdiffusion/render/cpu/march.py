@@ -17,11 +17,11 @@ from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cpu.adjoint import Gradients, Upstream, adjoin_boxes, weigh_rays
 from primdiffusion.render.cpu.compiled import on_all_threads
 from primdiffusion.render.cpu.forward import Ends, ImageRows, march_tiles
 from primdiffusion.render.cpu.packing import PackedScene, heaviest_first, pack
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span, check_camera, check_scene, check_unbatched, strides_of
 
 LARGEST_PAYLOAD = 256

@@ -17,11 +17,11 @@ from torch.autograd.function import once_differentiable
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives, S
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda import scene as cuda_scene
 from primdiffusion.render.cuda.marcher import prepared
 from primdiffusion.render.cuda.scene import BOX_FIELDS, Packed, Picture, Scene, Shapes, check, launch
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings, Span, check_scene
 
 LANES_OF_SEEDS = 256

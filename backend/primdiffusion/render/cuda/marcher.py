@@ -9,10 +9,10 @@ from torch import Tensor
 
 from primdiffusion.geometry.camera import Camera
 from primdiffusion.primitives.primitives import Primitives
-from primdiffusion.render.compositing import Rendering
 from primdiffusion.render.cuda import graph as cuda_graph
 from primdiffusion.render.cuda import scene as cuda_scene
 from primdiffusion.render.cuda.scene import Packed, Picture, Placed, Plan, Scene, Shapes
+from primdiffusion.render.image import Rendering
 from primdiffusion.render.lattice import MarchSettings
 
 MOST = 4

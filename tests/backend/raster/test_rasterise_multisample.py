@@ -11,8 +11,7 @@ from primdiffusion.capture.reader import as_camera
 from primdiffusion.formats.camera_rig import View, look_at
 from primdiffusion.geometry.srgb import decode_srgb
 from primdiffusion.geometry.textured_mesh import TexturedMesh, TexturedPart
-from primdiffusion.raster.multisample import figure_from_mesh
-from primdiffusion.raster.rasterise import rasterise
+from primdiffusion.raster.rasterise import figure_from_mesh, rasterise
 from support.errors import refused
 
 REST = np.tile(np.eye(4), (24, 1, 1))

@@ -3,7 +3,7 @@
 import math
 
 import torch
-from primdiffusion.render.compositing import composite
+from primdiffusion.render.image import composite
 
 OPACITY = torch.tensor([0.2, 0.0, 0.5, 0.6, 0.9], dtype=torch.float64)
 RGB = torch.eye(3, dtype=torch.float64)[[0, 1, 1, 2, 0]]
