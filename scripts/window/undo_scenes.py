@@ -3,8 +3,8 @@
     ROUNDS=100 python scripts/window/look.py --scenes undo_and_timers
     ROUNDS=50 python scripts/window/look.py --scenes undo_while_generating
 
-The figures of the first are window_rounds, those that went well; window_rounds_among_steps, those of them in which both the motion
-and the result were there before the last step; and window_crashes.
+The figures of the first are window_rounds, those that went well; window_rounds_among_steps, those of them in which both
+the motion and the result were there before the last step; and window_crashes.
 """
 
 from __future__ import annotations
