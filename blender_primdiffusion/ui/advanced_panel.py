@@ -191,15 +191,15 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     except ValueError as error:
         draw_lines(layout, sentence(error), "INFO")
         return
-    for name, text, anchor, draw in (
-        ("show_as", "Show As", "show-as", _draw_representation),
-        ("merge", "Merge for Cycles", "merge-for-cycles", _draw_merge),
-        ("look", "Cycles Material", "cycles-material", _draw_cycles_look),
-        ("facts", "Facts", "", _draw_facts),
+    for name, text, page, section, draw in (
+        ("show_as", "Show As", "rendering", "show-as", _draw_representation),
+        ("merge", "Merge for Cycles", "rendering", "merge-for-cycles", _draw_merge),
+        ("look", "Cycles Material", "rendering", "cycles-material", _draw_cycles_look),
+        ("facts", "Facts", "editing", "facts", _draw_facts),
     ):
         if name == "merge" and not backend_is_named():
             continue
-        body = draw_section(layout, name, text=text, page="rendering" if anchor else "", section=anchor)
+        body = draw_section(layout, name, text=text, page=page, section=section)
         if body is not None:
             draw(body, context, person)
 

@@ -146,8 +146,8 @@ def undo_while_generating(module: str, python: str) -> Steps:
         _check(this, 2)
         press("primdiffusion.variations")
         yield from wait(lambda: queue.request is not None and queue.request.step > 0, 120)
-        _do("primdiffusion.add_handles", human=name)
         _do("primdiffusion.import_motion", human=name, filepath=bvh)
+        _do("primdiffusion.add_handles", human=name)
         counted = [0, 0]
 
         def count(*_: object, counted: list[int] = counted) -> None:
