@@ -1,4 +1,4 @@
-"""The sidebar panel Export, with the operator that makes assets; and .human files: imported, or dropped onto the 3D view."""
+"""The sidebar panel Export, with the operator that makes assets; .human files, imported or dropped onto the 3D view."""
 
 from __future__ import annotations
 

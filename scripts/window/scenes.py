@@ -63,7 +63,8 @@ def newcomer(module: str, python: str) -> Steps:
         for _ in range(2):
             yield {"key": "Escape"}
             yield 0.5
-    press("primdiffusion.import_human", filepath=str(Path(import_module(module).__file__).parent / "gallery/Sample.human"))
+    sample = Path(import_module(module).__file__).parent / "gallery" / "Sample.human"
+    press("primdiffusion.import_human", filepath=str(sample))
     yield from wait(lambda: not queue_of(module).busy, 60)
     yield from sidebar()
     yield from at_rest(module)
