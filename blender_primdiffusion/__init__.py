@@ -17,7 +17,7 @@ def register() -> None:
     """Called by Blender when the extension is enabled.
 
     Raises, before anything is registered, RuntimeError if the other build (the extension or its viewer) is enabled, and
-    ImportError for a Blender whose Python lacks numpy or openvdb, as Debian's may; Blender shows both.
+    ImportError for a Blender whose Python lacks numpy, openvdb or OpenImageIO, as Debian's may; Blender shows both.
     """
     import bpy  # here, so that the backend's client can be imported without bpy
 
@@ -26,10 +26,10 @@ def register() -> None:
             f"{other} is enabled and has the same operators: disable it in Preferences > Add-ons, then enable this one"
         )
     bpy.utils.expose_bundled_modules()
-    if missing := [name for name in ("numpy", "openvdb") if importlib.util.find_spec(name) is None]:
+    if missing := [name for name in ("numpy", "openvdb", "OpenImageIO") if importlib.util.find_spec(name) is None]:
         raise ImportError(
             f"The Python of this Blender lacks {missing[0]}: install it (on Debian and Ubuntu: sudo apt install "
-            "python3-numpy python3-openvdb), or use Blender from blender.org"
+            "python3-numpy python3-openvdb python3-openimageio), or use Blender from blender.org"
         )
     from . import engine, ui  # which import numpy
 

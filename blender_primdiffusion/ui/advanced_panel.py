@@ -191,18 +191,17 @@ def _draw_person(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
     except ValueError as error:
         draw_lines(layout, sentence(error), "INFO")
         return
-    page = "rendering"
-    sections = [
-        (draw_section(layout, "show_as", text="Show As", page=page, section="show-as"), _draw_representation),
-        (draw_section(layout, "look", text="Cycles Material", page=page, section="cycles-material"), _draw_cycles_look),
-        (draw_section(layout, "facts", text="Facts"), _draw_facts),
-    ]
-    if backend_is_named():
-        merge = draw_section(layout, "merge", text="Merge for Cycles", page=page, section="merge-for-cycles")
-        sections.append((merge, _draw_merge))
-    for body, content in sections:
+    for name, text, page, section, draw in (
+        ("show_as", "Show As", "rendering", "show-as", _draw_representation),
+        ("merge", "Merge for Cycles", "rendering", "merge-for-cycles", _draw_merge),
+        ("look", "Cycles Material", "rendering", "cycles-material", _draw_cycles_look),
+        ("facts", "Facts", "editing", "facts", _draw_facts),
+    ):
+        if name == "merge" and not backend_is_named():
+            continue
+        body = draw_section(layout, name, text=text, page=page, section=section)
         if body is not None:
-            content(body, context, person)
+            draw(body, context, person)
 
 
 def _draw_representation(layout: bpy.types.UILayout, _context: bpy.types.Context, person: bpy.types.Object) -> None:

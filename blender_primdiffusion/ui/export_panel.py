@@ -1,5 +1,4 @@
-"""The sidebar panels Export and From File, with the operator that makes assets; and .human files dropped onto the 3D
-view."""
+"""The sidebar panel Export, with the operator that makes assets; .human files, imported or dropped onto the 3D view."""
 
 from __future__ import annotations
 
@@ -9,7 +8,7 @@ from ..backend.requests import sentence
 from ..jobs.assets import HumanAssetJob
 from ..jobs.follow import submit
 from ..jobs.target import HumanTarget, selected_person
-from ..places import INSTALLS_BACKEND, backend_is_named
+from ..places import backend_is_named
 from ..scene.human import humans, proxy_of
 from ..scene.proxy import is_outdated
 from .advanced_panel import draw_representations
@@ -109,18 +108,10 @@ def _draw_assets(layout: bpy.types.UILayout, context: bpy.types.Context) -> None
         draw_job(layout, "human_asset", "primdiffusion.mark_as_asset", "ASSET_MANAGER")
 
 
-class PRIMDIFFUSION_PT_from_file(SidebarPanel, bpy.types.Panel):
+def draw_from_file(layout: bpy.types.UILayout) -> None:
     """Humans from .human files."""
-
-    bl_label = "From File"
-    bl_parent_id = "PRIMDIFFUSION_PT_generate" if INSTALLS_BACKEND else ""
-    bl_order = 2 if INSTALLS_BACKEND else 0
-    bl_options = {"DEFAULT_CLOSED"} if INSTALLS_BACKEND else set()
-    manual_page, manual_section = "export", "human-files"
-
-    def draw(self, _context: bpy.types.Context) -> None:
-        draw_samples(self.layout)
-        draw_job(self.layout, "import_human", "primdiffusion.import_human", "IMPORT")
+    draw_samples(layout)
+    draw_job(layout, "import_human", "primdiffusion.import_human", "IMPORT")
 
 
 class PRIMDIFFUSION_FH_human(bpy.types.FileHandler):

@@ -13,7 +13,7 @@ from ..jobs.memory import device_line
 from ..jobs.queue import queue
 from ..scene.human import humans
 from .drawing import BackendPanel, draw_job, draw_lines, draw_section, property_columns
-from .export_panel import draw_as_mesh
+from .export_panel import draw_as_mesh, draw_from_file
 from .generate_settings import CATEGORIES, SCALARS, draw_attributes, last_seed, random_seed, sampling, seed_property
 from .manual import draw_manual_button
 from .menus import draw_samples
@@ -113,9 +113,12 @@ class PRIMDIFFUSION_PT_generate(BackendPanel, bpy.types.Panel):
             draw_next_step(layout, context.scene)
         if ready:
             draw_as_mesh(layout, context)
-        if (body := draw_section(layout, "attributes", text="Attributes")) is not None:
+        page, section = "first_human", "variations"
+        if (body := draw_section(layout, "attributes", text="Attributes", page=page, section="attributes")) is not None:
             draw_attributes(body, settings.attributes)
             body.prop(settings, "guidance")
-        page, section = "first_human", "variations"
         if (body := draw_section(layout, "variations", text="Variations", page=page, section=section)) is not None:
             draw_variations(body, context)
+        page, section = "export", "human-files"
+        if (body := draw_section(layout, "from_file", text="From File", page=page, section=section)) is not None:
+            draw_from_file(body)

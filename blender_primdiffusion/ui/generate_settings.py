@@ -132,9 +132,11 @@ class PRIMDIFFUSION_PG_attributes(bpy.types.PropertyGroup):
     hair: _menu_property("hair")
     hat: _menu_property("hat")
     use_height: bpy.props.BoolProperty(name="Use Height", description="Generate a body of this height")
-    height: bpy.props.FloatProperty(name="Height", description="Metres", default=1.7, min=0.5, max=2.5, step=1)
+    height: bpy.props.FloatProperty(name="Height (m)", description="Metres", default=1.7, min=0.5, max=2.5, step=1)
     use_weight: bpy.props.BoolProperty(name="Use Weight", description="Generate a body of this weight")
-    weight: bpy.props.FloatProperty(name="Weight", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100)
+    weight: bpy.props.FloatProperty(
+        name="Weight (kg)", description="Kilograms", default=70.0, min=10.0, max=300.0, step=100
+    )
 
 
 def chosen_attributes(group: PRIMDIFFUSION_PG_attributes) -> Attributes:
@@ -158,7 +160,7 @@ def draw_attributes(layout: bpy.types.UILayout, group: PRIMDIFFUSION_PG_attribut
             layout.prop(group, name)
     for name in SCALARS:
         if name in vocabulary.scalars:
-            row = layout.row(align=True, heading=title(name))
+            row = layout.row(align=True, heading=group.bl_rna.properties[name].name)
             row.prop(group, f"use_{name}", text="")
             number = row.row()
             number.enabled = getattr(group, f"use_{name}")

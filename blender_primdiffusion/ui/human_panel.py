@@ -10,6 +10,7 @@ from ..jobs.volumes import faults
 from ..places import backend_is_named
 from .drawing import SidebarPanel, draw_lines, draw_section
 from .edit_panel import draw_edit
+from .export_panel import draw_from_file
 from .motion_panel import draw_motion
 from .on_person import may_have_joints
 from .pose_panel import draw_pose
@@ -25,6 +26,8 @@ class PRIMDIFFUSION_PT_human(SidebarPanel, bpy.types.Panel):
 
     def draw(self, context: bpy.types.Context) -> None:
         layout, person = self.layout, None
+        if not backend_is_named():  # nor is there the panel Generate
+            draw_from_file(layout)
         if faults.text:
             draw_lines(layout, faults.text, "ERROR")
         try:

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import bpy
 
-from ..places import backend_is_named
+from ..places import EXTENSION, backend_is_named
+from .preferences import known
 
 _IMPORT, _EXPORT = "PrimDiffusion Human (.human)", "PrimDiffusion Human (.human, .glb, .ply, .vdb)"
-
-
 FOLDER = Path(__file__).resolve().parents[1] / "gallery"
 
 
@@ -29,9 +28,12 @@ class PRIMDIFFUSION_MT_add(bpy.types.Menu):
     def draw(self, _context: bpy.types.Context) -> None:
         layout = self.layout
         layout.operator_context = "INVOKE_DEFAULT"
-        if backend_is_named():
+        if backend_is_named() and known().usable:
             layout.operator("primdiffusion.generate", icon="OUTLINER_OB_ARMATURE")
             layout.operator("primdiffusion.choose_picture", text="Human from Picture...", icon="IMAGE_DATA")
+        elif backend_is_named():
+            text = "Generate Human: Set Up Backend..."
+            layout.operator("preferences.addon_show", text=text, icon="PREFERENCES").module = EXTENSION
         draw_samples(layout)
         layout.operator("primdiffusion.import_human", text="Import Human File...", icon="IMPORT")
 

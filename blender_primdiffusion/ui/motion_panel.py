@@ -112,7 +112,7 @@ def _draw_action(layout: bpy.types.UILayout, armature: bpy.types.Object) -> None
         row.label(text=label)
         row.label(text=text, translate=False)
     if action_curves(armature) is not None:
-        layout.prop(armature.primdiffusion_human, "loop", toggle=True, icon="FILE_REFRESH")
+        layout.prop(armature.primdiffusion_human, "loop")
 
 
 def facts_of(action: bpy.types.Action) -> dict[str, str]:

@@ -19,6 +19,7 @@ from ..scene.cycles import fit_cycles_to_volumes, frame_box, humans_extent, new_
 from ..scene.human import human_of, humans
 from ..scene.representation import in_viewport, representation_of
 from .drawing import SidebarPanel, draw_job_state, draw_lines, property_columns
+from .preferences import known
 
 _FROM_EEVEE = frozenset(
     {
@@ -132,7 +133,7 @@ class PRIMDIFFUSION_OT_set_up_engine(Reporting, bpy.types.Operator):
             scene.cycles.max_bounces = bounces
         scene.render.engine = self.engine
         _plain_colours(scene)
-        return _merge_all(self, context) if self.engine == "CYCLES" and backend_is_named() else {"FINISHED"}
+        return _merge_all(self, context) if self.engine == "CYCLES" and known().usable else {"FINISHED"}
 
 
 def _merge_all(operator: bpy.types.Operator, context: bpy.types.Context) -> set[str]:
@@ -197,7 +198,7 @@ def how_shown(scene: bpy.types.Scene) -> str:
 def draw_next_step(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     """The button that leads to a picture: an engine that shows humans as they are, a camera, the render."""
     engine = scene.render.engine
-    if engine not in (ENGINE, "CYCLES") and not backend_is_named():
+    if engine not in (ENGINE, "CYCLES") and not known().usable:
         props = layout.operator("primdiffusion.set_up_engine", text="Switch to Cycles", icon="SHADING_TEXTURE")
         props.engine = "CYCLES"
     elif engine not in (ENGINE, "CYCLES"):
@@ -213,7 +214,7 @@ def draw_engines(layout: bpy.types.UILayout, scene: bpy.types.Scene) -> None:
     engine, line = scene.render.engine, how_shown(scene)
     row = layout.row(align=True)
     for (name, label, _), icon in zip(_ENGINES, ("SHADING_RENDERED", "SHADING_TEXTURE"), strict=True):
-        if name != ENGINE or backend_is_named():
+        if name != ENGINE or known().usable:
             row.operator("primdiffusion.set_up_engine", text=label, depress=engine == name, icon=icon).engine = name
     draw_lines(layout, line, "INFO")
 

@@ -230,7 +230,9 @@ def _columns(context: bpy.types.Context) -> tuple[int, float]:
 
 
 def _grid(layout: bpy.types.UILayout, columns: int) -> bpy.types.UILayout:
-    return layout.grid_flow(row_major=True, columns=columns, even_columns=True, even_rows=True, align=False)
+    grid = layout.grid_flow(row_major=True, columns=columns, even_columns=True, even_rows=True, align=False)
+    grid.use_property_split = False  # a seed stands on its button, not beside it
+    return grid
 
 
 def _draw_progress(layout: bpy.types.UILayout, columns: tuple[int, float], job: VariationsJob) -> None:

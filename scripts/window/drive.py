@@ -27,10 +27,11 @@ def play() -> Iterator[float]:
     """Play all scenes; yields seconds to wait between steps."""
     import scenes
     from setting_up import set_up_real
-    from undo_scenes import undo_and_timers
+    from undo_scenes import undo_and_timers, undo_while_generating
     from viewer_scene import viewer
 
-    on_request = {"set_up_real": set_up_real, "undo_and_timers": undo_and_timers, "viewer": viewer}
+    scenes_on_request = (set_up_real, undo_and_timers, undo_while_generating, viewer)
+    on_request = {scene.__name__: scene for scene in scenes_on_request}
     asked_for = {name: scene for name, scene in on_request.items() if name in SCENES}
     yield 2.0
     install()

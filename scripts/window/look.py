@@ -7,8 +7,8 @@ Builds the zip, starts Xvfb (Debian's package xvfb) and Blender with software Op
 plays the scenes of `scenes.py` and requests screenshots of the whole screen (taken by ImageMagick's import) and clicks
 (made by xdotool). Next to each NAME.png, NAME.json gives the position of the sidebar. The exit code is Blender's, which
 is not 0 if a scene failed. A chroot needs /proc, /dev, /tmp/.X11-unix, this checkout and the interpreter's environment
-mounted at their own paths; Debian's packages are blender, python3-openvdb, python3-cattr, python3-numpy,
-python3-requests, libgl1 and libgl1-mesa-dri.
+mounted at their own paths; Debian's packages are blender, python3-openvdb, python3-openimageio, python3-cattr,
+python3-numpy, python3-requests, libgl1 and libgl1-mesa-dri.
 """
 
 from __future__ import annotations

@@ -8,6 +8,7 @@ from __future__ import annotations
 import tempfile
 import time
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 
 import bpy
@@ -48,6 +49,30 @@ def set_up(module: str, python: str) -> Steps:
     with bpy.context.temp_override(window=window):
         bpy.ops.wm.window_close()
     yield 0.5
+
+
+def newcomer(module: str, python: str) -> Steps:
+    """Blender's own ways to a human: Shift-A, F3, File > Import; F12 without a backend; the status bar during a job."""
+    yield from begin(module, "")
+    yield {"point": [500, 700]}
+    for name, keys in {"add": ("shift+a", *"hum"), "search": ("F3", *"generate")}.items():
+        for key in keys:
+            yield {"key": key}
+            yield 0.5
+        yield f"newcomer_{name}"
+        for _ in range(2):
+            yield {"key": "Escape"}
+            yield 0.5
+    sample = Path(import_module(module).__file__).parent / "gallery" / "Sample.human"
+    press("primdiffusion.import_human", filepath=str(sample))
+    yield from wait(lambda: not queue_of(module).busy, 60)
+    yield from sidebar()
+    yield from at_rest(module)
+    yield "newcomer_sample"
+    press("primdiffusion.set_up_engine")
+    yield {"key": "F12"}
+    yield 5.0
+    yield "newcomer_f12"
 
 
 def first_human(module: str, python: str) -> Steps:
@@ -317,6 +342,7 @@ GENERATE_BUTTON_PX = 118
 
 SCENES: dict[str, Callable[[str, str], Steps]] = {
     "set_up": set_up,
+    "newcomer": newcomer,
     "first_human": first_human,
     "visible_humans": visible_humans,
     "generate": generate,

@@ -1,9 +1,10 @@
 """Undo and redo by key, twenty at a time, while timers change data. Played on request: 100 rounds take an hour.
 
     ROUNDS=100 python scripts/window/look.py --scenes undo_and_timers
+    ROUNDS=50 python scripts/window/look.py --scenes undo_while_generating
 
-The figures are window_rounds, those that went well; window_rounds_among_steps, those of them in which both the motion
-and the result were there before the last step; and window_crashes.
+The figures of the first are window_rounds, those that went well; window_rounds_among_steps, those of them in which both
+the motion and the result were there before the last step; and window_crashes.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from __future__ import annotations
 import dataclasses
 import os
 from importlib import import_module
+from pathlib import Path
 
 import bpy
 from panels import view
 from press import Steps, press, wait
-from start import FIRST_SEED, armatures, people_file, queue_of, select, with_people
+from start import FIRST_SEED, armatures, cancel_all, people_file, queue_of, select, with_people
 
 ROUNDS = int(os.environ.get("ROUNDS", "100"))
 KEYS = 20
@@ -77,12 +79,8 @@ class Round:
 
     def _add_motion(self) -> None:
         """As a script of the user would, with an undo step."""
-        window, area = view()
-        region = next(region for region in area.regions if region.type == "WINDOW")
-        motion = _MOTIONS[self.number % len(_MOTIONS)]
-        with bpy.context.temp_override(window=window, area=area, region=region):
-            bpy.ops.primdiffusion.add_motion("EXEC_DEFAULT", True, motion=motion)
-            self.moving = bpy.context.object.name
+        _do("primdiffusion.add_motion", motion=_MOTIONS[self.number % len(_MOTIONS)])
+        self.moving = bpy.context.view_layer.objects.active.name
         self.motion = self.steps
 
     def _import(self) -> None:
@@ -117,6 +115,80 @@ def undo_and_timers(module: str, python: str) -> Steps:
         among += this.ready < this.steps and this.motion < this.steps
         print(this, flush=True)
         yield {"figures": {"window_rounds": number + 1, "window_rounds_among_steps": among}}
+
+
+def undo_while_generating(module: str, python: str) -> Steps:
+    """Shift-D, Alt-D, Delete, IK handles and an imported BVH file, undone and redone while variations are generated.
+
+    The figures are window_generating_rounds and window_keys_while_generating: steps that Blender had handled by then.
+    """
+    yield from with_people(module, python, FIRST_SEED)
+    path, bvh = str(people_file(module)), str(Path(bpy.app.tempdir) / "walk.bvh")
+    _do("primdiffusion.add_motion", motion="WALK")
+    _do("export_anim.bvh", filepath=bvh, frame_start=1, frame_end=20)
+    queue, total = queue_of(module), 0
+    for number in range(ROUNDS):
+        if number % FRESH_EVERY == 0:
+            bpy.ops.wm.open_mainfile(filepath=path, load_ui=False)
+            yield 1.0
+            settings = bpy.context.scene.primdiffusion_variations
+            settings.count, settings.quality = "4", "DRAFT"
+        select(armatures()[0])
+        this, name = Round(module, number), armatures()[0].name
+        yield {"point": _middle_of_the_view()}
+        for key in ("shift+d", "alt+d"):  # both are dragged until confirmed
+            yield {"key": key}
+            yield 0.5
+            yield {"key": "Return"}
+            yield 0.5
+        yield {"key": "Delete"}
+        yield 0.5
+        _check(this, 2)
+        press("primdiffusion.variations")
+        yield from wait(lambda: queue.request is not None and queue.request.step > 0, 120)
+        _do("primdiffusion.import_motion", human=name, filepath=bvh)
+        _do("primdiffusion.add_handles", human=name)
+        counted = [0, 0]
+
+        def count(*_: object, counted: list[int] = counted) -> None:
+            counted[queue.busy] += 1
+
+        handlers = (bpy.app.handlers.undo_post, bpy.app.handlers.redo_post)
+        for handler in handlers:
+            handler.append(count)
+        try:
+            for keys in ("ctrl+z", "ctrl+shift+z", "ctrl+z", "ctrl+shift+z"):
+                yield {"key": keys, "times": KEYS}
+                yield REST_S
+            before = -1
+            while sum(counted) != before:
+                before = sum(counted)
+                yield REST_S
+        finally:
+            for handler in handlers:
+                handler.remove(count)
+        total += counted[True]
+        print(f"round {number}: {counted[True]} steps while generating, {counted[False]} after it", flush=True)
+        _check(this, 2)
+        if number % FRESH_EVERY == 0:
+            yield f"undo_while_generating_{number:02}"
+        if number % 2:
+            yield from cancel_all(module)
+        else:
+            yield from wait(lambda: not queue.busy, 300)
+        yield {"key": "ctrl+z", "times": KEYS}
+        yield REST_S
+        _check(this)
+        yield {"figures": {"window_generating_rounds": number + 1, "window_keys_while_generating": total}}
+
+
+def _do(operator: str, **given: object) -> None:
+    """An operator with its undo step, as a button does it."""
+    window, area = view()
+    region = next(region for region in area.regions if region.type == "WINDOW")
+    room, name = operator.split(".")
+    with bpy.context.temp_override(window=window, area=area, region=region):
+        getattr(getattr(bpy.ops, room), name)("EXEC_DEFAULT", True, **given)
 
 
 def _play(this: Round) -> Steps:

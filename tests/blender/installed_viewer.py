@@ -67,7 +67,7 @@ try:
     press.generate(seed=7)
 except RuntimeError as error:
     report["generate"] = str(error)
-panels = ("generate", "from_file", "human", "render")
+panels = ("generate", "human", "render")
 polls = {name: getattr(getattr(bpy.types, f"PRIMDIFFUSION_PT_{name}"), "poll", None) for name in panels}
 report["panels"] = [name for name, poll in polls.items() if poll is None or poll(bpy.context)]
 report["rejected"] = []

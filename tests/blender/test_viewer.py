@@ -122,7 +122,7 @@ def test_generate_without_a_backend_says_in_one_sentence_what_to_do(used):
 
 def test_what_needs_a_backend_is_not_shown_and_says_so_when_a_script_asks(used):
     report, folder = used
-    assert report["panels"] == ["from_file", "human", "render"]
+    assert report["panels"] == ["human", "render"]
     said = [text.removeprefix("Error: ").strip().rstrip(".").lower() for text in report["rejected"]]
     assert said == [NOT_INSTALLED.lower()] * 2
     assert not (folder / "mesh.glb").exists()

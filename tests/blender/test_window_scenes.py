@@ -37,6 +37,7 @@ def test_scenes_open_sections_that_panels_have():
     sources = "".join(path.read_text(encoding="utf-8") for path in (ROOT / PACKAGE / "ui").glob("*_panel.py"))
     there = set(re.findall(r'draw_section\(\w+(?:\.\w+)?, "(\w+)"', sources))
     there |= {name.lower() for name in re.findall(r', "(\w+)", "\w+", "\w*", draw_\w+\)', sources)}
+    there |= set(re.findall(r'\("(\w+)", "[\w ]+", "\w+", "[\w-]+", _draw_\w+\)', sources))
     there |= {f"captures_{name.lower()}" for name in re.findall(r'^        \("(\w+)", [(_]', sources, re.MULTILINE)}
     opened = {name for (name,) in found(r'"PRIMDIFFUSION_PT_\w+/(\w+)"')}
     assert opened

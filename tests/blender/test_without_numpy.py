@@ -1,4 +1,4 @@
-"""A Blender without numpy, as Debian may package it: enabling the extension says what to install."""
+"""A Blender without numpy or OpenImageIO, as Debian may package it: enabling the extension says what to install."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ ROOT = Path(__file__).parents[2]
 CHILD = """
 import sys
 import bpy, numpy  # numpy first, or it could not be hidden
-for name in [name for name in sys.modules if name.partition(".")[0] == "numpy"]:
+bpy.utils.expose_bundled_modules()
+import OpenImageIO
+lacking = sys.argv[1]
+for name in [lacking, *(name for name in sys.modules if name.startswith(lacking + "."))]:
     sys.modules[name] = None  # importing it fails
 before = set(dir(bpy.types))
 import blender_primdiffusion
@@ -26,9 +29,10 @@ assert set(dir(bpy.types)) == before
 """
 
 
-def test_enabling_it_names_the_package_and_debians_and_registers_nothing():
-    done = subprocess.run([sys.executable, "-c", CHILD], cwd=ROOT, capture_output=True, text=True, check=False)
+@pytest.mark.parametrize("lacking", ["numpy", "OpenImageIO"])
+def test_enabling_it_names_the_package_and_debians_and_registers_nothing(lacking):
+    done = subprocess.run([sys.executable, "-c", CHILD, lacking], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     said = next(line for line in done.stdout.splitlines() if line.startswith("REFUSED"))
-    assert "lacks numpy" in said
-    assert "sudo apt install python3-numpy python3-openvdb" in said
+    assert f"lacks {lacking}" in said
+    assert "sudo apt install python3-numpy python3-openvdb python3-openimageio" in said

@@ -6,12 +6,13 @@ import bpy
 import pytest
 from jobs_driven import shown
 
-from blender_primdiffusion.ui import menus
+from blender_primdiffusion.ui import menus, preferences
 
 
-def offered(monkeypatch, named: bool) -> list[str]:
-    """Operators of Add > Human, with and without a Python that runs the backend."""
+def offered(monkeypatch, named: bool, state: str = "ready") -> list[str]:
+    """Operators of Add > Human, with and without a backend, and a Python that runs it."""
     monkeypatch.setattr(menus, "backend_is_named", lambda: named)
+    monkeypatch.setattr(menus, "known", lambda: preferences.Known(state, ""))
     return shown(menus.PRIMDIFFUSION_MT_add, bpy.context)
 
 
@@ -20,6 +21,8 @@ def test_add_human_offers_what_works_with_and_without_a_backend(addon, monkeypat
     always = ["primdiffusion.import_human"] * 2  # a sample, a file
     with_backend = ["primdiffusion.generate", "primdiffusion.choose_picture"]
     assert offered(monkeypatch, named) == (with_backend + always if named else always)
+    unready = offered(monkeypatch, named, "absent")
+    assert unready == (["preferences.addon_show", *always] if named else always)
 
 
 def test_the_entries_come_and_go_with_the_extension(addon):

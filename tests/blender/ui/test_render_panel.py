@@ -22,7 +22,7 @@ from blender_primdiffusion.scene.human import MARK, humans
 from blender_primdiffusion.scene.merged import merged_of, merged_state
 from blender_primdiffusion.scene.representation import representation_of, show_in_viewport
 from blender_primdiffusion.scene.splats import SPLATS_AVAILABLE
-from blender_primdiffusion.ui import advanced_panel, render_panel
+from blender_primdiffusion.ui import advanced_panel, preferences, render_panel
 
 ops = bpy.ops.primdiffusion
 
@@ -204,6 +204,13 @@ def test_setting_up_cycles_leaves_camera_world_and_bounces_between_objects(perso
     assert ops.set_up_engine() == {"FINISHED"}
     assert (scene.render.engine, scene.camera) == ("PRIMDIFFUSION", camera)
     scene.render.engine = "CYCLES"
+
+
+def test_before_the_backend_is_set_up_cycles_alone_is_offered_and_nothing_is_merged(person, monkeypatch):
+    monkeypatch.setattr(render_panel, "known", lambda: preferences.Known("absent", ""))
+    assert shown(render_panel.PRIMDIFFUSION_PT_render, bpy.context).count("primdiffusion.set_up_engine") == 1
+    assert ops.set_up_engine(engine="CYCLES") == {"FINISHED"}
+    assert merged_of(person) is None
 
 
 def test_the_panel_says_who_draws_humans(person):
