@@ -27,6 +27,7 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import default_frames
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.reconstruction.posture_prior import CameraPrior, unlikeliness
 from primdiffusion.render.inverse import BACKGROUND
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.render.view import PosedView
@@ -41,8 +42,8 @@ JOINT_STD = torch.tensor(
     [math.radians(_DEGREES[name.removeprefix("left_").removeprefix("right_")]) for name in JOINT_NAMES]
 )
 """Standard deviation of each joint's rotation from the start, radians; the pelvis turns the whole body."""
-SIDEWAYS_STD_M, DEPTH_STD, FOCAL_STD = 0.05, 0.1, 0.1
-"""Standard deviations of the position across the line of sight, and of the logarithms of distance and focal length."""
+SIDEWAYS_STD_M, DEPTH_STD = 0.05, 0.1
+"""Standard deviations of the position across the line of sight, and of the logarithm of the distance."""
 EVIDENCE = 1500.0
 """Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
 RATE = 0.15
@@ -85,15 +86,17 @@ def each(records: Record) -> Iterator[Record]:
 class PostureFit:
     """A posture on its way from where it started."""
 
-    def __init__(self, start: Posture, shapes: ShapePrior, tightness: float = 1.0) -> None:
+    def __init__(self, start: Posture, shapes: ShapePrior, cameras: CameraPrior, tightness: float = 1.0) -> None:
         """`tightness` divides the standard deviations of joints: above 1 where the pose is known well."""
-        self._start, self._shapes = start, shapes
+        self._start, self._shapes, self._cameras = start, shapes, cameras
         self._joint_std = JOINT_STD[:, None] / tightness
         count = len(start.pose.translation)
         self._turn = torch.zeros(count, len(JOINT_NAMES), 3)
         self._move = torch.zeros(count, 3)
         """Right, down, and the logarithm of the distance."""
         self._lens = torch.zeros(count)
+        self._tilt = torch.zeros(count, 2)
+        """Pitch and roll."""
         self._shape = torch.linalg.solve_triangular(
             shapes.scale, (start.betas - shapes.bias)[:, None], upper=False
         )[:, 0].clone()  # fmt: skip
@@ -115,7 +118,7 @@ class PostureFit:
         `targets` are of one size, and their cameras those of the posture so far, scaled; their frames do not count.
         `on_step` is called after each step; an exception that it raises cancels.
         """
-        unknowns = [self._turn, self._move, self._lens, self._shape]
+        unknowns = [self._turn, self._move, self._lens, self._tilt, self._shape]
         first, cameras = targets[0].camera, self.posture().camera
         scale = float(first.intrinsics[0, 0] / cameras.intrinsics[0, 0, 0])
         pictures = [_encoded(*target.rgba.split((3, 1), -1)) for target in targets]
@@ -130,7 +133,7 @@ class PostureFit:
             seen = zip(posture.frames(), each(resized(posture.camera, scale, first)), pictures, strict=True)
             errors = [_difference(frames, payload, camera, picture, blur) for frames, camera, picture in seen]
             prior = torch.cat([value.flatten() for value in unknowns]).square().sum() / 2
-            loss = EVIDENCE * torch.stack(errors).sum() + prior
+            loss = EVIDENCE * torch.stack(errors).sum() + prior + self._unlikeliness(posture)
             loss.backward()
             optimiser.step()
             schedule.step()
@@ -140,21 +143,32 @@ class PostureFit:
             value.requires_grad_(False)
 
     def _posture(self) -> Posture:
-        start, log_focal, log_depth = self._start, FOCAL_STD * self._lens, DEPTH_STD * self._move[:, 2]
+        start, log_focal = self._start, self._cameras.log_focal * self._lens
+        log_depth = DEPTH_STD * self._move[:, 2]
         extrinsics = start.camera.world_to_camera
         pelvis = default_body().shape(start.betas).joints[0] + start.pose.translation
         before = (extrinsics[:, :, :3] @ pelvis[:, :, None])[..., 0] + extrinsics[:, :, 3]
         # A longer lens from farther away shows the same size, which separates focal length from distance.
         sideways = before[:, :2] * log_depth.exp()[:, None] + SIDEWAYS_STD_M * self._move[:, :2]
         place = torch.cat([sideways, (before[:, 2] * (log_depth + log_focal).exp())[:, None]], 1)
-        pelvis = ((place - extrinsics[:, :, 3])[:, None] @ extrinsics[:, :, :3])[:, 0]
+        # A tilted camera stays where it is. The body moves to the same place in the picture, but keeps its own lean.
+        tilt = self._tilt * self._tilt.new_tensor(self._cameras.tilt)
+        turn = axis_angle_to_matrix(torch.stack([tilt[:, 0], torch.zeros_like(tilt[:, 0]), tilt[:, 1]], 1))
+        translation = (turn @ extrinsics[:, :, 3:])[..., 0]
+        extrinsics = torch.cat([turn @ extrinsics[:, :, :3], translation[..., None]], -1)
+        pelvis = ((place - translation)[:, None] @ extrinsics[:, :, :3])[:, 0]
         limit = torch.maximum(self._shapes.limit, start.betas.abs())
         betas = (self._shapes.bias + self._shapes.scale @ self._shape).clamp(-limit, limit)
         rotation = start.pose.joint_rotation @ axis_angle_to_matrix(self._turn * self._joint_std)
         pose = BodyPose(rotation, pelvis - default_body().shape(betas).joints[0])
         focal = start.camera.intrinsics[..., :2] * log_focal.exp()[:, None, None]
-        camera = dataclasses.replace(start.camera, intrinsics=torch.cat([focal, start.camera.intrinsics[..., 2:]], -1))
+        intrinsics = torch.cat([focal, start.camera.intrinsics[..., 2:]], -1)
+        camera = dataclasses.replace(start.camera, intrinsics=intrinsics, world_to_camera=extrinsics)
         return Posture(pose, betas, camera)
+
+    def _unlikeliness(self, posture: Posture) -> Float[Tensor, ""]:
+        height = posture.camera.position[:, 1] if self._cameras.held else None
+        return unlikeliness(default_body().shape(posture.betas), posture.pose, height)
 
 
 def resized(camera: Camera, scale: float, like: Camera) -> Camera:
