@@ -125,7 +125,7 @@ def drawn(assets, number: int, folder: Path) -> Case:
     straight = srgb_bytes(np.where(alpha > 0, seen.rgb / np.maximum(alpha, 1e-3), 0.1).clip(0, 1))
     exif, path = Image.Exif(), folder / f"{number}.png"
     if number % 2:
-        exif.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base.FocalLengthIn35mmFilm] = round(lens)
+        exif[ExifTags.IFD.Exif] = {ExifTags.Base.FocalLengthIn35mmFilm: round(lens)}
     picture = Image.fromarray(np.concatenate([straight, (255 * alpha).round().astype(np.uint8)], -1))
     picture.save(path, exif=exif)
     return Case(read_photographs([path])[0], posed, view, pitch)
