@@ -49,16 +49,8 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import Human, place, pose_body
 from primdiffusion.reconstruction.from_captures import reconstruct
-from primdiffusion.reconstruction.from_pictures import (
-    POSE_FILE_TIGHTNESS,
-    UNKNOWN_LENS_STD,
-    Start,
-    fit_posture_in,
-    person_in,
-    start_of,
-)
+from primdiffusion.reconstruction.from_pictures import POSE_FILE_TIGHTNESS, Start, fit_posture_in, person_in, start_of
 from primdiffusion.reconstruction.posture_fit import Posture
-from primdiffusion.reconstruction.posture_prior import CameraPrior
 from primdiffusion.reconstruction.posture_start import framed, views_of
 from primdiffusion.render.march import march
 from record import command_line, report
@@ -172,7 +164,7 @@ def given(case: Case, photograph: Photograph, model: DiffusionModel, fault: Faul
     rotation = torch.cat([turn @ rotation[:1], rotation[1:]])
     pose, betas = BodyPose(rotation[None], torch.zeros(1, 3)), model.shapes.bias.clone()
     camera = framed([photograph], pose, betas, [photograph.lens()])
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, False, CameraPrior(UNKNOWN_LENS_STD))
+    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=False, tilted=True)
 
 
 def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, seed: int) -> tuple[float, float]:

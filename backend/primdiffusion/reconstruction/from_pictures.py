@@ -11,8 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import torch
-
 from primdiffusion.capture.conditioning import CapturedPerson
 from primdiffusion.capture.photograph import Photograph, read_photographs, rgba_of
 from primdiffusion.capture.reader import Views
@@ -22,7 +20,6 @@ from primdiffusion.reconstruction.from_captures import PersonComponents, targets
 from primdiffusion.reconstruction.posture_file import read_cameras, read_posture
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, outline_error
 from primdiffusion.reconstruction.posture_fit import overlap as overlap_of
-from primdiffusion.reconstruction.posture_prior import PITCH_STD, ROLL_STD, CameraPrior
 from primdiffusion.reconstruction.posture_start import (
     STANDING_ARMS,
     before_cameras,
@@ -50,8 +47,6 @@ OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
 LEAST_OVERLAP = 0.8
 """Intersection over union of the human and the mask; of fits that look right it is above 0.9."""
-KNOWN_LENS_STD, UNKNOWN_LENS_STD = 0.03, 0.25
-"""Standard deviations of the logarithm of a focal length."""
 POSE_FILE_TIGHTNESS = 2.0
 """Poses of files are known twice as well as a standing body."""
 
@@ -66,7 +61,8 @@ class Start:
     """See `PostureFit`."""
     complete: bool
     """Pose and cameras are those of files."""
-    cameras: CameraPrior
+    tilted: bool
+    """See `PostureFit`."""
 
 
 def person_in_pictures(
@@ -128,27 +124,19 @@ def start_of(
     Raises FileNotFoundError, and ValueError for files that are no poses or cameras, or not one for each picture.
     """
     sizes = [(photograph.width, photograph.height) for photograph in photographs]
-    views = None if cameras_path is None else read_cameras(cameras_path, sizes)
-    if pose_path is None:
-        return Start(_standing(photographs, model, views), 1.0, False, _prior(photographs, views))
-    known = read_posture(pose_path, sizes)
+    known = None if pose_path is None else read_posture(pose_path, sizes)
+    views = known and known.views if cameras_path is None else read_cameras(cameras_path, sizes)
+    tilted = views is None or len(views) == 1  # cameras of several pictures belong together
+    if known is None:
+        return Start(_standing(photographs, model, views), 1.0, complete=False, tilted=tilted)
     pose = repeated(known.pose, len(photographs))
     betas = model.shapes.bias.clone() if known.betas is None else known.betas
-    views = known.views if views is None else views
     if views is None:
         pose = turned_to_camera(pose)
         camera = framed(photographs, pose, betas, [photograph.lens() for photograph in photographs])
     else:
         camera = cameras_of(photographs, views)
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, views is not None, _prior(photographs, views))
-
-
-def _prior(photographs: Sequence[Photograph], views: Sequence[View] | None) -> CameraPrior:
-    """One picture's camera may be tilted otherwise than stated; those of several pictures belong together."""
-    if views is not None:
-        return CameraPrior(KNOWN_LENS_STD, (PITCH_STD, ROLL_STD) if len(views) == 1 else (0.0, 0.0), held=False)
-    stated = [KNOWN_LENS_STD if photograph.focal else UNKNOWN_LENS_STD for photograph in photographs]
-    return CameraPrior(torch.tensor(stated))
+    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=views is not None, tilted=tilted)
 
 
 def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: Sequence[View] | None) -> Posture:
@@ -172,7 +160,7 @@ def fit_posture_in(
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
     """
     components = PersonComponents.of(model)
-    fit, people = PostureFit(start.posture, model.shapes, start.cameras, start.tightness), components.everyone()
+    fit, people = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted), components.everyone()
     for side, stage, coefficient_steps in ROUNDS:
         payload = components.payload(components.coefficients(people))
         fit.refine(payload, _targets(photographs, fit.posture(), side), stage, on_step)

@@ -27,7 +27,7 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import default_frames
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.reconstruction.posture_prior import CameraPrior, unlikeliness
+from primdiffusion.reconstruction.posture_prior import TILT_STD, unusual
 from primdiffusion.render.inverse import BACKGROUND
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.render.view import PosedView
@@ -42,8 +42,10 @@ JOINT_STD = torch.tensor(
     [math.radians(_DEGREES[name.removeprefix("left_").removeprefix("right_")]) for name in JOINT_NAMES]
 )
 """Standard deviation of each joint's rotation from the start, radians; the pelvis turns the whole body."""
-SIDEWAYS_STD_M, DEPTH_STD = 0.05, 0.1
-"""Standard deviations of the position across the line of sight, and of the logarithm of the distance."""
+SIDEWAYS_STD_M, DEPTH_STD, FOCAL_STD = 0.05, 0.1, 0.1
+"""Standard deviations of the position across the line of sight, and of the logarithms of distance and focal length."""
+NEEDED = 3.0
+"""Standard deviations off balance from which the pose of a start is taken to need it: a jump, a seat, a bow."""
 EVIDENCE = 1500.0
 """Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
 RATE = 0.15
@@ -86,20 +88,25 @@ def each(records: Record) -> Iterator[Record]:
 class PostureFit:
     """A posture on its way from where it started."""
 
-    def __init__(self, start: Posture, shapes: ShapePrior, cameras: CameraPrior, tightness: float = 1.0) -> None:
-        """`tightness` divides the standard deviations of joints: above 1 where the pose is known well."""
-        self._start, self._shapes, self._cameras = start, shapes, cameras
+    def __init__(self, start: Posture, shapes: ShapePrior, tightness: float = 1.0, *, tilted: bool = True) -> None:
+        """`tightness` divides the standard deviations of joints: above 1 where the pose is known well.
+
+        `tilted`: pitch, roll and height of the cameras are unknown; otherwise those of the start are true.
+        """
+        self._start, self._shapes, self._tilted = start, shapes, tilted
         self._joint_std = JOINT_STD[:, None] / tightness
         count = len(start.pose.translation)
         self._turn = torch.zeros(count, len(JOINT_NAMES), 3)
         self._move = torch.zeros(count, 3)
         """Right, down, and the logarithm of the distance."""
         self._lens = torch.zeros(count)
-        self._tilt = torch.zeros(count, 2)
-        """Pitch and roll."""
+        self._tilt = torch.zeros(count, 3)
+        """Pitch, yaw and roll."""
         self._shape = torch.linalg.solve_triangular(
             shapes.scale, (start.betas - shapes.bias)[:, None], upper=False
         )[:, 0].clone()  # fmt: skip
+        self._balance = (1 + (_unusual(start) / NEEDED).square()) ** -2
+        self._balance[-1] = 1  # a level camera is only a guess
 
     @torch.no_grad()
     def posture(self) -> Posture:
@@ -133,7 +140,9 @@ class PostureFit:
             seen = zip(posture.frames(), each(resized(posture.camera, scale, first)), pictures, strict=True)
             errors = [_difference(frames, payload, camera, picture, blur) for frames, camera, picture in seen]
             prior = torch.cat([value.flatten() for value in unknowns]).square().sum() / 2
-            loss = EVIDENCE * torch.stack(errors).sum() + prior + self._unlikeliness(posture)
+            if self._tilted:
+                prior = prior + (self._balance * _unusual(posture).square()).sum() / 2
+            loss = EVIDENCE * torch.stack(errors).sum() + prior
             loss.backward()
             optimiser.step()
             schedule.step()
@@ -143,8 +152,7 @@ class PostureFit:
             value.requires_grad_(False)
 
     def _posture(self) -> Posture:
-        start, log_focal = self._start, self._cameras.log_focal * self._lens
-        log_depth = DEPTH_STD * self._move[:, 2]
+        start, log_focal, log_depth = self._start, FOCAL_STD * self._lens, DEPTH_STD * self._move[:, 2]
         extrinsics = start.camera.world_to_camera
         pelvis = default_body().shape(start.betas).joints[0] + start.pose.translation
         before = (extrinsics[:, :, :3] @ pelvis[:, :, None])[..., 0] + extrinsics[:, :, 3]
@@ -152,8 +160,7 @@ class PostureFit:
         sideways = before[:, :2] * log_depth.exp()[:, None] + SIDEWAYS_STD_M * self._move[:, :2]
         place = torch.cat([sideways, (before[:, 2] * (log_depth + log_focal).exp())[:, None]], 1)
         # A tilted camera stays where it is. The body moves to the same place in the picture, but keeps its own lean.
-        tilt = self._tilt * self._tilt.new_tensor(self._cameras.tilt)
-        turn = axis_angle_to_matrix(torch.stack([tilt[:, 0], torch.zeros_like(tilt[:, 0]), tilt[:, 1]], 1))
+        turn = axis_angle_to_matrix(self._tilted * TILT_STD * self._tilt)
         translation = (turn @ extrinsics[:, :, 3:])[..., 0]
         extrinsics = torch.cat([turn @ extrinsics[:, :, :3], translation[..., None]], -1)
         pelvis = ((place - translation)[:, None] @ extrinsics[:, :, :3])[:, 0]
@@ -166,9 +173,9 @@ class PostureFit:
         camera = dataclasses.replace(start.camera, intrinsics=intrinsics, world_to_camera=extrinsics)
         return Posture(pose, betas, camera)
 
-    def _unlikeliness(self, posture: Posture) -> Float[Tensor, ""]:
-        height = posture.camera.position[:, 1] if self._cameras.held else None
-        return unlikeliness(default_body().shape(posture.betas), posture.pose, height)
+
+def _unusual(posture: Posture) -> Float[Tensor, "4 v"]:
+    return unusual(default_body().shape(posture.betas), posture.pose, posture.camera.position[:, 1])
 
 
 def resized(camera: Camera, scale: float, like: Camera) -> Camera:

@@ -5,7 +5,6 @@ A picture alone cannot tell a leaning body before a level camera from an upright
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import math
 
@@ -16,8 +15,8 @@ from torch import Tensor
 from primdiffusion.body.model import BodyPose, ShapedBody, default_body, skin, world_from_joints, world_from_rest
 from primdiffusion.formats.joints import JOINT_NAMES, PARENTS
 
-PITCH_STD, ROLL_STD = math.radians(12), math.radians(2.5)
-"""Standard deviations of a held camera's tilt."""
+TILT_STD = torch.tensor([math.radians(12), 0.0, math.radians(2.5)])
+"""Standard deviations of a held camera's pitch, yaw and roll; the body's own yaw stands for that of the camera."""
 HEIGHT_M, HEIGHT_STD_M = 1.5, 0.3
 """Height of a held camera above the floor."""
 LEAN_STD = math.sin(math.radians(3))
@@ -26,8 +25,6 @@ BALANCE_STD_M = 0.03
 """Standard deviation of the centre of mass from above the line between the feet."""
 SOLE_STD_M = 0.015
 """Standard deviation of the height of one sole above the other."""
-OFF_BALANCE = 3.0
-"""Standard deviations from which a pose is taken to need it: a jump, a seat, a bow."""
 _SEGMENTS = (
     ("pelvis", "neck", 0.497, 0.5), ("neck", "head", 0.081, 1.0),
     *((f"{side}_{near}", f"{side}_{far}", mass, share) for side in ("left", "right") for near, far, mass, share in (
@@ -38,22 +35,10 @@ _SEGMENTS = (
 and Motor Control of Human Movement, table 4.1)."""
 
 
-@dataclasses.dataclass(frozen=True)
-class CameraPrior:
-    """How far cameras may be from those that a fit starts with, as standard deviations."""
-
-    log_focal: Float[Tensor, "v"] | float
-    """Of the logarithm of the focal length."""
-    tilt: tuple[float, float] = (PITCH_STD, ROLL_STD)
-    """Pitch and roll, radians; 0: known."""
-    held: bool = True
-    """Whether somebody holds them, HEIGHT_M above the floor."""
-
-
-def unlikeliness(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v"] | None) -> Float[Tensor, ""]:
-    """Negative logarithm of the probability of poses [v] and of cameras at `camera_height` in their worlds (y up).
-
-    What is off balance by much costs no more when it is more so.
+def unusual(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v"]) -> Float[Tensor, "4 v"]:
+    """How far poses [v], and cameras at `camera_height` in their worlds (y up), are from the usual, as standard
+    deviations: the torso from the vertical, the centre of mass from above the feet, one sole above the other, and the
+    camera above the floor.
     """
     world_from_joint = world_from_joints(pose.joint_rotation, body.joints, PARENTS)
     places = world_from_joint[..., :3, 3] + pose.translation[:, None]
@@ -63,16 +48,12 @@ def unlikeliness(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, 
         soles.append(points[..., 1].amin(1) + pose.translation[:, 1])
     left, right = soles
     torso = torch.nn.functional.normalize(_joint(places, "neck") - _joint(places, "pelvis"), dim=-1)
-    off = [
+    return torch.stack([
         torso[:, [0, 2]].norm(dim=-1) / LEAN_STD,
         _beside_feet(places) / BALANCE_STD_M,
         (left - right) / SOLE_STD_M,
-    ]
-    square = torch.stack(off).square()
-    cost = (square / (1 + square / OFF_BALANCE**2)).sum() / 2
-    if camera_height is not None:
-        cost = cost + ((camera_height - torch.minimum(left, right) - HEIGHT_M) / HEIGHT_STD_M).square().sum() / 2
-    return cost
+        (camera_height - torch.minimum(left, right) - HEIGHT_M) / HEIGHT_STD_M,
+    ])  # fmt: skip
 
 
 def _beside_feet(places: Float[Tensor, "v 24 3"]) -> Float[Tensor, "v"]:
