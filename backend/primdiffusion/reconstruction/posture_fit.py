@@ -27,7 +27,7 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import default_frames
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
-from primdiffusion.reconstruction.posture_prior import TILT_STD, unusual
+from primdiffusion.reconstruction.posture_prior import TILT_STD, deviations
 from primdiffusion.render.inverse import BACKGROUND
 from primdiffusion.render.march import MarchSettings, march
 from primdiffusion.render.view import PosedView
@@ -45,7 +45,8 @@ JOINT_STD = torch.tensor(
 SIDEWAYS_STD_M, DEPTH_STD, FOCAL_STD = 0.05, 0.1, 0.1
 """Standard deviations of the position across the line of sight, and of the logarithms of distance and focal length."""
 NEEDED = 3.0
-"""Standard deviations off balance from which the pose of a start is taken to need it: a jump, a seat, a bow."""
+"""Standard deviations from balance from which the pose of a start is taken to need it: a jump, a seat, a bow. The weight
+of what is unusual falls as that of Geman and McClure."""
 EVIDENCE = 1500.0
 """Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
 RATE = 0.15
@@ -105,8 +106,8 @@ class PostureFit:
         self._shape = torch.linalg.solve_triangular(
             shapes.scale, (start.betas - shapes.bias)[:, None], upper=False
         )[:, 0].clone()  # fmt: skip
-        self._balance = (1 + (_unusual(start) / NEEDED).square()) ** -2
-        self._balance[-1] = 1  # a level camera is only a guess
+        self._weights = (1 + (_deviations(start) / NEEDED).square()) ** -2
+        self._weights[-1] = 1  # the height of the camera is a guess
 
     @torch.no_grad()
     def posture(self) -> Posture:
@@ -141,7 +142,7 @@ class PostureFit:
             errors = [_difference(frames, payload, camera, picture, blur) for frames, camera, picture in seen]
             prior = torch.cat([value.flatten() for value in unknowns]).square().sum() / 2
             if self._tilted:
-                prior = prior + (self._balance * _unusual(posture).square()).sum() / 2
+                prior = prior + (self._weights * _deviations(posture).square()).sum() / 2
             loss = EVIDENCE * torch.stack(errors).sum() + prior
             loss.backward()
             optimiser.step()
@@ -174,8 +175,8 @@ class PostureFit:
         return Posture(pose, betas, camera)
 
 
-def _unusual(posture: Posture) -> Float[Tensor, "4 v"]:
-    return unusual(default_body().shape(posture.betas), posture.pose, posture.camera.position[:, 1])
+def _deviations(posture: Posture) -> Float[Tensor, "4 v"]:
+    return deviations(default_body().shape(posture.betas), posture.pose, posture.camera.position[:, 1])
 
 
 def resized(camera: Camera, scale: float, like: Camera) -> Camera:

@@ -35,7 +35,7 @@ _SEGMENTS = (
 and Motor Control of Human Movement, table 4.1)."""
 
 
-def unusual(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v"]) -> Float[Tensor, "4 v"]:
+def deviations(body: ShapedBody, pose: BodyPose, camera_height: Float[Tensor, "v"]) -> Float[Tensor, "4 v"]:
     """How far poses [v], and cameras at `camera_height` in their worlds (y up), are from the usual, as standard
     deviations: the torso from the vertical, the centre of mass from above the feet, one sole above the other, and the
     camera above the floor.

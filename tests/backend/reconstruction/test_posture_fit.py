@@ -20,7 +20,7 @@ from primdiffusion.human import framing, pose_body
 from primdiffusion.primitives.primitives import Primitives
 from primdiffusion.reconstruction.posture_file import read_cameras, read_posture, write_posture
 from primdiffusion.reconstruction.posture_fit import Posture, PostureFit, Stage, each, overlap
-from primdiffusion.reconstruction.posture_prior import unusual
+from primdiffusion.reconstruction.posture_prior import deviations
 from primdiffusion.reconstruction.posture_start import (
     before_cameras,
     cameras_of,
@@ -114,7 +114,7 @@ def tilted_about_body(posture: Posture, degrees: float) -> Posture:
 def test_a_camera_is_usual_at_the_height_of_hands():
     body, pose = default_body().shape(torch.zeros(10)), standing(1, 50.0)
     floor = float(body.pose(pose).vertices[0, :, 1].min())
-    heights = [float(unusual(body, pose, torch.tensor([floor + height]))[3]) for height in (1.5, 2.4)]
+    heights = [float(deviations(body, pose, torch.tensor([floor + height]))[3]) for height in (1.5, 2.4)]
     assert heights == pytest.approx([0, 3], abs=1e-3)
 
 
@@ -126,7 +126,7 @@ def test_a_body_that_leans_or_lifts_a_foot_is_unusual(joint, degrees, kinds):
     theta = torch.zeros(1, 24, 3)
     theta[0, JOINT_NAMES.index(joint), 0] = math.radians(degrees)
     body, camera = default_body().shape(torch.zeros(10)), torch.tensor([0.5])
-    off = unusual(body, BodyPose.from_axis_angle(theta.flatten(1)), camera)[:3, 0]
+    off = deviations(body, BodyPose.from_axis_angle(theta.flatten(1)), camera)[:3, 0]
     assert (off.abs() > 2).nonzero()[:, 0].tolist() == kinds
 
 
