@@ -45,8 +45,8 @@ JOINT_STD = torch.tensor(
 SIDEWAYS_STD_M, DEPTH_STD, FOCAL_STD = 0.05, 0.1, 0.1
 """Standard deviations of the position across the line of sight, and of the logarithms of distance and focal length."""
 NEEDED = 3.0
-"""Standard deviations from balance from which the pose of a start is taken to need it: a jump, a seat, a bow. The weight
-of what is unusual falls as that of Geman and McClure."""
+"""Standard deviations from balance from which the pose of a start is taken to need it: a jump, a seat, a bow. Weights
+fall as those of Geman and McClure."""
 EVIDENCE = 1500.0
 """Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
 RATE = 0.15
@@ -77,6 +77,8 @@ class Stage:
     steps: int
     blur: float
     """Standard deviation of the blur at the start, as a share of the picture's side; it halves to the end."""
+    upright: bool = True
+    """Whether cameras tilt, and how people stand and hold cameras counts; limbs are found better before."""
 
 
 def each(records: Record) -> Iterator[Record]:
@@ -126,7 +128,8 @@ class PostureFit:
         `targets` are of one size, and their cameras those of the posture so far, scaled; their frames do not count.
         `on_step` is called after each step; an exception that it raises cancels.
         """
-        unknowns = [self._turn, self._move, self._lens, self._tilt, self._shape]
+        upright = self._tilted and stage.upright
+        unknowns = [self._turn, self._move, self._lens, self._shape, *[self._tilt] * upright]
         first, cameras = targets[0].camera, self.posture().camera
         scale = float(first.intrinsics[0, 0] / cameras.intrinsics[0, 0, 0])
         pictures = [_encoded(*target.rgba.split((3, 1), -1)) for target in targets]
@@ -141,7 +144,7 @@ class PostureFit:
             seen = zip(posture.frames(), each(resized(posture.camera, scale, first)), pictures, strict=True)
             errors = [_difference(frames, payload, camera, picture, blur) for frames, camera, picture in seen]
             prior = torch.cat([value.flatten() for value in unknowns]).square().sum() / 2
-            if self._tilted:
+            if upright:
                 prior = prior + (self._weights * _deviations(posture).square()).sum() / 2
             loss = EVIDENCE * torch.stack(errors).sum() + prior
             loss.backward()
@@ -161,7 +164,7 @@ class PostureFit:
         sideways = before[:, :2] * log_depth.exp()[:, None] + SIDEWAYS_STD_M * self._move[:, :2]
         place = torch.cat([sideways, (before[:, 2] * (log_depth + log_focal).exp())[:, None]], 1)
         # A tilted camera stays where it is. The body moves to the same place in the picture, but keeps its own lean.
-        turn = axis_angle_to_matrix(self._tilted * TILT_STD * self._tilt)
+        turn = axis_angle_to_matrix(TILT_STD * self._tilt)
         translation = (turn @ extrinsics[:, :, 3:])[..., 0]
         extrinsics = torch.cat([turn @ extrinsics[:, :, :3], translation[..., None]], -1)
         pelvis = ((place - translation)[:, None] @ extrinsics[:, :, :3])[:, 0]
