@@ -78,7 +78,7 @@ class Stage:
     blur: float
     """Standard deviation of the blur at the start, as a share of the picture's side; it halves to the end."""
     upright: bool = True
-    """Whether cameras tilt, and how people stand and hold cameras counts. A raised arm may be missed if it does at first."""
+    """Whether cameras tilt, and how people stand and hold cameras counts; not while limbs are far off."""
 
 
 def each(records: Record) -> Iterator[Record]:
