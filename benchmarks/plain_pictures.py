@@ -164,7 +164,7 @@ def given(case: Case, photograph: Photograph, model: DiffusionModel, fault: Faul
     rotation = torch.cat([turn @ rotation[:1], rotation[1:]])
     pose, betas = BodyPose(rotation[None], torch.zeros(1, 3)), model.shapes.bias.clone()
     camera = framed([photograph], pose, betas, [photograph.lens()])
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=False)
+    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=False, tilted=True)
 
 
 def with_fault(model: DiffusionModel, case: Case, folder: Path, fault: Fault, seed: int) -> tuple[float, float]:

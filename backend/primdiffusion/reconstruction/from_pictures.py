@@ -45,7 +45,7 @@ class Round(NamedTuple):
     coefficient_steps: int
 
 
-ROUNDS = (Round(96, Stage(60, 0.04), 2), Round(96, Stage(80, 0.02), 2), Round(192, Stage(60, 0.01), 0))
+ROUNDS = (Round(96, Stage(60, 0.04, upright=False), 2), Round(96, Stage(80, 0.02), 2), Round(192, Stage(60, 0.01), 0))
 POSTURE_STEPS = sum(each.stage.steps + each.coefficient_steps for each in ROUNDS)
 OUTLINE_SIDE = 64
 """Of the pictures that choose a standing body's arms."""
@@ -65,6 +65,8 @@ class Start:
     """See `PostureFit`."""
     complete: bool
     """Pose and cameras are those of files."""
+    tilted: bool
+    """See `PostureFit`."""
 
 
 def person_in_pictures(
@@ -126,19 +128,19 @@ def start_of(
     Raises FileNotFoundError, and ValueError for files that are no poses or cameras, or not one for each picture.
     """
     sizes = [(photograph.width, photograph.height) for photograph in photographs]
-    views = None if cameras_path is None else read_cameras(cameras_path, sizes)
-    if pose_path is None:
-        return Start(_standing(photographs, model, views), 1.0, complete=False)
-    known = read_posture(pose_path, sizes)
+    known = None if pose_path is None else read_posture(pose_path, sizes)
+    views = known and known.views if cameras_path is None else read_cameras(cameras_path, sizes)
+    tilted = views is None or len(views) == 1  # cameras of several pictures belong together
+    if known is None:
+        return Start(_standing(photographs, model, views), 1.0, complete=False, tilted=tilted)
     pose = repeated(known.pose, len(photographs))
     betas = model.shapes.bias.clone() if known.betas is None else known.betas
-    views = known.views if views is None else views
     if views is None:
         pose = turned_to_camera(pose)
         camera = framed(photographs, pose, betas, [photograph.lens() for photograph in photographs])
     else:
         camera = cameras_of(photographs, views)
-    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=views is not None)
+    return Start(Posture(pose, betas, camera), POSE_FILE_TIGHTNESS, complete=views is not None, tilted=tilted)
 
 
 def _standing(photographs: Sequence[Photograph], model: DiffusionModel, views: Sequence[View] | None) -> Posture:
@@ -162,7 +164,7 @@ def fit_posture_in(
     `on_step` is called POSTURE_STEPS times. Raises ValueError as `PersonComponents.of`.
     """
     components = PersonComponents.of(model)
-    fit, people = PostureFit(start.posture, model.shapes, start.tightness), components.everyone()
+    fit, people = PostureFit(start.posture, model.shapes, start.tightness, tilted=start.tilted), components.everyone()
     for side, stage, coefficient_steps in ROUNDS:
         payload = components.payload(components.coefficients(people))
         fit.refine(payload, _targets(photographs, fit.posture(), side), stage, on_step)

@@ -27,6 +27,7 @@ from primdiffusion.geometry.rotation import axis_angle_to_matrix
 from primdiffusion.geometry.srgb import encode_srgb
 from primdiffusion.human import default_frames
 from primdiffusion.primitives.primitives import Frames, Payload, Primitives
+from primdiffusion.reconstruction.posture_prior import TILT_STD, deviations
 from primdiffusion.render.image import PosedView
 from primdiffusion.render.inverse import BACKGROUND
 from primdiffusion.render.march import MarchSettings, march
@@ -43,6 +44,9 @@ JOINT_STD = torch.tensor(
 """Standard deviation of each joint's rotation from the start, radians; the pelvis turns the whole body."""
 SIDEWAYS_STD_M, DEPTH_STD, FOCAL_STD = 0.05, 0.1, 0.1
 """Standard deviations of the position across the line of sight, and of the logarithms of distance and focal length."""
+NEEDED = 3.0
+"""Standard deviations from balance from which the pose of a start is taken to need it: a jump, a seat, a bow. Weights
+fall as those of Geman and McClure."""
 EVIDENCE = 1500.0
 """Number of independent pixels over twice their variance: weight of the mean squared difference against the prior."""
 RATE = 0.15
@@ -73,6 +77,8 @@ class Stage:
     steps: int
     blur: float
     """Standard deviation of the blur at the start, as a share of the picture's side; it halves to the end."""
+    upright: bool = True
+    """Whether cameras tilt, and how people stand and hold cameras counts; not while limbs are far off."""
 
 
 def each(records: Record) -> Iterator[Record]:
@@ -85,18 +91,25 @@ def each(records: Record) -> Iterator[Record]:
 class PostureFit:
     """A posture on its way from where it started."""
 
-    def __init__(self, start: Posture, shapes: ShapePrior, tightness: float = 1.0) -> None:
-        """`tightness` divides the standard deviations of joints: above 1 where the pose is known well."""
-        self._start, self._shapes = start, shapes
+    def __init__(self, start: Posture, shapes: ShapePrior, tightness: float = 1.0, *, tilted: bool = True) -> None:
+        """`tightness` divides the standard deviations of joints: above 1 where the pose is known well.
+
+        `tilted`: pitch, roll and height of the cameras are unknown; otherwise those of the start are true.
+        """
+        self._start, self._shapes, self._tilted = start, shapes, tilted
         self._joint_std = JOINT_STD[:, None] / tightness
         count = len(start.pose.translation)
         self._turn = torch.zeros(count, len(JOINT_NAMES), 3)
         self._move = torch.zeros(count, 3)
         """Right, down, and the logarithm of the distance."""
         self._lens = torch.zeros(count)
+        self._tilt = torch.zeros(count, 3)
+        """Pitch, yaw and roll."""
         self._shape = torch.linalg.solve_triangular(
             shapes.scale, (start.betas - shapes.bias)[:, None], upper=False
         )[:, 0].clone()  # fmt: skip
+        self._weights = (1 + (_deviations(start) / NEEDED).square()) ** -2
+        self._weights[-1] = 1  # the height of the camera is a guess
 
     @torch.no_grad()
     def posture(self) -> Posture:
@@ -115,7 +128,8 @@ class PostureFit:
         `targets` are of one size, and their cameras those of the posture so far, scaled; their frames do not count.
         `on_step` is called after each step; an exception that it raises cancels.
         """
-        unknowns = [self._turn, self._move, self._lens, self._shape]
+        upright = self._tilted and stage.upright
+        unknowns = [self._turn, self._move, self._lens, self._shape, *[self._tilt] * upright]
         first, cameras = targets[0].camera, self.posture().camera
         scale = float(first.intrinsics[0, 0] / cameras.intrinsics[0, 0, 0])
         pictures = [_encoded(*target.rgba.split((3, 1), -1)) for target in targets]
@@ -130,6 +144,8 @@ class PostureFit:
             seen = zip(posture.frames(), each(resized(posture.camera, scale, first)), pictures, strict=True)
             errors = [_difference(frames, payload, camera, picture, blur) for frames, camera, picture in seen]
             prior = torch.cat([value.flatten() for value in unknowns]).square().sum() / 2
+            if upright:
+                prior = prior + (self._weights * _deviations(posture).square()).sum() / 2
             loss = EVIDENCE * torch.stack(errors).sum() + prior
             loss.backward()
             optimiser.step()
@@ -147,14 +163,23 @@ class PostureFit:
         # A longer lens from farther away shows the same size, which separates focal length from distance.
         sideways = before[:, :2] * log_depth.exp()[:, None] + SIDEWAYS_STD_M * self._move[:, :2]
         place = torch.cat([sideways, (before[:, 2] * (log_depth + log_focal).exp())[:, None]], 1)
-        pelvis = ((place - extrinsics[:, :, 3])[:, None] @ extrinsics[:, :, :3])[:, 0]
+        # A tilted camera stays where it is. The body moves to the same place in the picture, but keeps its own lean.
+        turn = axis_angle_to_matrix(TILT_STD * self._tilt)
+        translation = (turn @ extrinsics[:, :, 3:])[..., 0]
+        extrinsics = torch.cat([turn @ extrinsics[:, :, :3], translation[..., None]], -1)
+        pelvis = ((place - translation)[:, None] @ extrinsics[:, :, :3])[:, 0]
         limit = torch.maximum(self._shapes.limit, start.betas.abs())
         betas = (self._shapes.bias + self._shapes.scale @ self._shape).clamp(-limit, limit)
         rotation = start.pose.joint_rotation @ axis_angle_to_matrix(self._turn * self._joint_std)
         pose = BodyPose(rotation, pelvis - default_body().shape(betas).joints[0])
         focal = start.camera.intrinsics[..., :2] * log_focal.exp()[:, None, None]
-        camera = dataclasses.replace(start.camera, intrinsics=torch.cat([focal, start.camera.intrinsics[..., 2:]], -1))
+        intrinsics = torch.cat([focal, start.camera.intrinsics[..., 2:]], -1)
+        camera = dataclasses.replace(start.camera, intrinsics=intrinsics, world_to_camera=extrinsics)
         return Posture(pose, betas, camera)
+
+
+def _deviations(posture: Posture) -> Float[Tensor, "4 v"]:
+    return deviations(default_body().shape(posture.betas), posture.pose, posture.camera.position[:, 1])
 
 
 def resized(camera: Camera, scale: float, like: Camera) -> Camera:
