@@ -30,6 +30,7 @@ from diffusion_sets import (
     front,
     gaussian,
     generated,
+    like,
     placed,
     seeds_of,
     stored,
@@ -82,6 +83,7 @@ NEED_MORE = ("nearest_neighbour_ratio_latent", "fid_ours", "kid_100_ours", "fid_
 """Figures that are null without people or weights."""
 TITLES = {
     "ours": "ours",
+    "like_held": "ours, with the attributes of held-out people",
     "unguided": "ours, guidance 0",
     "old": "ours, the checkpoint before",
     "gaussian": "one Gaussian of the training people",
@@ -177,9 +179,10 @@ def comparisons(
 ) -> dict[str, Comparison]:
     """Compare each available set with the held-out meshes."""
     count = 16 if arguments.quick else arguments.count
-    seeds = seeds_of(count)
+    seeds, held = seeds_of(count), reference.held.attributes
     sets: dict[str, Callable[[], Iterable[Primitives]]] = {
         "ours": lambda: placed(generated(model, seeds)),
+        "like_held": lambda: placed(like(model, held[:: max(1, len(held) // count)][:count])),
         "unguided": lambda: placed(generated(model, seeds, guidance=0.0)),
         "gaussian": lambda: placed(gaussian(model, seeds)),
         "from_mesh": lambda: from_meshes(assets, seeds_of(count, OTHER_SEED)),
@@ -252,7 +255,7 @@ def quality_figures(rows: Mapping[str, Comparison], reference: ReferenceSet | No
     figures: Figures = {}
     for name in SETS:
         row = rows.get(name)
-        for figure, field in (("distance", "frechet"), ("kernel_distance", "kernel")):
+        for figure, field in (("distance", "frechet"), ("distance_std", "frechet_std"), ("kernel_distance", "kernel")):
             figures[f"{figure}_{name}"] = None if row is None else round(getattr(row, field), 5)
     ours, floor, old = (rows[name].frechet if name in rows else None for name in ("ours", "floor", "old"))
     figures["distance_ratio_floor"] = round(ours / floor, 4) if ours and floor else None

@@ -18,6 +18,7 @@ from primdiffusion.people.base_mesh import load_base_mesh
 from primdiffusion.people.payloads import rest_frames
 from primdiffusion.people.person import make_person
 from primdiffusion.people.stored_people import read_person
+from primdiffusion.people.wardrobe import words_of
 from primdiffusion.primitives.from_mesh import FULL_DENSITY, colour, surface_field
 from primdiffusion.primitives.primitives import Payload, Primitives
 from primdiffusion.render.march import march
@@ -50,6 +51,14 @@ def asked(model: DiffusionModel, seeds: Sequence[int], attributes: Mapping[str, 
     """Ours with these attributes, at the default guidance."""
     for first in range(0, len(seeds), TOGETHER):
         yield from generate_batch(model, seeds[first : first + TOGETHER], attributes=attributes)
+
+
+def like(model: DiffusionModel, people: Sequence[Mapping[str, object]]) -> Iterator[Human]:
+    """Ours, each with the attributes of one of these people: distances do not depend on which outfits seeds drew."""
+    known = model.vocabulary.categories
+    for seed, attributes in enumerate(people):
+        words = words_of(attributes)
+        yield from asked(model, [seed], {key: word for key, word in words.items() if word in known.get(key, ())})
 
 
 def from_meshes(assets: Assets, seeds: Sequence[int], model: DiffusionModel | None = None) -> Iterator[Primitives]:

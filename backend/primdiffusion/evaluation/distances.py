@@ -16,6 +16,8 @@ MIN_SAMPLES_PER_DIMENSION = 10
 """With fewer samples per feature, the bias of a Frechet distance is not small beside differences between models."""
 NEIGHBOURS = 3
 """k of precision and recall (Kynkäänniemi et al. 2019)."""
+REDRAWS = 20
+"""Bootstrap sets that the uncertainty of a distance is estimated from."""
 ROWS_AT_ONCE = 512
 """Rows of a distance matrix computed at a time; limits memory, no effect on the result."""
 
@@ -35,6 +37,16 @@ def frechet_distance(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) 
     overlap = torch.linalg.svdvals(roots[0] @ roots[1].T).sum()
     spread = sum(root.square().sum() for root in roots)
     return float((means[0] - means[1]).square().sum() + spread - 2 * overlap)
+
+
+def frechet_uncertainty(first: Float[Tensor, "n d"], second: Float[Tensor, "m d"]) -> float:
+    """Standard deviation of the Frechet distance when other samples are drawn: over REDRAWS bootstrap sets of `first`.
+
+    A few samples far from the others move the distance by more than models differ.
+    """
+    generator = torch.Generator().manual_seed(0)
+    redrawn = [torch.randint(len(first), (len(first),), generator=generator) for _ in range(REDRAWS)]
+    return float(np.std([frechet_distance(first[chosen], second) for chosen in redrawn], ddof=1))
 
 
 def too_few_samples(first: int, second: int, features: int) -> str | None:

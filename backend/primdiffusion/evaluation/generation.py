@@ -19,7 +19,14 @@ from primdiffusion.evaluation.attribute_network import (
     features_of,
     load_attribute_network,
 )
-from primdiffusion.evaluation.distances import Nearest, frechet_distance, kernel_distance, nearest, precision_recall
+from primdiffusion.evaluation.distances import (
+    Nearest,
+    frechet_distance,
+    frechet_uncertainty,
+    kernel_distance,
+    nearest,
+    precision_recall,
+)
 from primdiffusion.evaluation.gallery import Gallery, Report, Source, open_gallery, silent
 from primdiffusion.evaluation.markdown import markdown_table
 
@@ -59,6 +66,8 @@ class Comparison:
 
     people: int
     frechet: float
+    frechet_std: float
+    """How far the distance of as many other samples may lie from it (`frechet_uncertainty`)."""
     kernel: float
     precision: float
     recall: float
@@ -74,6 +83,7 @@ def compare(reference: ReferenceSet, made: Float[Tensor, "n f"]) -> Comparison:
     return Comparison(
         len(made),
         frechet_distance(made, held),
+        frechet_uncertainty(made, held),
         kernel_distance(made, held),
         precision,
         recall,
@@ -107,6 +117,7 @@ def nearest_other(features: Float[Tensor, "n d"], geometry: Int[Tensor, "n"]) ->
 COLUMNS = {
     "people": "number",
     "frechet": "Frechet distance",
+    "frechet_std": "+-",
     "kernel": "kernel distance",
     "precision": "precision",
     "recall": "recall",

@@ -7,7 +7,13 @@ import numpy as np
 import pytest
 import scipy.linalg
 import torch
-from primdiffusion.evaluation.distances import frechet_distance, kernel_distance, nearest, precision_recall
+from primdiffusion.evaluation.distances import (
+    frechet_distance,
+    frechet_uncertainty,
+    kernel_distance,
+    nearest,
+    precision_recall,
+)
 from primdiffusion.evaluation.generation import nearest_other
 from support.errors import refused
 from torchmetrics.image.kid import poly_mmd
@@ -32,6 +38,13 @@ def test_frechet_distance_of_a_moved_set_is_the_square_of_the_move():
     people = draws(40, 5, 0)
     assert frechet_distance(people, people + 2.0) == pytest.approx(5 * 2.0**2, rel=1e-5)
     assert frechet_distance(people, people) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize("count", [50, 800])
+def test_the_uncertainty_is_the_spread_of_distances_of_other_samples(count):
+    held = draws(400, 5, 1000)
+    others = np.std([frechet_distance(draws(count, 5, seed), held) for seed in range(60)])
+    assert frechet_uncertainty(draws(count, 5, 2000), held) == pytest.approx(others, rel=0.75)
 
 
 def test_frechet_distance_needs_no_more_samples_than_features():
