@@ -237,7 +237,7 @@ class _Image:
         kinds = PASSES if self.is_composed else PASSES[1:]
         stored = [subject.pictures(kinds, self.frame, self.camera) for subject in self.subjects]
         images, masks, depths = ([one[kind] for one in stored if kind in one] for kind in PASSES)
-        hips = [self.view.project(own[self.frame][_HIPS].mean(0))[1] for own in points]
+        hips = [float(self.view.project(own[self.frame][_HIPS].mean(0))[1]) for own in points]
         box = drawn_box([*images, *masks])
         parts = [mask[box] for mask in masks]
         shares = uncovered(parts, [depth[box] for depth in depths], hips)

@@ -49,8 +49,12 @@ class Block(NamedTuple):
     def chosen(self, kinds: Int[Tensor, "m"]) -> Block:
         """The block of some kinds, with their Gaussians."""
         groups, of = self.of[kinds].unique(return_inverse=True)
-        gaussians = (each[groups] for each in self[:6])
-        return Block(*gaussians, of, self.centre[kinds], self.along[kinds], self.by_shared[kinds])
+        of_kinds = {name: getattr(self, name)[kinds] for name in ("centre", "along", "by_shared")}
+        of_groups = {
+            name: getattr(self, name)[groups]
+            for name in ("axes", "variance", "left", "shared", "shared_along", "shared_gram")
+        }
+        return Block(of=of, **of_groups, **of_kinds)
 
 
 class _Evidence(NamedTuple):
