@@ -17,9 +17,10 @@ from primdiffusion.capture.smpl_parameters import read_smpl
 from primdiffusion.commands.options import ImportReleasedCommand
 from primdiffusion.commands.progress import ReportProgress
 from primdiffusion.commands.session import Session
-from primdiffusion.diffusion.checkpoint import file_hash, under
+from primdiffusion.diffusion.checkpoint import file_hash
 from primdiffusion.diffusion.model import BETAS
 from primdiffusion.files.regular_files import FileError
+from primdiffusion.files.tensor_file import under
 from primdiffusion.files.whole_files import replacing, write_atomically
 from primdiffusion.primitives.anchors import grid_points_outside
 from primdiffusion.primitives.body_setup import BodySetup, body_setup_from_files

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import torch
-from jaxtyping import Float, Int
 from torch import Tensor
 
 from primdiffusion.body.measures import LARGEST_BETA
@@ -23,17 +22,19 @@ from primdiffusion.diffusion.denoiser import DenoiserConfig, PersonDenoiser
 from primdiffusion.diffusion.gaussian import PersonPrior
 from primdiffusion.diffusion.model import BETAS, STANDARD_SHAPES, DiffusionModel, ShapePrior, check_codec, check_parts
 from primdiffusion.diffusion.schedule import CHAINS, SCHEDULES
+from primdiffusion.diffusion.stored_prior import restore_prior, store_prior
 from primdiffusion.diffusion.unet import SlabUNet, UNetConfig
 from primdiffusion.files import tensor_file
 from primdiffusion.files.arrays import LARGEST_NUMBER
 from primdiffusion.files.json_files import parse_json
 from primdiffusion.files.regular_files import FileError, as_file_error, open_regular, read_regular
+from primdiffusion.files.tensor_file import under
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.formats.schema import Open, Range, read
 from primdiffusion.geometry.records import TensorRecord
 from primdiffusion.primitives.anchors import Anchors
 from primdiffusion.primitives.body_setup import BodyFiles, BodySetup, find_body_setup
-from primdiffusion.primitives.primitives import GRID, K
+from primdiffusion.primitives.primitives import K
 
 FORMAT = "primdiffusion-checkpoint"
 RELEASED = "released"
@@ -47,12 +48,6 @@ _WHOLE = ("prior_variance", "prior_head_variance", "prior_log_weight")
 WEIGHTS = "model.safetensors"
 """The checkpoint in a folder of `save_pretrained` or of the Hugging Face hub."""
 _COMMIT = re.compile(r"[0-9a-zA-Z_-]{1,64}", re.ASCII)
-SYMMETRIC = 1e-4
-"""Largest difference between an entry of a person component and its mirror image; entries are up to 1."""
-RANK = 1e-5
-"""Smallest singular value of the centres of kinds that is kept, as a share of the largest."""
-MOST_CENTRES = 2**26
-"""Most numbers that factors in a file may be multiplied out to."""
 
 
 @dataclasses.dataclass(frozen=True, kw_only=True)
@@ -131,8 +126,7 @@ def save_checkpoint(path: Path, model: DiffusionModel, schedule: str) -> None:
     if isinstance(model.codec, CellCodec):
         codec = model.codec.codec
         tensors |= _fields("codec", codec)
-        _store_half(tensors, codec)
-        _store_effects(tensors)
+        store_prior(tensors, codec)
         tensors |= _fields("shapes", model.shapes)
         architecture |= {"kind": "person"}
     else:
@@ -233,7 +227,7 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
     else:
         codec = CellCodec(_linear_codec(under(tensors, "codec.")))
         check_codec(codec.codec)
-        _restore_prior(weights, codec.codec)
+        restore_prior(weights, codec.codec)
         prior = PersonPrior(**under(weights, "prior_"))
         shapes = ShapePrior(**under(tensors, "shapes."))
         check_parts(codec.codec, prior, shapes, vocabulary)
@@ -242,62 +236,6 @@ def _model(tensors: Mapping[str, Tensor], config: ModelConfig, card: Mapping[str
     chain = CHAINS[config.chain]
     density = float(config.full_density)
     return DiffusionModel(denoiser, schedule, codec, shapes, density, card, vocabulary, chain)
-
-
-def _store_half(tensors: dict[str, Tensor], codec: LinearCodec) -> None:
-    """Keep the left half of each person component where the right one is its mirror image times its parity."""
-    part, parity = tensors["denoiser.prior_part"], tensors["denoiser.prior_parity"]
-    basis = tensors["denoiser.prior_basis"][:, part.argsort(stable=True).argsort()].mT
-    half = basis.unflatten(2, (GRID, GRID))[..., : GRID // 2]
-    if torch.allclose(_whole_components(half, part, parity, codec), basis, atol=SYMMETRIC):
-        del tensors["denoiser.prior_basis"]
-        tensors["denoiser.prior_basis_half"] = half
-
-
-def _store_effects(tensors: dict[str, Tensor]) -> None:
-    """Keep the centres of kinds, which are sums of few effects (`training.prior`), as a product of two factors."""
-    centre = tensors["denoiser.prior_centre"].flatten(0, 1)
-    kinds, size, effects = torch.linalg.svd(centre, full_matrices=False)
-    rank = int((size > RANK * size[0]).sum())
-    if rank * sum(centre.shape) < centre.numel():
-        del tensors["denoiser.prior_centre"]
-        root = size[:rank].sqrt()
-        tensors["denoiser.prior_kinds"] = kinds[:, :rank] * root
-        tensors["denoiser.prior_effects"] = root[:, None] * effects[:rank]
-
-
-def _restore_prior(weights: dict[str, Tensor], codec: LinearCodec) -> None:
-    """Undo `_store_half` and `_store_effects`, in what `_model` reads, and complete priors of older files, whose
-    components are of the whole body.
-    """
-    if "prior_effects" in weights:
-        kinds, effects = weights.pop("prior_kinds"), weights.pop("prior_effects")
-        if len(kinds) * effects.shape[1] > MOST_CENTRES:
-            raise ValueError(f"centres of kinds are {len(kinds)} times {effects.shape[1]} numbers")
-        weights["prior_centre"] = (kinds @ effects).unflatten(0, weights["prior_log_weight"].shape)
-    older = "prior_part" not in weights
-    part = torch.zeros(K, dtype=torch.int64) if older else weights["prior_part"].long()
-    half = weights.pop("prior_basis_half", None)
-    if half is not None:
-        if half.ndim != 4 or half.shape[2:] != (GRID, GRID // 2) or half.shape[1] > codec.channels:
-            raise ValueError(f"halves of person components have shape {tuple(half.shape)}")
-        whole = _whole_components(half, part, weights["prior_parity"], codec)
-        weights["prior_basis"] = whole.flatten(1) if older else whole.mT[:, part.argsort(stable=True)].contiguous()
-    if older:
-        prior = PersonPrior.of_whole_body(**under(weights, "prior_"))
-        weights |= {f"prior_{field.name}": getattr(prior, field.name) for field in dataclasses.fields(prior)}
-    for name in ("prior_part", "prior_head"):
-        weights[name] = weights[name].long()
-
-
-def _whole_components(
-    half: Float[Tensor, "n d 32 16"], part: Int[Tensor, "k"], parity: Float[Tensor, "r"], codec: LinearCodec
-) -> Float[Tensor, "n d k"]:
-    left = torch.nn.functional.pad(half, (0, GRID // 2))
-    if len(parity) % len(half) or not bool(((part >= 0) & (part < len(parity) // len(half))).all()):
-        raise ValueError(f"{len(parity)} parities are not those of {len(half)} components of each part")
-    signs = parity.unflatten(0, (-1, len(half)))[part].T.unflatten(1, (1, GRID, GRID))
-    return (left + signs * codec.mirror(left)).flatten(2)
 
 
 def _linear_codec(tensors: Mapping[str, Tensor]) -> LinearCodec:
@@ -409,8 +347,3 @@ def _fields(prefix: str, record: TensorRecord) -> dict[str, Tensor]:
 
 def _is_halved(key: str, value: Tensor) -> bool:
     return key.startswith(_HALVED) and value.is_floating_point() and value.ndim > 1 and not key.endswith(_WHOLE)
-
-
-def under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Select the tensors whose names begin with `prefix`, and remove it."""
-    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Float, Int
@@ -291,6 +291,10 @@ class PersonDenoiser(nn.Module):
         self.local = LocalUNet(channels, components, grid, asked, config.local, drawn) if config.local else None
         if self.local is not None:
             self.local = self.local.to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+
+    def _load_from_state_dict(self, *arguments: Any) -> None:
+        self._prior = None  # what it has computed is of the former tensors, which are overwritten
+        super()._load_from_state_dict(*arguments)
 
     @property
     def prior(self) -> PersonPrior:

@@ -23,14 +23,13 @@ from primdiffusion.diffusion.checkpoint import (
     mismatches_named,
     read_tensors,
     stored_body_setup,
-    under,
 )
 from primdiffusion.encoder.config import EncoderConfig, config_from_json
 from primdiffusion.encoder.network import Encoder, motion_of
 from primdiffusion.encoder.texture import eroded, unproject_texture
 from primdiffusion.encoder.unproject import Unprojected, extents_of_hull, unproject_texels, unproject_voxels
 from primdiffusion.files.json_files import parse_json
-from primdiffusion.files.tensor_file import load_network, save
+from primdiffusion.files.tensor_file import load_network, save, under
 from primdiffusion.files.whole_files import write_atomically
 from primdiffusion.primitives.anchors import attach, default_anchors
 from primdiffusion.primitives.body_setup import BodySetup

@@ -125,3 +125,8 @@ class ParameterLimit(TorchFunctionMode):
             if self._left < 0:
                 raise RuntimeError("the network has more parameters than the file has values")
         return func(*args, **kwargs)
+
+
+def under(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Select the tensors whose names begin with `prefix`, and remove it."""
+    return {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}

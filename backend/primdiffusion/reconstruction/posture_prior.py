@@ -1,4 +1,4 @@
-"""What is likely of a person in a photograph: it stands on a floor, and somebody holds the camera.
+"""What is likely of a person in a photograph: it stands on a floor, and the camera is held by hand.
 
 A picture alone cannot tell a leaning body before a level camera from an upright one before a tilted camera.
 """

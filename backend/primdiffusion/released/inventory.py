@@ -13,9 +13,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from primdiffusion.diffusion.checkpoint import under
 from primdiffusion.diffusion.schedule import SCHEDULES
 from primdiffusion.diffusion.unet import PAPER, PAPER_WITH_ATTENTION, SlabUNet, UNetConfig
+from primdiffusion.files.tensor_file import under
 from primdiffusion.primitives.primitives import S
 from primdiffusion.primitives.slab import CHANNELS_PER_LAYER
 from primdiffusion.released import stage_one

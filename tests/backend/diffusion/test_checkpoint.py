@@ -98,6 +98,23 @@ def test_components_of_parts_are_stored_by_half_and_read_again(path):
         assert torch.allclose(getattr(read, field.name), getattr(prior, field.name), atol=1e-2), field.name
 
 
+def test_centres_that_are_sums_of_few_effects_are_stored_as_factors(path):
+    model = small_model()
+    centre = model.denoiser.prior_centre
+    effects = torch.outer(torch.arange(centre[..., 0].numel()) + 1.0, torch.linspace(-3, 2, COMPONENTS))
+    centre.copy_(effects.view_as(centre))
+    save_checkpoint(path, model, "linear")
+    with safe_open(path, framework="pt") as file:
+        assert "denoiser.prior_centre" not in file.keys()  # noqa: SIM118
+    assert torch.allclose(load_checkpoint(path).denoiser.prior.centre, centre, rtol=2e-3)
+    rewrite(path, lambda t: t | {"denoiser.prior_kinds": torch.zeros(2**24, 1)})
+    with refused(FileError, path.name, str(2**24)):
+        load_checkpoint(path)
+    rewrite(path, lambda t: {key: value for key, value in t.items() if key != "denoiser.prior_kinds"})
+    with refused(FileError, path.name, "prior_kinds"):
+        load_checkpoint(path)
+
+
 def test_a_prior_of_before_parts_is_one_of_the_whole_body(path):
     model = small_model()
     save_checkpoint(path, model, "linear")

@@ -55,6 +55,18 @@ def prior():
     return random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, 0, asked=2).to(dtype=torch.float32)
 
 
+def test_the_prior_follows_a_state_that_is_loaded_after_its_first_use():
+    first, second = (
+        PersonDenoiser(DenoiserConfig(None, None), random_prior((CHANNELS, GRID, GRID), COMPONENTS, 2, seed), linear())
+        for seed in (0, 1)
+    )
+    x, t = torch.randn(2, CHANNELS, GRID, GRID, dtype=torch.float64), torch.tensor([300, 700])
+    assert not torch.allclose(first(x, t), second(x, t))
+    first.load_state_dict(second.state_dict())
+    assert torch.equal(first.prior.centre, second.prior.centre)
+    assert torch.allclose(first(x, t), second(x, t))
+
+
 @pytest.mark.parametrize("config", [SMALL, DenoiserConfig(None, None), DenoiserConfig(SMALL.person, None)])
 def test_untrained_denoiser_is_the_closed_form(prior, config):
     denoiser = PersonDenoiser(config, prior, linear()).eval()
