@@ -2,7 +2,7 @@
 
 The mixture has all kinds of person that the training people suggest. Kinds are many (16 outfits of a sex, 9 styles of
 hair and hat, 6 pairs of shoes, plain or patterned) and people of one kind few or none, so kinds share what they can: a
-covariance of clothes for each group (outfit and pattern) and one of the head for each hair style, for which small
+covariance of clothes for each group (sex, outfit and pattern) and one of the head for each hair style, for which small
 groups lean on their like, and a mean that is a sum of effects: of the group, of the hair, of the shoes.
 """
 
@@ -28,6 +28,10 @@ from primdiffusion.training.latents import CHUNK, LatentSet
 
 RIDGE = 4.0
 """People without any effect that every effect is estimated with."""
+PASSES = 4
+"""Rounds of backfitting."""
+SAME_GARMENTS = 0.5
+"""What a person of the other sex in the same garments counts for a group's covariance."""
 
 Values = tuple[int, ...]
 """The value of each of some attributes, as its number in the vocabulary; -1 where unknown."""
@@ -53,11 +57,11 @@ def fit_mixture(
     values = _values(condition, vocabulary)
     rows = [[tuple(values[name][i] for name in key) for i in range(len(c))] for key in keys]
     choices = [sorted(set(row)) for row in rows]
-    effects = _effects(c, rows, choices)
-    remainder = c - sum(effects[k][[choices[k].index(v) for v in rows[k]]] for k in range(len(keys)))
-    shared, remainder = _shared(remainder, clothes, rows[0], choices[0], config)
-    axes = _covariances(remainder[:, :clothes], rows[0], choices[0], config)
-    head_axes = _covariances(remainder[:, clothes:], rows[1], choices[1], config)
+    effects, remainder = _effects(c, clothes, rows, choices)
+    garments = [tuple(v for name, v in zip(groups, row, strict=True) if name != "sex") for row in rows[0]]
+    shared, remainder = _shared(remainder, clothes, rows[0], choices[0], garments, config)
+    axes = _covariances(remainder[:, :clothes], rows[0], choices[0], garments, config)
+    head_axes = _covariances(remainder[:, clothes:], rows[1], choices[1], rows[1], config)
     all_kinds = [_kinds(group, keys, rows, choices) for group in choices[0]]
     size = len(all_kinds), max(map(len, all_kinds))
     log_weight, head = torch.full(size, IMPOSSIBLE), torch.zeros(size, dtype=torch.int64)
@@ -77,27 +81,32 @@ def fit_mixture(
 
 
 def _shared(
-    c: Float[Tensor, "n r"], clothes: int, group: Sequence[Values], groups: Sequence[Values], config: PriorConfig
+    c: Float[Tensor, "n r"],
+    clothes: int,
+    group: Sequence[Values],
+    groups: Sequence[Values],
+    garments: Sequence[Values],
+    config: PriorConfig,
 ) -> tuple[Float[Tensor, "g q r"], Float[Tensor, "n r"]]:
     """Leading principal directions of hands, with what goes with them elsewhere, and what they leave.
 
     Hands are bare in every outfit, so these are the directions of skin. Bare legs have its tone, trousers do not: so
-    clothes have a regression for each outfit, plain and patterned together, which leans on that of all.
+    clothes have a regression for each outfit, as far as they show it.
     """
     hands = c[:, clothes : (c.shape[1] + clothes) // 2]
     value, vector = torch.linalg.eigh((hands.T @ hands).double() / len(hands))
     value, vector = value.flip(0)[: config.shared].clamp_min(1e-12).float(), vector.flip(1)[:, : config.shared].float()
     scores = hands @ vector / value.sqrt()
-    pooled = scores.T @ c / len(c)
-    shared, remainder = pooled.repeat(len(groups), 1, 1), c.clone()
+    shared = (scores.T @ c / len(c)).repeat(len(groups), 1, 1)
+    remainder = c - scores @ shared[0]
     for g, values in enumerate(groups):
-        alike = torch.tensor([v[:2] == values[:2] for v in group])
-        own = scores[alike]
-        lean = config.lean * torch.eye(own.shape[1])
-        fitted = torch.linalg.solve(own.T @ own + lean, own.T @ c[alike] + lean @ pooled)
-        shared[g, :, :clothes] = fitted[:, :clothes]
         of_group = torch.tensor([v == values for v in group])
-        remainder[of_group] = c[of_group] - scores[of_group] @ shared[g]
+        garment = garments[group.index(values)]
+        alike = torch.tensor([v == garment for v in garments])
+        shared[g, :, :clothes], unknown = _shown(c[alike, :clothes], scores[alike], scores.shape[1])
+        remainder[of_group, :clothes] = c[of_group, :clothes] - (1 - unknown) * (
+            scores[of_group] @ shared[g, :, :clothes]
+        )
     return shared, remainder
 
 
@@ -111,34 +120,83 @@ def _values(condition: Float[Tensor, "n a"], vocabulary: AttributeVocabulary) ->
 
 
 def _effects(
-    c: Float[Tensor, "n r"], rows: Sequence[Sequence[Values]], choices: Sequence[Sequence[Values]]
-) -> list[Float[Tensor, "v r"]]:
-    """What every choice of every key adds to the mean, by ridge regression."""
-    blocks = [
+    c: Float[Tensor, "n r"], clothes: int, rows: Sequence[Sequence[Values]], choices: Sequence[Sequence[Values]]
+) -> tuple[list[Float[Tensor, "v r"]], Float[Tensor, "n r"]]:
+    """What every choice of every key adds to the mean, and what they leave, by backfitting.
+
+    Groups say what clothes are like, and heads what hands and head are like. The other keys add what they show to:
+    long hair hangs over a collar, but the shirts of the few people who have it do not colour everybody's.
+    """
+    designs = [
         torch.nn.functional.one_hot(torch.tensor([options.index(v) for v in row]), len(options)).float()
         for row, options in zip(rows, choices, strict=True)
     ]
-    design = torch.cat(blocks, dim=1).double()
-    normal = design.T @ design + RIDGE * torch.eye(design.shape[1], dtype=torch.float64)
-    effect = torch.linalg.solve(normal, design.T @ c.double()).float()
-    return list(effect.split([len(options) for options in choices]))
+    mean = c.mean(0)
+    effects, remainder = [torch.zeros(len(options), c.shape[1]) for options in choices], c - mean
+    for part, first in ((slice(0, clothes), 0), (slice(clothes, None), 1)):
+        unknown: dict[int, Tensor] = {}
+        for key in (first, *(k for k in range(len(rows)) if k != first)) * PASSES:
+            design = designs[key]
+            left = remainder[:, part] + design @ effects[key][:, part]
+            if key == first:
+                effect, unknown[key] = _ridge(left, design), torch.zeros(left.shape[1])
+            else:
+                effect, unknown[key] = _shown(left, design, design.shape[1] - 1)
+            effects[key][:, part] = effect
+            remainder[:, part] = left - design @ effect
+        for key, share in unknown.items():
+            remainder[:, part] += share * (designs[key] @ effects[key][:, part])
+    effects[0] += mean
+    return effects, remainder
+
+
+def _ridge(c: Float[Tensor, "n r"], design: Float[Tensor, "n v"]) -> Float[Tensor, "v r"]:
+    """Coefficients by ridge regression on a design."""
+    normal = design.T @ design + RIDGE * torch.eye(design.shape[1])
+    return torch.linalg.solve(normal.double(), (design.T @ c).double()).float()
+
+
+def _shown(
+    c: Float[Tensor, "n r"], design: Float[Tensor, "n v"], freedoms: int
+) -> tuple[Float[Tensor, "v r"], Float[Tensor, "r"]]:
+    """As `_ridge`, but each coefficient's part shrinks by s = 1 - 1/F (James and Stein), down to 0.
+
+    F compares what the design's degrees of freedom explain with what they would explain by chance. The second is how
+    much of the shrunk part belongs to what is left, independent of it, so that the variance stays what it was.
+    """
+    effect = _ridge(c, design)
+    fitted = design @ effect
+    chance = (c - fitted).square().sum(0) * freedoms / max(len(c) - freedoms, 1)
+    s = (1 - chance / fitted.square().sum(0).clamp_min(1e-12)).clamp(1e-6, 1)
+    people = design.square().sum(0)
+    shrunk = s * (people / (people + RIDGE)).mean()
+    return s * effect, 1 - (1 - (1 - shrunk**2).sqrt()) / shrunk
 
 
 def _covariances(
-    c: Float[Tensor, "n i"], group: Sequence[Values], groups: Sequence[Values], config: PriorConfig
+    c: Float[Tensor, "n i"],
+    group: Sequence[Values],
+    groups: Sequence[Values],
+    garments: Sequence[Values],
+    config: PriorConfig,
 ) -> tuple[Float[Tensor, "g a i"], Float[Tensor, "g a"], Float[Tensor, "g"]]:
-    """Principal axes and variances of each group's people, and of `config.lean` of all groups alike in the last value.
+    """Principal axes and variances of each group's people.
 
+    Those of the same `garments` in other groups count by half, and `config.lean` of all groups alike in the last value.
     `config.axes` axes are kept; the mean variance of the others is that of all directions left.
     """
-    of = torch.tensor([groups.index(v) for v in group])
-    scatter = [c[of == g].T @ c[of == g] for g in range(len(groups))]
-    counts = [int((of == g).sum()) for g in range(len(groups))]
+    worn = {values: garment for values, garment in zip(group, garments, strict=True)}
+    members = [torch.tensor([v == values for v in group]) for values in groups]
+    counts = [int(one.sum()) for one in members]
+    scatter = [c[one].T @ c[one] for one in members]
     axes, variances, left = [], [], []
-    for g, own in enumerate(groups):
+    for own in groups:
         like = [other for other, values in enumerate(groups) if values[-1:] == own[-1:]]
         pooled = sum(scatter[other] for other in like) / sum(counts[other] for other in like)
-        covariance = (scatter[g] + config.lean * pooled) / (counts[g] + config.lean)
+        share = [1.0 if values == own else SAME_GARMENTS * (worn[values] == worn[own]) for values in groups]
+        people = sum(s * count for s, count in zip(share, counts, strict=True))
+        covariance = sum(s * one for s, one in zip(share, scatter, strict=True) if s) + config.lean * pooled
+        covariance = covariance / (people + config.lean)
         value, vector = torch.linalg.eigh(covariance.double())
         value = value.flip(0).clamp_min(max(float(value.max()) * 1e-7, 1e-12) if len(value) else 0.0)
         kept = min(config.axes, len(value))

@@ -111,6 +111,43 @@ def test_heads_keep_the_variance_of_their_hair(mixture):
     assert spread[1] < 0.2
 
 
+def fitted(people, c, config=CONFIG):
+    condition = torch.stack([WORDS.encode({**person, "height": 1.7}) for person in people])
+    return SimpleNamespace(**fit_mixture(c, CLOTHES, condition, WORDS, config))
+
+
+def test_what_happens_to_go_with_hair_and_skin_does_not_colour_clothes():
+    few = [{**DRESS, "hair": hair, "shoes": "boots"} for hair in ("bob",) * 20 + ("long",) * 5]
+    c = torch.randn(len(few), CLOTHES + 2, generator=torch.Generator().manual_seed(1))
+    mixture = fitted(few, c)
+    bob, long = (part(mixture, **DRESS, hair=hair, shoes="boots") for hair in ("bob", "long"))
+    by_chance = (c[20:] - c[:20].mean(0)).mean(0)[:CLOTHES].square().sum()
+    assert (mixture.centre[long] - mixture.centre[bob])[:CLOTHES].square().sum() < 0.3 * by_chance
+    assert mixture.shared[0, 0, :CLOTHES].square().sum() < 0.2
+
+
+def test_the_variance_is_that_of_the_people_however_little_of_it_is_explained():
+    few = [{**DRESS, "hair": hair, "shoes": shoes} for hair in ("bob", "long") for shoes in ("boots", "pumps")] * 10
+    for seed in range(5):
+        c = torch.randn(len(few), CLOTHES + 2, generator=torch.Generator().manual_seed(seed))
+        mixture = fitted(few, c)
+        weight = mixture.log_weight[0].exp()
+        mean = weight @ mixture.centre[0]
+        spread = weight @ (mixture.centre[0] - mean).square() + mixture.shared[0].square().sum(0)
+        spread[:CLOTHES] += variances(mixture.axes[0], mixture.variance[0], mixture.left[0])
+        assert spread[:CLOTHES].sum() == pytest.approx(c[:, :CLOTHES].square().mean(0).sum().item(), rel=0.1)
+
+
+def test_the_other_sex_in_the_same_garments_counts_by_half():
+    women, men = [PEOPLE[400]] * 10, [PEOPLE[-1]] * 40
+    c = 0.01 * torch.randn(50, CLOTHES + 2, generator=torch.Generator().manual_seed(0))
+    c[10:, 3] *= 200
+    mixture = fitted(women + men, c, PriorConfig(lean=0.0, axes=4, shared=1))
+    women_s, men_s = (variances(mixture.axes[g], mixture.variance[g], mixture.left[g])[3].item() for g in range(2))
+    assert women_s == pytest.approx(4 * 20 / (10 + 20), rel=0.3)
+    assert men_s == pytest.approx(4 * 40 / (40 + 5), rel=0.3)
+
+
 def test_skin_is_shared_by_hands_and_head_and_by_clothes_that_show_it(mixture):
     dress, jeans = (
         mixture.shared[part(mixture, sex="female", outfit=outfit, hair="bob", shoes="boots")[0], 0]
