@@ -185,18 +185,16 @@ def _covariances(
     Those of the same `garments` in other groups count by half, and `config.lean` of all groups alike in the last value.
     `config.axes` axes are kept; the mean variance of the others is that of all directions left.
     """
-    worn = {values: garment for values, garment in zip(group, garments, strict=True)}
+    worn = dict(zip(group, garments, strict=True))
     members = [torch.tensor([v == values for v in group]) for values in groups]
-    counts = [int(one.sum()) for one in members]
-    scatter = [c[one].T @ c[one] for one in members]
+    counts = torch.tensor([float(one.sum()) for one in members])
+    scatter = torch.stack([c[one].T @ c[one] for one in members])
     axes, variances, left = [], [], []
     for own in groups:
-        like = [other for other, values in enumerate(groups) if values[-1:] == own[-1:]]
-        pooled = sum(scatter[other] for other in like) / sum(counts[other] for other in like)
-        share = [1.0 if values == own else SAME_GARMENTS * (worn[values] == worn[own]) for values in groups]
-        people = sum(s * count for s, count in zip(share, counts, strict=True))
-        covariance = sum(s * one for s, one in zip(share, scatter, strict=True) if s) + config.lean * pooled
-        covariance = covariance / (people + config.lean)
+        alike = torch.tensor([float(values[-1:] == own[-1:]) for values in groups])
+        share = torch.tensor([1.0 if v == own else SAME_GARMENTS * (worn[v] == worn[own]) for v in groups])
+        share += config.lean * alike / (alike @ counts)
+        covariance = torch.einsum("h,hij->ij", share / (share @ counts), scatter)
         value, vector = torch.linalg.eigh(covariance.double())
         value = value.flip(0).clamp_min(max(float(value.max()) * 1e-7, 1e-12) if len(value) else 0.0)
         kept = min(config.axes, len(value))
