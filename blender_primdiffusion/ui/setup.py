@@ -26,9 +26,7 @@ from .drawing import draw_lines
 LOCKS = Path(__file__).resolve().parents[1] / "requirements"
 OWN_LOCK = "requirements.txt"
 """In a folder of wheels: a list of packages that goes before ours."""
-_ONLINE = (
-    "Blender may not use the network: allow it in System > Network > Allow Online Access, or install from a folder"
-)
+_ONLINE = "Blender may not use the network: allow it, or install from a folder"
 
 
 session = Session(

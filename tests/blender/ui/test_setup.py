@@ -101,7 +101,7 @@ def test_without_online_access_set_up_is_rejected_with_the_remedy(wheels):
         press.set_up_backend()
     layout = Layout()
     preferences.draw_set_up(layout)
-    assert "Allow Online Access" in said(layout)
+    assert "may not use the network" in said(layout)
     assert "extensions.userpref_allow_online" in layout.of("button")
     assert not places.set_up_folder().root.exists()
 
